@@ -1,0 +1,23 @@
+"""What is raised when the user's input cannot be used, and how near misses are named."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+
+class InputError(ValueError):
+    """A config, log, model or option that cannot be used as given.
+
+    The message is one line: what is wrong, where it stands, and what would be right. The command
+    line prints it and exits with code 2.
+    """
+
+
+def choices(name: object, available: Iterable[object]) -> str:
+    """Return ``"; did you mean 'x'? (there are: x, y, z)"`` for an unknown ``name``."""
+    names = [str(a) for a in available]
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.5)
+    hint = f"; did you mean {near[0]!r}?" if near else ""
+    shown = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
+    return f"{hint} (there are: {shown})" if names else f"{hint} (there are none)"

@@ -1,0 +1,443 @@
+"""What may vary: named parameters of a model, and vectors of their values.
+
+A parameter names a field of ``MjModel``, the object that carries it and, where the field has several
+components, which one. Any real-valued field that ``mujoco.batch`` gives per simulation can vary. Two
+more fields stand for several at once: ``actuator_kp`` and ``actuator_kv``, the gains of position and
+velocity servos (in ``gainprm`` and ``biasprm`` together).
+"""
+
+from __future__ import annotations
+
+import copy
+import fnmatch
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import mujoco
+import mujoco.batch
+import numpy as np
+
+from dropo_torch.errors import InputError, choices
+from dropo_torch.model import load_model
+
+#: Fields whose values must be positive, whatever the search bounds.
+POSITIVE_FIELDS = frozenset({"body_mass", "body_inertia", "opt.timestep", "opt.impratio", "geom_size", "pair_friction"})
+#: Fields whose values must not be negative.
+NONNEGATIVE_FIELDS = frozenset(
+    {
+        "dof_damping", "dof_frictionloss", "dof_armature", "jnt_stiffness", "geom_friction", "opt.density",
+        "opt.viscosity", "actuator_damping", "actuator_armature", "actuator_kp", "actuator_kv", "actuator_delay",
+        "tendon_stiffness", "tendon_damping", "tendon_frictionloss", "tendon_armature", "body_gravcomp",
+    }
+)  # fmt: skip
+#: Servo gains: where a gain stands, as (field, component, factor).
+_SERVO = {
+    "actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)),
+    "actuator_kv": (("actuator_biasprm", 2, -1.0),),
+}
+_FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear", "actuator_gainprm"})
+_OBJECTS = {
+    "body": ("nbody", "body"), "geom": ("ngeom", "geom"), "jnt": ("njnt", "joint"), "dof": ("nv", "joint"),
+    "qpos0": ("nq", "joint"), "qpos": ("nq", "joint"), "actuator": ("nu", "actuator"), "site": ("nsite", "site"),
+    "tendon": ("ntendon", "tendon"), "eq": ("neq", "equality"), "pair": ("npair", "pair"),
+    "flex": ("nflex", "flex"),
+}  # fmt: skip
+_KEYS = ("field", "name", "index", "bounds", "limits", "unit", "scale", "relative", "scale_inertia")
+
+
+@dataclass(frozen=True)
+class Target:
+    """One number of a model that a parameter writes: ``field.flat[index] = factor * value``."""
+
+    field: str
+    index: int
+    factor: float = 1.0
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One parameter of a simulator.
+
+    Attributes:
+        name: what the parameter is called, in reports and files.
+        low, high: the search box of its mean, in ``unit``.
+        field: the field of ``MjModel``; empty for a simulator that is no MuJoCo model.
+        objects: names of the objects that carry it; several are tied to one value.
+        index: component of the field, where it has several.
+        unit: unit of the value, for people.
+        limits: values outside are never simulated: samples are redrawn inside them.
+        scale: ``"log"`` searches and distributes the logarithm of the value.
+        targets: the numbers of the model that it writes.
+    """
+
+    name: str
+    low: float
+    high: float
+    field: str = ""
+    objects: tuple[str, ...] = ()
+    index: int | None = None
+    unit: str = ""
+    limits: tuple[float, float] = (-np.inf, np.inf)
+    scale: Literal["linear", "log"] = "linear"
+    targets: tuple[Target, ...] = ()
+
+    @property
+    def where(self) -> str:
+        """The parameter's place in the model, such as ``body_mass of thigh``."""
+        component = "" if self.index is None else f"[{self.index}]"
+        of = f" of {', '.join(self.objects)}" if self.objects else ""
+        return f"{self.field or 'parameter'}{component}{of}"
+
+
+class ParameterSpace:
+    """The parameters that may vary, in order, and the vectors of their values ``(..., d)``.
+
+    Args:
+        model: the model or its path; ``None`` for a simulator that is no MuJoCo model.
+        parameters: name → ``field``, ``name`` (one, a list or a pattern such as ``"*_joint"``),
+            ``bounds`` and, where needed, ``index``, ``unit``, ``limits``, ``scale: log``,
+            ``relative: true`` (the value multiplies the model's own) and ``scale_inertia: true`` (a
+            mass takes its inertia along).
+
+    Raises:
+        InputError: an unknown key, field or object (the nearest is offered), bounds that cannot be.
+    """
+
+    def __init__(self, model: mujoco.MjModel | str | Path | None, parameters: Mapping[str, Mapping[str, Any]]) -> None:
+        self.model = None if model is None else load_model(model)
+        if not parameters:
+            raise InputError("parameters: none given; name at least one, such as 'mass: {field: body_mass, ...}'")
+        self.parameters = tuple(_parse(self.model, str(name), spec) for name, spec in parameters.items())
+        _refuse_overlap(self.parameters)
+
+    def __len__(self) -> int:
+        """Return the number of parameters d."""
+        return len(self.parameters)
+
+    def __repr__(self) -> str:
+        return f"ParameterSpace({', '.join(self.names)})"
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The parameters' names, d of them."""
+        return tuple(p.name for p in self.parameters)
+
+    @cached_property
+    def low(self) -> np.ndarray:
+        """Lower search bounds, ``(d,)``."""
+        return np.array([p.low for p in self.parameters])
+
+    @cached_property
+    def high(self) -> np.ndarray:
+        """Upper search bounds, ``(d,)``."""
+        return np.array([p.high for p in self.parameters])
+
+    @cached_property
+    def limits(self) -> np.ndarray:
+        """Physical limits, ``(d, 2)``."""
+        return np.array([p.limits for p in self.parameters])
+
+    @cached_property
+    def is_log(self) -> np.ndarray:
+        """Whether each parameter is searched by its logarithm, ``(d,)`` bool."""
+        return np.array([p.scale == "log" for p in self.parameters])
+
+    @cached_property
+    def fields(self) -> tuple[str, ...]:
+        """The model fields that the parameters write."""
+        return tuple(dict.fromkeys(t.field for p in self.parameters for t in p.targets))
+
+    @cached_property
+    def nominal(self) -> np.ndarray:
+        """The model's own values, ``(d,)``; NaN for a parameter outside the model."""
+        return np.array([_nominal(self.model, p) for p in self.parameters])
+
+    def vector(self, values: Mapping[str, float]) -> np.ndarray:
+        """Return named values as a vector ``(d,)``.
+
+        Raises:
+            InputError: a missing or unknown name.
+        """
+        for name in values:
+            if name not in self.names:
+                raise InputError(f"parameters: unknown name {name!r}" + choices(name, self.names))
+        missing = [n for n in self.names if n not in values]
+        if missing:
+            raise InputError(f"parameters: no value given for {missing[0]!r}")
+        return np.array([float(values[n]) for n in self.names])
+
+    def named(self, values: np.ndarray) -> dict[str, float]:
+        """Return a vector ``(d,)`` as name → value."""
+        return dict(zip(self.names, (float(v) for v in values), strict=True))
+
+    def write(self, fields: Mapping[str, np.ndarray], values: np.ndarray) -> None:
+        """Write parameter vectors ``(K, d)`` into per-simulation model fields ``(K, ...)``, in place."""
+        for column, parameter in enumerate(self.parameters):
+            for target in parameter.targets:
+                rows = fields[target.field].reshape(len(values), -1)
+                rows[:, target.index] = target.factor * values[:, column]
+
+    def apply(self, values: np.ndarray | Mapping[str, float]) -> mujoco.MjModel:
+        """Return a copy of the model with the given values and everything derived from them."""
+        if self.model is None:
+            raise InputError("parameters: these belong to no MuJoCo model")
+        vector = self.vector(values) if isinstance(values, Mapping) else np.asarray(values, dtype=np.float64)
+        model = copy.copy(self.model)
+        for column, parameter in enumerate(self.parameters):
+            for target in parameter.targets:
+                write_field(model, target.field, target.index, target.factor * vector[column])
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        return model
+
+
+def read_field(model: mujoco.MjModel, field: str) -> np.ndarray:
+    """Return a model field, or an option written ``opt.timestep``, as an array."""
+    owner, attribute = (model.opt, field[4:]) if field.startswith("opt.") else (model, field)
+    return np.asarray(getattr(owner, attribute))
+
+
+def write_field(model: mujoco.MjModel, field: str, index: int, value: float) -> None:
+    """Write one number of a model field, counted over the flattened field."""
+    array = read_field(model, field)
+    if array.ndim == 0:
+        setattr(model.opt, field[4:], value)
+    else:
+        array.reshape(-1)[index] = value
+
+
+def object_names(model: mujoco.MjModel, prefix: str) -> list[str]:
+    """Names of a model's objects of one kind, in order; unnamed ones are called ``body3``, ``geom0``.
+
+    An actuator without a name is called by its joint's.
+    """
+    count, accessor = _OBJECTS[prefix]
+    number = model.njnt if accessor == "joint" else getattr(model, count)
+    names = []
+    for i in range(number):
+        name = getattr(model, accessor)(i).name
+        if not name and accessor == "actuator" and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
+            name = model.joint(model.actuator_trnid[i, 0]).name
+        names.append(name or f"{accessor}{i}")
+    return names
+
+
+def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> Parameter:
+    """One entry of ``parameters``."""
+    where = f"parameters.{name}"
+    if not isinstance(spec, Mapping):
+        raise InputError(f"{where}: expected keys such as field, name and bounds, got {spec!r}")
+    for key in spec:
+        if key not in _KEYS:
+            raise InputError(f"{where}: unknown key {key!r}" + choices(key, _KEYS))
+    field, index = _field_and_index(where, spec)
+    if model is None and field:
+        raise InputError(f"{where}: field {field!r} needs a MuJoCo model; this simulator has none")
+    if model is not None and not field:
+        raise InputError(f"{where}: no field given; expected one of MjModel's, such as field: body_mass")
+    scale = spec.get("scale", "linear")
+    if scale not in ("linear", "log"):
+        raise InputError(f"{where}: scale is {scale!r}; expected linear or log")
+    targets, objects, index = _targets(model, where, field, index, spec) if model is not None else ((), (), None)
+    relative = bool(spec.get("relative", False))
+    if relative:
+        if model is None:
+            raise InputError(f"{where}: relative needs a MuJoCo model whose value it multiplies")
+        targets = tuple(_scaled(model, where, t) for t in targets)
+    if spec.get("scale_inertia", False):
+        targets = _with_inertia(model, where, field, targets, relative)
+    low, high = _interval(where, "bounds", spec.get("bounds"))
+    limits = _limits(where, field, relative, spec, low, high)
+    if scale == "log" and low <= 0:
+        raise InputError(f"{where}: scale log needs positive bounds, got [{low:g}, {high:g}]")
+    return Parameter(
+        name=name, low=low, high=high, field=field, objects=objects, index=index,
+        unit=str(spec.get("unit", "") or ""), limits=limits, scale=scale, targets=targets,
+    )  # fmt: skip
+
+
+def _field_and_index(where: str, spec: Mapping[str, Any]) -> tuple[str, int | None]:
+    """The field, and the component of ``geom_friction[0]`` or of ``index``."""
+    field = str(spec.get("field", "") or "")
+    index = spec.get("index")
+    inline = re.fullmatch(r"(.+)\[(\d+)\]", field)
+    if inline:
+        field, index = inline[1], int(inline[2]) if index is None else index
+    if index is not None and (isinstance(index, bool) or not isinstance(index, int) or index < 0):
+        raise InputError(f"{where}: index is {index!r}; expected a component counted from 0")
+    return field, index
+
+
+def _targets(
+    model: mujoco.MjModel, where: str, field: str, index: int | None, spec: Mapping[str, Any]
+) -> tuple[tuple[Target, ...], tuple[str, ...], int | None]:
+    """The numbers of the model that a field, its objects and component stand for."""
+    if field in _SERVO:
+        return _servo_targets(model, where, field, spec)
+    known = mujoco.batch.MODEL_FIELDS
+    if field not in known:
+        real = [f for f in known if read_field(model, f).dtype.kind == "f"]
+        raise InputError(f"{where}: unknown field {field!r}" + choices(field, sorted([*real, *_SERVO])))
+    array = read_field(model, field)
+    if array.dtype.kind != "f":
+        raise InputError(f"{where}: field {field!r} holds whole numbers or flags; only real-valued fields can vary")
+    if field.startswith("opt."):
+        if spec.get("name"):
+            raise InputError(f"{where}: {field} belongs to the whole model; leave out name")
+        component = _component(where, field, index, array.size)
+        return (Target(field, component),), (), (component if array.size > 1 else None)
+    prefix = field.split("_", 1)[0]
+    if prefix not in _OBJECTS:
+        raise InputError(f"{where}: field {field!r} belongs to no named object; it cannot vary")
+    objects = _select_objects(where, spec, object_names(model, prefix), _OBJECTS[prefix][1])
+    size = int(np.prod(array.shape[1:], dtype=int))
+    every: list[Target] = []
+    for number in objects.values():
+        rows = _rows(model, prefix, number)
+        if len(rows) > 1 and index is not None and size == 1:  # one degree of freedom of a free or ball joint
+            if index >= len(rows):
+                raise InputError(f"{where}: index {index} is outside {field} of this joint, which has {len(rows)}")
+            rows = rows[index : index + 1]
+            component = 0
+        else:
+            component = _component(where, field, index, size)
+        every += [Target(field, row * size + component) for row in rows]
+    return tuple(every), tuple(objects), (index if index is not None or size == 1 else 0)
+
+
+def _servo_targets(
+    model: mujoco.MjModel, where: str, field: str, spec: Mapping[str, Any]
+) -> tuple[tuple[Target, ...], tuple[str, ...], None]:
+    objects = _select_objects(where, spec, object_names(model, "actuator"), "actuator")
+    targets = []
+    for name, number in objects.items():
+        if model.actuator_biastype[number] != mujoco.mjtBias.mjBIAS_AFFINE:
+            raise InputError(
+                f"{where}: actuator {name!r} is no position or velocity servo; use actuator_gear or actuator_gainprm"
+            )
+        is_velocity = model.actuator_biasprm[number, 1] == 0 and model.actuator_biasprm[number, 2] != 0
+        if field == "actuator_kp" and is_velocity:
+            raise InputError(f"{where}: actuator {name!r} is a velocity servo; its gain is actuator_kv")
+        parts = _SERVO[field] + ((("actuator_gainprm", 0, 1.0),) if field == "actuator_kv" and is_velocity else ())
+        for part, component, factor in parts:
+            width = read_field(model, part).shape[1]
+            targets.append(Target(part, number * width + component, factor))
+    return tuple(targets), tuple(objects), None
+
+
+def _select_objects(where: str, spec: Mapping[str, Any], names: Sequence[str], kind: str) -> dict[str, int]:
+    """The objects of ``name``: one, a list, or patterns with ``*``; name → number."""
+    wanted = spec.get("name")
+    if wanted is None or wanted == []:
+        raise InputError(f"{where}: no name given; expected a {kind}" + choices("", names).replace("; ", " ", 1))
+    entries = [wanted] if isinstance(wanted, (str, int)) else list(wanted)
+    found: dict[str, int] = {}
+    for entry in map(str, entries):
+        matches = fnmatch.filter(names, entry) if "*" in entry else [n for n in names if n == entry]
+        if not matches:
+            raise InputError(f"{where}: the model has no {kind} {entry!r}" + choices(entry, names))
+        found.update({n: names.index(n) for n in matches})
+    return found
+
+
+def _rows(model: mujoco.MjModel, prefix: str, number: int) -> list[int]:
+    """Rows of a field for one object: a joint's may be several degrees of freedom."""
+    if prefix == "dof":
+        start = int(model.jnt_dofadr[number])
+        return list(range(start, start + {0: 6, 1: 3}.get(int(model.jnt_type[number]), 1)))
+    if prefix in ("qpos0", "qpos"):
+        start = int(model.jnt_qposadr[number])
+        return list(range(start, start + {0: 7, 1: 4}.get(int(model.jnt_type[number]), 1)))
+    return [number]
+
+
+def _component(where: str, field: str, index: int | None, size: int) -> int:
+    if index is None:
+        if size == 1 or field in _FIRST_COMPONENT:
+            return 0
+        raise InputError(f"{where}: {field} has {size} components; add index: 0 to {size - 1}")
+    if index >= size:
+        raise InputError(f"{where}: index {index} is outside {field}, which has {size} component{'s' * (size > 1)}")
+    return index
+
+
+def _scaled(model: mujoco.MjModel, where: str, target: Target) -> Target:
+    """The target of a relative parameter: its factor is the model's own value."""
+    own = float(read_field(model, target.field).reshape(-1)[target.index])
+    if own == 0:
+        raise InputError(f"{where}: relative, but the model's {target.field} is 0 there; give absolute bounds")
+    return Target(target.field, target.index, own)
+
+
+def _with_inertia(
+    model: mujoco.MjModel | None, where: str, field: str, targets: tuple[Target, ...], relative: bool
+) -> tuple[Target, ...]:
+    """Add the principal moments of inertia, in proportion to the mass."""
+    if model is None or field != "body_mass":
+        raise InputError(f"{where}: scale_inertia is for field body_mass, not {field!r}")
+    extra = []
+    for target in targets:
+        mass = 1.0 if relative else float(model.body_mass[target.index])
+        if mass <= 0:
+            raise InputError(f"{where}: scale_inertia needs a body whose mass in the model is positive")
+        extra += [
+            Target("body_inertia", 3 * target.index + i, float(model.body_inertia[target.index, i]) / mass)
+            for i in range(3)
+        ]
+    return targets + tuple(extra)
+
+
+def _interval(where: str, key: str, pair: Any) -> tuple[float, float]:
+    try:
+        low, high = (float(x) for x in pair)
+    except (TypeError, ValueError):
+        raise InputError(f"{where}: {key} is {pair!r}; expected [low, high]") from None
+    if np.isnan(low) or np.isnan(high) or (key == "bounds" and not np.isfinite([low, high]).all()):
+        raise InputError(f"{where}: {key} is [{low:g}, {high:g}]; expected finite numbers")
+    if low >= high:
+        raise InputError(f"{where}: {key} is [{low:g}, {high:g}]; the first must be below the second")
+    return low, high
+
+
+def _limits(
+    where: str, field: str, relative: bool, spec: Mapping[str, Any], low: float, high: float
+) -> tuple[float, float]:
+    """Physical limits: what the field allows, narrowed by the entry's own ``limits``."""
+    positive = field in POSITIVE_FIELDS
+    floor = 0.0 if positive or field in NONNEGATIVE_FIELDS else -np.inf
+    what = "value" if relative else field.replace("opt.", "").split("_")[-1]
+    if positive and low <= 0:
+        raise InputError(f"{where}: bounds [{low:g}, {high:g}] allow a {what} that is not positive; start above 0")
+    if low < floor and not relative:
+        raise InputError(f"{where}: bounds [{low:g}, {high:g}] allow a negative {what}; start at 0 or above")
+    if "limits" in spec and spec["limits"] is not None:
+        smallest, largest = _interval(where, "limits", spec["limits"])
+        if smallest > low or largest < high:
+            raise InputError(f"{where}: limits [{smallest:g}, {largest:g}] do not contain bounds [{low:g}, {high:g}]")
+        if smallest < floor or (positive and smallest <= 0):
+            raise InputError(f"{where}: limits [{smallest:g}, {largest:g}] allow a {what} that cannot be")
+        return smallest, largest
+    if positive or spec.get("scale") == "log":
+        return 0.1 * low, np.inf
+    return floor if low >= floor else -np.inf, np.inf
+
+
+def _nominal(model: mujoco.MjModel | None, parameter: Parameter) -> float:
+    if model is None or not parameter.targets:
+        return float("nan")
+    target = parameter.targets[0]
+    own = float(read_field(model, target.field).reshape(-1)[target.index])
+    return own / target.factor if target.factor else float("nan")
+
+
+def _refuse_overlap(parameters: Sequence[Parameter]) -> None:
+    """Two parameters must not write the same number."""
+    owner: dict[tuple[str, int], str] = {}
+    for p in parameters:
+        for t in p.targets:
+            other = owner.setdefault((t.field, t.index), p.name)
+            if other != p.name:
+                raise InputError(f"parameters.{p.name}: writes the same {t.field} as {other!r}; keep one of them")

@@ -1,0 +1,70 @@
+"""The interface of every simulator: many transitions under many parameter vectors, as one batch."""
+
+from __future__ import annotations
+
+import abc
+from typing import ClassVar
+
+import torch
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace
+
+
+class Simulator(abc.ABC):
+    """Simulates T transitions under each of K parameter vectors.
+
+    A simulator holds no state between calls: results depend on the arguments alone, whatever was
+    simulated before, the number of threads and the size of the chunks in which it works.
+
+    Attributes:
+        differentiable: whether autograd reaches ``states``, ``controls`` and ``values``.
+        parameters: what varies, d parameters.
+        frame_skip: physics steps of one logged transition.
+        num_states: width of a state, ``nq + nv`` for a MuJoCo model.
+        num_controls: width of a control, ``nu``.
+        timestep: seconds of one logged transition, or ``None`` if the simulator does not say.
+    """
+
+    differentiable: ClassVar[bool] = False
+    name: ClassVar[str]
+    parameters: ParameterSpace
+    frame_skip: int
+    num_states: int
+    num_controls: int
+    timestep: float | None
+
+    @abc.abstractmethod
+    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after ``lag`` transitions.
+
+        Args:
+            states: start states, ``(T, num_states)``, float64.
+            controls: the controls of each transition, ``(T, lag, num_controls)``.
+            values: parameter vectors in their units, ``(K, d)``.
+
+        Returns:
+            ``(T, K, num_states)``, float64. A simulation that diverges is NaN throughout.
+        """
+
+    @abc.abstractmethod
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after each of the ``lag`` transitions, ``(T, K, lag, num_states)``.
+
+        The arguments are those of :meth:`simulate`, whose result is the last of these.
+        """
+
+    def check_arguments(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> None:
+        """Raise an :class:`InputError` for arguments whose shapes do not fit."""
+        expected = {
+            "states": (states, 2, self.num_states, "(T, nq + nv)"),
+            "controls": (controls, 3, self.num_controls, "(T, lag, nu)"),
+            "values": (values, 2, len(self.parameters), "(K, d)"),
+        }
+        for name, (array, ndim, width, shape) in expected.items():
+            if array.ndim != ndim or array.shape[-1] != width:
+                raise InputError(f"{name}: shape {tuple(array.shape)} given; expected {shape} with {width} columns")
+        if len(states) != len(controls):
+            raise InputError(f"controls: {len(controls)} rows given for {len(states)} states; expected one each")
+        if controls.shape[1] < 1:
+            raise InputError("controls: no logged step given; expected (T, lag, nu) with lag 1 or more")

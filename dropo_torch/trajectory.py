@@ -1,0 +1,221 @@
+"""Logged trajectories, and the transitions that the likelihood compares."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dropo_torch.errors import InputError
+from dropo_torch.observation import Observation
+
+
+@dataclass(frozen=True)
+class Trajectories:
+    """Logged episodes, one row a transition, in the order in which they were recorded.
+
+    Attributes:
+        observations: what was observed before each transition, ``(T, n)``.
+        next_observations: what was observed after it, ``(T, n)``.
+        actions: the command applied during it, ``(T, m)``.
+        terminals: whether it is the last of its episode, for whatever reason, ``(T,)`` bool. The
+            last row always is.
+        dt: duration of a transition in seconds, or ``None`` where the log does not say.
+        source: where the log came from, for messages.
+
+    Raises:
+        InputError: shapes that do not fit, a value that is not finite, no transition.
+    """
+
+    observations: np.ndarray
+    next_observations: np.ndarray
+    actions: np.ndarray
+    terminals: np.ndarray
+    dt: float | None = None
+    source: str = "log"
+
+    def __post_init__(self) -> None:
+        for name in ("observations", "next_observations", "actions"):
+            array = _matrix(getattr(self, name), name, self.source)
+            object.__setattr__(self, name, array)
+        rows = len(self.observations)
+        if rows == 0:
+            raise InputError(f"{self.source}: the log has no transition; at least one is needed")
+        terminals = np.asarray(self.terminals)
+        if terminals.dtype.kind not in "biuf" or not np.isin(terminals, (0, 1)).all():
+            raise InputError(f"{self.source}: terminals must be true/false or 0/1 flags")
+        terminals = terminals.reshape(-1).astype(bool)
+        for name, array in (
+            ("next_observations", self.next_observations),
+            ("actions", self.actions),
+            ("terminals", terminals),
+        ):
+            if len(array) != rows:
+                raise InputError(
+                    f"{self.source}: {name} has {len(array)} rows and observations has {rows}; both need one row a transition"
+                )
+        if self.next_observations.shape != self.observations.shape:
+            raise InputError(
+                f"{self.source}: next_observations has {self.next_observations.shape[1]} columns and observations has "
+                f"{self.observations.shape[1]}; both need the same columns"
+            )
+        if self.dt is not None and not (np.isfinite(self.dt) and self.dt > 0):
+            raise InputError(
+                f"{self.source}: the time between samples is {self.dt}; expected a positive number of seconds"
+            )
+        terminals = terminals.copy()
+        terminals[-1] = True
+        object.__setattr__(self, "terminals", _frozen(terminals))
+
+    def __len__(self) -> int:
+        """Return the number of transitions T."""
+        return len(self.observations)
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of episodes."""
+        return int(self.terminals.sum())
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """The episode of each transition, counted from 0, ``(T,)`` int."""
+        ends = np.cumsum(self.terminals)
+        return np.concatenate([[0], ends[:-1]])
+
+    def select(self, rows: np.ndarray | slice) -> Trajectories:
+        """Return the given rows, ascending; an episode ends wherever rows are left out."""
+        index = np.arange(len(self))[rows]
+        gap = np.append(np.diff(index) != 1, True)
+        return replace(
+            self,
+            observations=self.observations[index],
+            next_observations=self.next_observations[index],
+            actions=self.actions[index],
+            terminals=self.terminals[index] | gap,
+        )
+
+    def select_episodes(self, which: Sequence[int]) -> Trajectories:
+        """Return the given episodes, counted from 0."""
+        wanted = [int(e) for e in which]
+        bad = [e for e in wanted if not 0 <= e < self.num_episodes]
+        if bad or not wanted:
+            raise InputError(
+                f"{self.source}: episode {bad[0] if bad else 'list'} asked for; "
+                f"the log has {self.num_episodes} episodes, counted from 0"
+            )
+        return self.select(np.isin(self.episodes, wanted))
+
+
+def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
+    """Join several logs of the same columns; no window crosses from one into the next.
+
+    Raises:
+        InputError: logs whose columns or sampling times differ.
+    """
+    first = logs[0]
+    for log in logs[1:]:
+        for name in ("observations", "actions"):
+            ours, theirs = getattr(first, name).shape[1], getattr(log, name).shape[1]
+            if ours != theirs:
+                raise InputError(f"{log.source}: {theirs} columns of {name}, but {first.source} has {ours}")
+        if log.dt is not None and first.dt is not None and not np.isclose(log.dt, first.dt, rtol=1e-3):
+            raise InputError(f"{log.source}: sampled every {log.dt:g} s, but {first.source} every {first.dt:g} s")
+    return Trajectories(
+        observations=np.concatenate([log.observations for log in logs]),
+        next_observations=np.concatenate([log.next_observations for log in logs]),
+        actions=np.concatenate([log.actions for log in logs]),
+        terminals=np.concatenate([log.terminals for log in logs]),
+        dt=next((log.dt for log in logs if log.dt is not None), None),
+        source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
+    )
+
+
+@dataclass(frozen=True)
+class Transitions:
+    """λ-step windows of a log: from a state, through λ controls, to what was measured.
+
+    Attributes:
+        states: simulator states at the windows' starts, ``(T, nq + nv)``.
+        controls: the controls applied, ``(T, lag, nu)``.
+        measured: observed columns at the windows' ends, ``(T, n)``.
+        rows: row of the log at which each window starts, ``(T,)``.
+        episodes: episode of each window, ``(T,)``.
+    """
+
+    states: np.ndarray
+    controls: np.ndarray
+    measured: np.ndarray
+    rows: np.ndarray
+    episodes: np.ndarray
+
+    def __len__(self) -> int:
+        """Return the number of windows T."""
+        return len(self.states)
+
+    @property
+    def lag(self) -> int:
+        """Number of logged steps λ of a window."""
+        return int(self.controls.shape[1])
+
+    def select(self, rows: np.ndarray | slice) -> Transitions:
+        """Return the given windows."""
+        return Transitions(
+            states=self.states[rows],
+            controls=self.controls[rows],
+            measured=self.measured[rows],
+            rows=self.rows[rows],
+            episodes=self.episodes[rows],
+        )
+
+
+def make_transitions(trajectories: Trajectories, observation: Observation, *, lag: int = 1) -> Transitions:
+    """Cut a log into consecutive windows of ``lag`` transitions that never cross an episode's end.
+
+    Raises:
+        InputError: a log without an episode of ``lag`` transitions.
+    """
+    if lag < 1:
+        raise InputError(f"lag: {lag} given; expected a whole number of logged steps, 1 or more")
+    bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
+    starts = [np.arange(a, b - lag + 1, lag) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    rows = np.concatenate(starts)
+    if rows.size == 0:
+        longest = int(np.diff(bounds).max())
+        raise InputError(
+            f"{trajectories.source}: too short for lag {lag}: the longest episode has {longest} transitions; "
+            f"lag must be at most {longest}"
+        )
+    steps = rows[:, None] + np.arange(lag)
+    return Transitions(
+        states=observation.states(trajectories.observations[rows]),
+        controls=trajectories.actions[steps],
+        measured=observation.observed(trajectories.next_observations[rows + lag - 1]),
+        rows=rows,
+        episodes=trajectories.episodes[rows],
+    )
+
+
+def _matrix(array: object, name: str, source: str) -> np.ndarray:
+    """``array`` as a read-only float64 ``(T, columns)`` matrix of finite values."""
+    try:
+        matrix = np.array(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{source}: {name} is not a table of numbers ({error})") from None
+    if matrix.ndim == 1:
+        matrix = matrix[:, None]
+    if matrix.ndim != 2:
+        raise InputError(f"{source}: {name} has shape {matrix.shape}; expected (transitions, columns)")
+    bad = np.argwhere(~np.isfinite(matrix))
+    if bad.size:
+        row, column = (int(i) for i in bad[0])
+        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+        raise InputError(
+            f"{source}: {name} is {matrix[row, column]} at row {row}, column {column}{more}; every value must be finite"
+        )
+    return _frozen(matrix)
+
+
+def _frozen(array: np.ndarray) -> np.ndarray:
+    array.flags.writeable = False
+    return array

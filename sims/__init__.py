@@ -1,0 +1,1 @@
+"""Bundled simulations: models, parameter spaces and logs to try the package on."""
