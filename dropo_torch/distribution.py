@@ -1,0 +1,295 @@
+"""The randomization distribution p_φ: independent truncated normals, one a parameter.
+
+Each parameter follows a normal of mean μ and deviation σ, truncated at μ ± 2σ and redrawn until it
+falls inside its physical limits: together, a normal truncated to the intersection of both intervals.
+Samples come from the inverse of its cumulative distribution, so that they are differentiable in μ
+and σ, and the same base uniforms give common random numbers.
+
+A log-scaled parameter has this law in the logarithm of its value. *Coordinates* are values, or
+logarithms of values for log-scaled parameters; μ and σ live there.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import yaml
+
+from dropo_torch.errors import InputError, choices
+from dropo_torch.parameters import ParameterSpace
+
+SCHEMA = "dropo-torch/distribution/1"
+#: A truncated normal reaches this many deviations from its mean.
+TRUNCATION = 2.0
+_LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
+
+
+def truncated_interval(
+    mean: torch.Tensor, std: torch.Tensor, low: torch.Tensor, high: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the truncation interval ``(a, b)`` in deviations from the mean, all shapes broadcast.
+
+    Where the limits lie outside μ ± 2σ altogether, the interval hugs the nearer end of the limits.
+    """
+    a = torch.clamp((low - mean) / std, min=-TRUNCATION)
+    b = torch.clamp((high - mean) / std, max=TRUNCATION)
+    a = torch.minimum(a, torch.full_like(a, TRUNCATION) - 1e-9)
+    b = torch.maximum(b, a + 1e-9)
+    return a, b
+
+
+def truncated_normal_icdf(
+    uniforms: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, low: torch.Tensor, high: torch.Tensor
+) -> torch.Tensor:
+    """Map uniforms in (0, 1) to the truncated normal; differentiable in ``mean`` and ``std``.
+
+    All shapes broadcast; ``low`` and ``high`` are the physical limits, which may be infinite.
+    """
+    a, b = truncated_interval(mean, std, low, high)
+    below, above = torch.special.ndtr(a), torch.special.ndtr(b)
+    z = torch.special.ndtri(below + uniforms * (above - below))
+    return mean + std * torch.clamp(z, a.detach(), b.detach())
+
+
+def truncated_moments(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return E[z], E[z²] and E[z⁴] of a standard normal truncated to ``[a, b]``, shapes broadcast."""
+    density_a, density_b = (torch.exp(-0.5 * z * z - _LOG_SQRT_2PI) for z in (a, b))
+    mass = torch.clamp(torch.special.ndtr(b) - torch.special.ndtr(a), min=1e-300)
+    first = (density_a - density_b) / mass
+    second = 1 + (a * density_a - b * density_b) / mass
+    fourth = 3 * second + (a**3 * density_a - b**3 * density_b) / mass
+    return first, second, fourth
+
+
+@dataclass(frozen=True)
+class Distribution:
+    """A fitted (or given) distribution over a simulator's parameters.
+
+    Attributes:
+        names: the parameters, d of them.
+        mean, std: μ and σ in coordinates, ``(d,)`` float64.
+        low, high: the search box of the mean, in the parameters' units, ``(d,)``.
+        limits: physical limits in the parameters' units, ``(d, 2)``.
+        is_log: whether each parameter's law is that of its logarithm, ``(d,)`` bool.
+        units: the parameters' units.
+    """
+
+    names: tuple[str, ...]
+    mean: np.ndarray
+    std: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    limits: np.ndarray
+    is_log: np.ndarray
+    units: tuple[str, ...]
+
+    def __len__(self) -> int:
+        """Return the number of parameters d."""
+        return len(self.names)
+
+    @classmethod
+    def over(cls, space: ParameterSpace, mean: np.ndarray, std: np.ndarray) -> Distribution:
+        """Return the distribution over ``space`` with μ and σ in coordinates, ``(d,)`` each."""
+        return cls(
+            names=space.names,
+            mean=np.asarray(mean, dtype=np.float64).copy(),
+            std=np.asarray(std, dtype=np.float64).copy(),
+            low=space.low,
+            high=space.high,
+            limits=space.limits,
+            is_log=space.is_log,
+            units=tuple(p.unit for p in space.parameters),
+        )
+
+    @property
+    def center(self) -> np.ndarray:
+        """The value at μ, in the parameters' units, ``(d,)``: the median of a log-scaled parameter."""
+        return to_values(self.mean, self.is_log)
+
+    @property
+    def spread(self) -> np.ndarray:
+        """σ in the parameters' units, ``(d,)``; for a log-scaled parameter σ times the value at μ."""
+        return np.where(self.is_log, self.std * self.center, self.std)
+
+    def rsample(self, uniforms: torch.Tensor) -> torch.Tensor:
+        """Return parameter values ``(K, d)``, in units, for base uniforms ``(K, d)`` in (0, 1)."""
+        return values_from_uniforms(
+            uniforms, torch.as_tensor(self.mean), torch.as_tensor(self.std), self.limits, self.is_log
+        )
+
+    def sample(self, num_samples: int, generator: torch.Generator) -> torch.Tensor:
+        """Return ``num_samples`` independent parameter vectors ``(num_samples, d)``, in units."""
+        return self.rsample(base_uniforms(num_samples, len(self), generator))
+
+    def log_prob(self, values: torch.Tensor) -> torch.Tensor:
+        """Return the log-density of values ``(..., d)``, in units; ``(...)``, -inf outside the support."""
+        is_log = torch.as_tensor(self.is_log)
+        mean, std = torch.as_tensor(self.mean), torch.as_tensor(self.std)
+        low, high = (torch.as_tensor(x) for x in coordinate_limits(self.limits, self.is_log))
+        x = torch.where(is_log, torch.log(values), values)
+        a, b = truncated_interval(mean, std, low, high)
+        z = (x - mean) / std
+        mass = torch.special.ndtr(b) - torch.special.ndtr(a)
+        density = -0.5 * z * z - _LOG_SQRT_2PI - torch.log(std) - torch.log(mass)
+        density = density - torch.where(is_log, x, torch.zeros_like(x))  # d(log v)/dv = 1/v
+        inside = (z >= a) & (z <= b)
+        return torch.where(inside, density, torch.full_like(density, -torch.inf)).sum(-1)
+
+    def summary(self) -> dict[str, dict[str, Any]]:
+        """Return name → mean, std, low, high, unit (and ``log_mean``, ``log_std`` where log-scaled)."""
+        entries: dict[str, dict[str, Any]] = {}
+        for i, name in enumerate(self.names):
+            entries[name] = {
+                "mean": float(self.center[i]),
+                "std": float(self.spread[i]),
+                "low": float(self.low[i]),
+                "high": float(self.high[i]),
+                "unit": self.units[i],
+            }
+            if self.is_log[i]:
+                entries[name] |= {"scale": "log", "log_mean": float(self.mean[i]), "log_std": float(self.std[i])}
+        return entries
+
+    def save(self, path: str | Path) -> None:
+        """Write the distribution as JSON, or as YAML where the path ends in ``.yaml`` or ``.yml``."""
+        document: dict[str, Any] = {"schema": SCHEMA, "parameters": self.summary()}
+        for i, name in enumerate(self.names):
+            document["parameters"][name]["limits"] = [None if math.isinf(x) else float(x) for x in self.limits[i]]
+        path = Path(path)
+        if path.suffix in (".yaml", ".yml"):
+            path.write_text(yaml.safe_dump(document, sort_keys=False))
+        else:
+            path.write_text(json.dumps(document, indent=2) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> Distribution:
+        """Read a distribution written by :meth:`save`, or the one inside a ``fit.json``.
+
+        Raises:
+            InputError: a missing file, or one that holds no distribution.
+        """
+        path = Path(path)
+        if not path.is_file():
+            raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
+        try:
+            document = yaml.safe_load(path.read_text())  # JSON is YAML
+        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            raise InputError(f"distribution: {path} cannot be read: {' '.join(str(error).split())}") from None
+        entries = document.get("parameters") if isinstance(document, Mapping) else None
+        if not isinstance(entries, Mapping) or not entries:
+            raise InputError(f"distribution: {path} has no 'parameters'; expected name → mean, std, low, high, unit")
+        return cls._from_entries(entries, path)
+
+    @classmethod
+    def _from_entries(cls, entries: Mapping[str, Mapping[str, Any]], path: Path) -> Distribution:
+        for name, entry in entries.items():
+            for key in ("mean", "std", "low", "high"):
+                if not isinstance(entry, Mapping) or not isinstance(entry.get(key), (int, float)):
+                    have = entry if isinstance(entry, Mapping) else {}
+                    raise InputError(
+                        f"distribution: {path}: parameters.{name} has no number {key!r}" + choices(key, have)
+                    )
+        is_log = np.array([entry.get("scale") == "log" for entry in entries.values()])
+        pick = [("log_mean", "log_std") if log else ("mean", "std") for log in is_log]
+        limits = [entry.get("limits") or [None, None] for entry in entries.values()]
+        return cls(
+            names=tuple(entries),
+            mean=np.array([float(e[k[0]]) for e, k in zip(entries.values(), pick, strict=True)]),
+            std=np.array([float(e[k[1]]) for e, k in zip(entries.values(), pick, strict=True)]),
+            low=np.array([float(e["low"]) for e in entries.values()]),
+            high=np.array([float(e["high"]) for e in entries.values()]),
+            limits=np.array(
+                [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits], dtype=float
+            ),
+            is_log=is_log,
+            units=tuple(str(e.get("unit", "")) for e in entries.values()),
+        )
+
+
+def base_uniforms(num_samples: int, num_parameters: int, generator: torch.Generator) -> torch.Tensor:
+    """Draw base uniforms ``(num_samples, num_parameters)``, float64."""
+    return torch.rand(num_samples, num_parameters, generator=generator, dtype=torch.float64)
+
+
+def values_from_uniforms(
+    uniforms: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, limits: np.ndarray, is_log: np.ndarray
+) -> torch.Tensor:
+    """Return parameter values, in units, of base uniforms under μ and σ in coordinates; shapes broadcast."""
+    low, high = (torch.as_tensor(x) for x in coordinate_limits(limits, is_log))
+    x = truncated_normal_icdf(uniforms, mean, std, low, high)
+    return torch.where(torch.as_tensor(is_log), torch.exp(x), x) if is_log.any() else x
+
+
+def to_values(coordinates: np.ndarray, is_log: np.ndarray) -> np.ndarray:
+    """Return values, in units, of coordinates ``(..., d)``."""
+    return np.where(is_log, np.exp(np.where(is_log, coordinates, 0.0)), coordinates)
+
+
+def to_coordinates(values: np.ndarray, is_log: np.ndarray) -> np.ndarray:
+    """Return coordinates of values ``(..., d)``, in units."""
+    return np.where(is_log, np.log(np.where(is_log, values, 1.0)), values)
+
+
+def coordinate_limits(limits: np.ndarray, is_log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return physical limits ``(d, 2)`` in coordinates, as low ``(d,)`` and high ``(d,)``."""
+    with np.errstate(divide="ignore"):
+        return to_coordinates(np.maximum(limits[:, 0], np.where(is_log, 0.0, -np.inf)), is_log), to_coordinates(
+            limits[:, 1], is_log
+        )
+
+
+@dataclass(frozen=True)
+class SearchBox:
+    """Where μ and σ are searched, in coordinates, and the normalised form that CMA-ES sees.
+
+    Means are linear and deviations logarithmic, both scaled to [0, 4], so that one initial step size
+    fits all of them. σ lies between 1e-5 (or 1e-5 of the width where that is less) and a quarter of
+    the width of the mean's interval.
+
+    Attributes:
+        low, high: bounds of μ, ``(d,)``.
+        min_std, max_std: bounds of σ, ``(d,)``.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    min_std: np.ndarray
+    max_std: np.ndarray
+
+    WIDTH = 4.0
+
+    @classmethod
+    def of(cls, space: ParameterSpace) -> SearchBox:
+        """Return the search box of a parameter space."""
+        low, high = to_coordinates(space.low, space.is_log), to_coordinates(space.high, space.is_log)
+        width = high - low
+        return cls(low, high, min_std=1e-5 * np.minimum(width, 1.0), max_std=width / 4)
+
+    @property
+    def width(self) -> np.ndarray:
+        """Widths of the intervals of μ, ``(d,)``."""
+        return self.high - self.low
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Middle of the box of μ, ``(d,)``."""
+        return 0.5 * (self.low + self.high)
+
+    def normalise(self, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+        """Return φ in [0, 4]: d means, then d logarithms of deviations, ``(..., 2d)``."""
+        means = (mean - self.low) / self.width
+        logs = np.log(std / self.min_std) / np.log(self.max_std / self.min_std)
+        return self.WIDTH * np.concatenate([means, logs], axis=-1)
+
+    def denormalise(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return μ and σ, ``(..., d)`` each, of normalised φ ``(..., 2d)``."""
+        unit = np.clip(np.asarray(phi) / self.WIDTH, 0.0, 1.0)
+        means, logs = np.split(unit, 2, axis=-1)
+        return self.low + means * self.width, self.min_std * (self.max_std / self.min_std) ** logs

@@ -1,0 +1,475 @@
+"""The likelihood of the measured next states, equations 2 and 3 of Tiboni et al. 2023.
+
+Pure functions of simulated and measured states come first; :class:`Objective` binds them to a log, an
+observation and a simulator, and evaluates them in chunks whose size does not depend on T·K.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from dropo_torch.distribution import SearchBox, base_uniforms, to_values, values_from_uniforms
+from dropo_torch.errors import InputError, choices
+from dropo_torch.observation import Observation
+from dropo_torch.simulators.base import Simulator
+from dropo_torch.trajectory import Transitions
+
+#: Log-likelihood taken from a transition for the share of its samples that diverged, in nats.
+DIVERGENCE_PENALTY = 1e3
+#: Log-likelihood of a transition of which fewer than two samples are left.
+LOST_TRANSITION = -1e4
+
+#: ``reduce(features (t, P, m), measured (t, m), covariance (t, m, m)) -> (r,)``, summed over chunks.
+Reduce = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
+
+
+def sample_moments(samples: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return mean ``(..., n)`` and unbiased covariance ``(..., n, n)`` of samples ``(..., K, n)`` (eq. 2)."""
+    mean = samples.mean(-2)
+    centred = samples - mean.unsqueeze(-2)
+    return mean, centred.mT @ centred / (samples.shape[-2] - 1)
+
+
+def gaussian_log_density(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Return log N(residual; 0, covariance), constant term included (eq. 3).
+
+    Args:
+        residual: ``(..., n)``.
+        covariance: positive definite, ``(..., n, n)``.
+
+    Returns:
+        ``(...)``.
+    """
+    factor = robust_cholesky(covariance)
+    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
+    return -0.5 * white.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
+
+
+def robust_cholesky(covariance: torch.Tensor) -> torch.Tensor:
+    """Return the lower Cholesky factor, ``(..., n, n)``.
+
+    A matrix that rounding has left indefinite (deviations of very different size) gets the smallest
+    multiple of its trace on the diagonal that cures it; all others are left as they are.
+    """
+    factor, info = torch.linalg.cholesky_ex(covariance)
+    jitter = 1e-15
+    while bool((info > 0).any()) and jitter < 1e-3:
+        scale = torch.diagonal(covariance, dim1=-2, dim2=-1).mean(-1)[..., None, None]
+        eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype)
+        covariance = torch.where((info > 0)[..., None, None], covariance + jitter * scale * eye, covariance)
+        factor, info = torch.linalg.cholesky_ex(covariance)
+        jitter *= 10
+    return factor
+
+
+def log_likelihood(
+    samples: torch.Tensor, measured: torch.Tensor, epsilon: torch.Tensor | float, extra: torch.Tensor | None = None
+) -> torch.Tensor:
+    """Return the log-likelihood of each measured next state under its simulated samples (eq. 2 and 3).
+
+    Args:
+        samples: simulated next states, ``(..., K, n)``, K at least 2.
+        measured: measured next states, broadcast to ``(..., n)``.
+        epsilon: added to the covariance's diagonal, scalar or ``(n,)``.
+        extra: a further covariance, broadcast to ``(..., n, n)``.
+
+    Returns:
+        ``(...)``, one value a transition, in nats.
+    """
+    mean, covariance = sample_moments(samples)
+    diagonal = torch.as_tensor(epsilon, dtype=samples.dtype).expand(samples.shape[-1])
+    covariance = covariance + torch.diag(diagonal)
+    return gaussian_log_density(measured - mean, covariance if extra is None else covariance + extra)
+
+
+def rotation_vector(measured: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:
+    """Return the rotation from measured to simulated unit quaternions (w, x, y, z), ``(..., 3)`` in rad.
+
+    Its length is the angle between the two orientations, in [0, π].
+    """
+    w0, v0 = measured[..., :1], measured[..., 1:]
+    w1, v1 = simulated[..., :1], simulated[..., 1:]
+    scalar = w0 * w1 + (v0 * v1).sum(-1, keepdim=True)
+    vector = w0 * v1 - w1 * v0 - torch.linalg.cross(v0.expand_as(v1), v1)
+    sign = torch.where(scalar < 0, -1.0, 1.0)
+    norm = vector.norm(dim=-1, keepdim=True)
+    angle = 2 * torch.atan2(norm, scalar * sign)
+    return sign * vector * torch.where(norm > 1e-12, angle / norm.clamp(min=1e-300), torch.full_like(norm, 2.0))
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """The sampled objective at one φ.
+
+    Attributes:
+        log_likelihood: sum over the log's transitions, in nats.
+        mse: mean squared difference between measured and simulated mean, over transitions and columns.
+        diverged: number of simulations that diverged.
+        simulated_transitions: logged steps that were simulated for it.
+    """
+
+    log_likelihood: float
+    mse: float
+    diverged: int
+    simulated_transitions: int
+
+
+class Objective:
+    """The likelihood of one log under one simulator.
+
+    *Features* are what the Gaussians compare: the observed columns without the masked ones, each
+    divided by its scale, and for each observed quaternion the rotation vector from its measured to its
+    simulated value (measured value 0) after the other columns.
+
+    Args:
+        simulator: simulates the transitions.
+        transitions: the log's windows.
+        observation: what the log's columns are.
+        epsilon: ε, variance added to each feature, scalar or one per feature; after scaling.
+        noise: standard deviation of the measurement in each observed column, scalar or one per
+            column; the start states are then uncertain too. ``None``: starts are exact.
+        mask: labels (or numbers) of observed columns which the likelihood leaves out.
+        scaling: divide each column by its standard deviation over the log.
+        chunk_size: rows (transition, parameter vector) held at once.
+
+    Raises:
+        InputError: ε or noise that is not positive or has the wrong length; a masked column that is none.
+    """
+
+    def __init__(
+        self,
+        simulator: Simulator,
+        transitions: Transitions,
+        observation: Observation,
+        *,
+        epsilon: float | Sequence[float] = 1e-5,
+        noise: float | Sequence[float] | None = None,
+        mask: Sequence[str | int] = (),
+        scaling: bool = False,
+        chunk_size: int = 20_000,
+    ) -> None:
+        self.simulator = simulator
+        self.transitions = transitions
+        self.observation = observation
+        self.box = SearchBox.of(simulator.parameters)
+        self.simulated_transitions = 0
+        self.linearised_at: np.ndarray | None = None
+        self._chunk_size = chunk_size
+        self._states = torch.from_numpy(np.ascontiguousarray(transitions.states, dtype=np.float64))
+        self._controls = torch.from_numpy(np.ascontiguousarray(transitions.controls, dtype=np.float64))
+        measured = torch.from_numpy(np.ascontiguousarray(transitions.measured, dtype=np.float64))
+        quaternions = [q for q in observation.quaternions if not _masked(observation, mask) & set(q)]
+        taken = {c for q in observation.quaternions for c in q} | _masked(observation, mask)
+        self._plain = [c for c in range(observation.size) if c not in taken]
+        self._quaternions = [list(q) for q in quaternions]
+        if not self._plain and not self._quaternions:
+            raise InputError("mask: every column is masked; leave at least one")
+        self.labels = tuple(observation.labels[c] for c in self._plain) + tuple(
+            f"{observation.labels[q[0]].split('[')[0]}.rotation[{axis}]" for q in self._quaternions for axis in "xyz"
+        )
+        self.units = tuple(observation.units[c] for c in self._plain) + ("rad",) * (3 * len(self._quaternions))
+        self.scale = (
+            _scales(measured[:, self._plain], len(self._quaternions))
+            if scaling
+            else torch.ones(self.num_features, dtype=torch.float64)
+        )
+        self._raw = measured
+        self.measured = self.features(measured, measured)
+        self.epsilon = _per_entry("epsilon", epsilon, self.num_features, "feature", self.labels)
+        self.noise = (
+            None if noise is None else _per_entry("noise", noise, observation.size, "column", observation.labels)
+        )
+        self._noise_covariance: torch.Tensor | None = None
+
+    def on(self, transitions: Transitions) -> Objective:
+        """Return the same objective over other transitions of the same log, not yet linearised."""
+        other = copy.copy(self)
+        other.transitions = transitions
+        other._states = torch.from_numpy(np.ascontiguousarray(transitions.states, dtype=np.float64))
+        other._controls = torch.from_numpy(np.ascontiguousarray(transitions.controls, dtype=np.float64))
+        other._raw = torch.from_numpy(np.ascontiguousarray(transitions.measured, dtype=np.float64))
+        other.measured = other.features(other._raw, other._raw)
+        other.simulated_transitions = 0
+        other.linearised_at, other._noise_covariance = None, None
+        return other
+
+    @property
+    def num_features(self) -> int:
+        """Number of features m."""
+        return len(self._plain) + 3 * len(self._quaternions)
+
+    def __len__(self) -> int:
+        """Return the number of transitions T."""
+        return len(self.transitions)
+
+    def features(self, observed: torch.Tensor, measured: torch.Tensor) -> torch.Tensor:
+        """Return features ``(..., m)`` of observed columns ``(..., n)`` beside their measured values."""
+        parts = [observed[..., self._plain]]
+        for q in self._quaternions:
+            parts.append(rotation_vector(measured[..., q].expand_as(observed[..., q]), observed[..., q]))
+        return torch.cat(parts, -1) / self.scale
+
+    def map(self, values: np.ndarray | torch.Tensor, reduce: Reduce) -> torch.Tensor:
+        """Simulate every transition under parameter values ``(P, d)`` and sum ``reduce`` over chunks.
+
+        The chunks do not depend on the number of threads, and neither does the sum.
+        """
+        values = torch.as_tensor(np.asarray(values), dtype=torch.float64)
+        rows = max(1, self._chunk_size // max(1, len(values)))
+        total: torch.Tensor | None = None
+        for block in _blocks(len(self), rows):
+            features = self._simulate(self._states[block], block, values)
+            with single_thread():
+                part = reduce(features, self.measured[block], self.base_covariance(block))
+                total = part if total is None else total + part
+        assert total is not None
+        return total
+
+    def evaluate(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> list[Evaluation]:
+        """Evaluate the sampled objective at several φ as one batch.
+
+        Args:
+            mean, std: μ and σ in coordinates, ``(P, d)`` each.
+            uniforms: base uniforms, ``(K, d)`` common to all or ``(P, K, d)``.
+        """
+        num_phi, num_samples = len(mean), uniforms.shape[-2]
+        values = self.values(mean, std, uniforms).reshape(num_phi * num_samples, -1)
+        before = self.simulated_transitions
+        sums = self.map(values, self.likelihood_reduction(num_phi)).reshape(3, num_phi)
+        cost = (self.simulated_transitions - before) // num_phi
+        entries = len(self) * self.num_features
+        return [Evaluation(float(a), float(b) / entries, int(c), cost) for a, b, c in sums.T]
+
+    def values(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> torch.Tensor:
+        """Return parameter values ``(P, K, d)``, in units, of φ ``(P, d)`` and base uniforms."""
+        space = self.simulator.parameters
+        mu, sigma = (torch.as_tensor(x)[:, None, :] for x in (mean, std))
+        return values_from_uniforms(
+            uniforms.expand(len(mean), *uniforms.shape[-2:]), mu, sigma, space.limits, space.is_log
+        )
+
+    def likelihood_reduction(self, num_phi: int) -> Reduce:
+        """Return the reduction to log-likelihood, squared error and divergences of P φ, ``(3 P,)``."""
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+            samples = features.unflatten(1, (num_phi, -1))
+            values, squared, lost = _likelihood_with_losses(
+                samples, measured[:, None], covariance[:, None], self._angles
+            )
+            return torch.cat([values.sum(0), squared.sum(0), lost.sum(0)])
+
+        return reduce
+
+    def base_covariance(self, block: slice) -> torch.Tensor:
+        """Return the covariance of features that no parameter explains, ``(t, m, m)``: ε and the noise."""
+        fixed = torch.diag(self.epsilon)
+        if self.noise is None:
+            return fixed.expand(block.stop - block.start, -1, -1)
+        if self._noise_covariance is None:  # not yet linearised: the measured ends' own noise
+            return (fixed + torch.diag(self._end_variance())).expand(block.stop - block.start, -1, -1)
+        return fixed + self._noise_covariance[block]
+
+    def linearise(self, mean: np.ndarray) -> None:
+        """Propagate the start states' noise through the simulation at μ ``(d,)``, in coordinates.
+
+        The covariance C = Σᵢ gᵢgᵢᵀ + diag(ν), gᵢ half the difference between the next states started one
+        standard deviation above and below in column i: a statistical linearisation, which sees a
+        stiff contact at the size of the noise. Without noise, nothing happens.
+        """
+        if self.noise is None:
+            return
+        values = torch.from_numpy(to_values(np.asarray(mean), self.simulator.parameters.is_log))[None]
+        columns = [i for i in range(self.observation.size) if self.noise[i] > 0]
+        parts = []
+        for block in _blocks(len(self), max(1, self._chunk_size // (2 * len(columns)))):
+            states = self._perturbed(block, columns)
+            features = self._simulate(states, block, values, copies=2 * len(columns))
+            plus, minus = features.reshape(-1, len(columns), 2, self.num_features).unbind(2)
+            with single_thread():
+                half = torch.nan_to_num(0.5 * (plus - minus))
+                parts.append(half.mT @ half)
+        self._noise_covariance = torch.cat(parts) + torch.diag(self._end_variance())
+        self.linearised_at = np.asarray(mean, dtype=np.float64).copy()
+
+    def simulated(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
+        """Return the observed columns ``(T, P, n)`` that the simulator gives for values ``(P, d)``, in units."""
+        values = torch.as_tensor(np.asarray(values), dtype=torch.float64)
+        parts = []
+        for block in _blocks(len(self), max(1, self._chunk_size // len(values))):
+            states = self.simulator.simulate(self._states[block], self._controls[block], values)
+            parts.append(states[..., self.observation.index])
+        self.simulated_transitions += len(self) * len(values) * self.transitions.lag
+        return torch.cat(parts)
+
+    @property
+    def _angles(self) -> int:
+        """Number of rotation vectors at the end of the features."""
+        return len(self._quaternions)
+
+    def _simulate(self, states: torch.Tensor, block: slice, values: torch.Tensor, copies: int = 1) -> torch.Tensor:
+        """Features ``(t * copies, P, m)`` after the controls of a block of transitions, NaN where diverged."""
+        controls, raw = self._controls[block], self._raw[block]
+        if copies > 1:
+            controls, raw = controls.repeat_interleave(copies, 0), raw.repeat_interleave(copies, 0)
+        after = self.simulator.simulate(states, controls, values)[..., self.observation.index]
+        self.simulated_transitions += len(states) * len(values) * self.transitions.lag
+        return self.features(after, raw[:, None].expand_as(after))
+
+    def _perturbed(self, block: slice, columns: list[int]) -> torch.Tensor:
+        """Start states moved by plus and minus one deviation of each noisy column, ``(t * 2c, num_states)``."""
+        assert self.noise is not None
+        states = self._states[block]
+        moved = states[:, None, None].repeat(1, len(columns), 2, 1)
+        for row, column in enumerate(columns):
+            state_column = self.observation.columns[column]
+            moved[:, row, 0, state_column] += self.noise[column]
+            moved[:, row, 1, state_column] -= self.noise[column]
+        for q in self.observation.quaternions:
+            target = self.observation.index[list(q)]
+            moved[..., target] = moved[..., target] / moved[..., target].norm(dim=-1, keepdim=True)
+        return moved.reshape(-1, states.shape[1])
+
+    def _end_variance(self) -> torch.Tensor:
+        """Variance of the measured features, ``(m,)``; a quaternion's noise ν turns by 2ν."""
+        assert self.noise is not None
+        plain = self.noise[self._plain]
+        turned = [2 * self.noise[q].mean().expand(3) for q in self._quaternions]
+        return (torch.cat([plain, *turned]) / self.scale) ** 2
+
+
+def no_effect(objective: Objective, *, max_transitions: int = 500) -> list[str]:
+    """Return the names of parameters that move no compared column of this log.
+
+    Each is moved to 1/4 and 3/4 of its box with the others in the middle; first on transitions spread
+    over the log, then, where nothing moved, on all of them.
+    """
+    box, space = objective.box, objective.simulator.parameters
+    d = len(space)
+    points = np.repeat(box.middle[None], 2 * d, axis=0)
+    points[np.arange(d), np.arange(d)] = box.low + 0.25 * box.width
+    points[np.arange(d) + d, np.arange(d)] = box.low + 0.75 * box.width
+    values = to_values(points, space.is_log)
+
+    def moved(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+        change = torch.nan_to_num(features[:, :d] - features[:, d:], nan=1.0).abs()
+        magnitude = 1e-12 * torch.nan_to_num(features).abs().amax((0, 1))
+        return (change > magnitude).sum((0, 2)).double()
+
+    spread = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
+    sparse = objective.on(objective.transitions.select(spread))
+    if bool((sparse.map(values, moved) > 0).all()):
+        return []
+    counts = objective.map(values, moved)
+    return [name for name, count in zip(space.names, counts, strict=True) if count == 0]
+
+
+@contextlib.contextmanager
+def single_thread() -> Iterator[None]:
+    """Run torch on one thread, so that sums do not depend on how many there are."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def draw_uniforms(num_samples: int, num_parameters: int, *seeds: int) -> torch.Tensor:
+    """Draw base uniforms ``(K, d)`` from a generator of its own, a pure function of the seeds."""
+    seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]) >> 1
+    return base_uniforms(num_samples, num_parameters, torch.Generator().manual_seed(seed))
+
+
+def _likelihood_with_losses(
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Log-likelihood, squared error and number of diverged samples, ``(t, P)`` each, of ``(t, P, K, m)``."""
+    finite = torch.isfinite(samples).all(-1)
+    lost = (~finite).sum(-1)
+    if not bool(lost.any()):
+        values, squared = _gaussian(samples, measured, covariance, num_rotations)
+        return values, squared, lost.double()
+    values = torch.full(lost.shape, LOST_TRANSITION, dtype=samples.dtype)
+    squared = torch.zeros_like(values)
+    num_samples = samples.shape[2]
+    for t, p in (finite.sum(-1) >= 2).nonzero().tolist():
+        kept = samples[t, p, finite[t, p]]
+        one, error = _gaussian(kept, measured[t, 0], covariance[t, 0], num_rotations)
+        values[t, p] = one - DIVERGENCE_PENALTY * lost[t, p] / num_samples
+        squared[t, p] = error
+    return values, squared, lost.double()
+
+
+def _gaussian(
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log-likelihood and squared error of the mean; rotations enter by their angles, with both signs."""
+    if num_rotations:
+        samples, measured, covariance = _rotation_angles(samples, measured, covariance, num_rotations)
+    mean, sampled = sample_moments(samples)
+    residual = measured - mean
+    return gaussian_log_density(residual, sampled + covariance), residual.square().sum(-1)
+
+
+def _rotation_angles(
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Replace each rotation vector by its angle α, the sample by its union with all angles negated."""
+    plain = samples.shape[-1] - 3 * num_rotations
+    angles = samples[..., plain:].unflatten(-1, (num_rotations, 3)).norm(dim=-1)
+    rest = samples[..., :plain]
+    both = torch.cat([torch.cat([rest, angles], -1), torch.cat([rest, -angles], -1)], -2)
+    average = torch.zeros(samples.shape[-1], plain + num_rotations, dtype=samples.dtype)
+    average[torch.arange(plain), torch.arange(plain)] = 1
+    for i in range(num_rotations):  # an angle's variance is its rotation vector's, averaged over the axes
+        average[plain + 3 * i : plain + 3 * i + 3, plain + i] = 3**-0.5
+    flat = torch.cat([measured[..., :plain], torch.zeros_like(angles[..., 0, :])], -1)
+    return both, flat, average.T @ covariance @ average
+
+
+def _blocks(total: int, rows: int) -> Iterator[slice]:
+    return (slice(a, min(a + rows, total)) for a in range(0, total, rows))
+
+
+def _masked(observation: Observation, mask: Sequence[str | int]) -> set[int]:
+    """Observed columns that the mask names; one column of a quaternion stands for all four."""
+    found: set[int] = set()
+    for entry in mask:
+        if isinstance(entry, int) and not isinstance(entry, bool) and 0 <= entry < observation.size:
+            column = entry
+        elif str(entry) in observation.labels:
+            column = observation.labels.index(str(entry))
+        else:
+            raise InputError(f"mask: no observed column {entry!r}" + choices(entry, observation.labels))
+        found |= next((set(q) for q in observation.quaternions if column in q), {column})
+    return found
+
+
+def _scales(measured: torch.Tensor, num_rotations: int) -> torch.Tensor:
+    deviation = measured.std(0, unbiased=False)
+    deviation = torch.where(deviation > 0, deviation, torch.ones_like(deviation))
+    return torch.cat([deviation, torch.ones(3 * num_rotations, dtype=torch.float64)])
+
+
+def _per_entry(key: str, given: float | Sequence[float], count: int, what: str, labels: Sequence[str]) -> torch.Tensor:
+    """A scalar or list of the config as a tensor ``(count,)`` of positive numbers."""
+    try:
+        entries = torch.as_tensor(np.asarray(given, dtype=np.float64))
+    except (TypeError, ValueError):
+        raise InputError(f"{key}: {given!r} given; expected a number or a list of {count}") from None
+    if entries.ndim > 1 or (entries.ndim == 1 and len(entries) != count):
+        shape = len(entries) if entries.ndim == 1 else tuple(entries.shape)
+        raise InputError(f"{key}: {shape} values given; expected one, or one per {what}: {', '.join(labels)}")
+    entries = entries.expand(count).clone()
+    lowest = float(entries.min())
+    if not bool(torch.isfinite(entries).all()) or lowest < 0 or (key == "epsilon" and lowest <= 0):
+        raise InputError(f"{key}: {given} given; expected positive numbers")
+    return entries

@@ -1,0 +1,84 @@
+"""The ask/tell interface: an optimizer names parameter vectors, and never sees a simulator."""
+
+from __future__ import annotations
+
+import abc
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+
+from dropo_torch.objective import Reduce
+
+
+@dataclass(frozen=True)
+class Request:
+    """A batch to simulate: every transition of the log under every one of these vectors.
+
+    Attributes:
+        values: parameter vectors in their units, ``(P, d)``.
+        reduce: what to sum over transitions, handed to :meth:`Objective.map`.
+        evaluations: how many evaluations of the objective this counts as.
+        linearise_at: μ in coordinates at which the start noise is propagated first, or ``None``.
+    """
+
+    values: np.ndarray
+    reduce: Reduce
+    evaluations: int
+    linearise_at: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class Progress:
+    """Where an optimizer stands.
+
+    Attributes:
+        stage: what it is doing, for people.
+        log_likelihood: the best found, in nats, as the optimizer itself measures it; NaN before the first.
+        fraction: a guess of the share of work that is done, in [0, 1].
+    """
+
+    stage: str
+    log_likelihood: float
+    fraction: float
+
+
+class Optimizer(abc.ABC):
+    """Moves φ = (μ, σ), in coordinates, towards the maximum of the likelihood.
+
+    The state between a ``tell`` and the next ``ask`` is all there is: an optimizer restored from
+    :meth:`state` goes on exactly as the one that was saved.
+    """
+
+    name: ClassVar[str]
+
+    @abc.abstractmethod
+    def ask(self) -> Request:
+        """Return the next batch; the same one again until it was told."""
+
+    @abc.abstractmethod
+    def tell(self, sums: torch.Tensor) -> None:
+        """Take the sums that the batch's reduction gave."""
+
+    @property
+    @abc.abstractmethod
+    def stop_reason(self) -> str | None:
+        """Why the optimizer has stopped, in words, or ``None`` while it goes on."""
+
+    @property
+    @abc.abstractmethod
+    def progress(self) -> Progress:
+        """Where the optimizer stands."""
+
+    @abc.abstractmethod
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the final φ to choose from, each μ and σ in coordinates, ``(d,)`` each."""
+
+    @abc.abstractmethod
+    def state(self) -> dict[str, Any]:
+        """Return everything needed to go on, as plain data."""
+
+    @abc.abstractmethod
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""

@@ -1,0 +1,267 @@
+"""Gauss-Newton on the means, then Fisher scoring on means and deviations over sigma points.
+
+Both stages need forward simulations only. The likelihood's Gaussians come from a quadratic
+model of the simulation around μ, built from the 2d + 1 points μ and μ ± σᵢeᵢ, which replaces sampling:
+with z the truncated standard normal, s(μ + σz) ≈ s₀ + Σ Aᵢzᵢ + ½ Σ Bᵢzᵢ².
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.distribution import (
+    SearchBox,
+    coordinate_limits,
+    to_values,
+    truncated_interval,
+    truncated_moments,
+)
+from dropo_torch.objective import LOST_TRANSITION, Reduce, gaussian_log_density
+from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.optimizers.gauss_newton import MeansStage, damped_step
+from dropo_torch.parameters import ParameterSpace
+
+MAX_ITERATIONS = 60
+#: Fisher scoring stops after two accepted steps in a row that each gain less than this, in nats.
+SMALL_GAIN = 0.01
+#: Refits of a log with uncertain starts, each around the start noise propagated at the last fit.
+NOISY_ROUNDS = 3
+
+
+@dataclass
+class ScoringStage:
+    """Maximises the sigma-point likelihood over μ and log σ.
+
+    Attributes:
+        box: bounds of μ and σ in coordinates.
+        limits: physical limits in coordinates, low and high, ``(d,)`` each.
+        mean, std: the best φ so far, ``(d,)`` each.
+    """
+
+    box: SearchBox
+    limits: tuple[np.ndarray, np.ndarray]
+    mean: np.ndarray
+    std: np.ndarray
+    damping: float = 1e-2
+    log_likelihood: float = -np.inf
+    iterations: int = 0
+    small_gains: int = 0
+    reason: str | None = None
+    candidate: tuple[np.ndarray, np.ndarray] | None = None
+    sums: np.ndarray | None = None
+
+    def points(self) -> np.ndarray:
+        """Return the sigma points of the candidate, ``(2d + 1, d)``: μ, then all μ + σ, then all μ − σ."""
+        mean, std = self.candidate or (self.mean, self.std)
+        up, down = self._reach(mean, std)
+        return np.concatenate([mean[None], mean + np.diag(up), mean - np.diag(down)])
+
+    def reduction(self) -> Reduce:
+        """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d²,)``."""
+        mean, std = self.candidate or (self.mean, self.std)
+        up, down = self._reach(mean, std)
+        low, high = self.limits
+        a, b = truncated_interval(*(torch.as_tensor(x) for x in (mean, std, low, high)))
+        moments = torch.stack(truncated_moments(a, b))
+        reach = torch.from_numpy(np.stack([up / std, down / std]))
+        sigma = torch.from_numpy(std)
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+            return scores(features, measured, covariance, sigma, reach, moments)
+
+        return reduce
+
+    def tell(self, sums: torch.Tensor) -> None:
+        """Accept or reject the candidate, and propose the next one."""
+        value = float(sums[0])
+        if np.isfinite(value) and value > self.log_likelihood:
+            gain = value - self.log_likelihood
+            self.mean, self.std = self.candidate or (self.mean, self.std)
+            self.log_likelihood, self.sums = value, sums.numpy().copy()
+            self.damping = max(self.damping / 4, 1e-6)
+            self.small_gains = self.small_gains + 1 if gain < SMALL_GAIN else 0
+            if self.small_gains >= 2:
+                self.reason = f"two steps in a row gained less than {SMALL_GAIN:g} nat"
+        elif self.candidate is None:
+            self.reason = "no simulation succeeded at the starting point"
+        else:
+            self.damping *= 8
+            if self.damping > 1e8:
+                self.reason = "no step improves the likelihood"
+        self.iterations += 1
+        if self.iterations >= MAX_ITERATIONS and self.reason is None:
+            self.reason = f"{MAX_ITERATIONS} iterations of Fisher scoring"
+        if self.reason is None:
+            self.candidate = self._step()
+
+    def _reach(self, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far the sigma points lie above and below μ: σ, less at a physical limit, ``(d,)`` each."""
+        low, high = self.limits
+        tiny = 1e-9 * self.box.width
+        up = np.where(mean + std <= high, std, np.maximum(high - mean, 0))
+        down = np.where(mean - std >= low, std, np.maximum(mean - low, 0))
+        return np.where(up < tiny, 0, up), np.where(down < tiny, 0, down)
+
+    def _step(self) -> tuple[np.ndarray, np.ndarray]:
+        """The damped Fisher step in μ and log σ, clipped and kept inside the box."""
+        assert self.sums is not None
+        d, box = len(self.mean), self.box
+        score_mean, score_log = self.sums[1 : 1 + d], self.sums[1 + d : 1 + 2 * d]
+        fisher_mean, fisher_log = self.sums[1 + 2 * d :].reshape(2, d, d)
+        free = ~((self.mean <= box.low) & (score_mean < 0)) & ~((self.mean >= box.high) & (score_mean > 0))
+        move = damped_step(fisher_mean, score_mean, free, self.damping)
+        move = np.clip(move, -0.25 * box.width, 0.25 * box.width)
+        log_std = np.log(self.std)
+        low, high = np.log(box.min_std), np.log(box.max_std)
+        free = ~((log_std <= low) & (score_log < 0)) & ~((log_std >= high) & (score_log > 0))
+        turn = np.clip(damped_step(fisher_log, score_log, free, self.damping), -1.5, 1.5)
+        # a deviation so small that it no longer shows in the covariance has no curvature left: send it down
+        turn = np.where(free & (score_log <= 0) & (np.diag(fisher_log) < 1e-3), -1.5 / (1 + self.damping), turn)
+        return np.clip(self.mean + move, box.low, box.high), np.exp(np.clip(log_std + turn, low, high))
+
+
+def scores(
+    features: torch.Tensor,
+    measured: torch.Tensor,
+    covariance: torch.Tensor,
+    std: torch.Tensor,
+    reach: torch.Tensor,
+    moments: torch.Tensor,
+) -> torch.Tensor:
+    """Return log-likelihood, scores and Fisher information of (μ, log σ), packed into ``(1 + 2d + 2d²,)``.
+
+    Derivatives treat the Jacobian of the simulation as constant.
+
+    Args:
+        features: at the sigma points, ``(t, 2d + 1, m)``.
+        measured: ``(t, m)``.
+        covariance: what no parameter explains, ``(t, m, m)``.
+        std: σ, ``(d,)``.
+        reach: how many σ the upper and lower points lie away, ``(2, d)``; 0 for a point at a limit.
+        moments: E[z], E[z²], E[z⁴] of the truncated standard normal, ``(3, d)``.
+    """
+    d = len(std)
+    alive = torch.isfinite(features).flatten(1).all(-1)
+    lost = float((~alive).sum()) * LOST_TRANSITION
+    features, measured, covariance = features[alive], measured[alive], covariance[alive]
+    base = features[:, 0]
+    slope, bend = _divided_differences(base, features[:, 1 : 1 + d], features[:, 1 + d :], reach)
+    first, second, fourth = moments[..., None]
+    variance = second - first**2
+    mean = base + (slope * first + 0.5 * bend * second).sum(1)
+    spread = variance.sqrt() * slope
+    curved = 0.5 * (fourth - second**2).clamp(min=0).sqrt() * bend
+    total = covariance + spread.mT @ spread + curved.mT @ curved
+    residual = measured - mean
+    value = gaussian_log_density(residual, total).sum() + lost
+    solved = torch.linalg.solve(total, torch.cat([residual[:, None], slope], 1).mT)  # C⁻¹[r, A], (t, m, 1 + d)
+    weighted = (slope @ solved[..., :1])[..., 0]  # Aᵀ C⁻¹ r
+    gram = slope @ solved[..., 1:]  # Aᵀ C⁻¹ A
+    v = variance[:, 0]
+    score_mean = weighted.sum(0) / std
+    drift = (first[:, 0] * weighted).sum(0)  # the mean of z moves with σ where the truncation is lopsided
+    score_log = v * (weighted.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0) + drift
+    fisher_mean = gram.sum(0) / torch.outer(std, std)
+    fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0) + torch.outer(first[:, 0], first[:, 0]) * gram.sum(0)
+    return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten()])
+
+
+def _divided_differences(
+    base: torch.Tensor, upper: torch.Tensor, lower: torch.Tensor, reach: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Slopes A and bends B per unit of z, ``(t, d, m)`` each, from points at +p and −q deviations."""
+    p, q = reach[0][:, None], reach[1][:, None]
+    rise, fall = upper - base[:, None], base[:, None] - lower
+    safe_p, safe_q = (torch.where(x > 0, x, torch.ones_like(x)) for x in (p, q))
+    right, left = rise / safe_p, fall / safe_q
+    both = (p > 0) & (q > 0)
+    slope = torch.where(both, (q * right + p * left) / (p + q).clamp(min=1e-300), torch.where(p > 0, right, left))
+    bend = torch.where(both, 2 * (right - left) / (p + q).clamp(min=1e-300), torch.zeros_like(slope))
+    return slope, bend
+
+
+class FisherOptimizer(Optimizer):
+    """Gauss-Newton on μ, then Fisher scoring on (μ, log σ); the default.
+
+    On a log whose start states are noisy, the noise is propagated at the current μ and the means are
+    refitted with robust weights, until μ rests; the scoring then works on that covariance.
+    """
+
+    name = "fisher"
+
+    def __init__(self, space: ParameterSpace, *, noisy: bool = False) -> None:
+        self._space = space
+        self._noisy = noisy
+        self._box = SearchBox.of(space)
+        self._limits = coordinate_limits(space.limits, space.is_log)
+        self._means = MeansStage(self._box.low, self._box.high, self._box.middle)
+        self._scoring: ScoringStage | None = None
+        self._round = 0
+        self._linearised: np.ndarray | None = self._means.point if noisy else None
+
+    def ask(self) -> Request:
+        """Return the stencil of the stage at work."""
+        stage = self._scoring or self._means
+        return Request(
+            values=to_values(stage.points(), self._space.is_log),
+            reduce=stage.reduction(),
+            evaluations=1,
+            linearise_at=self._linearised,
+        )
+
+    def tell(self, sums: torch.Tensor) -> None:
+        """Hand the sums to the stage at work, and change stages when it has finished."""
+        if self._scoring is not None:
+            self._scoring.tell(sums)
+            return
+        self._means.tell(sums)
+        if self._means.reason is None:
+            return
+        if self._noisy and self._round < NOISY_ROUNDS:
+            self._round += 1
+            self._linearised = self._means.point
+            self._means = MeansStage(self._box.low, self._box.high, self._means.point, robust=True)
+            return
+        self._linearised = self._means.point if self._noisy else None
+        start = np.clip(self._box.width / 40, self._box.min_std, self._box.max_std)
+        self._scoring = ScoringStage(self._box, self._limits, self._means.point, start)
+
+    @property
+    def stop_reason(self) -> str | None:
+        """The scoring's reason, in words."""
+        return None if self._scoring is None else self._scoring.reason
+
+    @property
+    def progress(self) -> Progress:
+        """Stage, best sigma-point log-likelihood and a guess of the share done."""
+        if self._scoring is None:
+            done = self._round / (NOISY_ROUNDS + 1) if self._noisy else 0.0
+            share = 0.4 * (done + (1 - done) * min(1.0, self._means.iterations / 10))
+            return Progress("means (Gauss-Newton)", float("nan"), share)
+        share = 0.4 + 0.6 * min(1.0, self._scoring.iterations / 15)
+        return Progress("deviations (Fisher scoring)", self._scoring.log_likelihood, share)
+
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the φ at which the scoring stopped."""
+        if self._scoring is None:
+            return [(self._means.point, np.full(len(self._space), 1.0) * self._box.min_std)]
+        return [(self._scoring.mean, self._scoring.std)]
+
+    def state(self) -> dict[str, Any]:
+        """Return both stages as plain data."""
+        means = asdict(self._means)
+        scoring = None
+        if self._scoring is not None:
+            scoring = {k: v for k, v in vars(self._scoring).items() if k not in ("box", "limits")}
+        return {"means": means, "scoring": scoring, "round": self._round, "linearised": self._linearised}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._means = MeansStage(**state["means"])
+        scoring = state["scoring"]
+        self._scoring = None if scoring is None else ScoringStage(self._box, self._limits, **scoring)
+        self._round, self._linearised = state["round"], state["linearised"]

@@ -1,0 +1,144 @@
+"""Levenberg-Marquardt on the means: one vector simulated, its Jacobian by forward differences."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+
+from dropo_torch.objective import DIVERGENCE_PENALTY, Reduce, robust_cholesky
+
+#: Residuals beyond this many deviations lose their weight under robust weights (Cauchy's loss).
+CAUCHY_SCALE = 3.0
+#: Step of the forward differences, as a share of the search width.
+DIFFERENCE_STEP = 1e-5
+MAX_ITERATIONS = 40
+
+
+@dataclass
+class MeansStage:
+    """Minimises Σ rᵀC⁻¹r over μ inside its box.
+
+    Attributes:
+        low, high: the box of μ in coordinates, ``(d,)``.
+        point: the best μ so far, ``(d,)``.
+        robust: Cauchy weights on whitened residuals instead of squares.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+    point: np.ndarray
+    robust: bool = False
+    damping: float = 1e-3
+    cost: float = np.inf
+    iterations: int = 0
+    reason: str | None = None
+    candidate: np.ndarray | None = None
+    gradient: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+
+    def points(self) -> np.ndarray:
+        """Return the stencil of the candidate: itself, then one moved point a parameter, ``(d + 1, d)``."""
+        center = self.point if self.candidate is None else self.candidate
+        return np.concatenate([center[None], center + np.diag(self._steps(center))])
+
+    def reduction(self) -> Reduce:
+        """Return the reduction to cost, gradient and Gauss-Newton matrix, ``(1 + d + d²,)``."""
+        center = self.point if self.candidate is None else self.candidate
+        steps = torch.from_numpy(self._steps(center))
+        robust = self.robust
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+            return normal_equations(features, measured, covariance, steps, robust=robust)
+
+        return reduce
+
+    def tell(self, sums: torch.Tensor) -> None:
+        """Accept or reject the candidate, and propose the next one."""
+        d = len(self.low)
+        cost = float(sums[0])
+        step = np.inf if self.candidate is None else float(np.max(np.abs(self.candidate - self.point) / self._width))
+        if np.isfinite(cost) and cost < self.cost:
+            gain = self.cost - cost
+            self.point = self.point if self.candidate is None else self.candidate
+            self.cost = cost
+            self.gradient = sums[1 : 1 + d].numpy().copy()
+            self.hessian = sums[1 + d :].numpy().reshape(d, d).copy()
+            self.damping = max(self.damping / 8, 1e-12)
+            if np.isfinite(gain) and (gain < 1e-4 or step < 1e-10):
+                self.reason = "the means no longer improve"
+        elif self.candidate is None:
+            self.reason = "no simulation succeeded at the starting point"
+        elif step < 1e-9:
+            self.reason = "the steps of the means have become too small"
+        else:
+            self.damping *= 6
+        self.iterations += 1
+        if self.iterations >= MAX_ITERATIONS and self.reason is None:
+            self.reason = f"{MAX_ITERATIONS} iterations of the means"
+        if self.reason is None:
+            self.candidate = np.clip(self.point + self._step(), self.low, self.high)
+            if np.array_equal(self.candidate, self.point):
+                self.reason = "the means rest at the bounds"
+
+    @property
+    def _width(self) -> np.ndarray:
+        return self.high - self.low
+
+    def _steps(self, center: np.ndarray) -> np.ndarray:
+        """Signed difference steps that stay inside the box, ``(d,)``."""
+        step = DIFFERENCE_STEP * self._width
+        return np.where(center + step > self.high, -step, step)
+
+    def _step(self) -> np.ndarray:
+        """The damped step; parameters that press against a bound stay there."""
+        free = ~(((self.point <= self.low) & (self.gradient > 0)) | ((self.point >= self.high) & (self.gradient < 0)))
+        return damped_step(self.hessian, -self.gradient, free, self.damping)
+
+
+def damped_step(matrix: np.ndarray, force: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
+    """Solve (A + damping · diag A) δ = force for the free entries; the others get 0."""
+    step = np.zeros(len(force))
+    if not free.any():
+        return step
+    part = matrix[np.ix_(free, free)]
+    diagonal = np.diag(part)
+    scale = np.sqrt(np.maximum(diagonal, 1e-14 * max(float(diagonal.max()), 1e-300)))
+    correlation = part / np.outer(scale, scale) + damping * np.eye(len(scale))
+    step[free] = np.linalg.lstsq(correlation, force[free] / scale, rcond=1e-14)[0] / scale
+    return step
+
+
+def normal_equations(
+    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor, *, robust: bool
+) -> torch.Tensor:
+    """Return cost, gradient and Gauss-Newton matrix of ½ Σ ρ(C^-½ r), packed into ``(1 + d + d²,)``.
+
+    Args:
+        features: at μ, then at μ + stepᵢeᵢ, ``(t, d + 1, m)``.
+        measured: ``(t, m)``.
+        covariance: ``(t, m, m)``.
+        steps: ``(d,)``.
+        robust: ρ is Cauchy's loss, else the square.
+    """
+    base, moved = features[:, 0], features[:, 1:]
+    alive = torch.isfinite(base).all(-1)
+    lost = float((~alive).sum()) * 2 * DIVERGENCE_PENALTY
+    jacobian = torch.nan_to_num((moved - base[:, None]) / steps[:, None])  # a diverged column says nothing
+    jacobian = torch.where(alive[:, None, None], jacobian, torch.zeros_like(jacobian))
+    residual = torch.where(alive[:, None], measured - base, torch.zeros_like(base))
+    factor = robust_cholesky(covariance)
+    white = torch.linalg.solve_triangular(
+        factor, torch.cat([residual[..., None], jacobian.mT], -1), upper=False
+    )  # (t, m, 1 + d)
+    r, jac = white[..., 0], white[..., 1:]
+    if robust:
+        ratio = (r / CAUCHY_SCALE).square()
+        weight = 1 / (1 + ratio)
+        cost = CAUCHY_SCALE**2 * torch.log1p(ratio).sum()
+    else:
+        weight, cost = torch.ones_like(r), r.square().sum()
+    gradient = -(jac * (weight * r)[..., None]).sum((0, 1))
+    flat = (jac * weight.sqrt()[..., None]).flatten(0, 1)
+    return torch.cat([0.5 * (cost + lost)[None], gradient, (flat.T @ flat).flatten()])

@@ -1,0 +1,192 @@
+"""The black-box backend: MuJoCo itself, many simulations as one ``mujoco.batch``."""
+
+from __future__ import annotations
+
+import copy
+from pathlib import Path
+
+import mujoco
+import mujoco.batch
+import numpy as np
+import torch
+
+from dropo_torch.errors import InputError
+from dropo_torch.model import load_model
+from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.simulators.base import Simulator
+
+_DIVERGED = 1e10  # MuJoCo's own bound on a state it still calls stable (mjMAXVAL)
+
+
+class MujocoSimulator(Simulator):
+    """Transitions on ``mujoco.batch``: bit-identical to ``mj_step``, at any thread count.
+
+    Rows of the batch are pairs (transition, parameter vector), in chunks of at most ``chunk_size``, so
+    that memory does not grow with T·K. The constants that MuJoCo derives from masses and geometry
+    (``mj_setConst``) are computed once a parameter vector. Each transition starts from a cold solver
+    (``qacc_warmstart`` zero), whatever ran before.
+
+    Args:
+        model: the model or its path.
+        parameters: what varies; a space over this model.
+        frame_skip: physics steps of one logged transition.
+        num_threads: threads, 0 for all processors.
+        chunk_size: rows that are simulated at once.
+
+    Raises:
+        InputError: a model whose actuators have a hidden state that no log holds.
+    """
+
+    name = "mujoco"
+
+    def __init__(
+        self,
+        model: mujoco.MjModel | str | Path,
+        *,
+        parameters: ParameterSpace,
+        frame_skip: int = 1,
+        num_threads: int = 0,
+        chunk_size: int = 10_000,
+    ) -> None:
+        model = load_model(model)
+        if frame_skip < 1 or chunk_size < 1:
+            raise InputError(f"frame_skip {frame_skip}, chunk_size {chunk_size}: both must be 1 or more")
+        self.model = copy.copy(model)
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
+        self.parameters = parameters
+        self.frame_skip = int(frame_skip)
+        self.num_states = model.nq + model.nv
+        self.num_controls = model.nu
+        self.timestep = float(model.opt.timestep) * self.frame_skip
+        self._num_threads = num_threads
+        self._chunk_size = int(chunk_size)
+        self._filters = _filter_activations(model)
+        self._row = _default_row(self.model)
+        self._batch: mujoco.batch.Batch | None = None
+        self._tiled: tuple[np.ndarray, int] | None = None  # the values that the batch's fields hold, and their repeats
+        self._constants: mujoco.batch.Batch | None = None
+
+    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
+        return self._run(states, controls, values, every_step=False)[:, :, 0]
+
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after each transition; see :meth:`Simulator.rollout`."""
+        return self._run(states, controls, values, every_step=True)
+
+    def _run(
+        self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, *, every_step: bool
+    ) -> torch.Tensor:
+        self.check_arguments(states, controls, values)
+        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+        num_t, num_k, lag = len(start), len(vectors), control.shape[1]
+        out = np.empty((num_t, num_k, lag if every_step else 1, self.num_states))
+        for k in range(0, num_k, self._chunk_size):
+            part = vectors[k : k + self._chunk_size]
+            rows = max(1, min(num_t, self._chunk_size // len(part)))
+            failed = self._set_parameters(part, rows)
+            for t in range(0, num_t, rows):
+                block = slice(t, min(t + rows, num_t))
+                out[block, k : k + len(part)] = self._step(start[block], control[block], len(part), every_step)
+            out[:, k : k + len(part)][:, failed] = np.nan
+        return torch.from_numpy(out)
+
+    def _set_parameters(self, vectors: np.ndarray, repeats: int) -> np.ndarray:
+        """Give the batch's rows their parameters, ``repeats`` times over; return which vectors MuJoCo refuses."""
+        failed = np.zeros(len(vectors), dtype=bool)
+        num_rows = repeats * len(vectors)
+        if self._batch is None or self._batch.nsim < num_rows:
+            self._batch = mujoco.batch.Batch(self.model, num_rows, self._num_threads)
+            self._tiled = None
+        if self._tiled is not None and self._tiled[1] >= repeats and np.array_equal(self._tiled[0], vectors):
+            return failed
+        if self._constants is None or self._constants.nsim != len(vectors):
+            self._constants = mujoco.batch.Batch(self.model, len(vectors), self._num_threads)
+        constants = self._constants
+        for field in _derived_fields(constants):  # whatever an earlier call derived starts afresh
+            constants.expand(field)[:] = read_field(self.model, field)
+        self.parameters.write({f: constants.expand(f) for f in self.parameters.fields}, vectors)
+        try:
+            constants.set_const()
+        except mujoco.batch.SimulationError as error:
+            failed[error.ids] = True
+        self._tiled = None if failed.any() else (vectors.copy(), repeats)
+        for field in _derived_fields(constants):
+            own = constants.expanded(field)
+            if own is None:
+                continue
+            shared = read_field(self.model, field)
+            if self._batch.expanded(field) is not None or not np.array_equal(own, np.broadcast_to(shared, own.shape)):
+                rows = self._batch.expand(field)[:num_rows]
+                rows.reshape(repeats, len(vectors), *shared.shape)[:] = own.reshape(len(vectors), *shared.shape)
+        return failed
+
+    def _step(self, start: np.ndarray, control: np.ndarray, num_k: int, every_step: bool) -> np.ndarray:
+        """Simulate ``len(start)`` transitions under each of the parameter vectors that the batch holds."""
+        batch = self._batch
+        assert batch is not None
+        model, num_rows, lag = self.model, len(start) * num_k, control.shape[1]
+        ids = np.arange(num_rows, dtype=np.int32)
+        rows = batch.state[:num_rows]
+        rows[:] = self._row
+        qpos, qvel = batch.bind("qpos")[:num_rows], batch.bind("qvel")[:num_rows]
+        qpos[:] = np.repeat(start[:, : model.nq], num_k, axis=0)
+        qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
+        if self._filters:
+            activation, source = (list(x) for x in zip(*self._filters, strict=True))
+            batch.bind("act")[:num_rows, activation] = np.repeat(control[:, 0, source], num_k, axis=0)
+        ctrl = batch.bind("ctrl")[:num_rows]
+        out = np.empty((num_rows, lag if every_step else 1, self.num_states))
+        failed = np.zeros(num_rows, dtype=bool)
+        for step in range(lag):
+            ctrl[:] = np.repeat(control[:, step], num_k, axis=0)
+            try:
+                batch.step(ids, nstep=self.frame_skip)
+            except mujoco.batch.SimulationError as error:
+                failed[error.ids] = True
+            if every_step or step == lag - 1:
+                record = out[:, step if every_step else 0]
+                record[:, : model.nq], record[:, model.nq :] = qpos, qvel
+        with np.errstate(invalid="ignore"):
+            failed |= ~(np.abs(out) < _DIVERGED).all(axis=(1, 2))
+        out[failed] = np.nan
+        return out.reshape(len(start), num_k, *out.shape[1:])
+
+
+def _derived_fields(batch: mujoco.batch.Batch) -> list[str]:
+    """Real-valued model fields that hold a value per simulation in this batch."""
+    return [
+        f
+        for f in sorted(mujoco.batch.MODEL_FIELDS)
+        if batch.expanded(f) is not None and read_field(batch.model, f).dtype.kind == "f"
+    ]
+
+
+def _default_row(model: mujoco.MjModel) -> np.ndarray:
+    """The integration state of a simulation that has just been reset, ``(nstate,)``."""
+    data = mujoco.MjData(model)
+    spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
+    row = np.empty(mujoco.mj_stateSize(model, spec))
+    mujoco.mj_getState(model, data, row, spec)
+    return row
+
+
+def _filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
+    """Activations of first-order filters and the controls they follow: each starts settled at its control.
+
+    Any other hidden state (integrators, muscles, delays) is not in a log of positions and velocities.
+    """
+    pairs, hidden = [], []
+    names = [model.actuator(i).name or f"actuator{i}" for i in range(model.nu)]
+    for i in range(model.nu):
+        kind = model.actuator_dyntype[i]
+        if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
+            pairs.append((int(model.actuator_actadr[i]), i))
+        elif kind != mujoco.mjtDyn.mjDYN_NONE or model.actuator_delay[i] > 0:
+            hidden.append(names[i])
+    if hidden:
+        raise InputError(
+            f"model: actuators {', '.join(hidden)} keep a hidden state (integrator, muscle or delay) which a log of "
+            "positions and velocities does not hold; model them as motors, servos or first-order filters"
+        )
+    return pairs
