@@ -7,7 +7,7 @@ with z the truncated standard normal, s(μ + σz) ≈ s₀ + Σ Aᵢzᵢ + ½ Σ
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -20,9 +20,10 @@ from dropo_torch.distribution import (
     truncated_interval,
     truncated_moments,
 )
-from dropo_torch.objective import LOST_TRANSITION, Reduce, gaussian_log_density
+from dropo_torch.objective import LOST_TRANSITION, Reduce, draw_uniforms, gaussian_log_density
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
-from dropo_torch.optimizers.gauss_newton import MeansStage, damped_step
+from dropo_torch.optimizers.gauss_newton import MeansStage
+from dropo_torch.optimizers.sampled import MAX_DAMPING, SampledStage, scoring_step
 from dropo_torch.parameters import ParameterSpace
 
 MAX_ITERATIONS = 60
@@ -30,6 +31,8 @@ MAX_ITERATIONS = 60
 SMALL_GAIN = 0.01
 #: Refits of a log with uncertain starts, each around the start noise propagated at the last fit.
 NOISY_ROUNDS = 3
+#: Curvature that counts for more than this in the likelihood calls for sampling, in nats.
+MUCH_BENDING = 1.0
 
 
 @dataclass
@@ -61,7 +64,7 @@ class ScoringStage:
         return np.concatenate([mean[None], mean + np.diag(up), mean - np.diag(down)])
 
     def reduction(self) -> Reduce:
-        """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d²,)``."""
+        """Return the reduction to log-likelihood, scores, Fisher matrices and bending, ``(2 + 2d + 2d²,)``."""
         mean, std = self.candidate or (self.mean, self.std)
         up, down = self._reach(mean, std)
         low, high = self.limits
@@ -90,13 +93,32 @@ class ScoringStage:
             self.reason = "no simulation succeeded at the starting point"
         else:
             self.damping *= 8
-            if self.damping > 1e8:
+            if self.damping > MAX_DAMPING:
                 self.reason = "no step improves the likelihood"
         self.iterations += 1
         if self.iterations >= MAX_ITERATIONS and self.reason is None:
             self.reason = f"{MAX_ITERATIONS} iterations of Fisher scoring"
         if self.reason is None:
-            self.candidate = self._step()
+            self._propose()
+
+    def state(self) -> dict[str, Any]:
+        """Return everything but the box and the limits."""
+        return {k: v for k, v in vars(self).items() if k not in ("box", "limits")}
+
+    @property
+    def bending(self) -> float:
+        """Share of the covariance that the simulation's curvature makes, summed over the log, in nats."""
+        return 0.0 if self.sums is None else float(self.sums[-1])
+
+    def _propose(self) -> None:
+        """Set the next candidate, or stop where the step cannot gain anything."""
+        assert self.sums is not None
+        d = len(self.mean)
+        mean, std = scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
+        move = np.concatenate([mean - self.mean, np.log(std / self.std)])
+        if float(self.sums[1 : 1 + 2 * d] @ move) < SMALL_GAIN:
+            self.reason = f"no step promises {SMALL_GAIN:g} nat"
+        self.candidate = (mean, std)
 
     def _reach(self, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far the sigma points lie above and below μ: σ, less at a physical limit, ``(d,)`` each."""
@@ -105,23 +127,6 @@ class ScoringStage:
         up = np.where(mean + std <= high, std, np.maximum(high - mean, 0))
         down = np.where(mean - std >= low, std, np.maximum(mean - low, 0))
         return np.where(up < tiny, 0, up), np.where(down < tiny, 0, down)
-
-    def _step(self) -> tuple[np.ndarray, np.ndarray]:
-        """The damped Fisher step in μ and log σ, clipped and kept inside the box."""
-        assert self.sums is not None
-        d, box = len(self.mean), self.box
-        score_mean, score_log = self.sums[1 : 1 + d], self.sums[1 + d : 1 + 2 * d]
-        fisher_mean, fisher_log = self.sums[1 + 2 * d :].reshape(2, d, d)
-        free = ~((self.mean <= box.low) & (score_mean < 0)) & ~((self.mean >= box.high) & (score_mean > 0))
-        move = damped_step(fisher_mean, score_mean, free, self.damping)
-        move = np.clip(move, -0.25 * box.width, 0.25 * box.width)
-        log_std = np.log(self.std)
-        low, high = np.log(box.min_std), np.log(box.max_std)
-        free = ~((log_std <= low) & (score_log < 0)) & ~((log_std >= high) & (score_log > 0))
-        turn = np.clip(damped_step(fisher_log, score_log, free, self.damping), -1.5, 1.5)
-        # a deviation so small that it no longer shows in the covariance has no curvature left: send it down
-        turn = np.where(free & (score_log <= 0) & (np.diag(fisher_log) < 1e-3), -1.5 / (1 + self.damping), turn)
-        return np.clip(self.mean + move, box.low, box.high), np.exp(np.clip(log_std + turn, low, high))
 
 
 def scores(
@@ -132,7 +137,7 @@ def scores(
     reach: torch.Tensor,
     moments: torch.Tensor,
 ) -> torch.Tensor:
-    """Return log-likelihood, scores and Fisher information of (μ, log σ), packed into ``(1 + 2d + 2d²,)``.
+    """Return log-likelihood, scores, Fisher information of (μ, log σ) and bending, ``(2 + 2d + 2d²,)``.
 
     Derivatives treat the Jacobian of the simulation as constant.
 
@@ -167,7 +172,8 @@ def scores(
     score_log = v * (weighted.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0) + drift
     fisher_mean = gram.sum(0) / torch.outer(std, std)
     fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0) + torch.outer(first[:, 0], first[:, 0]) * gram.sum(0)
-    return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten()])
+    bending = (curved * torch.linalg.solve(total, curved.mT).mT).sum()
+    return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten(), bending[None]])
 
 
 def _divided_differences(
@@ -188,24 +194,27 @@ class FisherOptimizer(Optimizer):
     """Gauss-Newton on μ, then Fisher scoring on (μ, log σ); the default.
 
     On a log whose start states are noisy, the noise is propagated at the current μ and the means are
-    refitted with robust weights, until μ rests; the scoring then works on that covariance.
+    refitted with robust weights, a few times; the scoring then works on that covariance. Where the
+    simulation bends within the distribution, the scoring goes on over ``samples`` samples.
     """
 
     name = "fisher"
 
-    def __init__(self, space: ParameterSpace, *, noisy: bool = False) -> None:
+    def __init__(self, space: ParameterSpace, *, samples: int = 100, seed: int = 0, noisy: bool = False) -> None:
         self._space = space
         self._noisy = noisy
         self._box = SearchBox.of(space)
         self._limits = coordinate_limits(space.limits, space.is_log)
+        self._uniforms = draw_uniforms(samples, len(space), seed, 2)
         self._means = MeansStage(self._box.low, self._box.high, self._box.middle)
         self._scoring: ScoringStage | None = None
+        self._sampled: SampledStage | None = None
         self._round = 0
         self._linearised: np.ndarray | None = self._means.point if noisy else None
 
     def ask(self) -> Request:
-        """Return the stencil of the stage at work."""
-        stage = self._scoring or self._means
+        """Return the points of the stage at work."""
+        stage = self._sampled or self._scoring or self._means
         return Request(
             values=to_values(stage.points(), self._space.is_log),
             reduce=stage.reduction(),
@@ -215,53 +224,76 @@ class FisherOptimizer(Optimizer):
 
     def tell(self, sums: torch.Tensor) -> None:
         """Hand the sums to the stage at work, and change stages when it has finished."""
-        if self._scoring is not None:
+        if self._sampled is not None:
+            self._sampled.tell(sums)
+        elif self._scoring is not None:
             self._scoring.tell(sums)
-            return
-        self._means.tell(sums)
-        if self._means.reason is None:
-            return
-        if self._noisy and self._round < NOISY_ROUNDS:
-            self._round += 1
-            self._linearised = self._means.point
-            self._means = MeansStage(self._box.low, self._box.high, self._means.point, robust=True)
-            return
-        self._linearised = self._means.point if self._noisy else None
-        start = np.clip(self._box.width / 40, self._box.min_std, self._box.max_std)
-        self._scoring = ScoringStage(self._box, self._limits, self._means.point, start)
+            if self._scoring.reason is not None and self._misleads(self._scoring):
+                self._sampled = SampledStage(
+                    self._box, self._limits, self._uniforms, self._scoring.mean, self._scoring.std
+                )
+        else:
+            self._means.tell(sums)
+            if self._means.reason is not None:
+                self._after_means()
 
     @property
     def stop_reason(self) -> str | None:
-        """The scoring's reason, in words."""
+        """The last stage's reason, in words."""
+        if self._sampled is not None:
+            return self._sampled.reason
         return None if self._scoring is None else self._scoring.reason
 
     @property
     def progress(self) -> Progress:
-        """Stage, best sigma-point log-likelihood and a guess of the share done."""
-        if self._scoring is None:
-            done = self._round / (NOISY_ROUNDS + 1) if self._noisy else 0.0
-            share = 0.4 * (done + (1 - done) * min(1.0, self._means.iterations / 10))
-            return Progress("means (Gauss-Newton)", float("nan"), share)
-        share = 0.4 + 0.6 * min(1.0, self._scoring.iterations / 15)
-        return Progress("deviations (Fisher scoring)", self._scoring.log_likelihood, share)
+        """Stage, best log-likelihood of that stage and a guess of the share done."""
+        if self._sampled is not None:
+            share = 0.7 + 0.3 * min(1.0, self._sampled.iterations / 10)
+            return Progress("Fisher scoring on samples", self._sampled.log_likelihood, share)
+        if self._scoring is not None:
+            share = 0.4 + 0.3 * min(1.0, self._scoring.iterations / 10)
+            return Progress("Fisher scoring on sigma points", self._scoring.log_likelihood, share)
+        done = self._round / (NOISY_ROUNDS + 1) if self._noisy else 0.0
+        return Progress(
+            "Gauss-Newton on the means", float("nan"), 0.4 * (done + (1 - done) * min(1.0, self._means.iterations / 10))
+        )
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the φ at which the scoring stopped."""
-        if self._scoring is None:
-            return [(self._means.point, np.full(len(self._space), 1.0) * self._box.min_std)]
-        return [(self._scoring.mean, self._scoring.std)]
+        """Return the φ at which the last stage stopped."""
+        stage = self._sampled or self._scoring
+        return [(self._means.point, self._box.min_std) if stage is None else (stage.mean, stage.std)]
 
     def state(self) -> dict[str, Any]:
-        """Return both stages as plain data."""
-        means = asdict(self._means)
-        scoring = None
-        if self._scoring is not None:
-            scoring = {k: v for k, v in vars(self._scoring).items() if k not in ("box", "limits")}
-        return {"means": means, "scoring": scoring, "round": self._round, "linearised": self._linearised}
+        """Return all stages as plain data."""
+        return {
+            "means": dict(vars(self._means)),
+            "scoring": None if self._scoring is None else self._scoring.state(),
+            "sampled": None if self._sampled is None else self._sampled.state(),
+            "round": self._round,
+            "linearised": self._linearised,
+        }
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
         self._means = MeansStage(**state["means"])
-        scoring = state["scoring"]
-        self._scoring = None if scoring is None else ScoringStage(self._box, self._limits, **scoring)
+        if state["scoring"] is not None:
+            self._scoring = ScoringStage(self._box, self._limits, **state["scoring"])
+        if state["sampled"] is not None:
+            self._sampled = SampledStage(self._box, self._limits, self._uniforms, **state["sampled"])
         self._round, self._linearised = state["round"], state["linearised"]
+
+    def _after_means(self) -> None:
+        """Refit the means around the noise propagated at them, or go on to the deviations."""
+        point = self._means.point
+        if self._noisy:
+            self._linearised = point
+        if self._noisy and self._round < NOISY_ROUNDS:
+            self._round += 1
+            self._means = MeansStage(self._box.low, self._box.high, point, robust=True)
+            return
+        self._scoring = ScoringStage(self._box, self._limits, point, self._means.deviations(self._box))
+
+    @staticmethod
+    def _misleads(stage: ScoringStage) -> bool:
+        """Whether sigma points are no good description of the simulation at this φ."""
+        return stage.log_likelihood > -np.inf and (stage.bending > MUCH_BENDING or stage.damping > MAX_DAMPING)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
+import scipy.optimize
 import torch
 
+from dropo_torch.distribution import SearchBox
 from dropo_torch.objective import DIVERGENCE_PENALTY, Reduce, robust_cholesky
 
 #: Residuals beyond this many deviations lose their weight under robust weights (Cauchy's loss).
@@ -37,6 +39,8 @@ class MeansStage:
     candidate: np.ndarray | None = None
     gradient: np.ndarray = field(default_factory=lambda: np.zeros(0))
     hessian: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
+    excess: np.ndarray = field(default_factory=lambda: np.zeros(0))
+    squares: np.ndarray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def points(self) -> np.ndarray:
         """Return the stencil of the candidate: itself, then one moved point a parameter, ``(d + 1, d)``."""
@@ -44,7 +48,7 @@ class MeansStage:
         return np.concatenate([center[None], center + np.diag(self._steps(center))])
 
     def reduction(self) -> Reduce:
-        """Return the reduction to cost, gradient and Gauss-Newton matrix, ``(1 + d + d²,)``."""
+        """Return the reduction to cost, normal equations and moments, ``(1 + 2d + 2d²,)``."""
         center = self.point if self.candidate is None else self.candidate
         steps = torch.from_numpy(self._steps(center))
         robust = self.robust
@@ -63,8 +67,9 @@ class MeansStage:
             gain = self.cost - cost
             self.point = self.point if self.candidate is None else self.candidate
             self.cost = cost
-            self.gradient = sums[1 : 1 + d].numpy().copy()
-            self.hessian = sums[1 + d :].numpy().reshape(d, d).copy()
+            vectors, matrices = sums[1 : 1 + 2 * d].numpy(), sums[1 + 2 * d :].numpy()
+            self.gradient, self.excess = vectors.reshape(2, d).copy()
+            self.hessian, self.squares = matrices.reshape(2, d, d).copy()
             self.damping = max(self.damping / 8, 1e-12)
             if np.isfinite(gain) and (gain < 1e-4 or step < 1e-10):
                 self.reason = "the means no longer improve"
@@ -81,6 +86,21 @@ class MeansStage:
             self.candidate = np.clip(self.point + self._step(), self.low, self.high)
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
+
+    def deviations(self, box: SearchBox) -> np.ndarray:
+        """Return a first guess of σ, ``(d,)``: the variances that explain the residuals' excess over C.
+
+        One scoring step from σ = 0 in the linear model, with variances kept non-negative. Where the
+        residuals do not exceed C there is nothing to explain, and σ starts at its floor; else no lower
+        than a hundredth of the width, from which it can still go either way.
+        """
+        if not len(self.excess):
+            return np.clip(box.width / 40, box.min_std, box.max_std)
+        if (self.excess <= 0).all():
+            return box.min_std.copy()
+        scale = np.sqrt(np.maximum(np.diag(self.squares), 1e-300))
+        variances = scipy.optimize.nnls(self.squares / np.outer(scale, scale), self.excess / scale)[0] / scale
+        return np.clip(np.sqrt(variances), np.maximum(box.width / 100, box.min_std), box.max_std / 2)
 
     @property
     def _width(self) -> np.ndarray:
@@ -113,7 +133,9 @@ def damped_step(matrix: np.ndarray, force: np.ndarray, free: np.ndarray, damping
 def normal_equations(
     features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor, *, robust: bool
 ) -> torch.Tensor:
-    """Return cost, gradient and Gauss-Newton matrix of ½ Σ ρ(C^-½ r), packed into ``(1 + d + d²,)``.
+    """Return cost, gradient and Gauss-Newton matrix of ½ Σ ρ(C^-½ r), and two moments for σ, ``(1 + 2d + 2d²,)``.
+
+    The order is cost, gradient, Σ (JᵀC⁻¹r)² − diag JᵀC⁻¹J, Gauss-Newton matrix, Σ (JᵀC⁻¹J)².
 
     Args:
         features: at μ, then at μ + stepᵢeᵢ, ``(t, d + 1, m)``.
@@ -141,4 +163,9 @@ def normal_equations(
         weight, cost = torch.ones_like(r), r.square().sum()
     gradient = -(jac * (weight * r)[..., None]).sum((0, 1))
     flat = (jac * weight.sqrt()[..., None]).flatten(0, 1)
-    return torch.cat([0.5 * (cost + lost)[None], gradient, (flat.T @ flat).flatten()])
+    gram = jac.mT @ jac
+    pulled = (jac.mT @ (weight * r)[..., None])[..., 0]
+    excess = (pulled.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0)
+    squares = gram.square().sum(0)
+    matrices = [(flat.T @ flat).flatten(), squares.flatten()]
+    return torch.cat([0.5 * (cost + lost)[None], gradient, excess, *matrices])

@@ -1,1 +1,50 @@
-"""Simulators behind one interface."""
+"""Simulators behind one interface: many transitions under many parameter vectors, as one batch."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+
+from dropo_torch.errors import InputError, choices
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.gymnasium import Adapter, GymnasiumSimulator, MujocoEnvAdapter
+from dropo_torch.simulators.mujoco import MujocoSimulator
+
+__all__ = ["Adapter", "GymnasiumSimulator", "MujocoEnvAdapter", "MujocoSimulator", "Simulator", "make_simulator"]
+
+BACKENDS = ("mujoco", "gymnasium")
+
+
+def make_simulator(
+    backend: str,
+    model: mujoco.MjModel | str | Path | Any,
+    *,
+    parameters: ParameterSpace,
+    frame_skip: int = 1,
+    num_threads: int = 0,
+    chunk_size: int = 10_000,
+) -> Simulator:
+    """Return the simulator of a backend.
+
+    Args:
+        backend: ``"mujoco"`` or ``"gymnasium"``.
+        model: the model or its path; for ``"gymnasium"`` an adapter, or a function of the parameter
+            space that makes one.
+        parameters: what varies.
+        frame_skip: physics steps (for ``"gymnasium"``: the adapter's steps) per logged transition.
+        num_threads: threads, 0 for all processors.
+        chunk_size: simulations held in memory at once.
+
+    Raises:
+        InputError: an unknown backend, or a model that it does not support.
+    """
+    if backend == "mujoco":
+        return MujocoSimulator(
+            model, parameters=parameters, frame_skip=frame_skip, num_threads=num_threads, chunk_size=chunk_size
+        )
+    if backend == "gymnasium":
+        return GymnasiumSimulator(model, parameters=parameters, frame_skip=frame_skip)
+    raise InputError(f"backend: unknown {backend!r}" + choices(backend, BACKENDS))

@@ -1,0 +1,166 @@
+"""The config of a run: its keys, their defaults, and reading one with overrides from the command line."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+import pydantic
+import yaml
+
+from dropo_torch.errors import InputError, choices
+
+
+class Config(pydantic.BaseModel):
+    """What a run is made of. Paths are relative to the config file."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
+
+    model: str | None = pydantic.Field(None, description="path of the MJCF, URDF or .mjb model")
+    sim: str | None = pydantic.Field(None, description="a bundled simulation instead of a model")
+    environment: str | None = pydantic.Field(
+        None,
+        description="with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter",
+    )
+    data: Any = pydantic.Field(None, description="path of the log, a list of paths, or path and reading options")
+    trajectories: int | list[int] | None = pydantic.Field(
+        None, description="how many of the log's episodes to use (the first ones), or which, counted from 0"
+    )
+    frame_skip: int | None = pydantic.Field(None, ge=1, description="physics steps per logged transition")
+    observation: list[str] | None = pydantic.Field(
+        None, description="what the log's columns are, such as [qpos[1:], qvel]"
+    )
+    parameters: dict[str, dict[str, Any]] | None = pydantic.Field(
+        None, description="name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
+    )
+    backend: Literal["mujoco", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
+    optimizer: Literal["fisher", "cma"] = pydantic.Field("fisher", description="how φ is searched")
+    epsilon: float | list[float] = pydantic.Field(1e-5, description="ε, variance added to every column, or one each")
+    noise: float | list[float] | None = pydantic.Field(
+        None, description="standard deviation of the measurement, or one per column; starts are then uncertain"
+    )
+    samples: int = pydantic.Field(100, ge=2, description="K, parameter vectors per transition")
+    lag: int = pydantic.Field(1, ge=1, description="λ, logged steps per window")
+    seed: int = pydantic.Field(0, ge=0, description="seed of everything that is random")
+    mask: list[str | int] = pydantic.Field([], description="observed columns which the likelihood leaves out")
+    scaling: bool = pydantic.Field(False, description="divide each column by its deviation over the log")
+    budget: int = pydantic.Field(1000, ge=1, description="with cma: evaluations of the objective")
+    population: int | None = pydantic.Field(None, ge=2, description="with cma: φ per generation")
+    common_random_numbers: bool = pydantic.Field(False, description="with cma: the same samples in every generation")
+    threads: int = pydantic.Field(0, ge=0, description="threads of the simulator, 0 for all processors")
+    chunk_size: int = pydantic.Field(10_000, ge=1, description="simulations held in memory at once")
+
+    #: Folder that relative paths start from; not a key of the file.
+    base: Path = pydantic.Field(Path(), exclude=True)
+
+    def path(self, given: str) -> Path:
+        """Return a path of the config as one that can be opened."""
+        return self.base / Path(given).expanduser()
+
+    def document(self) -> dict[str, Any]:
+        """Return the config as plain data, as it would stand in a file."""
+        return {k: v for k, v in self.model_dump(mode="json").items() if v is not None and v != []}
+
+    def fingerprint(self, *ignored: str) -> str:
+        """Return a digest of everything that decides a run's result; threads and chunks do not."""
+        document = {k: v for k, v in self.document().items() if k not in {"threads", *ignored}}
+        return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:16]
+
+
+KEYS = tuple(k for k in Config.model_fields if k != "base")
+
+
+def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
+    """Read a YAML config, with dotted overrides such as ``{"parameters.mass.bounds": [1, 2]}``.
+
+    Raises:
+        InputError: a missing or unreadable file, an unknown key, a value that does not fit.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"config: no file {path}; expected a YAML file with keys such as model, data and parameters")
+    try:
+        document = yaml.load(path.read_text(), Loader=_Loader)
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise InputError(f"config: {path} is no valid YAML: {' '.join(str(error).split())}") from None
+    if not isinstance(document, Mapping):
+        raise InputError(f"config: {path} holds no keys; expected model, data, parameters, ...")
+    return make_config(document, overrides, base=path.parent, source=str(path))
+
+
+def make_config(
+    document: Mapping[str, Any],
+    overrides: Mapping[str, Any] | None = None,
+    *,
+    base: Path = Path(),
+    source: str = "config",
+) -> Config:
+    """Return the config of a mapping, with dotted overrides; errors are those of :func:`load_config`."""
+    merged = json.loads(json.dumps(dict(document), default=str))
+    for dotted, value in (overrides or {}).items():
+        _override(merged, dotted, value)
+    for key in merged:
+        if key not in KEYS:
+            raise InputError(f"{source}: unknown key {key!r}" + choices(key, KEYS))
+    try:
+        return Config(**merged, base=base)
+    except pydantic.ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"] if not str(part).endswith("]"))
+        given = first.get("input")
+        raise InputError(f"{source}: {key} is {given!r}: {first['msg'][0].lower() + first['msg'][1:]}") from None
+
+
+def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
+    """Read ``--key value`` and ``--key=value`` pairs; values are YAML.
+
+    Raises:
+        InputError: an argument that is no such pair, or an unknown key.
+    """
+    found: dict[str, Any] = {}
+    waiting = list(arguments)
+    while waiting:
+        argument = waiting.pop(0)
+        if not argument.startswith("--"):
+            raise InputError(f"argument {argument!r} is not understood; expected --key value, such as --epsilon 1e-4")
+        key, equals, value = argument[2:].partition("=")
+        key = key.replace("-", "_")
+        if key.split(".")[0] not in KEYS:
+            raise InputError(f"unknown option --{key}" + choices(key, KEYS))
+        if not equals:
+            if not waiting:
+                raise InputError(f"--{key}: no value given")
+            value = waiting.pop(0)
+        try:
+            found[key] = yaml.load(value, Loader=_Loader)
+        except yaml.YAMLError:
+            raise InputError(f"--{key}: {value!r} is no valid value") from None
+    return found
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML as people write numbers: 1e-5 is one, although YAML 1.1 wants 1.0e-5."""
+
+
+_Loader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(
+        r"^[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)$|^[-+]?(\d+\.\d*|\.\d+)$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
+    ),
+    list("-+0123456789."),
+)
+
+
+def _override(document: dict[str, Any], dotted: str, value: Any) -> None:
+    """Set a nested entry in place."""
+    *parents, last = dotted.split(".")
+    place = document
+    for parent in parents:
+        if not isinstance(place.get(parent), dict):
+            raise InputError(f"--{dotted}: the config has no {parent!r} to change" + choices(parent, place))
+        place = place[parent]
+    place[last] = value

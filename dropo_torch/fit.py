@@ -1,0 +1,295 @@
+"""One loop from an objective and an optimizer to a frozen result, with checkpoints."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import pickle
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.distribution import Distribution
+from dropo_torch.errors import InputError, choices
+from dropo_torch.objective import Objective, draw_uniforms, no_effect
+from dropo_torch.optimizers import CMAOptimizer, FisherOptimizer, Optimizer, Progress
+
+SCHEMA = "dropo-torch/fit/1"
+OPTIMIZERS = ("fisher", "cma")
+
+
+@dataclass(frozen=True)
+class HistoryEntry:
+    """The state of a fit after one batch.
+
+    Attributes:
+        evaluations: evaluations of the objective so far.
+        simulated_transitions: logged steps simulated so far.
+        seconds: time spent so far, over all sessions of the fit.
+        log_likelihood: the best the optimizer has seen in this stage; NaN before the first.
+        stage: what the optimizer was doing.
+        mean, std: the best φ so far, in coordinates, ``(d,)`` each.
+    """
+
+    evaluations: int
+    simulated_transitions: int
+    seconds: float
+    log_likelihood: float
+    stage: str
+    mean: np.ndarray
+    std: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A fitted distribution and how it was found.
+
+    Attributes:
+        distribution: p_φ.
+        log_likelihood: the sampled objective at φ, in nats, on draws that no optimizer has seen.
+        mse: mean squared difference between measured and simulated mean next states, in (scaled) units.
+        epsilon: ε, one per compared column.
+        backend, optimizer: names.
+        samples, seed: K and the seed.
+        evaluations: evaluations of the objective by the optimizer.
+        simulated_transitions: logged steps simulated altogether, checks and the final value included.
+        diverged: simulations that diverged in the final evaluation.
+        seconds: time spent, over all sessions of the fit.
+        stop_reason: why the optimizer stopped, in words.
+        history: one entry a batch.
+    """
+
+    distribution: Distribution
+    log_likelihood: float
+    mse: float
+    epsilon: tuple[float, ...]
+    backend: str
+    optimizer: str
+    samples: int
+    seed: int
+    evaluations: int
+    simulated_transitions: int
+    diverged: int
+    seconds: float
+    stop_reason: str
+    history: tuple[HistoryEntry, ...]
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of ``fit.json``."""
+        same = len(set(self.epsilon)) == 1
+        return {
+            "schema": SCHEMA,
+            "parameters": self.distribution.summary(),
+            "log_likelihood": self.log_likelihood,
+            "mse": self.mse,
+            "epsilon": self.epsilon[0] if same else list(self.epsilon),
+            "backend": self.backend,
+            "optimizer": self.optimizer,
+            "samples": self.samples,
+            "evaluations": self.evaluations,
+            "simulated_transitions": self.simulated_transitions,
+            "diverged_simulations": self.diverged,
+            "seconds": round(self.seconds, 3),
+            "seed": self.seed,
+            "stop_reason": self.stop_reason,
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write ``fit.json``, whole or not at all."""
+        write_atomically(Path(path), json.dumps(self.document(), indent=2).encode() + b"\n")
+
+
+def fit(
+    objective: Objective,
+    *,
+    optimizer: str = "fisher",
+    samples: int = 100,
+    seed: int = 0,
+    budget: int = 1000,
+    population: int | None = None,
+    common_random_numbers: bool = False,
+    checkpoint: str | Path | None = None,
+    resume: bool = False,
+    fingerprint: str = "",
+    on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
+) -> Fit:
+    """Fit the distribution of a simulator's parameters to a log.
+
+    Args:
+        objective: the likelihood of the log.
+        optimizer: ``"fisher"`` or ``"cma"``.
+        samples: K, parameter vectors of each φ.
+        seed: seeds every random number.
+        budget, population, common_random_numbers: options of CMA-ES; see :class:`CMAOptimizer`.
+        checkpoint: file in which the fit's state is kept after every batch.
+        resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
+        fingerprint: identifies the config and log; a checkpoint of another one is refused.
+        on_progress: called after every batch.
+
+    Raises:
+        InputError: a parameter without effect on this log, an unknown optimizer, a checkpoint that does not fit.
+    """
+    if optimizer not in OPTIMIZERS:
+        raise InputError(f"optimizer: unknown {optimizer!r}" + choices(optimizer, OPTIMIZERS))
+    search: Optimizer
+    if optimizer == "cma":
+        search = CMAOptimizer(
+            objective,
+            samples=samples,
+            seed=seed,
+            budget=budget,
+            population=population,
+            common_random_numbers=common_random_numbers,
+        )
+    else:
+        search = FisherOptimizer(
+            objective.simulator.parameters, samples=samples, seed=seed, noisy=objective.noise is not None
+        )
+    path = None if checkpoint is None else Path(checkpoint)
+    history = _restore(path, fingerprint, search, objective) if resume and path is not None else None
+    if history is None:
+        history = []
+        refuse_dead_parameters(objective)
+    history = _run(search, objective, history, path, fingerprint, on_progress)
+    return _conclude(search, objective, history, samples, seed)
+
+
+def refuse_dead_parameters(objective: Objective) -> None:
+    """Raise an :class:`InputError` that names every parameter without effect on the log."""
+    dead = no_effect(objective)
+    if not dead:
+        return
+    space = objective.simulator.parameters
+    where = "; ".join(f"{p.name!r} ({p.where})" for p in space.parameters if p.name in dead)
+    raise InputError(
+        f"parameters: {where} moves no compared column of this log anywhere in its bounds; "
+        "leave it out, or log a motion that excites it"
+    )
+
+
+def _run(
+    search: Optimizer,
+    objective: Objective,
+    history: list[HistoryEntry],
+    path: Path | None,
+    fingerprint: str,
+    on_progress: Callable[[HistoryEntry, Progress], None] | None,
+) -> list[HistoryEntry]:
+    """Ask and tell until the optimizer stops; keep the state after every batch."""
+    begun = time.monotonic() - (history[-1].seconds if history else 0.0)
+    evaluations = history[-1].evaluations if history else 0
+    while search.stop_reason is None:
+        request = search.ask()
+        at = request.linearise_at
+        if at is not None and (objective.linearised_at is None or not np.array_equal(at, objective.linearised_at)):
+            objective.linearise(at)
+        search.tell(objective.map(request.values, request.reduce))
+        evaluations += request.evaluations
+        progress = search.progress
+        mean, std = search.candidates()[0]
+        entry = HistoryEntry(
+            evaluations=evaluations,
+            simulated_transitions=objective.simulated_transitions,
+            seconds=time.monotonic() - begun,
+            log_likelihood=progress.log_likelihood,
+            stage=progress.stage,
+            mean=np.array(mean),
+            std=np.array(std),
+        )
+        history.append(entry)
+        if path is not None:
+            _save_checkpoint(path, fingerprint, search, objective, history)
+        if on_progress is not None:
+            on_progress(entry, progress)
+    return history
+
+
+def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntry], samples: int, seed: int) -> Fit:
+    """Evaluate the candidates on draws of their own and return the best."""
+    begun = time.monotonic()
+    spent = history[-1].seconds if history else 0.0
+    space = objective.simulator.parameters
+    uniforms = draw_uniforms(samples, len(space), seed, 0)
+    results = []
+    for mean, std in search.candidates():
+        objective.linearise(mean)
+        evaluation = objective.evaluate(mean[None], std[None], uniforms)[0]
+        results.append((evaluation.log_likelihood, mean, std, evaluation))
+    _, mean, std, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
+    objective.linearise(mean)
+    return Fit(
+        distribution=Distribution.over(space, mean, std),
+        log_likelihood=best.log_likelihood,
+        mse=best.mse,
+        epsilon=tuple(objective.epsilon.tolist()),
+        backend=objective.simulator.name,
+        optimizer=search.name,
+        samples=samples,
+        seed=seed,
+        evaluations=history[-1].evaluations if history else 0,
+        simulated_transitions=objective.simulated_transitions,
+        diverged=best.diverged,
+        seconds=spent + time.monotonic() - begun,
+        stop_reason=search.stop_reason or "",
+        history=tuple(history),
+    )
+
+
+def _save_checkpoint(
+    path: Path, fingerprint: str, search: Optimizer, objective: Objective, history: list[HistoryEntry]
+) -> None:
+    state = {
+        "fingerprint": fingerprint,
+        "optimizer": search.name,
+        "state": search.state(),
+        "history": [vars(entry) for entry in history],
+        "simulated_transitions": objective.simulated_transitions,
+        "linearised_at": objective.linearised_at,
+    }
+    write_atomically(path, pickle.dumps(state))
+
+
+def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objective) -> list[HistoryEntry] | None:
+    """Restore a checkpoint into a fresh optimizer; ``None`` where there is none yet."""
+    if not path.is_file():
+        return None
+    try:
+        state = pickle.loads(path.read_bytes())
+        owner, stored = (state["fingerprint"], state["optimizer"])
+    except Exception as error:
+        raise InputError(f"resume: {path} is no checkpoint of a fit ({error}); start again without --resume") from None
+    if owner != fingerprint or stored != search.name:
+        raise InputError(
+            f"resume: {path} belongs to another config, log or optimizer; restore those, or start again without --resume"
+        )
+    search.restore(state["state"])
+    if state["linearised_at"] is not None:
+        objective.linearise(state["linearised_at"])
+    objective.simulated_transitions = state["simulated_transitions"]
+    return [HistoryEntry(**entry) for entry in state["history"]]
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Write a file whole or not at all, whatever interrupts it."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with open(temporary, "wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    finally:
+        with contextlib.suppress(FileNotFoundError):
+            temporary.unlink()
+
+
+def without_history(result: Fit) -> Fit:
+    """Return a fit without its history, for comparison."""
+    return replace(result, history=(), seconds=0.0)

@@ -1,0 +1,163 @@
+"""Fisher scoring on the sampled objective itself, for simulations that bend within the distribution.
+
+Where the next state is far from quadratic in the parameters (a contact that some samples make and others
+do not), sigma points mislead. Here the likelihood is that of K samples x_k = μ + σz_k with fixed z_k, and
+its gradient follows from how the samples' next states regress on z: no further simulation.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.distribution import SearchBox, truncated_normal_icdf
+from dropo_torch.objective import LOST_TRANSITION, Reduce, gaussian_log_density, sample_moments
+from dropo_torch.optimizers.gauss_newton import damped_step
+
+MAX_ITERATIONS = 25
+#: The stage stops after two accepted steps in a row that each gain less than this, in nats.
+SMALL_GAIN = 0.1
+MAX_DAMPING = 1e2
+
+
+@dataclass
+class SampledStage:
+    """Maximises the sampled likelihood over μ and log σ on fixed base uniforms.
+
+    Attributes:
+        box: bounds of μ and σ in coordinates.
+        limits: physical limits in coordinates, low and high, ``(d,)`` each.
+        uniforms: base uniforms, ``(K, d)``.
+        mean, std: the best φ so far, ``(d,)`` each.
+    """
+
+    box: SearchBox
+    limits: tuple[np.ndarray, np.ndarray]
+    uniforms: torch.Tensor
+    mean: np.ndarray
+    std: np.ndarray
+    damping: float = 1e-2
+    log_likelihood: float = -np.inf
+    iterations: int = 0
+    small_gains: int = 0
+    reason: str | None = None
+    candidate: tuple[np.ndarray, np.ndarray] | None = None
+    sums: np.ndarray | None = None
+
+    def points(self) -> np.ndarray:
+        """Return the candidate's samples in coordinates, ``(K, d)``."""
+        mean, std = (torch.as_tensor(x) for x in self.candidate or (self.mean, self.std))
+        low, high = (torch.as_tensor(x) for x in self.limits)
+        return truncated_normal_icdf(self.uniforms, mean, std, low, high).numpy()
+
+    def reduction(self) -> Reduce:
+        """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d²,)``."""
+        mean, std = self.candidate or (self.mean, self.std)
+        z = torch.from_numpy((self.points() - mean) / std)
+        sigma = torch.from_numpy(std)
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+            return sampled_scores(features, measured, covariance, sigma, z)
+
+        return reduce
+
+    def tell(self, sums: torch.Tensor) -> None:
+        """Accept or reject the candidate, and propose the next one."""
+        value = float(sums[0])
+        if np.isfinite(value) and value > self.log_likelihood:
+            gain = value - self.log_likelihood
+            self.mean, self.std = self.candidate or (self.mean, self.std)
+            self.log_likelihood, self.sums = value, sums.numpy().copy()
+            self.damping = max(self.damping / 4, 1e-6)
+            self.small_gains = self.small_gains + 1 if gain < SMALL_GAIN else 0
+            if self.small_gains >= 2:
+                self.reason = f"two steps in a row gained less than {SMALL_GAIN:g} nat"
+        elif self.candidate is None:
+            self.reason = "no simulation succeeded at the starting point"
+        else:
+            self.damping *= 8
+            if self.damping > MAX_DAMPING:
+                self.reason = "no step improves the sampled likelihood"
+        self.iterations += 1
+        if self.iterations >= MAX_ITERATIONS and self.reason is None:
+            self.reason = f"{MAX_ITERATIONS} iterations on the sampled likelihood"
+        if self.reason is None and self.sums is not None:
+            self.candidate = scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
+
+    def state(self) -> dict[str, Any]:
+        """Return everything but the box, the limits and the uniforms."""
+        return {k: v for k, v in vars(self).items() if k not in ("box", "limits", "uniforms")}
+
+
+def scoring_step(
+    mean: np.ndarray, std: np.ndarray, sums: np.ndarray, box: SearchBox, damping: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the next (μ, σ): a damped Fisher step in μ and log σ, clipped and kept inside the box.
+
+    Args:
+        mean, std: φ, ``(d,)`` each.
+        sums: log-likelihood, scores and Fisher matrices of (μ, log σ), packed as ``(1 + 2d + 2d² ...,)``.
+        box: bounds of μ and σ.
+        damping: Marquardt's, on the diagonal of the Fisher matrices scaled to 1.
+    """
+    d = len(mean)
+    score_mean, score_log = sums[1 : 1 + d], sums[1 + d : 1 + 2 * d]
+    fisher_mean, fisher_log = sums[1 + 2 * d : 1 + 2 * d + 2 * d * d].reshape(2, d, d)
+    free = ~((mean <= box.low) & (score_mean < 0)) & ~((mean >= box.high) & (score_mean > 0))
+    move = np.clip(damped_step(fisher_mean, score_mean, free, damping), -0.25 * box.width, 0.25 * box.width)
+    log_std, low, high = np.log(std), np.log(box.min_std), np.log(box.max_std)
+    free = ~((log_std <= low) & (score_log < 0)) & ~((log_std >= high) & (score_log > 0))
+    turn = np.clip(damped_step(fisher_log, score_log, free, damping), -1.5, 1.5)
+    # a deviation that no longer shows in the covariance has no curvature left: send it down
+    turn = np.where(free & (score_log <= 0) & (np.diag(fisher_log) < 1e-3), -1.5 / (1 + damping), turn)
+    return np.clip(mean + move, box.low, box.high), np.exp(np.clip(log_std + turn, low, high))
+
+
+def sampled_scores(
+    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, std: torch.Tensor, z: torch.Tensor
+) -> torch.Tensor:
+    """Return sampled log-likelihood, scores and Fisher information of (μ, log σ), ``(1 + 2d + 2d²,)``.
+
+    Args:
+        features: at the samples, ``(t, K, m)``.
+        measured: ``(t, m)``.
+        covariance: what no parameter explains, ``(t, m, m)``.
+        std: σ, ``(d,)``.
+        z: the samples' deviations from μ in units of σ, ``(K, d)``.
+    """
+    num_samples, d = z.shape
+    alive = torch.isfinite(features).flatten(1).all(-1)
+    lost = float((~alive).sum()) * LOST_TRANSITION
+    features, measured, covariance = features[alive], measured[alive], covariance[alive]
+    mean, sampled = sample_moments(features)
+    total = sampled + covariance
+    residual = measured - mean
+    value = gaussian_log_density(residual, total).sum() + lost
+    slope, bend = _regress(features, z)
+    solved = torch.linalg.solve(total, residual[..., None])  # C⁻¹ r
+    pull = torch.linalg.solve(total, (features - mean[:, None]).mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
+    along = (features - mean[:, None]) @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
+    # ∂ log N / ∂ s_k, with C's and s̄'s dependence on the samples (eq. 2)
+    force = (along * solved.mT - pull) / (num_samples - 1) + solved.mT / num_samples
+    flat = torch.einsum("tkm,tdm->tkd", force, slope) + torch.einsum("tkm,tdm->tkd", force, bend) * z
+    score_mean = flat.sum((0, 1)) / std
+    score_log = (flat * z).sum((0, 1))
+    gram = slope @ torch.linalg.solve(total, slope.mT)
+    v = z.var(0)
+    fisher_mean = gram.sum(0) / torch.outer(std, std)
+    fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0)
+    return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten()])
+
+
+def _regress(features: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Slopes and bends per unit of z, ``(t, d, m)`` each; bends only where the samples can carry them."""
+    num_samples, d = z.shape
+    quadratic = num_samples >= 6 * d
+    columns = [torch.ones(num_samples, 1, dtype=z.dtype), z] + ([0.5 * z.square()] if quadratic else [])
+    inverse = torch.linalg.pinv(torch.cat(columns, 1))  # (1 + d [+ d], K)
+    fitted = inverse @ features
+    slope = fitted[:, 1 : 1 + d]
+    return slope, fitted[:, 1 + d :] if quadratic else torch.zeros_like(slope)

@@ -1,0 +1,138 @@
+"""The backend for any other simulator: a Gymnasium environment, or an adapter of the user's own."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import gymnasium
+import mujoco
+import numpy as np
+import torch
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace, write_field
+from dropo_torch.simulators.base import Simulator
+
+
+class Adapter(Protocol):
+    """What a simulator must do to be fitted. States and controls are flat float64 arrays.
+
+    Attributes:
+        num_states: width of a state.
+        num_controls: width of a control.
+        timestep: seconds of one step, or ``None``.
+    """
+
+    num_states: int
+    num_controls: int
+    timestep: float | None
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Give the simulator named parameter values, in their units."""
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Put the simulator into a state ``(num_states,)``, with nothing left of an earlier one."""
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        """Apply a control ``(num_controls,)`` for one logged transition; return the state after it."""
+
+
+class MujocoEnvAdapter:
+    """Drives a Gymnasium MuJoCo environment; states are ``[qpos, qvel]``.
+
+    The environment's own actions are applied through its ``do_simulation``, so that a wrapper's or the
+    environment's treatment of actions counts, and its rewards and terminations do not.
+
+    Raises:
+        InputError: an environment that is none of MuJoCo's.
+    """
+
+    def __init__(self, environment: gymnasium.Env, parameters: ParameterSpace) -> None:
+        self._env: Any = environment.unwrapped
+        if not hasattr(self._env, "do_simulation") or not isinstance(getattr(self._env, "model", None), mujoco.MjModel):
+            raise InputError(
+                f"environment: {environment} is no Gymnasium MuJoCo environment; write an adapter with "
+                "set_parameters, set_state and step, and name it as file.py:function"
+            )
+        self._env.reset(seed=0)
+        self._parameters = parameters
+        self._data = mujoco.MjData(self._env.model)
+        self.num_states = int(self._env.model.nq + self._env.model.nv)
+        self.num_controls = int(self._env.model.nu)
+        self.timestep: float | None = float(self._env.dt)
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Write the parameters into the environment's model, and everything derived from them."""
+        for parameter in self._parameters.parameters:
+            for target in parameter.targets:
+                write_field(self._env.model, target.field, target.index, target.factor * values[parameter.name])
+        mujoco.mj_setConst(self._env.model, self._data)
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Reset the physics and set positions and velocities."""
+        model, data = self._env.model, self._env.data
+        mujoco.mj_resetData(model, data)
+        self._env.set_state(state[: model.nq].copy(), state[model.nq :].copy())
+        data.qacc_warmstart[:] = 0  # set_state has run the solver; each transition starts it cold
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        """Apply an action for the environment's own frame skip."""
+        self._env.do_simulation(control, self._env.frame_skip)
+        return np.concatenate([self._env.data.qpos, self._env.data.qvel])
+
+
+class GymnasiumSimulator(Simulator):
+    """Transitions on one environment, one after the other.
+
+    Args:
+        adapter: the simulator, or a function of the parameter space that makes it.
+        parameters: what varies.
+        frame_skip: steps of the adapter per logged transition.
+    """
+
+    name = "gymnasium"
+
+    def __init__(
+        self,
+        adapter: Adapter | Callable[[ParameterSpace], Adapter],
+        *,
+        parameters: ParameterSpace,
+        frame_skip: int = 1,
+    ) -> None:
+        self._adapter: Adapter = adapter(parameters) if callable(adapter) else adapter
+        for needed in ("set_parameters", "set_state", "step", "num_states", "num_controls"):
+            if not hasattr(self._adapter, needed):
+                raise InputError(
+                    f"environment: {type(self._adapter).__name__} has no {needed}; an adapter has num_states, "
+                    "num_controls, timestep, set_parameters(values), set_state(state) and step(control)"
+                )
+        self.parameters = parameters
+        self.frame_skip = frame_skip
+        self.num_states, self.num_controls = int(self._adapter.num_states), int(self._adapter.num_controls)
+        step = getattr(self._adapter, "timestep", None)
+        self.timestep = None if step is None else float(step) * frame_skip
+
+    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
+        return self.rollout(states, controls, values)[:, :, -1]
+
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after each transition; see :meth:`Simulator.rollout`."""
+        self.check_arguments(states, controls, values)
+        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+        out = np.empty((len(start), len(vectors), control.shape[1], self.num_states))
+        for k, vector in enumerate(vectors):
+            self._adapter.set_parameters(self.parameters.named(vector))
+            for t in range(len(start)):
+                out[t, k] = self._one(start[t], control[t])
+        return torch.from_numpy(out)
+
+    def _one(self, state: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """One transition, ``(lag, num_states)``; NaN where the simulator fails."""
+        after = np.full((len(controls), self.num_states), np.nan)
+        self._adapter.set_state(state)
+        for step, control in enumerate(controls):
+            for _ in range(self.frame_skip):
+                after[step] = self._adapter.step(control)
+        return after if np.isfinite(after).all() else np.full_like(after, np.nan)
