@@ -316,15 +316,26 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
     signals = parse_columns(options.time, f"{table.source}: time")
     if len(signals) == 1 and signals[0].signal in table.names:
         stamps = table.array(signals[0].signal, "time")
-        if stamps.ndim == 1 and pd.api.types.infer_dtype(stamps) in _DATES:
-            with reading(f"{table.source}: {signals[0].signal}", "dates"):
-                dates = pd.to_datetime(pd.Series(stamps), utc=True)
-            return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
+        if _are_dates(stamps):
+            return _since_first(stamps, f"{table.source}: {signals[0].signal}")
     values, names = table.matrix(options.time, "time")
     if len(names) != 1:
         raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
     _check_rows(table, "time", len(values), len(episodes))
     return values[:, 0]
+
+
+def _are_dates(stamps: np.ndarray) -> bool:
+    """Whether a column holds dates, or text that does not start with a number."""
+    if stamps.ndim != 1 or pd.api.types.infer_dtype(stamps) not in _DATES:
+        return False
+    return stamps.dtype.kind == "M" or bool(np.isnan(pd.to_numeric(stamps[:1], errors="coerce"))[0])
+
+
+def _since_first(stamps: np.ndarray, where: str) -> np.ndarray:
+    with reading(where, "dates such as 2024-05-01T12:00:00.125"):
+        dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
+    return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
 
 
 def _check_rows(table: Table, what: str, rows: int, expected: int) -> None:

@@ -16,13 +16,13 @@ and a map is one entry, a list of entries, or a mapping from names to entries su
 from __future__ import annotations
 
 import re
+import warnings
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
-from fnmatch import fnmatchcase
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import h5py
@@ -258,6 +258,7 @@ def reading(path: Path | str, kind: str) -> Iterator[None]:
         RuntimeError,
         zipfile.BadZipFile,
         zlib.error,
+        pd.errors.ParserWarning,
         scipy.io.matlab.MatReadError,
     ) as error:
         reason = " ".join(str(error).split()) or type(error).__name__
@@ -265,11 +266,13 @@ def reading(path: Path | str, kind: str) -> Iterator[None]:
 
 
 def _open_npz(path: Path) -> Table:
-    with reading(path, ".npz"), np.load(path, allow_pickle=False) as archive:
+    # the file is opened here because numpy leaves it open where it is corrupt
+    with reading(path, ".npz"), path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         names = tuple(archive.files)
 
     def read(name: str) -> np.ndarray:
-        with reading(f"{path}: {name}", "an array"), np.load(path, allow_pickle=False) as archive:
+        where = f"{path}: {name}"
+        with reading(where, "an array"), path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return np.asarray(archive[name])
 
     return Table(str(path), names, read)
@@ -306,8 +309,11 @@ def _single_log(folder: Path) -> Path:
 
 
 def _open_text(path: Path, separator: str) -> Table:
-    with reading(path, "a table of text"):
-        frame = pd.read_csv(path, sep=separator, skipinitialspace=True)
+    with (
+        reading(path, "a table of text"),
+        warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
+    ):
+        frame = pd.read_csv(path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False)
     frame.columns = frame.columns.str.strip()
     only = str(frame.columns[0])
     other = next((mark for mark in (";", "\t", ",") if mark != separator and mark in only), None)
@@ -317,7 +323,10 @@ def _open_text(path: Path, separator: str) -> Table:
 
 
 def _frame_table(path: Path, frame: pd.DataFrame) -> Table:
-    return Table(str(path), tuple(str(c) for c in frame.columns), lambda name: frame[name].to_numpy())
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    columns = {str(name): i for i, name in enumerate(frame.columns)}
+    return Table(str(path), tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
 
 
 def _open_hdf5(path: Path, group: str | None) -> list[Table]:
@@ -331,7 +340,8 @@ def _open_hdf5(path: Path, group: str | None) -> list[Table]:
         file.visititems(visit)
     if group is None:
         return [_hdf5_table(path, "", datasets)]
-    matched = sorted((g for g in groups if fnmatchcase(g, group.strip("/"))), key=_natural)
+    pattern = f"/{group.strip('/')}"
+    matched = sorted((g for g in groups if PurePosixPath(f"/{g}").match(pattern)), key=_natural)
     if not matched:
         raise InputError(f"{path}: group: no group matches {group!r}{choices(group, groups)}")
     return [_hdf5_table(path, f"{g}/", datasets) for g in matched]
