@@ -267,12 +267,12 @@ def reading(path: Path | str, kind: str) -> Iterator[None]:
 
 def _open_npz(path: Path) -> Table:
     # the file is opened here because numpy leaves it open where it is corrupt
-    with reading(path, ".npz"), path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+    with reading(path, ".npz of plain arrays"), path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         names = tuple(archive.files)
 
     def read(name: str) -> np.ndarray:
         where = f"{path}: {name}"
-        with reading(where, "an array"), path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        with reading(where, "a plain array"), path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
             return np.asarray(archive[name])
 
     return Table(str(path), names, read)
@@ -290,7 +290,7 @@ def _open_npy(observations: Path) -> Table:
             )
 
     def read(name: str) -> np.ndarray:
-        with reading(files[name], ".npy"):
+        with reading(files[name], "a plain .npy array"):
             return np.asarray(np.load(files[name], allow_pickle=False))
 
     return Table(str(observations.parent), tuple(files), read)
@@ -378,10 +378,10 @@ def _open_mat73(path: Path) -> Table:
 
 
 def flatten(nested: object, joint: str, prefix: str = "") -> dict[str, np.ndarray]:
-    """Return the leaves of nested mappings and tuples, their keys joined by ``joint``."""
+    """Return the leaves of nested mappings, lists and tuples, their keys joined by ``joint``."""
     if isinstance(nested, Mapping):
         items = list(nested.items())
-    elif isinstance(nested, tuple):
+    elif isinstance(nested, list | tuple):
         items = list(enumerate(nested))
     else:
         return {prefix: np.asarray(nested)}

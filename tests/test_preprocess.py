@@ -171,6 +171,12 @@ def test_command_is_held_from_its_stamp_on():
     np.testing.assert_array_equal(out.actions[:, 0], np.arange(100) >= 25)
 
 
+def test_stamp_that_jitters_behind_the_step_still_counts_for_it():
+    time = TIME + np.where(TIME > 0, 2e-8, 0)
+    out = preprocess(recording(time, {"q": SINE}, {"u": np.arange(len(TIME))}), Preprocess(dt=0.01))
+    np.testing.assert_array_equal(out.actions[:, 0], 10 * np.arange(len(out)))
+
+
 @given(change=st.floats(0.1, 1.9))
 def test_held_command_changes_at_the_first_step_after_it(change):
     stamps = np.array([0.0, change, 2.0])
@@ -221,6 +227,12 @@ def test_aligned_signal_comes_back_in_time():
     np.testing.assert_allclose(given.observations, out.observations, atol=5e-4)
 
 
+def test_delay_of_the_reference_counts_for_what_is_aligned_with_it():
+    rec = sine_recording(late=np.sin(2 * np.pi * (TIME - 0.02)))
+    options = Preprocess(dt=0.01, align=["late"], reference="q", delays={"q": 0.005})
+    assert signal_delays(rec, options) == {"q": 0.005, "late": pytest.approx(0.025, abs=2e-5)}
+
+
 def test_delayed_command_is_taken_earlier():
     step = (TIME >= 0.5 - 1e-9).astype(float)
     out = preprocess(recording(TIME, {"q": SINE}, {"u": step}), Preprocess(dt=0.02, delays={"u": 0.1}))
@@ -262,6 +274,14 @@ def test_turning_body_has_its_angular_velocity_in_its_own_frame():
     at = start * Rotation.from_rotvec(np.outer(0.01 * np.arange(len(out)), rate))
     turned = at.inv() * Rotation.from_quat(np.roll(out.observations[:, 1:5], -1, axis=1))
     assert turned.magnitude().max() < 1e-5
+
+
+def test_quaternion_between_samples_has_unit_length():
+    turns = Rotation.from_rotvec(np.outer(TIME[::100], [0, 0, 5]))
+    names = ("qw", "qx", "qy", "qz")
+    rec = recording(TIME[::100], dict(zip(names, np.roll(turns.as_quat(), 1, axis=1).T, strict=True)))
+    out = preprocess(rec, Preprocess(dt=0.013, quaternions=[names]))
+    np.testing.assert_allclose(np.linalg.norm(out.observations[:, :4], axis=1), 1, atol=1e-12)
 
 
 # -- what is refused ------------------------------------------------------------------------------

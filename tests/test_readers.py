@@ -367,7 +367,7 @@ def test_pickles_are_never_loaded(tmp_path):
     folder.mkdir()
     write_npy(folder)
     np.save(folder / "hopper_actions.npy", evil)
-    fails(r"hopper_actions\.npy: cannot be read as \.npy .*allow_pickle", folder)
+    fails(r"hopper_actions\.npy: cannot be read as a plain \.npy array .*allow_pickle", folder)
 
 
 def test_folder_of_npy_files_must_be_one_complete_log(tmp_path):
@@ -432,6 +432,14 @@ def test_wrong_separator_is_suggested(tmp_path):
 def test_rows_longer_than_the_header(tmp_path):
     (tmp_path / "log.csv").write_text("t,q,u\n0,1,2,3\n1,1,2,3\n")
     fails(r"log\.csv: cannot be read as a table of text", tmp_path / "log.csv", observations="q", actions="u")
+
+
+def test_matlab_struct_array_has_numbered_elements(tmp_path):
+    runs = np.array([{"q": OBSERVATIONS[:, 0], "note": "a"}, {"q": OBSERVATIONS[:3, 0], "note": "b"}], dtype=object)
+    scipy.io.savemat(tmp_path / "log.mat", {"runs": runs})
+    log = read_recording(tmp_path / "log.mat", observations={"q": "runs.1.q"}, actions=[])
+    np.testing.assert_array_equal(log.observations[:, 0], OBSERVATIONS[:3, 0])
+    fails(r"runs\.1\.note holds <U1 values", tmp_path / "log.mat", observations="runs.1.note", actions=[])
 
 
 def test_no_hdf5_group_matches(tmp_path):
