@@ -17,8 +17,6 @@ from __future__ import annotations
 
 import re
 import warnings
-import zipfile
-import zlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
@@ -249,18 +247,7 @@ def reading(path: Path | str, kind: str) -> Iterator[None]:
         yield
     except InputError:
         raise
-    except (
-        OSError,
-        ValueError,
-        TypeError,
-        KeyError,
-        EOFError,
-        RuntimeError,
-        zipfile.BadZipFile,
-        zlib.error,
-        pd.errors.ParserWarning,
-        scipy.io.matlab.MatReadError,
-    ) as error:
+    except Exception as error:  # on a corrupt file these libraries raise whatever comes up
         reason = " ".join(str(error).split()) or type(error).__name__
         raise InputError(f"{path}: cannot be read as {kind} ({reason})") from None
 
@@ -333,8 +320,9 @@ def _open_hdf5(path: Path, group: str | None) -> list[Table]:
     groups: list[str] = []
     datasets: list[str] = []
 
-    def visit(name: str, item: object) -> None:
-        (datasets if isinstance(item, h5py.Dataset) else groups).append(name)
+    def visit(name: str | bytes, item: object) -> None:
+        if isinstance(name, str):  # a name that is no UTF-8 comes as bytes
+            (datasets if isinstance(item, h5py.Dataset) else groups).append(name)
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
         file.visititems(visit)
