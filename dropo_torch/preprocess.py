@@ -257,7 +257,7 @@ def _common_grid(part: Recording, reference: str, name: str) -> tuple[np.ndarray
     """Two signals on one even grid at the faster one's sampling interval, and that interval."""
     splines, stamps = [], []
     for label in (reference, name):
-        samples = _samples(part, label, 0.0)
+        samples = _samples(part, label)
         stamps.append(samples.time)
         splines.append(samples.spline)
     dt = float(min(np.median(np.diff(time)) for time in stamps))
@@ -268,17 +268,9 @@ def _common_grid(part: Recording, reference: str, name: str) -> tuple[np.ndarray
 
 
 def _episode(part: Recording, options: Preprocess, delays: Mapping[str, float]) -> Trajectories:
-    measured = options.velocities or ()
-    velocities = resolve_names(measured, part.observation_names, part.source, "preprocess: velocities")
-    rest = [name for name in part.observation_names if name not in velocities]
-    positions = resolve_names(
-        rest if options.positions is None else options.positions,
-        part.observation_names,
-        part.source,
-        "preprocess: positions",
-    )
+    positions, velocities = _measured(part, options)
     quaternions = _quaternions(options, positions, part.source)
-    signals = {name: _samples(part, name, delays.get(name, 0.0), options.max_gap) for name in positions + velocities}
+    signals = {name: _samples(part, name, delays.get(name, 0.0)) for name in positions + velocities}
     for quaternion in quaternions:
         signals |= _continuous({name: signals[name] for name in quaternion}, part.source)
     for name, samples in signals.items():
@@ -304,7 +296,17 @@ def _episode(part: Recording, options: Preprocess, delays: Mapping[str, float]) 
     )
 
 
-def _samples(part: Recording, name: str, delay: float, max_gap: float | None = 0.0) -> _Samples:
+def _measured(part: Recording, options: Preprocess) -> tuple[list[str], list[str]]:
+    """The signals that are positions, and those that are velocities."""
+    names = part.observation_names
+    velocities = resolve_names(options.velocities or (), names, part.source, "preprocess: velocities")
+    wanted = options.positions
+    if wanted is None:
+        wanted = [name for name in names if name not in velocities]
+    return resolve_names(wanted, names, part.source, "preprocess: positions"), velocities
+
+
+def _samples(part: Recording, name: str, delay: float = 0.0) -> _Samples:
     """A signal's samples at the times of what they measure; NaN counts as none."""
     assert part.time is not None
     values = part.signal(name)
