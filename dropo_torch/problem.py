@@ -112,7 +112,9 @@ def _model_path(config: Config, sim: BundledSim | None) -> Path:
 def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None) -> ParameterSpace:
     given = config.parameters if config.parameters is not None else (sim.parameters if sim else None)
     if given is None:
-        raise InputError("config: no parameters given; expected name: {field: body_mass, name: BODY, bounds: [low, high]}")
+        raise InputError(
+            "config: no parameters given; expected name: {field: body_mass, name: BODY, bounds: [low, high]}"
+        )
     return ParameterSpace(model, given)
 
 
@@ -223,7 +225,12 @@ def _observation(
 
 def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> str:
     digest = hashlib.sha256(config.fingerprint().encode())
-    for array in (trajectories.observations, trajectories.next_observations, trajectories.actions, trajectories.terminals):
+    for array in (
+        trajectories.observations,
+        trajectories.next_observations,
+        trajectories.actions,
+        trajectories.terminals,
+    ):
         digest.update(np.ascontiguousarray(array).tobytes())
     if model is not None:
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
