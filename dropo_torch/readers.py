@@ -103,7 +103,8 @@ def read_trajectories(
         time: the column of time stamps in seconds, as dates, or in any unit with ``{signal: stamp_ns, scale: 1e-9}``.
         episode: a column whose value differs from one episode to the next.
         terminals: columns of flags that are true at an episode's last row, any of them; by default the
-            arrays ``terminals`` and ``timeouts`` where they are.
+            arrays ``terminals`` and ``timeouts``, one of which must be there unless ``observations`` is given;
+            ``[]`` for a log that is one episode.
         dt: seconds between rows, for a log without time stamps.
         tolerance: fraction by which the spacing of time stamps may differ from its median.
         group: pattern of HDF5 groups with an episode each, such as ``data/demo_*``.
@@ -283,6 +284,11 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
     flags = options.terminals
     if flags is None:
         flags = [name for name in ("terminals", "timeouts") if name in table.names]
+        if not flags and options.observations is None and options.episode is None and options.group is None:
+            raise InputError(
+                f"{table.source}: there is no 'terminals'; say where episodes end with terminals: NAME "
+                f"(or terminals: [] if all of it is one episode){choices('terminals', table.names)}"
+            )
     values, names = table.matrix(flags, "terminals")
     if names:
         _check_rows(table, names[0], len(values), rows)

@@ -2,11 +2,11 @@
 
 A column map is what a config writes after ``observations``, ``actions`` or ``time``. Each entry is
 
-=============================================  ===================================================
-``q``                                          the column or variable ``q``, every column of a matrix
-``q[2]``, ``q[0:3]``                           one column, a slice of the columns of a matrix
+============================================  ===================================================
+``q``                                         the column or variable ``q``, every column of a matrix
+``q[2]``, ``q[0:3]``                          one column, a slice of the columns of a matrix
 ``{signal: vir, scale: 35.15, name: force}``  ``scale · signal + offset``, renamed
-=============================================  ===================================================
+============================================  ===================================================
 
 and a map is one entry, a list of entries, or a mapping from names to entries such as
 ``{force: {signal: vir, scale: 35.15}}``. ``scale`` may also name a scalar variable of the file, and

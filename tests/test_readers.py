@@ -456,6 +456,12 @@ def test_matrix_of_another_length_may_be_transposed(tmp_path):
     )
 
 
+def test_log_without_flags_says_that_it_is_one_episode(tmp_path):
+    np.savez(tmp_path / "log.npz", observations=OBSERVATIONS, actions=ACTIONS)
+    fails(r"there is no 'terminals'; .*\(or terminals: \[\] if all of it is one episode\)", tmp_path / "log.npz")
+    assert read_trajectories(tmp_path / "log.npz", terminals=[]).num_episodes == 1
+
+
 def test_ragged_lists(tmp_path):
     frame(state=[[0.0]] * 6 + [[0.0, 1.0]]).to_parquet(tmp_path / "log.parquet")
     fails(
