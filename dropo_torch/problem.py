@@ -68,7 +68,7 @@ def make_problem(config: Config) -> Problem:
         model_path = _model_path(config, sim)
         space = _space(load_model(model_path), config, sim)
         source = space.model
-    trajectories = _log(config, sim)
+    trajectories = _log(config, sim, space.model)
     frame_skip = _frame_skip(config, sim, space.model, trajectories)
     simulator = make_simulator(
         config.backend,
@@ -153,10 +153,15 @@ def _load_function(config: Config, name: str) -> Callable[..., Any]:
     return getattr(module, function)
 
 
-def _log(config: Config, sim: BundledSim | None) -> Trajectories:
+def _log(config: Config, sim: BundledSim | None, model: mujoco.MjModel | None) -> Trajectories:
     source = config.data if config.data is not None else (str(sim.log) if sim else None)
     if source is None:
         raise InputError("config: no data given; expected the path of a log, such as data: log.npz")
+    if isinstance(source, dict) and isinstance(source.get("preprocess"), dict) and "dt" not in source["preprocess"]:
+        if model is None or config.frame_skip is None:
+            raise InputError("data: preprocess needs dt, the seconds of one transition (or frame_skip, and a model)")
+        step = float(model.opt.timestep) * config.frame_skip
+        source = {**source, "preprocess": {"dt": step, **source["preprocess"]}}
     log = read_trajectories(source, base=config.base)
     if config.trajectories is None:
         return log
