@@ -11,6 +11,7 @@ import html
 import io
 import re
 import warnings
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -54,6 +55,7 @@ def distribution_row(axis: Axis, values: np.ndarray, density: np.ndarray, center
         axes.minorticks_off()
     axes.set_xlim(axis.low, axis.high)
     _few_ticks(axes.xaxis, 6, axis.is_log)
+    _tick_the_ends(axes, axis)
     axes.set_yticks([])
     top = float(np.max(density, initial=0.0, where=np.isfinite(density)))
     if top > 0 and np.isfinite(values).all():
@@ -84,13 +86,12 @@ def trace_panel(
     joined = _insert_breaks(breaks, position, simulated, expected)
     upper.plot(joined[0], joined[1], color=BLUE, linewidth=1.1)
     _dots(upper, position, measured, INK)
-    if np.isfinite(joined[1:]).any():
-        single = 0.5 * (np.nan_to_num(breaks.astype(float)).mean() == 1)
-        for start, stop in _runs(joined):
-            x, band = joined[0, start:stop], 2 * joined[2, start:stop]
-            if stop - start == 1:
-                x, band = np.array([x[0] - 0.4 - single, x[0] + 0.4 + single]), np.repeat(band, 2)
-            lower.fill_between(x, -band, band, color=SKY, linewidth=0)
+    for start, stop in _runs(joined):
+        x, simulation, band = joined[:, start:stop]
+        if stop - start == 1:  # no neighbour to draw a line to
+            _strokes(upper, x, simulation, simulation, BLUE, 6)
+            x, band = x[0] + np.array([-0.4, 0.4]), np.repeat(band, 2)
+        lower.fill_between(x, -2 * band, 2 * band, color=SKY, linewidth=0)
     lower.axhline(0, color=BLUE, linewidth=1.0)
     _dots(lower, position, measured - simulated, INK)
     for axes in (upper, lower):
@@ -114,7 +115,7 @@ def residual_panel(position: np.ndarray, standardised: np.ndarray) -> str:
     along, across = _axes(figure, (34, 20, 92, 6)), _axes(figure, (236, 20, 8, 6))
     finite = np.isfinite(standardised)
     x, z = position[finite], standardised[finite]
-    reach = max(4.0, 1.1 * float(np.quantile(np.abs(z), 0.995))) if len(z) else 4.0
+    reach = _reach(z)
     for axes in (along, across):
         axes.axhspan(-2, 2, color=SKY, linewidth=0)
         axes.axhline(0, color=BLUE, linewidth=0.8)
@@ -128,7 +129,7 @@ def residual_panel(position: np.ndarray, standardised: np.ndarray) -> str:
     across.set_xlim(0, 1.08 * max(0.4, float(share.max())))
     across.set_xticks([])
     across.tick_params(labelleft=False)
-    _few_ticks(along.yaxis, 5)
+    _few_ticks(along.yaxis, 5, whole=True)
     _few_ticks(along.xaxis, 4, whole=True)
     return to_svg(figure, "standardised residuals along the log and their histogram")
 
@@ -159,10 +160,13 @@ def progress_panel(
         limits: of the vertical axis.
     """
     figure = _figure(340, 225)
-    axes = _axes(figure, (50, 36, 12, 34))
+    axes = _axes(figure, (58, 36, 12, 34))
     keep = _thinned(len(cost), MAX_POINTS)
     for column, colour in sorted(enumerate(colours), key=lambda pair: pair[1] != FAINT):
-        axes.plot(cost[keep], lines[keep, column], color=colour, linewidth=1.4, marker=".", markersize=3.5)
+        few = colour != FAINT and len(keep) <= 40
+        axes.plot(cost[keep], lines[keep, column], color=colour, linewidth=1.4, marker="." if few else "", markersize=4)
+    if not np.isfinite(lines).any():
+        axes.text(0.5, 0.5, "no finite value", transform=axes.transAxes, ha="center", color=GREY, fontsize=9.5)
     if log:
         axes.set_yscale("log")
         axes.minorticks_off()
@@ -179,11 +183,19 @@ def progress_panel(
     axes.set_xlim(0, 1.02 * end)
     for number, change in enumerate(changes):
         axes.axvline(change, color=GREY, linewidth=0.8)
+        offset = (3, -10 - 11 * (number % 2))  # neighbours may begin close together
         axes.annotate(
-            chr(ord("A") + number % 26), (change, 1), xycoords=("data", "axes fraction"), xytext=(3, -10),
-            textcoords="offset points", color=GREY, fontsize=8.5, fontweight="bold",
-        )  # fmt: skip
+            chr(ord("A") + number % 26),
+            (change, 1),
+            xycoords=("data", "axes fraction"),
+            xytext=offset,
+            textcoords="offset points",
+            color=GREY,
+            fontsize=8.5,
+            fontweight="bold",
+        )
     axes.set_ylabel(label)
+    axes.yaxis.set_label_coords(-48 / 270, 0.5)
     axes.set_xlabel("simulated transitions")
     _few_ticks(axes.xaxis, 6, whole=True)
     if len(cost):
@@ -229,7 +241,7 @@ def heat_map(
         text.set_parse_math(False)
     if roomy:
         for i, j in np.argwhere(np.isfinite(shown)):
-            dark = colours[i, j, :3].mean() < 0.55
+            dark = colours[i, j, :3] @ (0.2126, 0.7152, 0.0722) < 0.5
             axes.text(j, i, _brief(shown[i, j], diverging), ha="center", va="center", fontsize=7.5,
                       color="white" if dark else INK)  # fmt: skip
     return to_svg(figure, "heat map", grow=False)
@@ -317,6 +329,14 @@ def shorten(label: str, length: int = MAX_LABEL) -> str:
     return f"{label[:head]}…{label[len(label) - (length - 1 - head) :]}"
 
 
+def _reach(standardised: np.ndarray) -> float:
+    """How far an axis of standardised residuals goes: to the largest, or to where but a few lie beyond."""
+    size = np.abs(standardised)
+    if not len(size) or size.max() <= 4:
+        return 4.0
+    return float(1.05 * size.max()) if size.max() <= 12 else max(4.0, 1.1 * float(np.quantile(size, 0.995)))
+
+
 def _figure(width: float, height: float) -> Any:
     """An empty figure of a size in CSS pixels; the SVG's points are scaled to that."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -355,8 +375,21 @@ def _few_ticks(axis: Any, count: int, is_log: bool = False, *, whole: bool = Fal
         low, high = sorted(axis.get_view_interval())
         axis.set_major_locator(FixedLocator(_log_ticks(low, high, count)))
     else:
-        axis.set_major_locator(MaxNLocator(count - 1, integer=whole, steps=[1, 2, 2.5, 5, 10], min_n_ticks=2))
+        axis.set_major_locator(
+            MaxNLocator(count - 1, integer=whole, steps=[1, 2, 5, 10] if whole else [1, 2, 2.5, 5, 10], min_n_ticks=2)
+        )
     axis.set_major_formatter(FuncFormatter(lambda value, _: plain(value)))
+
+
+def _tick_the_ends(axes: Any, axis: Axis) -> None:
+    """Add ticks at both ends of the horizontal axis, in place of those too near to them."""
+    place = np.log if axis.is_log else np.asarray
+    low, high = float(place(axis.low)), float(place(axis.high))
+    inner = [float(t) for t in axes.get_xticks() if 0.16 < (float(place(max(t, axis.low))) - low) / (high - low) < 0.84]
+    axes.set_xticks([axis.low, *inner, axis.high])
+    labels = axes.get_xticklabels()
+    labels[0].set_horizontalalignment("left")
+    labels[-1].set_horizontalalignment("right")
 
 
 def _log_ticks(low: float, high: float, count: int) -> list[float]:
@@ -429,14 +462,15 @@ def _strokes(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour
 
 
 def _dots_or_envelope(axes: Any, x: np.ndarray, y: np.ndarray) -> None:
-    """Draw few values as dots, many as the span from least to greatest of each stretch."""
+    """Draw few values as dots, many as each stretch's whole span, and its middle two thirds darker."""
     if len(x) <= 2 * MAX_POINTS:
         _dots(axes, x, y, INK)
         return
     groups = np.array_split(np.arange(len(x)), MAX_POINTS)
     middle = np.array([x[g].mean() for g in groups])
-    low, high = (np.array([extreme(y[g]) for g in groups]) for extreme in (np.min, np.max))
-    _strokes(axes, middle, low, high, INK, 1.2)
+    least, low, high, greatest = np.array([np.quantile(y[g], (0, 0.16, 0.84, 1)) for g in groups]).T
+    _strokes(axes, middle, least, greatest, "#a3afbb", 1.3)
+    _strokes(axes, middle, low, high, INK, 1.3)
 
 
 def _insert_breaks(breaks: np.ndarray, *lines: np.ndarray) -> np.ndarray:
@@ -468,7 +502,7 @@ def _brief(value: float, diverging: bool) -> str:
         return f"{value:.2f}".replace("-", "−").replace("−0.00", "0.00")
     if value == 0:
         return "0"
-    return f"{value:.2g}" if value >= 0.01 else f"{value:.0e}".replace("e-0", "e−").replace("e-", "e−")
+    return f"{value:#.2g}".rstrip(".") if value >= 0.01 else f"{value:.0e}".replace("e-0", "e−").replace("e-", "e−")
 
 
 def _inline(document: str, label: str, grow: bool) -> str:
@@ -484,6 +518,9 @@ def _inline(document: str, label: str, grow: bool) -> str:
     body = re.sub(r"<[^>]*>", lambda tag: re.sub(r"\d+\.\d{2,}", _rounded, tag[0]), body)
     body = re.sub(r"(?<=base64,)[^\"]*", lambda m: re.sub(r"\s", "", m[0]), body)
     body = re.sub(r' d="([^"]*)"', lambda m: f' d="{_shorter(m[1])}"', body)
+    tag = f"s{zlib.crc32(body.encode()):x}"
+    for count, name in enumerate(dict.fromkeys(re.findall(r' id="(\w+)"', body))):
+        body = re.sub(rf'(?<=["#]){name}(?=["\)])', f"{tag}{count}", body)
     body = re.sub(r">\s+<", "><", re.sub(r"\s*\n\s*", " ", body)).strip()
     extent = f"max-width:{1.25 * width:.0f}px" if grow else f"width:{1.15 * width:.0f}px"
     return (
@@ -505,4 +542,5 @@ def _shorter(path: str) -> str:
     """A path without spaces that say nothing; a stroke of no length stays one."""
     path = re.sub(r"\s+", " ", path).strip()
     path = re.sub(r"M ([-\d.]+ [-\d.]+) L \1(?= M|$)", r"M\1h0", path)
+    path = re.sub(r"M ([-\d.]+) ([-\d.]+) L \1 ([-\d.]+)(?= M|$)", r"M\1 \2V\3", path)
     return re.sub(r" ?([MLCQzZ]) ?", r"\1", path)

@@ -49,7 +49,7 @@ def write_fit_report(
         versions: name → version of what the result depends on.
         space: the parameters, for their place in the model and the model's own values.
     """
-    ok, verdict = words.verdict(diagnostics)
+    ok, verdict = words.verdict(fit, diagnostics)
     nominal = np.full(len(fit.distribution), np.nan) if space is None else space.nominal
     shown = shown_columns(diagnostics)
     content = {
@@ -100,12 +100,17 @@ def write_sweep_report(
     order = np.argsort(np.asarray(epsilons, dtype=float), kind="stable")
     x, y, ll = (np.asarray(values, dtype=float)[order] for values in (epsilons, mse, log_likelihood))
     rows = [
-        {"epsilon": f"{e:g}", "mse": words.number(m), "log_likelihood": nats(v), "chosen": bool(np.isclose(e, chosen))}
+        {
+            "epsilon": figures.plain(float(e)),
+            "mse": words.number(m),
+            "log_likelihood": nats(v),
+            "chosen": bool(np.isclose(e, chosen)),
+        }
         for e, m, v in zip(x, y, ll, strict=True)
     ]
     content = {
         "title": title,
-        "chosen": f"{chosen:g}",
+        "chosen": figures.plain(float(chosen)),
         "reason": reason,
         "rows": rows,
         "mse_figure": Markup(figures.log_log(x, y, chosen=chosen, x_label="ε", y_label="mean squared difference")),
@@ -140,7 +145,11 @@ def config_yaml(config: Mapping[str, Any] | None) -> str:
     if config is None:
         return ""
     document = json.loads(json.dumps(dict(config), default=_plain_data))
-    return yaml.safe_dump(document, sort_keys=False, allow_unicode=True, default_flow_style=None, width=100)
+    options: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "width": 100}
+    return "".join(
+        yaml.safe_dump({key: value}, default_flow_style=None if isinstance(value, (dict, list)) else False, **options)
+        for key, value in document.items()
+    )
 
 
 def nats(value: float) -> str:
@@ -199,8 +208,8 @@ def _parameter_rows(
                 "log": bool(distribution.is_log[i]),
                 "error": words.number(error * float(scale[i]), error * float(scale[i])),
                 "unit": distribution.units[i],
-                "low": words.number(float(distribution.low[i])).rstrip("0").rstrip("."),
-                "high": f"{distribution.high[i]:.4g}",
+                "low": figures.plain(float(distribution.low[i])),
+                "high": figures.plain(float(distribution.high[i])),
                 "nominal": words.number(float(nominal[i])) if np.isfinite(nominal[i]) else "",
                 "left": _percent(shares[0][i]),
                 "width": _percent(shares[1][i] - shares[0][i]),
@@ -208,7 +217,6 @@ def _parameter_rows(
                 "own": _percent(own[i]) if np.isfinite(own[i]) else "",
             }
         )
-        rows[-1]["low"] = f"{distribution.low[i]:.4g}"
     return rows
 
 
@@ -404,7 +412,7 @@ def _identifiability(fit: Fit, diagnostics: Diagnostics) -> dict[str, Any]:
 def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     """How the result came about."""
     same = len(set(fit.epsilon)) == 1
-    epsilon = f"{fit.epsilon[0]:g}" if same else ", ".join(f"{e:g}" for e in fit.epsilon)
+    epsilon = ", ".join(figures.plain(e) for e in (fit.epsilon[:1] if same else fit.epsilon))
     return [
         ("Log-likelihood", f"{nats(fit.log_likelihood)} nats, on samples that the optimizer has not seen"),
         ("Mean squared difference", f"{words.number(fit.mse)}, measured against mean simulated next state"),

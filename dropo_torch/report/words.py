@@ -67,14 +67,14 @@ def headline(fit: Fit, diagnostics: Diagnostics) -> str:
     if len(names) > MOST_NAMED:
         return f"{start} The fitted values are in the table below."
     values = [
-        f"{name} = {value} ± {std}{f' {unit}' if unit else ''}"
+        f"{name} = {value} ± {std}{f' {unit}' if unit else ''}".replace(" ", "\u00a0")
         for name, (value, std), unit in zip(names, _pairs(distribution), distribution.units, strict=True)
     ]
-    return f"{start} Found: {joined(values, len(values))}."
+    return f"{start} Mean ± standard deviation: {joined(values, len(values))}."
 
 
-def verdict(diagnostics: Diagnostics) -> tuple[bool, str]:
-    """Return whether the model explains the log, and that in words."""
+def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
+    """Return whether the model explains the log without reservation, and that in words."""
     standardised = column_rms(diagnostics)
     overall = overall_rms(diagnostics)
     if not np.isfinite(overall):
@@ -87,6 +87,11 @@ def verdict(diagnostics: Diagnostics) -> tuple[bool, str]:
         bad = int(np.sum(standardised > limit))
         where = "" if len(standardised) == 1 else f" in {bad} of {len(standardised)} columns"
         return False, f"The simulator does not explain the log{where}. {scale}; {at_worst}."
+    if at_largest_deviation(fit.distribution).any():
+        return False, (
+            "The simulator explains the log only with parameters that vary as widely as they may (see below). "
+            f"{scale}; {at_worst}."
+        )
     if overall < DROWNED:
         return True, f"The simulator explains the log, with room to spare. {scale}; {at_worst}."
     return True, f"The simulator explains the log. {scale}; {at_worst}."
@@ -121,6 +126,11 @@ def unexplained_above(diagnostics: Diagnostics) -> float:
 def search_box(distribution: Distribution) -> SearchBox:
     """Return the search box of a fitted distribution."""
     return SearchBox.of(cast(ParameterSpace, distribution))  # it has the same low, high and is_log
+
+
+def at_largest_deviation(distribution: Distribution) -> np.ndarray:
+    """Return which deviations lie at their upper bound, ``(d,)`` bool."""
+    return np.asarray(distribution.std >= search_box(distribution).max_std / AT_DEVIATION_BOUND)
 
 
 def density_curve(distribution: Distribution, index: int, points: int = 121) -> tuple[np.ndarray, np.ndarray]:
@@ -236,7 +246,7 @@ def _at_bounds(distribution: Distribution) -> list[Finding]:
 
 def _deviations(distribution: Distribution) -> list[Finding]:
     box = search_box(distribution)
-    top = distribution.std >= box.max_std / AT_DEVIATION_BOUND
+    top = at_largest_deviation(distribution)
     floor = distribution.std <= box.min_std * AT_DEVIATION_BOUND
     found = []
     if top.any():
