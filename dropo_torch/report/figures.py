@@ -162,12 +162,13 @@ def progress_panel(
     figure = _figure(340, 225)
     axes = _axes(figure, (58, 36, 12, 34))
     keep = _thinned(len(cost), MAX_POINTS)
+    lines = np.where(np.isfinite(lines) & ((lines > 0) | (not log)), lines, np.nan)
     for column, colour in sorted(enumerate(colours), key=lambda pair: pair[1] != FAINT):
         few = colour != FAINT and len(keep) <= 40
         axes.plot(cost[keep], lines[keep, column], color=colour, linewidth=1.4, marker="." if few else "", markersize=4)
     if not np.isfinite(lines).any():
         axes.text(0.5, 0.5, "no finite value", transform=axes.transAxes, ha="center", color=GREY, fontsize=9.5)
-    if log:
+    if log and np.isfinite(lines).any():
         axes.set_yscale("log")
         axes.minorticks_off()
         _few_ticks(axes.yaxis, 6, is_log=True)
@@ -216,11 +217,12 @@ def heat_map(
     """
     count, width = matrix.shape
     roomy = count <= 14 and width <= 14
-    cell = (40, 24) if roomy else (15, 15)
+    small = 15 if max(count, width) <= 42 else 12
+    cell, right = ((40, 24), 70) if roomy else ((small, small), 8)
     rows, columns = [shorten(r) for r in rows], [shorten(c) for c in columns]
     left, top = (12 + 5.6 * max(map(len, names), default=1) for names in (rows, columns))
-    figure = _figure(left + cell[0] * width + 70, top + cell[1] * count + 6)
-    axes = _axes(figure, (left, 6, 70, top))
+    figure = _figure(left + cell[0] * width + right, top + cell[1] * count + 6)
+    axes = _axes(figure, (left, 6, right, top))
     shown = np.where(np.tri(count, width, dtype=bool) | (not lower), matrix, np.nan)
     colours = heat_colours(shown, diverging)
     axes.imshow(colours, aspect="auto", interpolation="none")
@@ -284,10 +286,10 @@ def log_log(x: np.ndarray, y: np.ndarray, *, chosen: float, x_label: str, y_labe
     figure = _figure(460, 300)
     axes = _axes(figure, (62, 42, 14, 12))
     usable = np.isfinite(x) & (x > 0) & np.isfinite(y) & ((y > 0) | (not y_log))
-    axes.set_xscale("log")
-    if y_log:
-        axes.set_yscale("log")
-    axes.minorticks_off()
+    if usable.any():
+        axes.set_xscale("log")
+        axes.set_yscale("log" if y_log else "linear")
+        axes.minorticks_off()
     axes.grid(color="#edf0f3", linewidth=0.8)
     axes.plot(x[usable], y[usable], color=BLUE, linewidth=1.5, marker="o", markersize=4.5)
     if np.isfinite(chosen) and chosen > 0:
@@ -296,8 +298,8 @@ def log_log(x: np.ndarray, y: np.ndarray, *, chosen: float, x_label: str, y_labe
         axes.plot(x[at], y[at], color=ORANGE, marker="o", markersize=9, markerfacecolor="none", markeredgewidth=2)
     if usable.any():
         axes.set_xlim(x[usable].min() / 1.5, x[usable].max() * 1.5)
-    _few_ticks(axes.xaxis, 12, is_log=True)
-    _few_ticks(axes.yaxis, 6, is_log=y_log)
+        _few_ticks(axes.xaxis, 12, is_log=True)
+        _few_ticks(axes.yaxis, 6, is_log=y_log)
     axes.set_xlabel(x_label)
     axes.set_ylabel(y_label)
     return to_svg(figure, f"{y_label} against {x_label}")
@@ -410,6 +412,8 @@ def _log_ticks(low: float, high: float, count: int) -> list[float]:
 
 def plain(value: float) -> str:
     """Return a tick's number: short, a true minus, 20k for 20000."""
+    if not np.isfinite(value):
+        return "n/a" if np.isnan(value) else "∞" if value > 0 else "−∞"
     value = 0.0 if abs(value) < 1e-300 else value
     if value != 0 and abs(value) >= 1e4 and abs(value) < 1e9:
         scaled, suffix = (value / 1e6, "M") if abs(value) >= 1e6 else (value / 1e3, "k")

@@ -421,7 +421,7 @@ def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
         ("Stopped because", fit.stop_reason or "not recorded"),
         ("Evaluations of the objective", f"{fit.evaluations:,}"),
         ("Simulated transitions", f"{fit.simulated_transitions:,}"),
-        ("Computing time", f"{fit.seconds:,.1f} s"),
+        ("Computing time", f"{fit.seconds:,.1f} s" if np.isfinite(fit.seconds) else "n/a"),
         ("Parameter vectors per transition (K)", f"{fit.samples:,}"),
         ("ε, variance added to each column", epsilon),
         ("Seed", str(fit.seed)),

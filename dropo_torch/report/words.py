@@ -12,6 +12,7 @@ from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, SearchBox, coordinate_limits, to_coordinates, to_values
 from dropo_torch.fit import Fit
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.report.figures import plain
 
 #: A mean nearer to its bound than this share of the box is at its bound.
 AT_BOUND = 2e-3
@@ -186,6 +187,8 @@ def rms(value: float) -> str:
 
 def signed(value: float, digits: int = 2) -> str:
     """Return a number with its sign, zero without one."""
+    if not np.isfinite(value):
+        return plain(value)
     text = f"{value:+.{digits}f}"
     return text[1:] if not text.strip("+-0.") else text.replace("-", "−")
 
@@ -361,7 +364,7 @@ def _chosen(distribution: Distribution, mask: np.ndarray) -> list[str]:
 
 def _with_values(distribution: Distribution, mask: np.ndarray, values: np.ndarray) -> list[str]:
     return [
-        f"{name} ({number(float(value))}{f' {unit}' if unit else ''})"
+        f"{name} ({plain(float(value))}{f' {unit}' if unit else ''})"
         for name, value, unit, chosen in zip(distribution.names, values, distribution.units, mask, strict=True)
         if chosen
     ]
