@@ -80,7 +80,7 @@ def trace_panel(
         breaks: whether a point does not follow on the one before, ``(n,)`` bool.
     """
     figure = _figure(320, 200)
-    upper, lower = _axes(figure, (46, 92, 8, 6)), _axes(figure, (46, 20, 8, 120))
+    upper, lower = _axes(figure, (46, 92, 14, 6)), _axes(figure, (46, 20, 14, 120))
     lower.sharex(upper)
     upper.tick_params(labelbottom=False)
     joined = _insert_breaks(breaks, position, simulated, expected)
