@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.model import load_model
+from dropo_torch.model import load_model, quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import Simulator
 
@@ -107,7 +107,8 @@ class MujocoSimulator(Simulator):
             constants.expand(field)[:] = read_field(self.model, field)
         self.parameters.write({f: constants.expand(f) for f in self.parameters.fields}, vectors)
         try:
-            constants.set_const()
+            with quiet_mujoco():
+                constants.set_const()
         except mujoco.batch.SimulationError as error:
             failed[error.ids] = True
         self._tiled = None if failed.any() else (vectors.copy(), repeats)
@@ -141,7 +142,8 @@ class MujocoSimulator(Simulator):
         for step in range(lag):
             ctrl[:] = np.repeat(control[:, step], num_k, axis=0)
             try:
-                batch.step(ids, nstep=self.frame_skip)
+                with quiet_mujoco():
+                    batch.step(ids, nstep=self.frame_skip)
             except mujoco.batch.SimulationError as error:
                 failed[error.ids] = True
             if every_step or step == lag - 1:
