@@ -135,7 +135,8 @@ class MujocoSimulator(Simulator):
         qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
         if self._filters:
             activation, source = (list(x) for x in zip(*self._filters, strict=True))
-            batch.bind("act")[:num_rows, activation] = np.repeat(control[:, 0, source], num_k, axis=0)
+            settled = np.clip(control[:, 0], *_control_range(model))[:, source]
+            batch.bind("act")[:num_rows, activation] = np.repeat(settled, num_k, axis=0)
         ctrl = batch.bind("ctrl")[:num_rows]
         out = np.empty((num_rows, lag if every_step else 1, self.num_states))
         failed = np.zeros(num_rows, dtype=bool)
@@ -171,6 +172,15 @@ def _default_row(model: mujoco.MjModel) -> np.ndarray:
     row = np.empty(mujoco.mj_stateSize(model, spec))
     mujoco.mj_getState(model, data, row, spec)
     return row
+
+
+def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest control that acts, ``(nu,)`` each."""
+    limited = model.actuator_ctrllimited.astype(bool) & ~bool(
+        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    )
+    low, high = model.actuator_ctrlrange.T
+    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
 
 def _filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
