@@ -13,9 +13,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.model import load_model, quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
-from dropo_torch.simulators.base import Simulator
-
-_DIVERGED = 1e10  # MuJoCo's own bound on a state it still calls stable (mjMAXVAL)
+from dropo_torch.simulators.base import DIVERGED, Simulator
 
 
 class MujocoSimulator(Simulator):
@@ -151,7 +149,7 @@ class MujocoSimulator(Simulator):
                 record = out[:, step if every_step else 0]
                 record[:, : model.nq], record[:, model.nq :] = qpos, qvel
         with np.errstate(invalid="ignore"):
-            failed |= ~(np.abs(out) < _DIVERGED).all(axis=(1, 2))
+            failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
         out[failed] = np.nan
         return out.reshape(len(start), num_k, *out.shape[1:])
 
