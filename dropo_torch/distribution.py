@@ -38,8 +38,10 @@ def truncated_interval(
 
     Where the limits lie outside μ ± 2σ altogether, the interval hugs the nearer end of the limits.
     """
-    a = torch.clamp((low - mean) / std, min=-TRUNCATION)
-    b = torch.clamp((high - mean) / std, max=TRUNCATION)
+    # an infinite limit, divided by σ, would make the gradient in σ 0 · ∞
+    lower, upper = (torch.where(torch.isfinite(x), x, torch.zeros_like(x)) for x in (low, high))
+    a = torch.clamp(torch.where(torch.isfinite(low), (lower - mean) / std, -TRUNCATION), min=-TRUNCATION)
+    b = torch.clamp(torch.where(torch.isfinite(high), (upper - mean) / std, TRUNCATION), max=TRUNCATION)
     a = torch.minimum(a, torch.full_like(a, TRUNCATION) - 1e-9)
     b = torch.maximum(b, a + 1e-9)
     return a, b
