@@ -114,7 +114,8 @@ def masses(model: mujoco.MjModel, names: Sequence[str] = HOPPER_BODIES) -> Param
     """A space of the given bodies' masses, between 0.6 and 1.5 times the model's own."""
     own = {n: float(model.body(n).mass[0]) for n in names}
     return ParameterSpace(
-        model, {n: {"field": "body_mass", "name": n, "bounds": [0.6 * m, 1.5 * m], "unit": "kg"} for n, m in own.items()}
+        model,
+        {n: {"field": "body_mass", "name": n, "bounds": [0.6 * m, 1.5 * m], "unit": "kg"} for n, m in own.items()},
     )
 
 
@@ -222,9 +223,7 @@ def numerical_gradient(function: Callable[[np.ndarray], float], at: np.ndarray, 
     return np.array([(function(at + e) - function(at - e)) / (2 * step) for e in eye])
 
 
-def settled_rollout(
-    model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, frame_skip: int
-) -> np.ndarray:
+def settled_rollout(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, frame_skip: int) -> np.ndarray:
     """C MuJoCo's own answer: ``mj_step`` from a reset, filters settled at their first control."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]

@@ -18,7 +18,9 @@ def numbered_log(episode_lengths: list[int], **options: object) -> Trajectories:
     episode = np.repeat(np.arange(len(episode_lengths)), episode_lengths)
     t = np.arange(len(episode), dtype=float)
     terminals = np.append(np.diff(episode) != 0, True)
-    return Trajectories(np.stack([t, episode], 1), np.stack([t + 0.5, episode], 1), t[:, None] * 10, terminals, **options)
+    return Trajectories(
+        np.stack([t, episode], 1), np.stack([t + 0.5, episode], 1), t[:, None] * 10, terminals, **options
+    )
 
 
 @given(lengths, st.integers(1, 9))
