@@ -126,11 +126,9 @@ def test_moments_are_those_of_the_truncated_normal(law):
 @pytest.mark.parametrize("law", LAWS)
 @pytest.mark.parametrize("log", [False, True])
 def test_the_density_integrates_to_one_and_matches_the_law(law, log):
-    mean, std, low, high = law
-    if log:
-        low, high = max(low, 0.05), high
-    p = distribution(mean, std, low, high, log=log)
-    expected = truncnorm(mean, std, np.log(low) if log else low, np.log(high) if log and high < np.inf else high)
+    mean, std, *limits = law
+    p = distribution(mean, std, *(np.exp(limits) if log else limits), log=log)
+    expected = truncnorm(*law)
     ends = expected.support()
     ends = np.exp(ends) if log else np.array(ends)
     density = lambda v: float(p.log_prob(torch.tensor([v], dtype=torch.float64)).exp())  # noqa: E731
