@@ -42,7 +42,7 @@ _SERVO = {
 _FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear", "actuator_gainprm"})
 _OBJECTS = {
     "body": ("nbody", "body"), "geom": ("ngeom", "geom"), "jnt": ("njnt", "joint"), "dof": ("nv", "joint"),
-    "qpos0": ("nq", "joint"), "qpos": ("nq", "joint"), "actuator": ("nu", "actuator"), "site": ("nsite", "site"),
+    "qpos0": ("nq", "joint"), "qpos": ("nq", "joint"), "actuator": ("nactuator", "actuator"), "site": ("nsite", "site"),
     "tendon": ("ntendon", "tendon"), "eq": ("neq", "equality"), "pair": ("npair", "pair"),
     "flex": ("nflex", "flex"),
 }  # fmt: skip

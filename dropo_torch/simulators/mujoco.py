@@ -187,11 +187,11 @@ def _filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
     Any other hidden state (integrators, muscles, delays) is not in a log of positions and velocities.
     """
     pairs, hidden = [], []
-    names = [model.actuator(i).name or f"actuator{i}" for i in range(model.nu)]
-    for i in range(model.nu):
-        kind = model.actuator_dyntype[i]
+    names = [model.actuator(i).name or f"actuator{i}" for i in range(model.nactuator)]
+    for i in range(model.nactuator):
+        kind = int(model.actuator_dyntype[i])  # a numpy integer equals no enum on the left
         if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
-            pairs.append((int(model.actuator_actadr[i]), i))
+            pairs.append((int(model.actuator_actadr[i]), int(model.actuator_ctrladr[i])))
         elif kind != mujoco.mjtDyn.mjDYN_NONE or model.actuator_delay[i] > 0:
             hidden.append(names[i])
     if hidden:
