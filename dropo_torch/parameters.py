@@ -323,6 +323,8 @@ def _servo_targets(
         if field == "actuator_kp" and is_velocity:
             raise InputError(f"{where}: actuator {name!r} is a velocity servo; its gain is actuator_kv")
         parts = _SERVO[field] + ((("actuator_gainprm", 0, 1.0),) if field == "actuator_kv" and is_velocity else ())
+        if model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_PID:  # its gains stand in biasprm alone
+            parts = tuple(p for p in parts if p[0] == "actuator_biasprm")
         for part, component, factor in parts:
             width = read_field(model, part).shape[1]
             targets.append(Target(part, number * width + component, factor))

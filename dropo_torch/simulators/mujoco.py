@@ -192,7 +192,7 @@ def _filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
         kind = int(model.actuator_dyntype[i])  # a numpy integer equals no enum on the left
         if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
             pairs.append((int(model.actuator_actadr[i]), int(model.actuator_ctrladr[i])))
-        elif kind != mujoco.mjtDyn.mjDYN_NONE or model.actuator_delay[i] > 0:
+        elif model.actuator_actnum[i] > 0 or model.actuator_delay[i] > 0:
             hidden.append(names[i])
     if hidden:
         raise InputError(
