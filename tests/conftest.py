@@ -227,10 +227,11 @@ def settled_rollout(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarr
     """C MuJoCo's own answer: ``mj_step`` from a reset, filters settled at their first control."""
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
-    for i in range(model.nu):
+    for i in range(model.nactuator):
         if model.actuator_actadr[i] >= 0:
-            low, high = model.actuator_ctrlrange[i] if model.actuator_ctrllimited[i] else (-np.inf, np.inf)
-            data.act[model.actuator_actadr[i]] = np.clip(controls[0, i], low, high)
+            u = model.actuator_ctrladr[i]
+            low, high = model.actuator_ctrlrange[u] if model.actuator_ctrllimited[u] else (-np.inf, np.inf)
+            data.act[model.actuator_actadr[i]] = np.clip(controls[0, u], low, high)
     states = []
     for control in controls:
         data.ctrl[:] = control

@@ -233,6 +233,17 @@ def test_a_servo_gain_equals_compiling_the_servo_with_it(field, name, old, new, 
     assert (rollout(changed, state, controls, 4) != rollout(model, state, controls, 4)).any()
 
 
+@pytest.mark.parametrize(("field", "gains"), [("actuator_kp", 'kp="7" kv=".4"'), ("actuator_kv", 'kp="3" kv="7"')])
+def test_a_servo_with_two_controls_has_gains_and_shifts_no_other_actuator(field, gains):
+    xml = ARM_XML.replace('<position name="reach" joint="shoulder" kp="12" kv="0.5"/>', "<pid {}/>")
+    own, expected = (compiled(xml.format(f'name="reach" joint="shoulder" {g}')) for g in ('kp="3" kv=".4"', gains))
+    assert (own.nactuator, own.nu) == (3, 4)
+    changed = space(own, field, "reach", bounds=(0.1, 50)).apply([7.0])
+    for key, array in float_fields(expected).items():
+        np.testing.assert_array_equal(read_field(changed, key), array, err_msg=key)
+    assert space(own, "actuator_kv", "turn").nominal == 1.5
+
+
 @pytest.mark.parametrize("field", ["actuator_kp", "actuator_kv"])
 def test_a_relative_servo_gain_multiplies_the_gain(field):
     absolute = space(compiled(ARM_XML), field, "reach", bounds=(0.1, 50))
