@@ -1,1 +1,54 @@
-"""Fit a distribution over a simulator's dynamics parameters to a log of the real robot."""
+"""Fit a distribution over a simulator's dynamics parameters to a log of the real robot.
+
+>>> import dropo_torch as dropo
+>>> problem = dropo.make_problem(dropo.load_config("robot.yaml"))
+>>> result = dropo.fit(problem.objective)
+>>> result.distribution.save("distribution.json")
+"""
+
+from dropo_torch.config import Config, load_config, make_config
+from dropo_torch.diagnostics import Diagnostics, diagnose
+from dropo_torch.distribution import Distribution
+from dropo_torch.errors import InputError
+from dropo_torch.export import export_model
+from dropo_torch.fit import Fit, fit
+from dropo_torch.objective import Objective, log_likelihood
+from dropo_torch.observation import Observation, parse_observation
+from dropo_torch.parameters import Parameter, ParameterSpace
+from dropo_torch.preprocess import Preprocess, preprocess
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.readers import read_recording, read_trajectories
+from dropo_torch.recording import Recording
+from dropo_torch.simulators import Simulator, make_simulator
+from dropo_torch.trajectory import Trajectories, Transitions, make_transitions
+
+__all__ = [
+    "Config",
+    "Diagnostics",
+    "Distribution",
+    "Fit",
+    "InputError",
+    "Objective",
+    "Observation",
+    "Parameter",
+    "ParameterSpace",
+    "Preprocess",
+    "Problem",
+    "Recording",
+    "Simulator",
+    "Trajectories",
+    "Transitions",
+    "diagnose",
+    "export_model",
+    "fit",
+    "load_config",
+    "log_likelihood",
+    "make_config",
+    "make_problem",
+    "make_simulator",
+    "make_transitions",
+    "parse_observation",
+    "preprocess",
+    "read_recording",
+    "read_trajectories",
+]

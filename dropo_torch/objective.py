@@ -26,6 +26,11 @@ DIVERGENCE_PENALTY = 1e3
 #: Log-likelihood of a transition of which fewer than two samples are left.
 LOST_TRANSITION = -1e4
 
+#: Antithetic pairs of start noise per noisy column, their seed, and degrees of freedom of Student's law.
+NOISE_DRAWS = 2
+NOISE_SEED = 4
+STUDENT_DOF = 5.0
+
 #: ``reduce(features (t, P, m), measured (t, m), covariance (t, m, m)) -> (r,)``, summed over chunks.
 Reduce = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 
@@ -88,6 +93,35 @@ def log_likelihood(
     diagonal = torch.as_tensor(epsilon, dtype=samples.dtype).expand(samples.shape[-1])
     covariance = covariance + torch.diag(diagonal)
     return gaussian_log_density(measured - mean, covariance if extra is None else covariance + extra)
+
+
+def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return shift ``(t, m)`` and covariance ``(t, m, m)`` of outcomes of noisy starts.
+
+    Args:
+        outcomes: the undisturbed one, then those of antithetic draws, ``(t, 1 + M, m)``.
+        draws: standard normal, ``(1 + M, c)``, the first zero.
+    """
+    outcomes = torch.where(torch.isfinite(outcomes), outcomes, outcomes[:, :1])
+    outcomes = torch.nan_to_num(outcomes)
+    spread = outcomes[:, 1:] - outcomes[:, 1:].mean(1, keepdim=True)
+    gain = (torch.linalg.pinv(draws[1:]) @ spread).mT  # G √ν, (t, m, c)
+    left = spread - draws[1:] @ gain.mT
+    variance = left.square().sum(1) / (len(draws) - 1 - draws.shape[1])
+    shift = outcomes[:, 1:].mean(1) - outcomes[:, 0]
+    return shift, gain @ gain.mT + torch.diag_embed(variance)
+
+
+def widen(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Return covariances ``(t, m, m)`` widened where the residual ``(t, m)`` lies far outside them.
+
+    The factor is that of the scale-mixture form of Student's t law: (ν + χ²) / (ν + m), at least 1.
+    """
+    factor = robust_cholesky(covariance)
+    white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)
+    chi2 = white.square().sum((-2, -1))
+    scale = (STUDENT_DOF + chi2) / (STUDENT_DOF + residual.shape[-1])
+    return covariance * scale.clamp(min=1.0)[:, None, None]
 
 
 def rotation_vector(measured: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:
@@ -190,6 +224,7 @@ class Objective:
         if self.noise is not None and not bool(self.noise.any()):
             self.noise = None  # no noise in any column: the starts are exact
         self._noise_covariance: torch.Tensor | None = None
+        self._noise_shift: torch.Tensor | None = None
 
     def on(self, transitions: Transitions) -> Objective:
         """Return the same objective over other transitions of the same log, not yet linearised."""
@@ -200,7 +235,7 @@ class Objective:
         other._raw = torch.from_numpy(np.ascontiguousarray(transitions.measured, dtype=np.float64))
         other.measured = other.features(other._raw, other._raw)
         other.simulated_transitions = 0
-        other.linearised_at, other._noise_covariance = None, None
+        other.linearised_at, other._noise_covariance, other._noise_shift = None, None, None
         return other
 
     @property
@@ -230,7 +265,7 @@ class Objective:
         for block in _blocks(len(self), rows):
             features = self._simulate(self._states[block], block, values)
             with single_thread():
-                part = reduce(features, self.measured[block], self.base_covariance(block))
+                part = reduce(features, self.target(block), self.base_covariance(block))
                 total = part if total is None else total + part
         assert total is not None
         return total
@@ -270,6 +305,10 @@ class Objective:
 
         return reduce
 
+    def target(self, block: slice) -> torch.Tensor:
+        """Return the measured features ``(t, m)``, less the shift that the start noise gives the prediction."""
+        return self.measured[block] if self._noise_shift is None else self.measured[block] - self._noise_shift[block]
+
     def base_covariance(self, block: slice) -> torch.Tensor:
         """Return the covariance of features that no parameter explains, ``(t, m, m)``: ε and the noise."""
         fixed = torch.diag(self.epsilon)
@@ -282,23 +321,30 @@ class Objective:
     def linearise(self, mean: np.ndarray) -> None:
         """Propagate the start states' noise through the simulation at μ ``(d,)``, in coordinates.
 
-        The covariance C = Σᵢ gᵢgᵢᵀ + diag(ν), gᵢ half the difference between the next states started one
-        standard deviation above and below in column i: a statistical linearisation, which sees a
-        stiff contact at the size of the noise. Without noise, nothing happens.
+        Statistical linearisation: each start state is simulated from antithetic draws of its noise. The
+        mean of the outcomes shifts the prediction. The regression of the outcomes on the draws gives
+        G and with it the covariance G diag(ν) Gᵀ, to which the variance that the regression leaves is
+        added: a contact that some draws make and others do not. Windows that the result still does
+        not explain have their covariance widened, as under Student's t law. Without noise, nothing happens.
         """
         if self.noise is None:
             return
         values = torch.from_numpy(to_values(np.asarray(mean), self.simulator.parameters.is_log))[None]
         columns = [i for i in range(self.observation.size) if self.noise[i] > 0]
-        parts = []
-        for block in _blocks(len(self), max(1, self._chunk_size // (2 * len(columns)))):
-            states = self._perturbed(block, columns)
-            features = self._simulate(states, block, values, copies=2 * len(columns))
-            plus, minus = features.reshape(-1, len(columns), 2, self.num_features).unbind(2)
+        half = draw_normals(NOISE_DRAWS * len(columns), len(columns), NOISE_SEED)
+        draws = torch.cat([torch.zeros(1, len(columns), dtype=torch.float64), half, -half])
+        fixed = torch.diag(self.epsilon) + torch.diag(self._end_variance())
+        shifts, covariances = [], []
+        for block in _blocks(len(self), max(1, self._chunk_size // len(draws))):
+            features = self._simulate(self._perturbed(block, columns, draws), block, values, copies=len(draws))
             with single_thread():
-                half = torch.nan_to_num(0.5 * (plus - minus))
-                parts.append(half.mT @ half)
-        self._noise_covariance = torch.cat(parts) + torch.diag(self._end_variance())
+                outcomes = features.reshape(-1, len(draws), self.num_features)
+                shift, covariance = propagate(outcomes, draws)
+                centre = torch.nan_to_num(outcomes[:, 0])
+                widened = widen(self.measured[block] - centre - shift, covariance + fixed) - torch.diag(self.epsilon)
+            shifts.append(shift)
+            covariances.append(widened)
+        self._noise_shift, self._noise_covariance = torch.cat(shifts), torch.cat(covariances)
         self.linearised_at = np.asarray(mean, dtype=np.float64).copy()
 
     def simulated(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
@@ -325,15 +371,13 @@ class Objective:
         self.simulated_transitions += len(states) * len(values) * self.transitions.lag
         return self.features(after, raw[:, None].expand_as(after))
 
-    def _perturbed(self, block: slice, columns: list[int]) -> torch.Tensor:
-        """Start states moved by plus and minus one deviation of each noisy column, ``(t * 2c, num_states)``."""
+    def _perturbed(self, block: slice, columns: list[int], draws: torch.Tensor) -> torch.Tensor:
+        """Start states moved by draws ``(M, c)`` of the noise of c columns, ``(t * M, num_states)``."""
         assert self.noise is not None
         states = self._states[block]
-        moved = states[:, None, None].repeat(1, len(columns), 2, 1)
-        for row, column in enumerate(columns):
-            state_column = self.observation.columns[column]
-            moved[:, row, 0, state_column] += self.noise[column]
-            moved[:, row, 1, state_column] -= self.noise[column]
+        moved = states[:, None].repeat(1, len(draws), 1)
+        for position, column in enumerate(columns):
+            moved[..., self.observation.columns[column]] += self.noise[column] * draws[:, position]
         for q in self.observation.quaternions:
             target = self.observation.index[list(q)]
             moved[..., target] = moved[..., target] / moved[..., target].norm(dim=-1, keepdim=True)
@@ -388,6 +432,11 @@ def draw_uniforms(num_samples: int, num_parameters: int, *seeds: int) -> torch.T
     """Draw base uniforms ``(K, d)`` from a generator of its own, a pure function of the seeds."""
     seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]) >> 1
     return base_uniforms(num_samples, num_parameters, torch.Generator().manual_seed(seed))
+
+
+def draw_normals(num_draws: int, width: int, seed: int) -> torch.Tensor:
+    """Draw standard normals ``(num_draws, width)``, a pure function of the seed."""
+    return torch.special.ndtri(draw_uniforms(num_draws, width, seed))
 
 
 def _likelihood_with_losses(

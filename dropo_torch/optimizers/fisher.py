@@ -30,7 +30,9 @@ MAX_ITERATIONS = 60
 #: Fisher scoring stops after two accepted steps in a row that each gain less than this, in nats.
 SMALL_GAIN = 0.01
 #: Refits of a log with uncertain starts, each around the start noise propagated at the last fit.
-NOISY_ROUNDS = 3
+NOISY_ROUNDS = 6
+#: The means rest when no refit moves them by more than this share of their box.
+AT_REST = 1e-3
 #: Curvature that counts for more than this in the likelihood calls for sampling, in nats.
 MUCH_BENDING = 1.0
 
@@ -194,7 +196,7 @@ class FisherOptimizer(Optimizer):
     """Gauss-Newton on μ, then Fisher scoring on (μ, log σ); the default.
 
     On a log whose start states are noisy, the noise is propagated at the current μ and the means are
-    refitted with robust weights, a few times; the scoring then works on that covariance. Where the
+    refitted until they rest; the scoring then works on that covariance. Where the
     simulation bends within the distribution, the scoring goes on over ``samples`` samples.
     """
 
@@ -284,14 +286,15 @@ class FisherOptimizer(Optimizer):
         self._round, self._linearised = state["round"], state["linearised"]
 
     def _after_means(self) -> None:
-        """Refit the means around the noise propagated at them, or go on to the deviations."""
-        point = self._means.point
-        if self._noisy:
+        """Refit the means around the noise propagated at them until they rest, then go on to the deviations."""
+        point, before = self._means.point, self._linearised
+        if before is not None:
             self._linearised = point
-        if self._noisy and self._round < NOISY_ROUNDS:
-            self._round += 1
-            self._means = MeansStage(self._box.low, self._box.high, point, robust=True)
-            return
+            rests = bool((np.abs(point - before) <= AT_REST * self._box.width).all())
+            if self._round < NOISY_ROUNDS and not rests:
+                self._round += 1
+                self._means = MeansStage(self._box.low, self._box.high, point)
+                return
         self._scoring = ScoringStage(self._box, self._limits, point, self._means.deviations(self._box))
 
     @staticmethod

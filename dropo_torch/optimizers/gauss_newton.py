@@ -11,8 +11,6 @@ import torch
 from dropo_torch.distribution import SearchBox
 from dropo_torch.objective import DIVERGENCE_PENALTY, Reduce, robust_cholesky
 
-#: Residuals beyond this many deviations lose their weight under robust weights (Cauchy's loss).
-CAUCHY_SCALE = 3.0
 #: Step of the forward differences, as a share of the search width.
 DIFFERENCE_STEP = 1e-5
 MAX_ITERATIONS = 40
@@ -25,13 +23,11 @@ class MeansStage:
     Attributes:
         low, high: the box of μ in coordinates, ``(d,)``.
         point: the best μ so far, ``(d,)``.
-        robust: Cauchy weights on whitened residuals instead of squares.
     """
 
     low: np.ndarray
     high: np.ndarray
     point: np.ndarray
-    robust: bool = False
     damping: float = 1e-3
     cost: float = np.inf
     iterations: int = 0
@@ -51,10 +47,9 @@ class MeansStage:
         """Return the reduction to cost, normal equations and moments, ``(1 + 2d + 2d²,)``."""
         center = self.point if self.candidate is None else self.candidate
         steps = torch.from_numpy(self._steps(center))
-        robust = self.robust
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-            return normal_equations(features, measured, covariance, steps, robust=robust)
+            return normal_equations(features, measured, covariance, steps)
 
         return reduce
 
@@ -131,9 +126,9 @@ def damped_step(matrix: np.ndarray, force: np.ndarray, free: np.ndarray, damping
 
 
 def normal_equations(
-    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor, *, robust: bool
+    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor
 ) -> torch.Tensor:
-    """Return cost, gradient and Gauss-Newton matrix of ½ Σ ρ(C^-½ r), and two moments for σ, ``(1 + 2d + 2d²,)``.
+    """Return cost, gradient and Gauss-Newton matrix of ½ Σ rᵀC⁻¹r, and two moments for σ, ``(1 + 2d + 2d²,)``.
 
     The order is cost, gradient, Σ (JᵀC⁻¹r)² − diag JᵀC⁻¹J, Gauss-Newton matrix, Σ (JᵀC⁻¹J)².
 
@@ -142,7 +137,6 @@ def normal_equations(
         measured: ``(t, m)``.
         covariance: ``(t, m, m)``.
         steps: ``(d,)``.
-        robust: ρ is Cauchy's loss, else the square.
     """
     base, moved = features[:, 0], features[:, 1:]
     alive = torch.isfinite(base).all(-1)
@@ -155,17 +149,11 @@ def normal_equations(
         factor, torch.cat([residual[..., None], jacobian.mT], -1), upper=False
     )  # (t, m, 1 + d)
     r, jac = white[..., 0], white[..., 1:]
-    if robust:
-        ratio = (r / CAUCHY_SCALE).square()
-        weight = 1 / (1 + ratio)
-        cost = CAUCHY_SCALE**2 * torch.log1p(ratio).sum()
-    else:
-        weight, cost = torch.ones_like(r), r.square().sum()
-    gradient = -(jac * (weight * r)[..., None]).sum((0, 1))
-    flat = (jac * weight.sqrt()[..., None]).flatten(0, 1)
+    gradient = -(jac * r[..., None]).sum((0, 1))
+    flat = jac.flatten(0, 1)
     gram = jac.mT @ jac
-    pulled = (jac.mT @ (weight * r)[..., None])[..., 0]
+    pulled = (jac.mT @ r[..., None])[..., 0]
     excess = (pulled.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0)
     squares = gram.square().sum(0)
     matrices = [(flat.T @ flat).flatten(), squares.flatten()]
-    return torch.cat([0.5 * (cost + lost)[None], gradient, excess, *matrices])
+    return torch.cat([0.5 * (r.square().sum() + lost)[None], gradient, excess, *matrices])

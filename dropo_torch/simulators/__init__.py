@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
-
-import mujoco
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
@@ -20,7 +17,7 @@ BACKENDS = ("mujoco", "gymnasium")
 
 def make_simulator(
     backend: str,
-    model: mujoco.MjModel | str | Path | Any,
+    model: Any,
     *,
     parameters: ParameterSpace,
     frame_skip: int = 1,

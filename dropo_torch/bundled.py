@@ -1,0 +1,54 @@
+"""Bundled simulations, found by name.
+
+A package offers one by an entry point of the group ``dropo_torch.sims`` that is a :class:`BundledSim`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from dropo_torch.errors import InputError, choices
+
+GROUP = "dropo_torch.sims"
+
+
+@dataclass(frozen=True)
+class BundledSim:
+    """A model with what a config would say about it.
+
+    Attributes:
+        name: what it is called in a config's ``sim``.
+        model: path of the MJCF.
+        frame_skip: physics steps of one logged transition.
+        observation: what the log's columns are.
+        parameters: what may vary, as in a config.
+        log: path of a small log, for the demo.
+        truth: the values that the log was recorded with.
+    """
+
+    name: str
+    model: Path
+    frame_skip: int
+    observation: tuple[str, ...]
+    parameters: Mapping[str, Mapping[str, Any]]
+    log: Path
+    truth: Mapping[str, float] = field(default_factory=dict)
+
+
+def bundled_sim(name: str) -> BundledSim:
+    """Return a bundled simulation.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    found = {e.name: e for e in entry_points(group=GROUP)}
+    if name not in found:
+        raise InputError(f"sim: no bundled simulation {name!r}" + choices(name, sorted(found)))
+    sim = found[name].load()
+    if not isinstance(sim, BundledSim):
+        raise InputError(f"sim: {found[name].value} is no BundledSim")
+    return sim

@@ -1,0 +1,119 @@
+"""The command line: ``dropo fit``, ``dropo sweep-epsilon``, ``dropo demo``."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from dropo_torch.errors import InputError, choices
+
+COMMANDS = ("fit", "sweep-epsilon", "demo")
+
+
+class _Parser(argparse.ArgumentParser):
+    """Says what is wrong in one line."""
+
+    def error(self, message: str) -> NoReturn:
+        raise InputError(message)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run a command; return 0 on success, 2 on bad input, 130 when interrupted."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        return _dispatch(given)
+    except InputError as error:
+        print(f"dropo: {' '.join(str(error).split())}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print("dropo: interrupted; the same command with --resume goes on where it stopped", file=sys.stderr)
+        return 130
+
+
+def _dispatch(given: list[str]) -> int:
+    if given and not given[0].startswith("-") and given[0] not in COMMANDS:
+        raise InputError(f"unknown command {given[0]!r}" + choices(given[0], COMMANDS))
+    parsed, rest = _parser().parse_known_args(given)
+    if parsed.command is None:
+        _parser().print_help()
+        return 0
+    from rich.console import Console
+
+    from dropo_torch import runs
+    from dropo_torch.config import load_config, parse_overrides
+
+    console = Console()
+    overrides = parse_overrides(rest)
+    if parsed.command == "demo":
+        runs.run_demo(parsed.out, console=console, overrides=overrides)
+        return 0
+    config = load_config(parsed.config, overrides)
+    if parsed.command == "fit":
+        runs.run_fit(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
+    else:
+        runs.run_sweep(config, parsed.out, console=console, epsilons=parsed.epsilons, resume=parsed.resume)
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = _Parser(
+        prog="dropo",
+        description="Fit a distribution over a simulator's parameters to a log of the real robot.",
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=_version())
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
+    fit = _command(commands, "fit", "fit the distribution to the log")
+    fit.add_argument("--log", metavar="tensorboard", help="write the history as TensorBoard events, too")
+    sweep = _command(commands, "sweep-epsilon", "fit at several ε and choose one by the elbow")
+    sweep.add_argument("--epsilons", type=_numbers, metavar="1e-6,1e-5,...", help="the values to try")
+    demo = commands.add_parser("demo", help="fit the bundled Hopper's masses", allow_abbrev=False)
+    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="folder of the results")
+    return parser
+
+
+def _command(commands: argparse._SubParsersAction, name: str, summary: str) -> argparse.ArgumentParser:
+    parser = commands.add_parser(
+        name,
+        help=summary,
+        description=summary.capitalize() + ".",
+        allow_abbrev=False,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        epilog=_keys_help(),
+    )
+    parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results")
+    parser.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
+    return parser
+
+
+def _keys_help() -> str:
+    """Every key of the config is an option."""
+    from dropo_torch.config import Config
+
+    lines = ["every key of the config is an option too (--epsilon 1e-4, --parameters.mass.bounds '[1, 2]'):"]
+    for name, entry in Config.model_fields.items():
+        if name != "base":
+            default = "" if entry.default in (None, []) else f" (default {entry.default})"
+            lines.append(f"  --{name:<22} {entry.description}{default}")
+    return "\n".join(lines)
+
+
+def _numbers(text: str) -> list[float]:
+    try:
+        return [float(x) for x in text.strip("[]").split(",")]
+    except ValueError:
+        raise InputError(f"--epsilons: {text!r} given; expected numbers such as 1e-6,1e-5,1e-4") from None
+
+
+def _version() -> str:
+    from importlib.metadata import version
+
+    return f"dropo_torch {version('dropo_torch')}"
+
+
+if __name__ == "__main__":
+    sys.exit(main())

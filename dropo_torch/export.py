@@ -1,0 +1,59 @@
+"""A fitted model as MJCF, for programs that know nothing of this package."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace, read_field, write_field
+
+#: MJCF is written with six significant digits.
+PRECISION = 2e-5
+
+
+def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, path: str | Path) -> None:
+    """Write the model ``source`` with parameter values ``(d,)``, in units, as a self-contained MJCF file.
+
+    Inertias that the compiler would infer from geoms are written out, and asset folders become
+    absolute paths. The file is read back and compared before it counts as written.
+
+    Raises:
+        InputError: a source that is no XML file, or a parameter that MJCF cannot express.
+    """
+    source, path = Path(source).resolve(), Path(path)
+    if source.suffix not in (".xml", ".urdf", ".mjcf"):
+        raise InputError(f"export: {source} is no XML model; only those can be written as MJCF")
+    spec = mujoco.MjSpec.from_file(str(source))
+    for folder in ("meshdir", "texturedir"):
+        setattr(spec, folder, str((source.parent / getattr(spec, folder)).resolve()))
+    if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
+        for body in spec.bodies[1:]:
+            if space.model is not None and space.model.body(body.name).mass[0] > 0:
+                spec.adopt_inertial(body)
+        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    model = spec.compile()
+    for column, parameter in enumerate(space.parameters):
+        for target in parameter.targets:
+            write_field(model, target.field, target.index, target.factor * values[column])
+    try:
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        spec.copy_back(model)
+        path.write_text(spec.to_xml())
+    except (ValueError, mujoco.FatalError) as error:
+        raise InputError(f"export: MJCF cannot express these parameters: {' '.join(str(error).split())}") from None
+    _compare(path, space, values)
+
+
+def _compare(path: Path, space: ParameterSpace, values: np.ndarray) -> None:
+    """Raise an :class:`InputError` unless the written model holds the parameters."""
+    written = mujoco.MjModel.from_xml_path(str(path))
+    for column, parameter in enumerate(space.parameters):
+        for target in parameter.targets:
+            wanted = target.factor * values[column]
+            found = float(read_field(written, target.field).reshape(-1)[target.index])
+            if abs(found - wanted) > PRECISION * max(abs(wanted), 1e-6):
+                path.unlink()
+                raise InputError(f"export: MJCF gives {found:g} for {parameter.name} instead of {wanted:g}")

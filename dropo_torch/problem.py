@@ -1,0 +1,244 @@
+"""From a config to what a fit needs: model, parameters, simulator, log and objective."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import importlib.util
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import mujoco
+import numpy as np
+
+from dropo_torch.bundled import BundledSim, bundled_sim
+from dropo_torch.config import Config
+from dropo_torch.errors import InputError
+from dropo_torch.model import load_model
+from dropo_torch.objective import Objective
+from dropo_torch.observation import Observation, generic_observation, parse_observation
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.readers import read_trajectories
+from dropo_torch.simulators import MujocoEnvAdapter, Simulator, make_simulator
+from dropo_torch.trajectory import Trajectories, make_transitions
+
+#: Relative difference between the log's time step and the simulator's that is still called equal.
+TIME_TOLERANCE = 1e-3
+
+
+@dataclass(frozen=True)
+class Problem:
+    """Everything that a config stands for.
+
+    Attributes:
+        config: the config.
+        model_path: path of the model, where there is one.
+        space: what varies.
+        simulator: simulates transitions.
+        trajectories: the log, or the part of it that is used.
+        observation: what its columns are.
+        objective: the likelihood of the log.
+        fingerprint: identifies config, model and log; an interrupted run continues only with the same.
+    """
+
+    config: Config
+    model_path: Path | None
+    space: ParameterSpace
+    simulator: Simulator
+    trajectories: Trajectories
+    observation: Observation
+    objective: Objective
+    fingerprint: str
+
+
+def make_problem(config: Config) -> Problem:
+    """Read, build and check everything that a config names.
+
+    Raises:
+        InputError: anything that does not fit, by key.
+    """
+    sim = None if config.sim is None else bundled_sim(config.sim)
+    if config.backend == "gymnasium":
+        model_path, space, source = _gymnasium_source(config)
+    else:
+        model_path = _model_path(config, sim)
+        space = _space(load_model(model_path), config, sim)
+        source = space.model
+    trajectories = _log(config, sim, space.model)
+    frame_skip = _frame_skip(config, sim, space.model, trajectories)
+    simulator = make_simulator(
+        config.backend,
+        source,
+        parameters=space,
+        frame_skip=frame_skip,
+        num_threads=config.threads,
+        chunk_size=config.chunk_size,
+    )
+    _check_log(trajectories, simulator, frame_skip)
+    width = trajectories.observations.shape[1]
+    observation = _observation(config, sim, space.model, simulator, width)
+    objective = Objective(
+        simulator,
+        make_transitions(trajectories, observation, lag=config.lag),
+        observation,
+        epsilon=config.epsilon,
+        noise=config.noise,
+        mask=config.mask,
+        scaling=config.scaling,
+    )
+    return Problem(
+        config=config,
+        model_path=model_path,
+        space=space,
+        simulator=simulator,
+        trajectories=trajectories,
+        observation=observation,
+        objective=objective,
+        fingerprint=_fingerprint(config, space.model, trajectories),
+    )
+
+
+def _model_path(config: Config, sim: BundledSim | None) -> Path:
+    if (config.model is None) == (sim is None):
+        both = "both model and sim are" if sim else "neither model nor sim is"
+        raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
+    return sim.model if sim is not None else config.path(str(config.model))
+
+
+def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None) -> ParameterSpace:
+    given = config.parameters if config.parameters is not None else (sim.parameters if sim else None)
+    if given is None:
+        raise InputError(
+            "config: no parameters given; expected name: {field: body_mass, name: BODY, bounds: [low, high]}"
+        )
+    return ParameterSpace(model, given)
+
+
+def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]:
+    """The parameter space and the adapter (or its maker) of a Gymnasium environment or of the user's own."""
+    name = config.environment
+    if name is None:
+        raise InputError("config: backend gymnasium needs environment: an id such as Hopper-v5, or file.py:function")
+    if re.search(r"-v\d+$", name):
+        try:
+            environment = gymnasium.make(name)
+        except (gymnasium.error.Error, ImportError) as error:
+            raise InputError(f"environment: Gymnasium cannot make {name!r}: {' '.join(str(error).split())}") from None
+        space = _space(getattr(environment.unwrapped, "model", None), config, None)
+        return None, space, MujocoEnvAdapter(environment, space)
+    maker = _load_function(config, name)
+    model = None if config.model is None else load_model(config.path(config.model))
+    return None if config.model is None else config.path(config.model), _space(model, config, None), maker
+
+
+def _load_function(config: Config, name: str) -> Callable[..., Any]:
+    """Load ``file.py:function`` or ``module:function``."""
+    where, _, function = name.rpartition(":")
+    if where.endswith(".py"):
+        path = config.path(where)
+        if not path.is_file():
+            raise InputError(f"environment: no file {path}; expected file.py:function of an adapter")
+        spec = importlib.util.spec_from_file_location(path.stem, path)
+        assert spec is not None and spec.loader is not None
+        module = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(module)
+    else:
+        module = importlib.import_module(where)
+    if not callable(getattr(module, function, None)):
+        raise InputError(f"environment: {where} has no function {function!r} that makes an adapter")
+    return getattr(module, function)
+
+
+def _log(config: Config, sim: BundledSim | None, model: mujoco.MjModel | None) -> Trajectories:
+    source = config.data if config.data is not None else (str(sim.log) if sim else None)
+    if source is None:
+        raise InputError("config: no data given; expected the path of a log, such as data: log.npz")
+    if isinstance(source, dict) and isinstance(source.get("preprocess"), dict) and "dt" not in source["preprocess"]:
+        if model is None or config.frame_skip is None:
+            raise InputError("data: preprocess needs dt, the seconds of one transition (or frame_skip, and a model)")
+        step = float(model.opt.timestep) * config.frame_skip
+        source = {**source, "preprocess": {"dt": step, **source["preprocess"]}}
+    log = read_trajectories(source, base=config.base)
+    if config.trajectories is None:
+        return log
+    wanted = config.trajectories
+    if isinstance(wanted, int) and not 1 <= wanted <= log.num_episodes:
+        raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")
+    return log.select_episodes(range(wanted) if isinstance(wanted, int) else wanted)
+
+
+def _frame_skip(
+    config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, trajectories: Trajectories
+) -> int:
+    """``frame_skip`` as given, or as the log's time step says."""
+    if config.frame_skip is not None:
+        return config.frame_skip
+    if sim is not None:
+        return sim.frame_skip
+    if config.backend == "gymnasium":
+        return 1  # an environment's step is what its designer calls one
+    assert model is not None
+    step = float(model.opt.timestep)
+    if trajectories.dt is None:
+        raise InputError(
+            f"config: no frame_skip given, and the log has no time stamps; the model's step is {step:g} s, "
+            "so a log sampled every x seconds needs frame_skip: x / step"
+        )
+    ratio = trajectories.dt / step
+    if round(ratio) < 1 or abs(ratio - round(ratio)) > TIME_TOLERANCE * ratio:
+        raise InputError(
+            f"data: sampled every {trajectories.dt:g} s, which is no whole number of the model's steps of {step:g} s; "
+            "resample the log (data: preprocess: dt) or change the model's timestep"
+        )
+    return round(ratio)
+
+
+def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int) -> None:
+    """The log's actions and time stamps must be the simulator's."""
+    width = trajectories.actions.shape[1]
+    if width != simulator.num_controls:
+        raise InputError(
+            f"data: {width} action column{'s' * (width != 1)}, but the simulator has {simulator.num_controls} actuators"
+        )
+    ours, theirs = simulator.timestep, trajectories.dt
+    if ours is None or theirs is None or abs(ours - theirs) <= TIME_TOLERANCE * theirs:
+        return
+    step = ours / frame_skip
+    right = theirs / step
+    hint = f"expected frame_skip {round(right)}" if abs(right - round(right)) < 0.01 * right else "resample the log"
+    raise InputError(
+        f"frame_skip: {frame_skip} steps of {step:g} s make {ours:g} s, but the log is sampled every {theirs:g} s; {hint}"
+    )
+
+
+def _observation(
+    config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, simulator: Simulator, width: int
+) -> Observation:
+    entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
+    if model is not None and simulator.num_states == model.nq + model.nv:
+        return parse_observation(model, entries, width)
+    if entries is not None:
+        raise InputError("observation: this simulator's states have no names; leave the key out")
+    if width != simulator.num_states:
+        raise InputError(f"data: {width} observed columns, but the simulator's state has {simulator.num_states}")
+    return generic_observation(width)
+
+
+def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> str:
+    digest = hashlib.sha256(config.fingerprint().encode())
+    for array in (
+        trajectories.observations,
+        trajectories.next_observations,
+        trajectories.actions,
+        trajectories.terminals,
+    ):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    if model is not None:
+        buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+        mujoco.mj_saveModel(model, None, buffer)
+        digest.update(buffer.tobytes())
+    return digest.hexdigest()[:32]

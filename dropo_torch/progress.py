@@ -1,0 +1,63 @@
+"""What a person sees while a run goes on."""
+
+from __future__ import annotations
+
+import math
+import time
+from types import TracebackType
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+from dropo_torch import fit as _fit
+from dropo_torch.optimizers import Progress as OptimizerProgress
+
+#: Seconds between lines where the output is no terminal.
+INTERVAL = 10.0
+
+
+class FitProgress:
+    """A progress line of a fit: stage, evaluations, best log-likelihood, time spent and left.
+
+    On a terminal it is redrawn in place; elsewhere a line is printed every ten seconds.
+    """
+
+    def __init__(self, console: Console, label: str) -> None:
+        self._console = console
+        self._label = label
+        self._last = time.monotonic()
+        self._bar = Progress(
+            SpinnerColumn(),
+            TextColumn("{task.description}"),
+            BarColumn(bar_width=20),
+            TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(),
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task(label, total=1.0, status="simulating")
+
+    def __enter__(self) -> FitProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def update(self, entry: _fit.HistoryEntry, progress: OptimizerProgress) -> None:
+        """Show the state after a batch."""
+        best = "" if math.isnan(entry.log_likelihood) else f", best log-likelihood {entry.log_likelihood:.1f}"
+        left = entry.seconds * (1 - progress.fraction) / max(progress.fraction, 0.05)
+        status = f"{progress.stage}: {entry.evaluations} evaluations{best}, about {_duration(left)} left"
+        self._bar.update(self._task, completed=progress.fraction, status=status)
+        now = time.monotonic()
+        if not self._console.is_terminal and now - self._last > INTERVAL:
+            self._last = now
+            self._console.print(f"{self._label}: {status}", soft_wrap=True)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

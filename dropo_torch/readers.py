@@ -1,0 +1,423 @@
+"""Read a robot's log, in any of the formats listed here, into :class:`~dropo_torch.trajectory.Trajectories`.
+
+=================================  ===============================================================
+``.npz``                           arrays ``observations``, ``next_observations``, ``actions``, ``terminals``
+folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_actions``, ``*_terminals``
+``.h5``, ``.hdf5``                 data sets in the layout of D4RL, or any others by a column map
+``.csv``, ``.tsv``, ``.parquet``   by a column map
+``.mat``                           MATLAB variables (all versions), by a column map
+``minari:ID``, a Minari folder     a local Minari dataset
+=================================  ===============================================================
+
+The column map is described in :mod:`dropo_torch.tables`. Where a log has no next observations, they
+are the observations of the next row of the same episode.
+"""
+
+from __future__ import annotations
+
+import glob
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from dropo_torch.errors import InputError, choices
+from dropo_torch.preprocess import Preprocess, preprocess
+from dropo_torch.recording import TOLERANCE, Recording, check_values, checked_time, sampling_interval
+from dropo_torch.tables import ColumnMap, Table, flatten, missing_file, open_tables, parse_columns, reading
+from dropo_torch.trajectory import Trajectories, concatenate
+
+Source = str | Path | Mapping[str, Any] | Sequence["Source"]
+
+_MINARI = "minari:"
+_DATES = ("string", "datetime", "datetime64", "date")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """How a log is read; :func:`read_trajectories` explains each."""
+
+    observations: ColumnMap | None = None
+    next_observations: ColumnMap | None = None
+    actions: ColumnMap | None = None
+    time: ColumnMap | None = None
+    episode: str | None = None
+    terminals: ColumnMap | None = None
+    dt: float | None = None
+    tolerance: float = TOLERANCE
+    group: str | None = None
+    separator: str | None = None
+    preprocess: Preprocess | Mapping[str, Any] | None = None
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "tolerance"):
+            value = getattr(self, name)
+            if value is not None:
+                object.__setattr__(self, name, _positive(value, name))
+        for name in ("episode", "group", "separator"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, str):
+                raise InputError(f"data: {name} is {value!r}; expected text")
+        if isinstance(self.preprocess, Mapping):
+            object.__setattr__(self, "preprocess", Preprocess.from_mapping(self.preprocess))
+
+    def updated(self, mapping: Mapping[str, Any]) -> ReadOptions:
+        """Return these options with those of a config's mapping in their place."""
+        known = [field.name for field in fields(self)]
+        for key in mapping:
+            if key not in known:
+                raise InputError(f"data: unknown key {key!r}{choices(key, ['path', *known])}")
+        return replace(self, **mapping)
+
+
+def read_trajectories(
+    source: Source,
+    *,
+    observations: ColumnMap | None = None,
+    next_observations: ColumnMap | None = None,
+    actions: ColumnMap | None = None,
+    time: ColumnMap | None = None,
+    episode: str | None = None,
+    terminals: ColumnMap | None = None,
+    dt: float | None = None,
+    tolerance: float = TOLERANCE,
+    group: str | None = None,
+    separator: str | None = None,
+    preprocess: Preprocess | Mapping[str, Any] | None = None,
+    base: str | Path | None = None,
+) -> Trajectories:
+    """Read one or more logs.
+
+    Args:
+        source: a path, a pattern such as ``logs/*.csv``, ``minari:ID``, a mapping with ``path`` and any
+            of the options below (which then count for it), or a list of those, joined in its order.
+        observations: the columns observed; by default the array ``observations``.
+        next_observations: the columns observed after the transition. By default the array
+            ``next_observations`` where there is one and ``observations`` is not given; otherwise the next
+            row of the same episode.
+        actions: the columns commanded, by default the array ``actions``; ``[]`` for a passive system.
+        time: the column of time stamps in seconds, as dates, or in any unit with ``{signal: stamp_ns, scale: 1e-9}``.
+        episode: a column whose value differs from one episode to the next.
+        terminals: columns of flags that are true at an episode's last row, any of them; by default the
+            arrays ``terminals`` and ``timeouts``, one of which must be there unless ``observations`` is given;
+            ``[]`` for a log that is one episode.
+        dt: seconds between rows, for a log without time stamps.
+        tolerance: fraction by which the spacing of time stamps may differ from its median.
+        group: pattern of HDF5 groups with an episode each, such as ``data/demo_*``.
+        separator: what separates the columns of a text file.
+        preprocess: how to synchronise, filter and resample; see :class:`~dropo_torch.preprocess.Preprocess`.
+        base: folder from which relative paths start, by default the current one.
+
+    Raises:
+        InputError: a file, name or value that cannot be used; its one line says which.
+    """
+    options = ReadOptions(
+        observations=observations,
+        next_observations=next_observations,
+        actions=actions,
+        time=time,
+        episode=episode,
+        terminals=terminals,
+        dt=dt,
+        tolerance=tolerance,
+        group=group,
+        separator=separator,
+        preprocess=preprocess,
+    )
+    return concatenate(_read(source, options, Path(base or ".")))
+
+
+def read_recording(
+    path: str | Path,
+    *,
+    observations: ColumnMap | None = None,
+    actions: ColumnMap | None = None,
+    time: ColumnMap | None = None,
+    episode: str | None = None,
+    terminals: ColumnMap | None = None,
+    dt: float | None = None,
+    separator: str | None = None,
+) -> Recording:
+    """Read one log as samples in time; the arguments are those of :func:`read_trajectories`.
+
+    Raises:
+        InputError: a file, name or value that cannot be used; its one line says which.
+    """
+    options = ReadOptions(
+        observations=observations, actions=actions, time=time, episode=episode, terminals=terminals, dt=dt
+    )
+    return _recording(open_tables(Path(path), separator=separator)[0], options)
+
+
+def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories]:
+    if isinstance(source, Mapping):
+        if "path" not in source:
+            raise InputError(f"data: there is no key 'path'{choices('path', source)}")
+        rest = {key: value for key, value in source.items() if key != "path"}
+        return _read(source["path"], options.updated(rest), base)
+    if isinstance(source, str) and source.startswith(_MINARI):
+        return [_read_minari(source.removeprefix(_MINARI), options)]
+    if isinstance(source, str | Path):
+        return [log for path in _paths(source, base) for log in _read_path(path, options)]
+    if isinstance(source, Sequence) and source:
+        return [log for entry in source for log in _read(entry, options, base)]
+    raise InputError(f"data: {source!r} given; expected a path, a list of paths, or a mapping with 'path'")
+
+
+def _paths(source: str | Path, base: Path) -> list[Path]:
+    """The path meant, or those that a pattern matches."""
+    path = base / Path(source).expanduser()
+    if path.exists() or not glob.has_magic(str(source)):
+        return [path]
+    found = sorted(Path(match) for match in glob.glob(str(path), recursive=True))
+    if not found:
+        raise InputError(f"{path}: no file matches this pattern")
+    return found
+
+
+def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
+    for folder in (path, path / "data"):
+        if (folder / "metadata.json").exists():
+            return [_read_minari(folder, options)]
+    if not path.exists() and not path.suffix and "-v" in path.name:
+        raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
+    return [
+        _read_table(table, options) for table in open_tables(path, group=options.group, separator=options.separator)
+    ]
+
+
+def _read_table(table: Table, options: ReadOptions) -> Trajectories:
+    if isinstance(options.preprocess, Preprocess):
+        if options.next_observations is not None:
+            raise InputError(
+                f"{table.source}: preprocess works on samples in time; leave next_observations out, they are resampled"
+            )
+        return preprocess(_recording(table, options), options.preprocess)
+    following = options.next_observations
+    if following is None and options.observations is None and "next_observations" in table.names:
+        following = "next_observations"
+    if following is None:
+        return _recording(table, options).trajectories(tolerance=options.tolerance)
+    return _transitions(table, options, following)
+
+
+def _transitions(table: Table, options: ReadOptions, following: ColumnMap) -> Trajectories:
+    """A log that has its next observations: each row is a transition."""
+    observations, names = _observations(table, options)
+    next_observations, next_names = table.matrix(following, "next_observations")
+    actions, action_names = _actions(table, options, len(observations))
+    for what, values, labels in (
+        ("observations", observations, names),
+        ("next_observations", next_observations, next_names),
+        ("actions", actions, action_names),
+    ):
+        _check_rows(table, what, len(values), len(observations))
+        check_values(values, labels, f"{table.source}: {what}")
+    episodes = _episodes(table, options, len(observations))
+    time = _time(table, options, episodes)
+    dt = options.dt
+    if time is not None:
+        stamps = checked_time(time, episodes, table.source)
+        dt = sampling_interval(stamps, episodes, table.source, options.tolerance)
+    return Trajectories(
+        observations=observations,
+        next_observations=next_observations,
+        actions=actions,
+        terminals=np.append(np.diff(episodes) != 0, True),
+        dt=dt,
+        source=table.source,
+    )
+
+
+def _recording(table: Table, options: ReadOptions) -> Recording:
+    observations, names = _observations(table, options)
+    actions, action_names = _actions(table, options, len(observations))
+    _check_rows(table, "actions", len(actions), len(observations))
+    episodes = _episodes(table, options, len(observations))
+    return Recording(
+        observations=observations,
+        actions=actions,
+        time=_time(table, options, episodes),
+        episodes=episodes,
+        observation_names=names,
+        action_names=action_names,
+        source=table.source,
+    )
+
+
+def _observations(table: Table, options: ReadOptions) -> tuple[np.ndarray, tuple[str, ...]]:
+    observations, names = table.matrix(_wanted(table, options.observations, "observations"), "observations")
+    if not names:
+        raise InputError(f"{table.source}: observations: the list is empty; name at least one column")
+    if len(observations) == 0:
+        raise InputError(f"{table.source}: the log has no row; at least two samples are needed")
+    return observations, names
+
+
+def _actions(table: Table, options: ReadOptions, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
+    inferred = isinstance(options.preprocess, Preprocess) and options.preprocess.infers_actions
+    if options.actions is None and inferred:
+        return np.empty((rows, 0)), ()
+    actions, names = table.matrix(_wanted(table, options.actions, "actions"), "actions")
+    return (actions, names) if names else (np.empty((rows, 0)), ())
+
+
+def _wanted(table: Table, columns: ColumnMap | None, default: str) -> ColumnMap:
+    if columns is not None:
+        return columns
+    if default in table.names:
+        return default
+    empty = " ([] for a system without)" if default == "actions" else ""
+    raise InputError(
+        f"{table.source}: there is no {default!r}; say which columns are the {default} with "
+        f"{default}: [NAME, ...]{empty}{choices(default, table.names)}"
+    )
+
+
+def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
+    """The episode of each row, counted from 0, by flags and by the episode column, ``(rows,)``."""
+    start = np.zeros(rows, dtype=bool)
+    flags = options.terminals
+    if flags is None:
+        flags = [name for name in ("terminals", "timeouts") if name in table.names]
+        if not flags and options.observations is None and options.episode is None and options.group is None:
+            raise InputError(
+                f"{table.source}: there is no 'terminals'; say where episodes end with terminals: NAME "
+                f"(or terminals: [] if all of it is one episode){choices('terminals', table.names)}"
+            )
+    values, names = table.matrix(flags, "terminals")
+    if names:
+        _check_rows(table, names[0], len(values), rows)
+        bad = np.argwhere(~np.isin(values, (0, 1)))
+        if bad.size:
+            row, column = bad[0]
+            raise InputError(
+                f"{table.source}: terminals: {names[column]} is {values[row, column]:g} at row {row} (counted from 0); "
+                "expected true/false or 0/1"
+            )
+        start[1:] |= values[:-1].any(axis=1)
+    if options.episode is not None:
+        label = table.array(options.episode, "episode").reshape(-1)
+        _check_rows(table, options.episode, len(label), rows)
+        if pd.isna(label).any():
+            row = np.flatnonzero(pd.isna(label))[0]
+            raise InputError(f"{table.source}: {options.episode} has no value at row {row} (counted from 0)")
+        start[1:] |= label[1:] != label[:-1]
+    return np.cumsum(start)
+
+
+def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarray | None:
+    """Time stamps in seconds since the log's first, ``(rows,)``."""
+    if options.time is None:
+        if options.dt is None:
+            return None
+        first = np.searchsorted(episodes, episodes)
+        return (np.arange(len(episodes)) - first) * options.dt
+    if options.dt is not None:
+        raise InputError(f"{table.source}: both time and dt are given; dt is for a log without time stamps")
+    signals = parse_columns(options.time, f"{table.source}: time")
+    if len(signals) == 1 and signals[0].signal in table.names:
+        stamps = table.array(signals[0].signal, "time")
+        if _are_dates(stamps):
+            return _since_first(stamps, f"{table.source}: {signals[0].signal}")
+    values, names = table.matrix(options.time, "time")
+    if len(names) != 1:
+        raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
+    _check_rows(table, "time", len(values), len(episodes))
+    return values[:, 0]
+
+
+def _are_dates(stamps: np.ndarray) -> bool:
+    """Whether a column holds dates, or text that does not start with a number."""
+    if stamps.ndim != 1 or pd.api.types.infer_dtype(stamps) not in _DATES:
+        return False
+    return stamps.dtype.kind == "M" or bool(np.isnan(pd.to_numeric(stamps[:1], errors="coerce"))[0])
+
+
+def _since_first(stamps: np.ndarray, where: str) -> np.ndarray:
+    with reading(where, "dates such as 2024-05-01T12:00:00.125"):
+        dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
+    return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
+
+
+def _check_rows(table: Table, what: str, rows: int, expected: int) -> None:
+    if rows != expected:
+        raise InputError(
+            f"{table.source}: {what} has {rows} rows and observations has {expected}; both need one row a sample"
+        )
+
+
+def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
+    """A local Minari dataset, by its id or its folder; an episode has one observation more than actions."""
+    minari = _minari()
+    source = f"{_MINARI}{dataset}" if isinstance(dataset, str) else str(dataset)
+    unused = ("next_observations", "time", "episode", "terminals", "group", "separator", "preprocess")
+    for name in unused:
+        if getattr(options, name) is not None:
+            raise InputError(
+                f"{source}: {name} has no meaning for a Minari dataset, which holds transitions; leave it out"
+            )
+    if isinstance(dataset, str):
+        local = list(minari.list_local_datasets())
+        if dataset not in local:
+            raise InputError(f"{source}: no such local dataset{choices(dataset, local)}; `minari download` fetches one")
+    with reading(source, "a Minari dataset"):
+        data = minari.load_dataset(dataset) if isinstance(dataset, str) else minari.MinariDataset(dataset)
+        episodes = list(data.iterate_episodes())
+    logs = [_minari_episode(episode, f"{source}: episode {i}", options) for i, episode in enumerate(episodes)]
+    if not logs:
+        raise InputError(f"{source}: the dataset has no episode")
+    return replace(concatenate(logs), source=source)
+
+
+def _minari_episode(episode: Any, source: str, options: ReadOptions) -> Trajectories:
+    parts = {}
+    for what, chosen in (("observations", options.observations), ("actions", options.actions)):
+        arrays = flatten(getattr(episode, what), "/")
+        arrays = {name or what: array for name, array in arrays.items()}
+        table = Table(source, tuple(arrays), arrays.__getitem__)
+        if chosen is None and what not in arrays:
+            raise InputError(
+                f"{source}: {what} are a dictionary; choose from it with {what}: [KEY, ...]{choices(what, arrays)}"
+            )
+        values, names = table.matrix(what if chosen is None else chosen, what)
+        check_values(values, names, source)
+        parts[what] = values
+    observations, actions = parts["observations"], parts["actions"]
+    if len(observations) != len(actions) + 1:
+        raise InputError(
+            f"{source}: {len(observations)} observations and {len(actions)} actions; expected one observation more"
+        )
+    return Trajectories(
+        observations=observations[:-1],
+        next_observations=observations[1:],
+        actions=actions,
+        terminals=np.arange(1, len(actions) + 1) == len(actions),
+        dt=options.dt,
+        source=source,
+    )
+
+
+def _minari() -> ModuleType:
+    try:
+        import minari
+    except ImportError:
+        raise InputError(
+            "reading a Minari dataset needs the package minari: pip install 'dropo_torch[minari]'"
+        ) from None
+    return minari
+
+
+def _positive(value: object, name: str) -> float:
+    """A positive number of seconds or fraction (also where YAML reads ``1e-3`` as text)."""
+    try:
+        number = float(value)  # type: ignore[arg-type]
+    except (TypeError, ValueError):
+        number = float("nan")
+    if isinstance(value, bool) or not (np.isfinite(number) and number > 0):
+        raise InputError(f"data: {name} is {value!r}; expected a positive number")
+    return number

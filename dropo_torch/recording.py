@@ -1,0 +1,206 @@
+"""What a robot's logger wrote: samples in time, before they become transitions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dropo_torch.errors import InputError, choices
+from dropo_torch.trajectory import Trajectories
+
+TOLERANCE = 0.05
+"""Fraction by which the spacing of regular time stamps may differ from its median."""
+
+
+@dataclass(frozen=True)
+class Recording:
+    """Samples in time of named signals, one row a time stamp, in one or more episodes.
+
+    A transition runs from a sample to the next one of the same episode, under the first one's action.
+    NaN says that a signal has no sample at that time: :meth:`trajectories` refuses it where it is
+    needed, and preprocessing can interpolate over it.
+
+    Attributes:
+        observations: what was measured, ``(N, n)``.
+        actions: the commands in force from each sample on, ``(N, m)``; ``m`` may be 0.
+        time: time stamps in seconds, ``(N,)``, rising within an episode; ``None`` where the log does not say.
+        episodes: episode of each sample, counted from 0, ``(N,)`` int, never falling.
+        observation_names: a name for each column of ``observations``.
+        action_names: a name for each column of ``actions``.
+        source: where it came from, for messages.
+
+    Raises:
+        InputError: shapes that do not fit, an infinite value, a name that stands twice, time stamps
+            that do not rise.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    time: np.ndarray | None
+    episodes: np.ndarray
+    observation_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    source: str = "recording"
+
+    def __post_init__(self) -> None:
+        rows = len(self.observations)
+        for name, names in (("observations", self.observation_names), ("actions", self.action_names)):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            if array.shape != (rows, len(names)):
+                raise InputError(
+                    f"{self.source}: {name} has shape {array.shape}; expected ({rows}, {len(names)}), "
+                    "one row a sample and one column a name"
+                )
+            check_values(array, names, self.source, missing_allowed=True)
+            _set(self, name, array)
+        names = self.observation_names + self.action_names
+        twice = [name for name in names if names.count(name) > 1]
+        if twice:
+            raise InputError(f"{self.source}: two columns are named {twice[0]!r}; give each a name of its own")
+        episodes = np.array(self.episodes, dtype=np.int64)
+        if episodes.shape != (rows,) or (np.diff(episodes) < 0).any():
+            raise InputError(f"{self.source}: episodes must be {rows} whole numbers that never fall")
+        _set(self, "episodes", episodes)
+        if self.time is not None:
+            _set(self, "time", checked_time(self.time, episodes, self.source))
+
+    def __len__(self) -> int:
+        """Return the number of samples N."""
+        return len(self.observations)
+
+    def split(self) -> tuple[Recording, ...]:
+        """Return each episode as a recording of its own."""
+        bounds = np.flatnonzero(np.diff(self.episodes)) + 1
+        return tuple(
+            replace(
+                self,
+                observations=self.observations[rows],
+                actions=self.actions[rows],
+                time=None if self.time is None else self.time[rows],
+                episodes=np.zeros(len(rows), dtype=np.int64),
+            )
+            for rows in np.split(np.arange(len(self)), bounds)
+        )
+
+    def signal(self, name: str) -> np.ndarray:
+        """Return the samples ``(N,)`` of one named observation or action.
+
+        Raises:
+            InputError: a name that is not there.
+        """
+        names = self.observation_names + self.action_names
+        if name not in names:
+            raise InputError(f"{self.source}: there is no signal {name!r}{choices(name, names)}")
+        column = names.index(name)
+        width = len(self.observation_names)
+        return self.observations[:, column] if column < width else self.actions[:, column - width]
+
+    def trajectories(self, *, tolerance: float = TOLERANCE) -> Trajectories:
+        """Return the transitions between consecutive samples, ``dt`` being the mean spacing of the time stamps.
+
+        An episode's last sample is the end of its last transition; its action is not used.
+
+        Args:
+            tolerance: fraction by which the spacing may differ from its median.
+
+        Raises:
+            InputError: a missing value, irregular time stamps, no two samples in one episode.
+        """
+        dt = None if self.time is None else sampling_interval(self.time, self.episodes, self.source, tolerance)
+        check_values(self.observations, self.observation_names, self.source)
+        start = np.flatnonzero(self.episodes[1:] == self.episodes[:-1])
+        if start.size == 0:
+            raise InputError(
+                f"{self.source}: no episode has two samples, {len(self)} samples in all; a transition needs two"
+            )
+        used = np.zeros_like(self.actions)
+        used[start] = self.actions[start]
+        check_values(used, self.action_names, self.source)
+        return Trajectories(
+            observations=self.observations[start],
+            next_observations=self.observations[start + 1],
+            actions=self.actions[start],
+            terminals=np.diff(start, append=len(self) + 1) != 1,
+            dt=dt,
+            source=self.source,
+        )
+
+
+def resolve_names(wanted: Sequence[str], names: Sequence[str], source: str, what: str) -> list[str]:
+    """Return the column names meant by ``wanted``, where ``q`` stands for ``q[0]``, ``q[1]``, ... as well.
+
+    Raises:
+        InputError: a name that is not there.
+    """
+    found: list[str] = []
+    for name in wanted:
+        matches = [n for n in names if n == name or n.startswith(f"{name}[")]
+        if not matches:
+            raise InputError(f"{source}: {what}: there is no signal {name!r}{choices(name, names)}")
+        found += matches
+    return found
+
+
+def check_values(values: np.ndarray, names: Sequence[str], source: str, *, missing_allowed: bool = False) -> None:
+    """Check that ``values (N, len(names))`` are finite, or finite or NaN.
+
+    Raises:
+        InputError: naming the first bad row and its column.
+    """
+    bad = np.argwhere(np.isinf(values) if missing_allowed else ~np.isfinite(values))
+    if bad.size:
+        row, column = (int(i) for i in bad[0])
+        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+        raise InputError(
+            f"{source}: {names[column]} is {values[row, column]} at row {row} (counted from 0){more}; "
+            "every value must be finite"
+        )
+
+
+def checked_time(time: np.ndarray, episodes: np.ndarray, source: str) -> np.ndarray:
+    """Return ``time (N,)`` as float64 seconds.
+
+    Raises:
+        InputError: a stamp that is not finite, or not later than the one before it in its episode.
+    """
+    stamps = np.array(time, dtype=np.float64)
+    if stamps.shape != episodes.shape:
+        raise InputError(f"{source}: time has shape {stamps.shape}; expected ({len(episodes)},), one stamp a sample")
+    check_values(stamps[:, None], ["time"], source)
+    backwards = np.flatnonzero((np.diff(stamps) <= 0) & (np.diff(episodes) == 0)) + 1
+    if backwards.size:
+        row = int(backwards[0])
+        raise InputError(
+            f"{source}: time goes from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s at row {row} (counted from 0); "
+            "it must rise within an episode (name the column that tells episodes apart with episode, or remove the row)"
+        )
+    return stamps
+
+
+def sampling_interval(time: np.ndarray, episodes: np.ndarray, source: str, tolerance: float) -> float | None:
+    """Return the mean spacing of regular time stamps in seconds, ``None`` if no episode has two.
+
+    Raises:
+        InputError: a spacing that differs from the median by more than the fraction ``tolerance``.
+    """
+    end = np.flatnonzero(np.diff(episodes) == 0) + 1
+    if end.size == 0:
+        return None
+    steps = time[end] - time[end - 1]
+    median = float(np.median(steps))
+    off = np.flatnonzero(np.abs(steps - median) > tolerance * median)
+    if off.size:
+        first = off[0]
+        raise InputError(
+            f"{source}: irregular time stamps: {steps[first]:.6g} s before row {end[first]} (counted from 0) and "
+            f"{median:.6g} s as a rule, {off.size} spacings in all are off by more than {tolerance:.0%}; resample the "
+            "log with the option preprocess: {dt: SECONDS}"
+        )
+    return float(steps.mean())
+
+
+def _set(recording: Recording, name: str, array: np.ndarray) -> None:
+    array.flags.writeable = False
+    object.__setattr__(recording, name, array)

@@ -1,0 +1,223 @@
+"""What each command does: a config and a folder in, files in that folder out."""
+
+from __future__ import annotations
+
+import functools
+import json
+import platform
+import shutil
+from collections.abc import Mapping, Sequence
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import yaml
+from rich.console import Console
+from rich.table import Table
+
+from dropo_torch.bundled import bundled_sim
+from dropo_torch.config import Config, make_config
+from dropo_torch.diagnostics import diagnose
+from dropo_torch.errors import InputError
+from dropo_torch.export import export_model
+from dropo_torch.fit import Fit, fit, write_atomically
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.progress import FitProgress
+from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
+
+_PACKAGES = ("dropo_torch", "torch", "mujoco", "numpy", "scipy", "cma", "gymnasium")
+
+
+def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None) -> Fit:
+    """Fit, and write ``fit.json``, ``report.html``, the distribution and the model to ``out``.
+
+    Args:
+        config: the config.
+        out: the folder; results of an earlier run there are moved aside, never overwritten.
+        console: where progress and results are shown.
+        resume: continue an interrupted run in ``out``.
+        log: ``"tensorboard"`` writes the history as TensorBoard events too.
+    """
+    _check_log_option(log)
+    problem = make_problem(config)
+    _prepare(out, "fit.json", resume=resume)
+    result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
+    _write_fit(problem, result, out)
+    if log == "tensorboard":
+        _write_tensorboard(result, out / "tensorboard")
+    _show(problem, result, out, console)
+    return result
+
+
+def run_demo(out: Path, *, console: Console, overrides: Mapping[str, Any] | None = None) -> Fit:
+    """Fit the bundled Hopper's masses to its log and compare them with the masses it was recorded with."""
+    config = make_config({"sim": "hopper"}, overrides)
+    sim = bundled_sim(str(config.sim))
+    console.print(
+        "The demo fits four link masses of a simulated Hopper to 200 logged transitions "
+        "(sims/hopper/log.npz),\nrecorded with masses that the model does not have."
+    )
+    result = run_fit(config, out, console=console)
+    table = Table("parameter", "recorded with", "found", "error", title="Against the truth", title_justify="left")
+    for name, entry in result.distribution.summary().items():
+        truth = sim.truth[name]
+        error = 100 * (entry["mean"] / truth - 1)
+        table.add_row(name, f"{truth:.4g} {entry['unit']}", f"{entry['mean']:.4g}", f"{error:+.3f} %")
+    console.print(table)
+    return result
+
+
+def run_sweep(
+    config: Config, out: Path, *, console: Console, epsilons: Sequence[float] | None = None, resume: bool = False
+) -> Sweep:
+    """Fit at several ε, choose by the elbow, and write ``sweep.json`` and ``report.html`` to ``out``."""
+    from dropo_torch.report import write_sweep_report
+
+    problem = make_problem(config)
+    _prepare(out, "sweep.json", resume=resume)
+    store = out / "sweep-progress.json"
+    if not resume:
+        store.unlink(missing_ok=True)
+    values = default_epsilons(problem.objective.measured.numpy()) if epsilons is None else list(epsilons)
+
+    def fit_at(epsilon: float) -> Fit:
+        part = make_problem(config.model_copy(update={"epsilon": epsilon}))
+        return _fit(part, None, resume=False, console=console, label=f"ε = {epsilon:g}")
+
+    sweep = sweep_epsilon(fit_at, values, fingerprint=problem.fingerprint, store=store)
+    table = Table("ε", "mean squared error", "log-likelihood", *problem.space.names)
+    for p in sweep.points:
+        marked = "[bold]" if p.epsilon == sweep.chosen else ""
+        cells = [f"{p.mean[n]:.4g} ± {p.std[n]:.2g}" for n in problem.space.names]
+        table.add_row(f"{marked}{p.epsilon:g}", f"{p.mse:.4g}", f"{p.log_likelihood:.1f}", *cells)
+    console.print(table)
+    console.print(f"chosen: [bold]epsilon: {sweep.chosen:g}[/], since {sweep.reason}")
+    write_atomically(out / "sweep.json", json.dumps(sweep.document(), indent=2).encode() + b"\n")
+    write_sweep_report(
+        out / "report.html",
+        epsilons=[p.epsilon for p in sweep.points],
+        mse=[p.mse for p in sweep.points],
+        log_likelihood=[p.log_likelihood for p in sweep.points],
+        chosen=sweep.chosen,
+        reason=sweep.reason,
+        config=config.document(),
+        versions=versions(),
+    )
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+    return sweep
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of what a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
+
+
+def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Console, label: str = "fit") -> Fit:
+    config = problem.config
+    with FitProgress(console, label) as progress:
+        return fit(
+            problem.objective,
+            optimizer=config.optimizer,
+            samples=config.samples,
+            seed=config.seed,
+            budget=config.budget,
+            population=config.population,
+            common_random_numbers=config.common_random_numbers,
+            checkpoint=checkpoint,
+            resume=resume,
+            fingerprint=problem.fingerprint,
+            on_progress=progress.update,
+        )
+
+
+def _prepare(out: Path, result: str, *, resume: bool) -> None:
+    """Make the folder; move an earlier, finished run aside unless it is to be continued."""
+    if out.exists() and not out.is_dir():
+        raise InputError(f"--out: {out} is a file; expected a folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"--out: cannot make folder {out}: {error.strerror}") from None
+    if resume or not (out / result).exists():
+        return
+    number = next(i for i in range(1, 10_000) if not (out / f"previous-{i}").exists())
+    aside = out / f"previous-{number}"
+    aside.mkdir()
+    for item in out.iterdir():
+        if not item.name.startswith("previous-"):
+            shutil.move(str(item), aside / item.name)
+
+
+def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
+    from dropo_torch.report import write_fit_report
+
+    result.save(out / "fit.json")
+    result.distribution.save(out / "distribution.yaml")
+    document = problem.config.document()
+    (out / "fitted_config.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+    notes = []
+    if problem.model_path is not None:
+        try:
+            export_model(problem.model_path, problem.space, result.distribution.center, out / "model.xml")
+        except InputError as error:
+            notes.append(f"No model.xml was written: {error}.")
+    write_fit_report(
+        out / "report.html",
+        fit=result,
+        diagnostics=diagnose(problem.objective, result.distribution, seed=problem.config.seed),
+        config=document,
+        title=f"Fit of {problem.config.sim or problem.config.model or problem.config.environment}",
+        notes=notes,
+        versions=versions(),
+    )
+
+
+def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
+    table = Table("parameter", "mean", "std", "unit", "search box")
+    for name, entry in result.distribution.summary().items():
+        box = f"[{entry['low']:g}, {entry['high']:g}]".replace("[", "\\[")
+        table.add_row(name, f"{entry['mean']:.5g}", f"{entry['std']:.2g}", entry["unit"], box)
+    console.print(table)
+    console.print(
+        f"log-likelihood {result.log_likelihood:.2f}, mean squared error {result.mse:.3g}, "
+        f"{len(problem.objective)} windows, {result.simulated_transitions} simulated transitions, "
+        f"{result.seconds:.1f} s; stopped because {result.stop_reason}",
+        soft_wrap=True,
+        highlight=False,
+    )
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False)
+
+
+def _check_log_option(log: str | None) -> None:
+    if log not in (None, "tensorboard"):
+        raise InputError(f"--log: unknown {log!r}; expected tensorboard")
+    if log is not None:
+        _summary_writer()
+
+
+@functools.cache
+def _summary_writer() -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError:
+        raise InputError(
+            "--log tensorboard: TensorBoard is not installed; pip install 'dropo_torch[tensorboard]'"
+        ) from None
+    return SummaryWriter
+
+
+def _write_tensorboard(result: Fit, folder: Path) -> None:
+    """Write the history as TensorBoard scalars, over simulated transitions."""
+    with _summary_writer()(str(folder)) as writer:
+        for entry in result.history:
+            step = entry.simulated_transitions
+            writer.add_scalar("log_likelihood", entry.log_likelihood, step)
+            for i, name in enumerate(result.distribution.names):
+                writer.add_scalar(f"mean/{name}", entry.mean[i], step)
+                writer.add_scalar(f"std/{name}", entry.std[i], step)
