@@ -386,6 +386,22 @@ def test_start_noise_goes_through_the_simulation_exactly_where_it_is_linear(lag,
             atol=1e-13,
         )
     assert objective.linearised_at == [2.0]
+    torch.testing.assert_close(objective.target(slice(0, 8)), objective.measured, rtol=0, atol=1e-12)
+
+
+def test_a_window_that_the_noise_does_not_explain_is_widened_as_under_students_law():
+    noise = np.array([0.02, 0.3])
+    exact, matrix = slide_objective(noise)
+    measured = exact.transitions.measured.copy()
+    measured[2] += [0.5, -4.0]
+    states, controls = (torch.from_numpy(x) for x in (exact.transitions.states, exact.transitions.controls))
+    objective = exact.on(windows(states, controls, measured))
+    objective.linearise(np.array([2.0]))
+    covariance = matrix @ np.diag(noise**2) @ matrix.T + np.diag(noise**2) + 1e-6 * np.eye(2)
+    distance = [0.5, -4.0] @ np.linalg.inv(covariance) @ [0.5, -4.0]
+    found = objective.base_covariance(slice(0, 8))
+    np.testing.assert_allclose(found[2], covariance * (5 + distance) / (5 + 2), rtol=1e-9)
+    np.testing.assert_allclose(found[3], covariance, rtol=1e-9)
 
 
 def test_start_noise_follows_scaling_and_masks():
