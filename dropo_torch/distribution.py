@@ -38,8 +38,10 @@ def truncated_interval(
 
     Where the limits lie outside μ ± 2σ altogether, the interval hugs the nearer end of the limits.
     """
-    a = torch.clamp((low - mean) / std, min=-TRUNCATION)
-    b = torch.clamp((high - mean) / std, max=TRUNCATION)
+    # an infinite limit, divided by σ, would make the gradient in σ 0 · ∞
+    lower, upper = (torch.where(torch.isfinite(x), x, torch.zeros_like(x)) for x in (low, high))
+    a = torch.clamp(torch.where(torch.isfinite(low), (lower - mean) / std, -TRUNCATION), min=-TRUNCATION)
+    b = torch.clamp(torch.where(torch.isfinite(high), (upper - mean) / std, TRUNCATION), max=TRUNCATION)
     a = torch.minimum(a, torch.full_like(a, TRUNCATION) - 1e-9)
     b = torch.maximum(b, a + 1e-9)
     return a, b
@@ -143,7 +145,7 @@ class Distribution:
         return torch.where(inside, density, torch.full_like(density, -torch.inf)).sum(-1)
 
     def summary(self) -> dict[str, dict[str, Any]]:
-        """Return name → mean, std, low, high, unit (and ``log_mean``, ``log_std`` where log-scaled)."""
+        """Return name → mean, std, low, high, unit, limits (and ``log_mean``, ``log_std`` where log-scaled)."""
         entries: dict[str, dict[str, Any]] = {}
         for i, name in enumerate(self.names):
             entries[name] = {
@@ -152,6 +154,7 @@ class Distribution:
                 "low": float(self.low[i]),
                 "high": float(self.high[i]),
                 "unit": self.units[i],
+                "limits": [None if math.isinf(x) else float(x) for x in self.limits[i]],
             }
             if self.is_log[i]:
                 entries[name] |= {"scale": "log", "log_mean": float(self.mean[i]), "log_std": float(self.std[i])}
@@ -160,8 +163,6 @@ class Distribution:
     def save(self, path: str | Path) -> None:
         """Write the distribution as JSON, or as YAML where the path ends in ``.yaml`` or ``.yml``."""
         document: dict[str, Any] = {"schema": SCHEMA, "parameters": self.summary()}
-        for i, name in enumerate(self.names):
-            document["parameters"][name]["limits"] = [None if math.isinf(x) else float(x) for x in self.limits[i]]
         path = Path(path)
         if path.suffix in (".yaml", ".yml"):
             path.write_text(yaml.safe_dump(document, sort_keys=False))
@@ -179,8 +180,9 @@ class Distribution:
         if not path.is_file():
             raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
         try:
-            document = yaml.safe_load(path.read_text())  # JSON is YAML
-        except (yaml.YAMLError, UnicodeDecodeError) as error:
+            text = path.read_text()  # JSON is not quite YAML 1.1, which reads 1e-05 as text
+            document = yaml.safe_load(text) if path.suffix in (".yaml", ".yml") else json.loads(text)
+        except (yaml.YAMLError, ValueError) as error:
             raise InputError(f"distribution: {path} cannot be read: {' '.join(str(error).split())}") from None
         entries = document.get("parameters") if isinstance(document, Mapping) else None
         if not isinstance(entries, Mapping) or not entries:

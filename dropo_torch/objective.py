@@ -221,6 +221,8 @@ class Objective:
         self.noise = (
             None if noise is None else _per_entry("noise", noise, observation.size, "column", observation.labels)
         )
+        if self.noise is not None and not bool(self.noise.any()):
+            self.noise = None  # no noise in any column: the starts are exact
         self._noise_covariance: torch.Tensor | None = None
         self._noise_shift: torch.Tensor | None = None
 

@@ -200,6 +200,8 @@ def _entry_columns(model: mujoco.MjModel, entry: str) -> list[int] | int:
     part = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d+))?", inside)
     if part:
         bounds = [int(p) if p else None for p in part.groups()]
+        if bounds[2] == 0:
+            raise InputError(f"observation: {entry} has step 0; expected a step such as 1 or -1")
         found = list(range(offset, offset + size))[slice(*bounds)]
         if not found:
             raise InputError(f"observation: {entry} is empty; {match[1]} has {size} entries")

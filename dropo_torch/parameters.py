@@ -42,7 +42,7 @@ _SERVO = {
 _FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear", "actuator_gainprm"})
 _OBJECTS = {
     "body": ("nbody", "body"), "geom": ("ngeom", "geom"), "jnt": ("njnt", "joint"), "dof": ("nv", "joint"),
-    "qpos0": ("nq", "joint"), "qpos": ("nq", "joint"), "actuator": ("nu", "actuator"), "site": ("nsite", "site"),
+    "qpos0": ("nq", "joint"), "qpos": ("nq", "joint"), "actuator": ("nactuator", "actuator"), "site": ("nsite", "site"),
     "tendon": ("ntendon", "tendon"), "eq": ("neq", "equality"), "pair": ("npair", "pair"),
     "flex": ("nflex", "flex"),
 }  # fmt: skip
@@ -212,7 +212,7 @@ def write_field(model: mujoco.MjModel, field: str, index: int, value: float) -> 
 def object_names(model: mujoco.MjModel, prefix: str) -> list[str]:
     """Names of a model's objects of one kind, in order; unnamed ones are called ``body3``, ``geom0``.
 
-    An actuator without a name is called by its joint's.
+    An actuator without a name is called by its joint's, where it is the first that would be.
     """
     count, accessor = _OBJECTS[prefix]
     number = model.njnt if accessor == "joint" else getattr(model, count)
@@ -221,6 +221,7 @@ def object_names(model: mujoco.MjModel, prefix: str) -> list[str]:
         name = getattr(model, accessor)(i).name
         if not name and accessor == "actuator" and model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
             name = model.joint(model.actuator_trnid[i, 0]).name
+            name = "" if name in names else name
         names.append(name or f"{accessor}{i}")
     return names
 
@@ -322,6 +323,8 @@ def _servo_targets(
         if field == "actuator_kp" and is_velocity:
             raise InputError(f"{where}: actuator {name!r} is a velocity servo; its gain is actuator_kv")
         parts = _SERVO[field] + ((("actuator_gainprm", 0, 1.0),) if field == "actuator_kv" and is_velocity else ())
+        if model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_PID:  # its gains stand in biasprm alone
+            parts = tuple(p for p in parts if p[0] == "actuator_biasprm")
         for part, component, factor in parts:
             width = read_field(model, part).shape[1]
             targets.append(Target(part, number * width + component, factor))
@@ -411,7 +414,7 @@ def _limits(
     what = "value" if relative else field.replace("opt.", "").split("_")[-1]
     if positive and low <= 0:
         raise InputError(f"{where}: bounds [{low:g}, {high:g}] allow a {what} that is not positive; start above 0")
-    if low < floor and not relative:
+    if low < floor:
         raise InputError(f"{where}: bounds [{low:g}, {high:g}] allow a negative {what}; start at 0 or above")
     if "limits" in spec and spec["limits"] is not None:
         smallest, largest = _interval(where, "limits", spec["limits"])
@@ -422,7 +425,7 @@ def _limits(
         return smallest, largest
     if positive or spec.get("scale") == "log":
         return 0.1 * low, np.inf
-    return floor if low >= floor else -np.inf, np.inf
+    return floor, np.inf
 
 
 def _nominal(model: mujoco.MjModel | None, parameter: Parameter) -> float:

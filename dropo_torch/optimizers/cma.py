@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from typing import Any
 
 import cma
@@ -140,7 +141,7 @@ class CMAOptimizer(Optimizer):
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
-        self._search = cma.CMAEvolutionStrategy.pickle_loads(state["search"])
+        self._search = pickle.loads(state["search"])
         self._asked, self._best, self._best_phi = state["asked"], state["best"], state["best_phi"]
 
     def _center(self) -> np.ndarray:

@@ -278,6 +278,7 @@ class FisherOptimizer(Optimizer):
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
         self._means = MeansStage(**state["means"])
+        self._scoring = self._sampled = None
         if state["scoring"] is not None:
             self._scoring = ScoringStage(self._box, self._limits, **state["scoring"])
         if state["sampled"] is not None:

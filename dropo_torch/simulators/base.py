@@ -10,6 +10,9 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 
+#: MuJoCo's own bound on a state it still calls stable (mjMAXVAL).
+DIVERGED = 1e10
+
 
 class Simulator(abc.ABC):
     """Simulates T transitions under each of K parameter vectors.

@@ -11,8 +11,9 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
+from dropo_torch.model import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, write_field
-from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.base import DIVERGED, Simulator
 
 
 class Adapter(Protocol):
@@ -56,6 +57,7 @@ class MujocoEnvAdapter:
                 "set_parameters, set_state and step, and name it as file.py:function"
             )
         self._env.reset(seed=0)
+        self._env.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
         self._parameters = parameters
         self._data = mujoco.MjData(self._env.model)
         self.num_states = int(self._env.model.nq + self._env.model.nv)
@@ -67,19 +69,23 @@ class MujocoEnvAdapter:
         for parameter in self._parameters.parameters:
             for target in parameter.targets:
                 write_field(self._env.model, target.field, target.index, target.factor * values[parameter.name])
-        mujoco.mj_setConst(self._env.model, self._data)
+        with quiet_mujoco():
+            mujoco.mj_setConst(self._env.model, self._data)
 
     def set_state(self, state: np.ndarray) -> None:
         """Reset the physics and set positions and velocities."""
         model, data = self._env.model, self._env.data
         mujoco.mj_resetData(model, data)
-        self._env.set_state(state[: model.nq].copy(), state[model.nq :].copy())
+        with quiet_mujoco():
+            self._env.set_state(state[: model.nq].copy(), state[model.nq :].copy())
         data.qacc_warmstart[:] = 0  # set_state has run the solver; each transition starts it cold
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        """Apply an action for the environment's own frame skip."""
-        self._env.do_simulation(control, self._env.frame_skip)
-        return np.concatenate([self._env.data.qpos, self._env.data.qvel])
+        """Apply an action for the environment's own frame skip; NaN where the physics has diverged."""
+        with quiet_mujoco():
+            self._env.do_simulation(control, self._env.frame_skip)
+        after = np.concatenate([self._env.data.qpos, self._env.data.qvel])
+        return after if (np.abs(after) < DIVERGED).all() else np.full_like(after, np.nan)
 
 
 class GymnasiumSimulator(Simulator):

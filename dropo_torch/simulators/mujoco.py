@@ -11,11 +11,9 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.model import load_model
+from dropo_torch.model import load_model, quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
-from dropo_torch.simulators.base import Simulator
-
-_DIVERGED = 1e10  # MuJoCo's own bound on a state it still calls stable (mjMAXVAL)
+from dropo_torch.simulators.base import DIVERGED, Simulator
 
 
 class MujocoSimulator(Simulator):
@@ -107,7 +105,8 @@ class MujocoSimulator(Simulator):
             constants.expand(field)[:] = read_field(self.model, field)
         self.parameters.write({f: constants.expand(f) for f in self.parameters.fields}, vectors)
         try:
-            constants.set_const()
+            with quiet_mujoco():
+                constants.set_const()
         except mujoco.batch.SimulationError as error:
             failed[error.ids] = True
         self._tiled = None if failed.any() else (vectors.copy(), repeats)
@@ -134,21 +133,23 @@ class MujocoSimulator(Simulator):
         qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
         if self._filters:
             activation, source = (list(x) for x in zip(*self._filters, strict=True))
-            batch.bind("act")[:num_rows, activation] = np.repeat(control[:, 0, source], num_k, axis=0)
+            settled = np.clip(control[:, 0], *_control_range(model))[:, source]
+            batch.bind("act")[:num_rows, activation] = np.repeat(settled, num_k, axis=0)
         ctrl = batch.bind("ctrl")[:num_rows]
         out = np.empty((num_rows, lag if every_step else 1, self.num_states))
         failed = np.zeros(num_rows, dtype=bool)
         for step in range(lag):
             ctrl[:] = np.repeat(control[:, step], num_k, axis=0)
             try:
-                batch.step(ids, nstep=self.frame_skip)
+                with quiet_mujoco():
+                    batch.step(ids, nstep=self.frame_skip)
             except mujoco.batch.SimulationError as error:
                 failed[error.ids] = True
             if every_step or step == lag - 1:
                 record = out[:, step if every_step else 0]
                 record[:, : model.nq], record[:, model.nq :] = qpos, qvel
         with np.errstate(invalid="ignore"):
-            failed |= ~(np.abs(out) < _DIVERGED).all(axis=(1, 2))
+            failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
         out[failed] = np.nan
         return out.reshape(len(start), num_k, *out.shape[1:])
 
@@ -171,18 +172,27 @@ def _default_row(model: mujoco.MjModel) -> np.ndarray:
     return row
 
 
+def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest control that acts, ``(nu,)`` each."""
+    limited = model.actuator_ctrllimited.astype(bool) & ~bool(
+        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    )
+    low, high = model.actuator_ctrlrange.T
+    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
+
+
 def _filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Activations of first-order filters and the controls they follow: each starts settled at its control.
 
     Any other hidden state (integrators, muscles, delays) is not in a log of positions and velocities.
     """
     pairs, hidden = [], []
-    names = [model.actuator(i).name or f"actuator{i}" for i in range(model.nu)]
-    for i in range(model.nu):
-        kind = model.actuator_dyntype[i]
+    names = [model.actuator(i).name or f"actuator{i}" for i in range(model.nactuator)]
+    for i in range(model.nactuator):
+        kind = int(model.actuator_dyntype[i])  # a numpy integer equals no enum on the left
         if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
-            pairs.append((int(model.actuator_actadr[i]), i))
-        elif kind != mujoco.mjtDyn.mjDYN_NONE or model.actuator_delay[i] > 0:
+            pairs.append((int(model.actuator_actadr[i]), int(model.actuator_ctrladr[i])))
+        elif model.actuator_actnum[i] > 0 or model.actuator_delay[i] > 0:
             hidden.append(names[i])
     if hidden:
         raise InputError(

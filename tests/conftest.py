@@ -1,0 +1,241 @@
+"""Models, an analytic simulator and reference implementations shared by the tests."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import gymnasium
+import hypothesis
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from dropo_torch.objective import Objective
+from dropo_torch.observation import generic_observation
+from dropo_torch.optimizers import Optimizer
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators import Simulator
+from dropo_torch.trajectory import Transitions
+
+hypothesis.settings.register_profile("tests", deadline=None, derandomize=True, max_examples=60, database=None)
+hypothesis.settings.load_profile("tests")
+
+HOPPER = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
+HOPPER_BODIES = ("torso", "thigh", "leg", "foot")
+
+#: A free box and a fixed ball on a slippery floor; a second box hangs out of everything's reach.
+BOX_XML = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1" friction="0.01 0.001 0.0001"/>
+    <body name="box" pos="0 0 .1">
+      <freejoint name="root"/>
+      <geom name="box" type="box" size=".1 .08 .06" mass="1.5" friction="0.5 0.005 0.0001"/>
+    </body>
+    <body name="far" pos="0 0 4">
+      <joint name="hang" type="hinge" axis="0 1 0" damping="0.1"/>
+      <geom name="far" type="sphere" size=".05" pos=".2 0 0" mass=".3"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="hang"/></actuator>
+</mujoco>"""
+
+#: A two-link arm with a position servo, a velocity servo and a filtered motor; no contact.
+ARM_XML = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <inertial mass="1.1" pos="0 0 -.2" diaginertia=".02 .018 .004"/>
+      <joint name="shoulder" type="hinge" axis="0 1 0" damping=".3" armature=".01"/>
+      <body name="lower" pos="0 0 -.4">
+        <inertial mass=".6" pos="0 0 -.15" diaginertia=".009 .008 .002"/>
+        <joint name="elbow" type="hinge" axis="0 1 0" damping=".1" stiffness=".4" armature=".005"/>
+        <body name="hand" pos="0 0 -.3">
+          <inertial mass=".2" pos="0 0 -.05" diaginertia=".001 .001 .0005"/>
+          <joint name="wrist" type="slide" axis="0 0 1" damping=".2"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="reach" joint="shoulder" kp="12" kv="0.5"/>
+    <velocity name="turn" joint="elbow" kv="1.5"/>
+    <general name="extend" joint="wrist" gainprm="3" dyntype="filterexact" dynprm=".05" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>"""
+
+#: Two fingers coupled by a tendon with limits, stiffness and friction, and a ball joint beside them.
+TENDON_XML = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <body name="a"><joint name="ja" type="hinge" axis="0 1 0" frictionloss=".02"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass=".2"/></body>
+    <body name="b" pos="0 .5 0"><joint name="jb" type="hinge" axis="0 1 0"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .3 0 0" mass=".3"/></body>
+    <body name="c" pos="0 1 0"><joint name="jc" type="ball" damping=".02"/>
+      <geom type="box" size=".05 .1 .15" pos=".1 0 0" mass=".4"/></body>
+  </worldbody>
+  <tendon>
+    <fixed name="cable" stiffness="2" damping=".1" limited="true" range="-.4 .4" frictionloss=".01">
+      <joint joint="ja" coef="1"/><joint joint="jb" coef="-.5"/></fixed>
+  </tendon>
+  <actuator><motor name="pull" tendon="cable" gear="2"/></actuator>
+</mujoco>"""
+
+#: A block on a spring; nothing else. One step of MuJoCo is a matrix.
+SLIDE_XML = """
+<mujoco>
+  <option timestep="0.01"><flag gravity="disable" contact="disable"/></option>
+  <worldbody>
+    <body name="block">
+      <inertial mass="2" pos="0 0 0" diaginertia="1 1 1"/>
+      <joint name="rail" type="slide" axis="1 0 0" stiffness="30"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="rail"/></actuator>
+</mujoco>"""
+
+
+@pytest.fixture(scope="session")
+def hopper() -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(HOPPER))
+
+
+def compiled(xml: str) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def masses(model: mujoco.MjModel, names: Sequence[str] = HOPPER_BODIES) -> ParameterSpace:
+    """A space of the given bodies' masses, between 0.6 and 1.5 times the model's own."""
+    own = {n: float(model.body(n).mass[0]) for n in names}
+    return ParameterSpace(
+        model,
+        {n: {"field": "body_mass", "name": n, "bounds": [0.6 * m, 1.5 * m], "unit": "kg"} for n, m in own.items()},
+    )
+
+
+def hopper_states(model: mujoco.MjModel, number: int, seed: int = 0) -> torch.Tensor:
+    """Hopper states around standing, about half of them in contact with the floor."""
+    rng = np.random.default_rng(seed)
+    qpos = np.tile(model.qpos0, (number, 1)) + rng.uniform(-0.2, 0.2, (number, model.nq))
+    qpos[:, 1] = 1.25 + rng.uniform(-0.06, 0.15, number)
+    return torch.from_numpy(np.concatenate([qpos, rng.normal(0, 1.0, (number, model.nv))], 1))
+
+
+def random_states(model: mujoco.MjModel, number: int, seed: int = 0, height: float | None = None) -> torch.Tensor:
+    """Random states of any model with unit quaternions; ``height`` bounds a free body's."""
+    rng = np.random.default_rng(seed)
+    velocity = rng.normal(0, 0.7, (number, model.nv))
+    qpos = np.tile(model.qpos0, (number, 1))
+    for row, move in zip(qpos, rng.normal(0, 0.5, (number, model.nv)), strict=True):
+        mujoco.mj_integratePos(model, row, move, 1.0)
+        if height is not None:
+            row[2] = rng.uniform(0.05, height)
+    return torch.from_numpy(np.concatenate([qpos, velocity], 1))
+
+
+def random_controls(model: mujoco.MjModel, number: int, lag: int, seed: int = 1) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(seed).uniform(-1, 1, (number, lag, model.nu)))
+
+
+def windows(states: torch.Tensor, controls: torch.Tensor, measured: torch.Tensor | np.ndarray) -> Transitions:
+    number = len(states)
+    return Transitions(
+        states=states.numpy(), controls=controls.numpy(), measured=np.asarray(measured),
+        rows=np.arange(number) * controls.shape[1], episodes=np.zeros(number, dtype=int),
+    )  # fmt: skip
+
+
+def space_of(**bounds: Sequence[float] | dict) -> ParameterSpace:
+    """Parameters of no MuJoCo model: name=[low, high], or name={bounds: ..., scale: ...}."""
+    return ParameterSpace(None, {k: v if isinstance(v, dict) else {"bounds": list(v)} for k, v in bounds.items()})
+
+
+class LinearSimulator(Simulator):
+    """s' = A s + B u + C f(ξ), with f the identity unless given: everything about it is known in closed form."""
+
+    name = "linear"
+    timestep = 1.0
+    frame_skip = 1
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        effect: np.ndarray,
+        *,
+        transition: np.ndarray | None = None,
+        control: np.ndarray | None = None,
+        transform: Callable[[torch.Tensor], torch.Tensor] = lambda x: x,
+    ) -> None:
+        self.parameters = space
+        self.effect = torch.as_tensor(effect, dtype=torch.float64)
+        self.num_states = len(self.effect)
+        zero = np.zeros((self.num_states, self.num_states))
+        self.transition = torch.as_tensor(zero if transition is None else transition, dtype=torch.float64)
+        self.control = torch.as_tensor(np.zeros((self.num_states, 1)) if control is None else control).double()
+        self.num_controls = self.control.shape[1]
+        self.transform = transform
+        self.calls = 0
+
+    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return self.rollout(states, controls, values)[:, :, -1]
+
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        self.check_arguments(states, controls, values)
+        self.calls += 1
+        push = self.transform(values) @ self.effect.T
+        now = states[:, None].expand(-1, len(values), -1)
+        out = []
+        for u in controls.unbind(1):
+            now = now @ self.transition.T + (u @ self.control.T)[:, None] + push
+            out.append(now)
+        return torch.stack(out, 2)
+
+
+def linear_objective(simulator: LinearSimulator, measured: np.ndarray, **options: object) -> Objective:
+    """The likelihood of measured next states from zero start states and controls."""
+    number = len(measured)
+    states = torch.zeros(number, simulator.num_states, dtype=torch.float64)
+    controls = torch.zeros(number, 1, simulator.num_controls, dtype=torch.float64)
+    return Objective(
+        simulator, windows(states, controls, measured), generic_observation(simulator.num_states), **options
+    )
+
+
+def drive(optimizer: Optimizer, objective: Objective, after_tell: Callable[[], None] = lambda: None) -> None:
+    """Ask, simulate and tell until the optimizer stops."""
+    while optimizer.stop_reason is None:
+        request = optimizer.ask()
+        if request.linearise_at is not None:
+            objective.linearise(request.linearise_at)
+        optimizer.tell(objective.map(request.values, request.reduce))
+        after_tell()
+
+
+def numerical_gradient(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-5) -> np.ndarray:
+    """Central differences of a scalar function, ``(d,)``."""
+    eye = step * np.eye(len(at))
+    return np.array([(function(at + e) - function(at - e)) / (2 * step) for e in eye])
+
+
+def settled_rollout(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, frame_skip: int) -> np.ndarray:
+    """C MuJoCo's own answer: ``mj_step`` from a reset, filters settled at their first control."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
+    for i in range(model.nactuator):
+        if model.actuator_actadr[i] >= 0:
+            u = model.actuator_ctrladr[i]
+            low, high = model.actuator_ctrlrange[u] if model.actuator_ctrllimited[u] else (-np.inf, np.inf)
+            data.act[model.actuator_actadr[i]] = np.clip(controls[0, u], low, high)
+    states = []
+    for control in controls:
+        data.ctrl[:] = control
+        for _ in range(frame_skip):
+            mujoco.mj_step(model, data)
+        states.append(np.concatenate([data.qpos, data.qvel]))
+    return np.array(states)

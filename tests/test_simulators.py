@@ -1,0 +1,423 @@
+"""Laws that every backend keeps. A new backend is one more entry in ``BACKENDS``."""
+
+from __future__ import annotations
+
+import copy
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import (
+    ARM_XML,
+    BOX_XML,
+    HOPPER,
+    TENDON_XML,
+    compiled,
+    hopper_states,
+    masses,
+    random_controls,
+    random_states,
+    settled_rollout,
+    space_of,
+)
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators import GymnasiumSimulator, MujocoEnvAdapter, MujocoSimulator, Simulator, make_simulator
+
+
+class PlainEnv:
+    """As much of a Gymnasium MuJoCo environment as the adapter drives, on any model."""
+
+    def __init__(self, model: mujoco.MjModel, frame_skip: int) -> None:
+        self.unwrapped = self
+        self.model, self.data = model, mujoco.MjData(model)
+        self.frame_skip, self.dt = frame_skip, frame_skip * model.opt.timestep
+
+    def reset(self, seed: int) -> None:
+        mujoco.mj_resetData(self.model, self.data)
+
+    def set_state(self, qpos: np.ndarray, qvel: np.ndarray) -> None:
+        self.data.qpos[:], self.data.qvel[:] = qpos, qvel
+        mujoco.mj_forward(self.model, self.data)
+
+    def do_simulation(self, control: np.ndarray, frame_skip: int) -> None:
+        self.data.ctrl[:] = control
+        mujoco.mj_step(self.model, self.data, frame_skip)
+
+
+def plain_gymnasium(space: ParameterSpace, frame_skip: int) -> GymnasiumSimulator:
+    model = copy.copy(space.model)
+    return GymnasiumSimulator(MujocoEnvAdapter(PlainEnv(model, frame_skip), space), parameters=space)
+
+
+@dataclass(frozen=True)
+class Backend:
+    """How to make a backend, and how near to C MuJoCo it must come.
+
+    Attributes:
+        make: from a parameter space and a frame skip, with any of ``options``.
+        options: constructor options that must not change a result.
+        rtol: 0 where results are C MuJoCo's to the bit.
+        settles_filters: whether first-order filters start settled at their control.
+    """
+
+    make: Callable[..., Simulator]
+    options: tuple[Mapping[str, int], ...] = ({},)
+    rtol: float = 0.0
+    settles_filters: bool = True
+
+
+BACKENDS = {
+    "mujoco": Backend(
+        lambda space, frame_skip, **options: MujocoSimulator(
+            space.model, parameters=space, frame_skip=frame_skip, **options
+        ),
+        options=({"num_threads": 1}, {"num_threads": 2}, {"chunk_size": 1}, {"chunk_size": 7}, {"chunk_size": 10**6}),
+    ),
+    "gymnasium": Backend(plain_gymnasium, rtol=1e-9, settles_filters=False),
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """A model, what varies in it, and where its transitions start."""
+
+    space: ParameterSpace
+    frame_skip: int
+    states: torch.Tensor
+    controls: torch.Tensor
+    values: torch.Tensor
+
+
+def case_of(space: ParameterSpace, frame_skip: int, states: torch.Tensor, lag: int = 3, num_values: int = 4) -> Case:
+    share = np.random.default_rng(5).uniform(0, 1, (num_values, len(space)))
+    values = torch.from_numpy(space.low + share * (space.high - space.low))
+    return Case(space, frame_skip, states, random_controls(space.model, len(states), lag), values)
+
+
+def hopper_case() -> Case:
+    model = mujoco.MjModel.from_xml_path(str(HOPPER))
+    return case_of(masses(model), 4, hopper_states(model, 12))
+
+
+def box_case() -> Case:
+    model = compiled(BOX_XML)
+    space = ParameterSpace(
+        model,
+        {
+            "mass": {"field": "body_mass", "name": "box", "bounds": [0.5, 3], "scale_inertia": True},
+            "friction": {"field": "geom_friction", "name": "box", "bounds": [0.1, 1]},
+            "size": {"field": "geom_size[2]", "name": "box", "bounds": [0.05, 0.08]},
+        },
+    )
+    return case_of(space, 5, random_states(model, 8, height=0.15))
+
+
+def arm_case() -> Case:
+    space = ParameterSpace(
+        compiled(ARM_XML),
+        {
+            "kp": {"field": "actuator_kp", "name": "reach", "bounds": [5, 20]},
+            "kv": {"field": "actuator_kv", "name": "reach", "bounds": [0.1, 1]},
+            "armature": {"field": "dof_armature", "name": "*", "bounds": [0.001, 0.02]},
+            "gravity": {"field": "opt.gravity", "index": 2, "bounds": [-12, -3]},
+        },
+    )
+    return case_of(space, 3, random_states(space.model, 8))
+
+
+def tendon_case() -> Case:
+    space = ParameterSpace(
+        compiled(TENDON_XML),
+        {
+            "stiffness": {"field": "tendon_stiffness", "name": "cable", "bounds": [1, 5]},
+            "friction": {"field": "tendon_frictionloss", "name": "cable", "bounds": [0, 0.1]},
+            "loss": {"field": "dof_frictionloss", "name": "ja", "bounds": [0, 0.1]},
+            "mass": {"field": "body_mass", "name": ["a", "b"], "bounds": [0.5, 2], "relative": True},
+            "step": {"field": "opt.timestep", "bounds": [0.001, 0.004]},
+        },
+    )
+    return case_of(space, 2, random_states(space.model, 8))
+
+
+CASES = {"hopper": hopper_case, "box": box_case, "arm": arm_case, "tendon": tendon_case}
+
+
+@pytest.fixture(params=CASES)
+def case(request: pytest.FixtureRequest) -> Case:
+    return CASES[request.param]()
+
+
+@pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS.keys())
+class TestBackend:
+    def make(self, backend: Backend, case: Case, **options: int) -> Simulator:
+        return backend.make(case.space, case.frame_skip, **options)
+
+    def same(self, backend: Backend, ours: torch.Tensor | np.ndarray, theirs: torch.Tensor | np.ndarray) -> None:
+        if backend.rtol:
+            np.testing.assert_allclose(ours, theirs, rtol=backend.rtol, atol=backend.rtol)
+        else:
+            np.testing.assert_array_equal(ours, theirs)
+
+    def test_transitions_are_those_of_mj_step(self, backend, case):
+        if case.space.model.na and not backend.settles_filters:
+            case = Case(case.space, case.frame_skip, case.states, torch.zeros_like(case.controls), case.values)
+        ours = self.make(backend, case).rollout(case.states, case.controls, case.values)
+        models = [case.space.apply(v) for v in case.values.numpy()]
+        theirs = [
+            [settled_rollout(m, s, u, case.frame_skip) for m in models]
+            for s, u in zip(case.states.numpy(), case.controls.numpy(), strict=True)
+        ]
+        assert ours.dtype == torch.float64
+        assert ours.shape == (len(case.states), len(case.values), 3, case.space.model.nq + case.space.model.nv)
+        self.same(backend, ours, np.array(theirs))
+        assert (ours[:, 0] != ours[:, 1]).any()
+
+    def test_simulate_is_the_last_of_a_rollout(self, backend, case):
+        simulator = self.make(backend, case)
+        every = simulator.rollout(case.states, case.controls, case.values)
+        torch.testing.assert_close(
+            simulator.simulate(case.states, case.controls, case.values), every[:, :, -1], rtol=0, atol=0
+        )
+        first = simulator.simulate(case.states, case.controls[:, :1], case.values)
+        torch.testing.assert_close(first, every[:, :, 0], rtol=0, atol=0)
+
+    def test_threads_and_chunks_do_not_change_a_result(self, backend, case):
+        expected = self.make(backend, case).simulate(case.states, case.controls, case.values)
+        for options in backend.options:
+            ours = self.make(backend, case, **options).simulate(case.states, case.controls, case.values)
+            torch.testing.assert_close(ours, expected, rtol=0, atol=0, msg=str(options))
+
+    def test_nothing_is_left_of_what_was_simulated_before(self, backend, case):
+        simulator = self.make(backend, case)
+        expected = self.make(backend, case).simulate(case.states, case.controls, case.values)
+        simulator.simulate(case.states.flip(0), case.controls, case.values[:1])
+        simulator.simulate(case.states[:1], case.controls[:1, :1], torch.cat([case.values] * 3))
+        simulator.rollout(torch.full_like(case.states, 1e7), case.controls, case.values)
+        simulator.simulate(case.states[:2], case.controls[:2], torch.full_like(case.values, torch.nan))
+        for _ in range(2):
+            again = simulator.simulate(case.states, case.controls, case.values)
+            torch.testing.assert_close(again, expected, rtol=0, atol=0)
+
+    def test_the_order_of_transitions_and_values_does_not_matter(self, backend, case):
+        simulator = self.make(backend, case)
+        expected = simulator.simulate(case.states, case.controls, case.values)
+        rows, columns = torch.randperm(len(case.states)), torch.tensor([2, 0, 3, 1])
+        ours = simulator.simulate(case.states[rows], case.controls[rows], case.values[columns])
+        torch.testing.assert_close(ours, expected[rows][:, columns], rtol=0, atol=0)
+        alone = simulator.simulate(case.states[3:4], case.controls[3:4], case.values[1:2])
+        torch.testing.assert_close(alone[0, 0], expected[3, 1], rtol=0, atol=0)
+
+    def test_a_result_belongs_to_the_caller_and_every_entry_is_written(self, backend, case, monkeypatch):
+        simulator = self.make(backend, case)
+        expected = simulator.simulate(case.states, case.controls, case.values).clone()
+        simulator.simulate(case.states, case.controls, case.values).fill_(1e3)
+        given = [x.clone() for x in (case.states, case.controls, case.values)]
+        monkeypatch.setattr(np, "empty", lambda shape, *a, **k: np.full(shape, 1e99, *a, **k))
+        torch.testing.assert_close(simulator.simulate(*given), expected, rtol=0, atol=0)
+        for mine, theirs in zip(given, (case.states, case.controls, case.values), strict=True):
+            assert torch.equal(mine, theirs)
+
+    def test_empty_batches_give_empty_results(self, backend, case):
+        simulator = self.make(backend, case)
+        width = simulator.num_states
+        assert simulator.simulate(case.states[:0], case.controls[:0], case.values).shape == (0, 4, width)
+        assert simulator.simulate(case.states, case.controls, case.values[:0]).shape == (len(case.states), 0, width)
+
+    def test_a_value_that_diverges_is_nan_and_takes_no_other_with_it(self, backend, tmp_path, monkeypatch, capfd):
+        monkeypatch.chdir(tmp_path)
+        model = mujoco.MjModel.from_xml_path(str(HOPPER))
+        space = ParameterSpace(model, {"damping": {"field": "dof_damping", "name": "leg_joint", "bounds": [0.1, 5]}})
+        simulator = backend.make(space, 4)
+        states, controls = hopper_states(model, 5), random_controls(model, 5, 3)
+        good = simulator.rollout(states, controls, torch.tensor([[1.0], [2.0]], dtype=torch.float64))
+        ours = simulator.rollout(states, controls, torch.tensor([[1.0], [-1e7], [2.0]], dtype=torch.float64))
+        assert torch.isnan(ours[:, 1]).all()
+        torch.testing.assert_close(ours[:, [0, 2]], good, rtol=0, atol=0)
+        assert os.listdir(tmp_path) == []
+        captured = capfd.readouterr()
+        assert captured.out + captured.err == ""
+
+    def test_a_state_that_diverges_is_nan_and_takes_no_other_with_it(self, backend, tmp_path, monkeypatch):
+        monkeypatch.chdir(tmp_path)
+        case = hopper_case()
+        simulator = self.make(backend, case)
+        good = simulator.simulate(case.states, case.controls, case.values)
+        states = case.states.clone()
+        states[3, -3:] = 1e9
+        states[5, 2] = torch.nan
+        ours = simulator.simulate(states, case.controls, case.values)
+        assert torch.isnan(ours[[3, 5]]).all()
+        rest = [i for i in range(len(states)) if i not in (3, 5)]
+        torch.testing.assert_close(ours[rest], good[rest], rtol=0, atol=0)
+        assert os.listdir(tmp_path) == []
+
+    def test_shapes_that_do_not_fit_are_named(self, backend):
+        case = hopper_case()
+        simulator = self.make(backend, case)
+        for arguments, message in (
+            ((case.states[:, 1:], case.controls, case.values), r"states: shape \(12, 11\) given.*12 columns"),
+            (
+                (case.states, case.controls[:, 0], case.values),
+                r"controls: shape \(12, 3\) given; expected \(T, lag, nu\)",
+            ),
+            ((case.states, case.controls, case.values[0]), r"values: shape \(4,\) given"),
+            ((case.states[:5], case.controls, case.values), "controls: 12 rows given for 5 states"),
+            ((case.states, case.controls[:, :0], case.values), "no logged step given"),
+        ):
+            with pytest.raises(InputError, match=message):
+                simulator.simulate(*arguments)
+
+    def test_the_timestep_is_that_of_a_logged_transition(self, backend, case):
+        simulator = self.make(backend, case)
+        assert simulator.timestep == pytest.approx(case.frame_skip * case.space.model.opt.timestep)
+        assert (simulator.num_states, simulator.num_controls) == (case.states.shape[1], case.controls.shape[2])
+
+
+def test_the_given_model_is_left_alone():
+    case = hopper_case()
+    flags, mass = case.space.model.opt.disableflags, case.space.model.body_mass.copy()
+    simulator = MujocoSimulator(case.space.model, parameters=case.space, frame_skip=4)
+    simulator.simulate(case.states, case.controls, case.values)
+    assert case.space.model.opt.disableflags == flags
+    np.testing.assert_array_equal(case.space.model.body_mass, mass)
+
+
+@pytest.mark.parametrize("push", [0.5, 3.0])
+def test_a_filter_settled_at_a_constant_control_acts_like_none(push):
+    plain = compiled(ARM_XML.replace('dyntype="filterexact" dynprm=".05"', ""))
+    filtered = compiled(ARM_XML)
+    controls = torch.full((6, 4, 3), push, dtype=torch.float64)
+    results = []
+    for model in (plain, filtered):
+        space = masses(model, ["upper"])
+        simulator = MujocoSimulator(model, parameters=space, frame_skip=3)
+        results.append(simulator.simulate(random_states(model, 6), controls, torch.from_numpy(space.nominal[None])))
+    torch.testing.assert_close(results[1], results[0], rtol=1e-12, atol=1e-12)
+
+
+def test_actuators_with_several_controls_or_no_state_are_simulated():
+    model = compiled(
+        ARM_XML.replace("<position", "<pid").replace(
+            '<velocity name="turn" joint="elbow" kv="1.5"/>',
+            '<dcmotor name="turn" joint="elbow" motorconst="1" resistance="2"/>',
+        )
+    )
+    assert model.nu == model.nactuator + 1
+    space = masses(model, ["lower"])
+    states, controls = random_states(model, 4), random_controls(model, 4, 2)
+    ours = MujocoSimulator(model, parameters=space, frame_skip=3).rollout(
+        states, controls, torch.from_numpy(space.nominal[None])
+    )
+    for row, state, control in zip(ours, states.numpy(), controls.numpy(), strict=True):
+        np.testing.assert_array_equal(row[0], settled_rollout(space.apply(space.nominal), state, control, 3))
+
+
+def test_actuators_with_a_hidden_state_are_refused():
+    xml = ARM_XML.replace('dyntype="filterexact"', 'dyntype="integrator"')
+    with pytest.raises(InputError, match="actuators extend keep a hidden state"):
+        MujocoSimulator(compiled(xml), parameters=masses(compiled(xml), ["upper"]))
+
+
+def test_a_frame_skip_below_one_is_refused():
+    case = hopper_case()
+    with pytest.raises(InputError, match="frame_skip 0"):
+        MujocoSimulator(case.space.model, parameters=case.space, frame_skip=0)
+
+
+def test_the_environment_of_gymnasium_gives_the_mujoco_backends_transitions():
+    pytest.importorskip("imageio", reason="gymnasium's MuJoCo environments import it")
+    environment = gymnasium.make("Hopper-v5")
+    space = masses(environment.unwrapped.model)
+    case = case_of(space, 4, hopper_states(space.model, 10))
+    nominal = space.nominal.copy()
+    ours = make_simulator("gymnasium", lambda s: MujocoEnvAdapter(environment, s), parameters=space)
+    theirs = make_simulator("mujoco", str(HOPPER), parameters=space, frame_skip=4)
+    arguments = (case.states, case.controls, torch.cat([case.values, torch.from_numpy(nominal[None])]))
+    torch.testing.assert_close(ours.rollout(*arguments), theirs.rollout(*arguments), rtol=1e-9, atol=1e-9)
+    assert ours.timestep == pytest.approx(theirs.timestep)
+
+
+class Pendulum:
+    """A user's own simulator: a damped pendulum in numpy, semi-implicit Euler."""
+
+    num_states, num_controls, timestep = 2, 1, 0.01
+
+    def __init__(self) -> None:
+        self.values: dict[str, float] = {}
+        self.state = np.zeros(2)
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        self.values = dict(values)
+
+    def set_state(self, state: np.ndarray) -> None:
+        self.state = state
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        angle, speed = self.state
+        torque = control[0] - self.values["damping"] * speed
+        speed = speed + self.timestep * (torque / self.values["mass"] - 9.81 * np.sin(angle))
+        self.state = np.array([angle + self.timestep * speed, speed])
+        return self.state
+
+
+def pendulum_space() -> ParameterSpace:
+    return space_of(mass=[0.1, 2], damping=[0.0, 1])
+
+
+def test_any_python_simulator_can_be_fitted_through_an_adapter():
+    space = pendulum_space()
+    simulator = GymnasiumSimulator(Pendulum(), parameters=space, frame_skip=3)
+    assert simulator.timestep == pytest.approx(0.03)
+    rng = np.random.default_rng(0)
+    states, controls, values = rng.normal(size=(5, 2)), rng.normal(size=(5, 2, 1)), rng.uniform(0.2, 1, (3, 2))
+    ours = simulator.rollout(*(torch.from_numpy(x) for x in (states, controls, values)))
+    angle, speed = (np.repeat(states[:, None, i], 3, 1) for i in range(2))
+    for step in range(2):
+        for _ in range(3):
+            torque = controls[:, None, step, 0] - values[:, 1] * speed
+            speed = speed + 0.01 * (torque / values[:, 0] - 9.81 * np.sin(angle))
+            angle = angle + 0.01 * speed
+        np.testing.assert_allclose(ours[:, :, step], np.stack([angle, speed], -1), rtol=1e-13)
+
+
+def test_an_adapter_may_be_made_from_the_parameter_space():
+    seen = []
+    GymnasiumSimulator(lambda space: seen.append(space) or Pendulum(), parameters=(space := pendulum_space()))
+    assert seen == [space]
+
+
+@pytest.mark.parametrize("missing", ["set_parameters", "set_state", "step", "num_states", "num_controls"])
+def test_an_adapter_that_lacks_something_is_refused(missing):
+    members = {k: getattr(Pendulum, k) for k in ("set_parameters", "set_state", "step", "num_states", "num_controls")}
+    del members[missing]
+    with pytest.raises(InputError, match=f"Half has no {missing}; an adapter has"):
+        GymnasiumSimulator(type("Half", (), members)(), parameters=pendulum_space())
+
+
+def test_an_adapter_that_returns_nan_has_diverged_for_that_value_only():
+    class Fragile(Pendulum):
+        def step(self, control: np.ndarray) -> np.ndarray:
+            return super().step(control) * (np.nan if self.values["mass"] > 1 else 1)
+
+    values = torch.tensor([[0.5, 0.1], [1.5, 0.1]], dtype=torch.float64)
+    states, controls = torch.ones(3, 2, dtype=torch.float64), torch.ones(3, 2, 1, dtype=torch.float64)
+    ours = GymnasiumSimulator(Fragile(), parameters=pendulum_space()).rollout(states, controls, values)
+    assert torch.isnan(ours[:, 1]).all()
+    assert torch.isfinite(ours[:, 0]).all()
+
+
+def test_an_environment_that_is_none_of_mujocos_is_refused():
+    with pytest.raises(InputError, match="no Gymnasium MuJoCo environment; write an adapter"):
+        MujocoEnvAdapter(gymnasium.make("CartPole-v1"), pendulum_space())
+
+
+def test_an_unknown_backend_is_refused_with_the_nearest():
+    with pytest.raises(InputError, match="unknown 'mujocco'; did you mean 'mujoco'"):
+        make_simulator("mujocco", None, parameters=pendulum_space())
