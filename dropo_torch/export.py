@@ -30,10 +30,7 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     for folder in ("meshdir", "texturedir"):
         setattr(spec, folder, str((source.parent / getattr(spec, folder)).resolve()))
     if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
-        for body in spec.bodies[1:]:
-            if space.model is not None and space.model.body(body.name).mass[0] > 0:
-                spec.adopt_inertial(body)
-        spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+        _write_inertials(spec)
     model = spec.compile()
     for column, parameter in enumerate(space.parameters):
         for target in parameter.targets:
@@ -45,6 +42,17 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"export: MJCF cannot express these parameters: {' '.join(str(error).split())}") from None
     _compare(path, space, values)
+
+
+def _write_inertials(spec: mujoco.MjSpec) -> None:
+    """Give every body the inertial that it compiles to, explicitly."""
+    compiled = spec.compile()
+    for body in spec.bodies[1:]:
+        body.explicitinertial = True
+        body.fullinertia = np.full(6, np.nan)
+        body.mass, body.inertia = compiled.body_mass[body.id], compiled.body_inertia[body.id]
+        body.ipos, body.iquat = compiled.body_ipos[body.id], compiled.body_iquat[body.id]
+    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
 
 
 def _compare(path: Path, space: ParameterSpace, values: np.ndarray) -> None:

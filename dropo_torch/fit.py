@@ -266,7 +266,8 @@ def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objecti
         raise InputError(f"resume: {path} is no checkpoint of a fit ({error}); start again without --resume") from None
     if owner != fingerprint or stored != search.name:
         raise InputError(
-            f"resume: {path} belongs to another config, log or optimizer; restore those, or start again without --resume"
+            f"resume: {path} belongs to another config, log or optimizer; restore those, "
+            "or start again without --resume"
         )
     search.restore(state["state"])
     if state["linearised_at"] is not None:

@@ -143,7 +143,8 @@ def _load_function(config: Config, name: str) -> Callable[..., Any]:
         if not path.is_file():
             raise InputError(f"environment: no file {path}; expected file.py:function of an adapter")
         spec = importlib.util.spec_from_file_location(path.stem, path)
-        assert spec is not None and spec.loader is not None
+        assert spec is not None
+        assert spec.loader is not None
         module = importlib.util.module_from_spec(spec)
         spec.loader.exec_module(module)
     else:
@@ -211,7 +212,8 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
     right = theirs / step
     hint = f"expected frame_skip {round(right)}" if abs(right - round(right)) < 0.01 * right else "resample the log"
     raise InputError(
-        f"frame_skip: {frame_skip} steps of {step:g} s make {ours:g} s, but the log is sampled every {theirs:g} s; {hint}"
+        f"frame_skip: {frame_skip} steps of {step:g} s make {ours:g} s, "
+        f"but the log is sampled every {theirs:g} s; {hint}"
     )
 
 

@@ -9,7 +9,7 @@ from types import TracebackType
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-from dropo_torch import fit as _fit
+from dropo_torch.fit import HistoryEntry
 from dropo_torch.optimizers import Progress as OptimizerProgress
 
 #: Seconds between lines where the output is no terminal.
@@ -47,7 +47,7 @@ class FitProgress:
     ) -> None:
         self._bar.stop()
 
-    def update(self, entry: _fit.HistoryEntry, progress: OptimizerProgress) -> None:
+    def update(self, entry: HistoryEntry, progress: OptimizerProgress) -> None:
         """Show the state after a batch."""
         best = "" if math.isnan(entry.log_likelihood) else f", best log-likelihood {entry.log_likelihood:.1f}"
         left = entry.seconds * (1 - progress.fraction) / max(progress.fraction, 0.05)

@@ -175,6 +175,7 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
         title=f"Fit of {problem.config.sim or problem.config.model or problem.config.environment}",
         notes=notes,
         versions=versions(),
+        space=problem.space,
     )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -53,7 +54,8 @@ class Trajectories:
         ):
             if len(array) != rows:
                 raise InputError(
-                    f"{self.source}: {name} has {len(array)} rows and observations has {rows}; both need one row a transition"
+                    f"{self.source}: {name} has {len(array)} rows and observations has {rows}; "
+                    "both need one row a transition"
                 )
         if self.next_observations.shape != self.observations.shape:
             raise InputError(
@@ -178,7 +180,7 @@ def make_transitions(trajectories: Trajectories, observation: Observation, *, la
     if lag < 1:
         raise InputError(f"lag: {lag} given; expected a whole number of logged steps, 1 or more")
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
-    starts = [np.arange(a, b - lag + 1, lag) for a, b in zip(bounds[:-1], bounds[1:], strict=True)]
+    starts = [np.arange(a, b - lag + 1, lag) for a, b in itertools.pairwise(bounds)]
     rows = np.concatenate(starts)
     if rows.size == 0:
         longest = int(np.diff(bounds).max())

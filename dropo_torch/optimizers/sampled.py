@@ -128,7 +128,7 @@ def sampled_scores(
         std: σ, ``(d,)``.
         z: the samples' deviations from μ in units of σ, ``(K, d)``.
     """
-    num_samples, d = z.shape
+    num_samples = len(z)
     alive = torch.isfinite(features).flatten(1).all(-1)
     lost = float((~alive).sum()) * LOST_TRANSITION
     features, measured, covariance = features[alive], measured[alive], covariance[alive]
