@@ -323,6 +323,18 @@ def test_scores_are_the_gradient_of_the_sigma_point_likelihood():
     assert sums[-1] == pytest.approx(0, abs=1e-6)  # nothing bends
 
 
+def test_at_a_physical_limit_the_mean_of_the_samples_moves_with_the_deviation():
+    space = ParameterSpace(
+        None, {"a": {"bounds": [0.0, 3.0], "limits": [0.0, 9.0]}, "b": {"bounds": [1.0, 9.0], "limits": [1.0, 20.0]}}
+    )
+    effect = np.array([[1.0, 0.2], [-0.3, 2.0], [0.5, 0.5]])
+    objective = linear_objective(LinearSimulator(space, effect), np.full((5, 3), 1.5), epsilon=1e-2)
+    sums, expected = stage_gradient(
+        lambda m, s: ScoringStage(objective.box, limits_of(objective), m, s), objective, space.low, AWAY[1]
+    )
+    np.testing.assert_allclose(sums[3:5], expected[2:], rtol=1e-6)
+
+
 def test_sampled_scores_are_the_gradient_of_the_sampled_likelihood():
     objective = mixed_objective()
     for samples in (8, 40):  # without and with bends in the regression
