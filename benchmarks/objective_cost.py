@@ -1,7 +1,7 @@
 """What an evaluation of the objective costs beside the bare simulation that it contains.
 
-    python benchmarks/objective_cost.py            # cost, T = 998, K = 100, in turn on the same cores
-    python benchmarks/objective_cost.py --memory   # peak memory at T K = 10 million (half an hour)
+python benchmarks/objective_cost.py            # cost, T = 998, K = 100, in turn on the same cores
+python benchmarks/objective_cost.py --memory   # peak memory at T K = 10 million (half an hour)
 """
 
 from __future__ import annotations
@@ -88,7 +88,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         t2 = time.perf_counter()
         ratios.append((t2 - t1) / (t1 - t0))
         print(f"bare rollout {t1 - t0:.2f} s, objective {t2 - t1:.2f} s, ratio {ratios[-1]:.3f}")
-    print(f"T = {transitions}, K = {given.samples}, {torch.get_num_threads()} threads: median ratio {np.median(ratios):.3f}")
+    cores = torch.get_num_threads()
+    print(f"T = {transitions}, K = {given.samples}, {cores} cores: median ratio {np.median(ratios):.3f}")
 
 
 if __name__ == "__main__":

@@ -61,6 +61,25 @@ class Config(pydantic.BaseModel):
         """Return a path of the config as one that can be opened."""
         return self.base / Path(given).expanduser()
 
+    def absolute(self) -> Config:
+        """Return the same config with absolute paths, valid from any folder."""
+        changes: dict[str, Any] = {"base": Path()}
+        if self.model is not None:
+            changes["model"] = str(self.path(self.model).resolve())
+        if self.environment is not None and ".py:" in self.environment:
+            changes["environment"] = str(self.path(self.environment).resolve())
+        changes["data"] = self._absolute_data(self.data)
+        return self.model_copy(update=changes)
+
+    def _absolute_data(self, source: Any) -> Any:
+        if isinstance(source, list):
+            return [self._absolute_data(entry) for entry in source]
+        if isinstance(source, dict) and "path" in source:
+            return {**source, "path": self._absolute_data(source["path"])}
+        if isinstance(source, str) and not source.startswith("minari:"):
+            return str(self.path(source).absolute())
+        return source
+
     def document(self) -> dict[str, Any]:
         """Return the config as plain data, as it would stand in a file."""
         return {k: v for k, v in self.model_dump(mode="json").items() if v is not None and v != []}

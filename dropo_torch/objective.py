@@ -145,7 +145,8 @@ class Evaluation:
 
     Attributes:
         log_likelihood: sum over the log's transitions, in nats.
-        mse: mean squared difference between measured and simulated mean, over transitions and columns.
+        mse: mean squared difference between measured and simulated mean, over features and those transitions
+            of which at least two samples did not diverge.
         diverged: number of simulations that diverged.
         simulated_transitions: logged steps that were simulated for it.
     """
@@ -280,10 +281,13 @@ class Objective:
         num_phi, num_samples = len(mean), uniforms.shape[-2]
         values = self.values(mean, std, uniforms).reshape(num_phi * num_samples, -1)
         before = self.simulated_transitions
-        sums = self.map(values, self.likelihood_reduction(num_phi)).reshape(3, num_phi)
+        sums = self.map(values, self.likelihood_reduction(num_phi)).reshape(4, num_phi)
         cost = (self.simulated_transitions - before) // num_phi
-        entries = len(self) * self.num_features
-        return [Evaluation(float(a), float(b) / entries, int(c), cost) for a, b, c in sums.T]
+        found = zip(*sums.tolist(), strict=True)
+        return [
+            Evaluation(value, squared / (kept * self.num_features) if kept else math.nan, int(lost), cost)
+            for value, squared, kept, lost in found
+        ]
 
     def values(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> torch.Tensor:
         """Return parameter values ``(P, K, d)``, in units, of φ ``(P, d)`` and base uniforms."""
@@ -294,14 +298,17 @@ class Objective:
         )
 
     def likelihood_reduction(self, num_phi: int) -> Reduce:
-        """Return the reduction to log-likelihood, squared error and divergences of P φ, ``(3 P,)``."""
+        """Return the reduction to log-likelihood, squared error, transitions and divergences of P φ, ``(4 P,)``.
+
+        The squared error counts only transitions of which some samples are left.
+        """
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
             samples = features.unflatten(1, (num_phi, -1))
             values, squared, lost = _likelihood_with_losses(
                 samples, measured[:, None], covariance[:, None], self._angles
             )
-            return torch.cat([values.sum(0), squared.sum(0), lost.sum(0)])
+            return torch.cat([values.sum(0), squared.nansum(0), squared.isfinite().sum(0).double(), lost.sum(0)])
 
         return reduce
 
@@ -442,14 +449,17 @@ def draw_normals(num_draws: int, width: int, seed: int) -> torch.Tensor:
 def _likelihood_with_losses(
     samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Log-likelihood, squared error and number of diverged samples, ``(t, P)`` each, of ``(t, P, K, m)``."""
+    """Log-likelihood, squared error and number of diverged samples, ``(t, P)`` each, of ``(t, P, K, m)``.
+
+    The squared error of a transition of which nothing is left is NaN.
+    """
     finite = torch.isfinite(samples).all(-1)
     lost = (~finite).sum(-1)
     if not bool(lost.any()):
         values, squared = _gaussian(samples, measured, covariance, num_rotations)
         return values, squared, lost.double()
     values = torch.full(lost.shape, LOST_TRANSITION, dtype=samples.dtype)
-    squared = torch.zeros_like(values)
+    squared = torch.full_like(values, torch.nan)
     num_samples = samples.shape[2]
     for t, p in (finite.sum(-1) >= 2).nonzero().tolist():
         kept = samples[t, p, finite[t, p]]
@@ -462,12 +472,12 @@ def _likelihood_with_losses(
 def _gaussian(
     samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-likelihood and squared error of the mean; rotations enter by their angles, with both signs."""
+    """Log-likelihood, with rotations by their angles and both signs, and squared error of the mean features."""
+    squared = (measured - samples.mean(-2)).square().sum(-1)
     if num_rotations:
         samples, measured, covariance = _rotation_angles(samples, measured, covariance, num_rotations)
     mean, sampled = sample_moments(samples)
-    residual = measured - mean
-    return gaussian_log_density(residual, sampled + covariance), residual.square().sum(-1)
+    return gaussian_log_density(measured - mean, sampled + covariance), squared
 
 
 def _rotation_angles(

@@ -113,6 +113,8 @@ class ParameterSpace:
             raise InputError("parameters: none given; name at least one, such as 'mass: {field: body_mass, ...}'")
         self.parameters = tuple(_parse(self.model, str(name), spec) for name, spec in parameters.items())
         _refuse_overlap(self.parameters)
+        if self.model is not None:
+            _refuse_derived(self)
 
     def __len__(self) -> int:
         """Return the number of parameters d."""
@@ -298,6 +300,8 @@ def _targets(
     every: list[Target] = []
     for number in objects.values():
         rows = _rows(model, prefix, number)
+        if prefix in ("qpos0", "qpos") and len(rows) > 1 and index is None:
+            raise InputError(f"{where}: {field} of this joint has {len(rows)} entries; add index: 0 to {len(rows) - 1}")
         if len(rows) > 1 and index is not None and size == 1:  # one degree of freedom of a free or ball joint
             if index >= len(rows):
                 raise InputError(f"{where}: index {index} is outside {field} of this joint, which has {len(rows)}")
@@ -434,6 +438,22 @@ def _nominal(model: mujoco.MjModel | None, parameter: Parameter) -> float:
     target = parameter.targets[0]
     own = float(read_field(model, target.field).reshape(-1)[target.index])
     return own / target.factor if target.factor else float("nan")
+
+
+def _refuse_derived(space: ParameterSpace) -> None:
+    """MuJoCo computes some fields from others whenever its constants are set: those cannot vary."""
+    values = 0.5 * (space.low + space.high)
+    try:
+        model = space.apply(values)
+    except mujoco.FatalError as error:
+        raise InputError(
+            f"parameters: MuJoCo refuses the middle of the bounds: {' '.join(str(error).split())}"
+        ) from None
+    for column, p in enumerate(space.parameters):
+        for t in p.targets:
+            found = read_field(model, t.field).reshape(-1)[t.index]
+            if not np.isclose(found, t.factor * values[column], rtol=1e-6):
+                raise InputError(f"parameters.{p.name}: MuJoCo derives {t.field} from other fields; vary those instead")
 
 
 def _refuse_overlap(parameters: Sequence[Parameter]) -> None:

@@ -160,7 +160,7 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
     result.save(out / "fit.json")
     result.distribution.save(out / "distribution.yaml")
     document = problem.config.document()
-    (out / "fitted_config.yaml").write_text(yaml.safe_dump(document, sort_keys=False))
+    (out / "config.yaml").write_text(yaml.safe_dump(problem.config.absolute().document(), sort_keys=False))
     notes = []
     if problem.model_path is not None:
         try:

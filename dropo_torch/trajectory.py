@@ -115,6 +115,8 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
     Raises:
         InputError: logs whose columns or sampling times differ.
     """
+    if not logs:
+        raise InputError("data: no log given; expected at least one")
     first = logs[0]
     for log in logs[1:]:
         for name in ("observations", "actions"):
@@ -179,6 +181,11 @@ def make_transitions(trajectories: Trajectories, observation: Observation, *, la
     """
     if lag < 1:
         raise InputError(f"lag: {lag} given; expected a whole number of logged steps, 1 or more")
+    width = trajectories.observations.shape[1]
+    if width != observation.log_width:
+        raise InputError(
+            f"{trajectories.source}: {width} observed columns; the observation has {observation.log_width}"
+        )
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
     starts = [np.arange(a, b - lag + 1, lag) for a, b in itertools.pairwise(bounds)]
     rows = np.concatenate(starts)
