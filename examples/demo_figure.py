@@ -30,9 +30,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2, width_ratios=[1.25, 1])
     for states, color, label in ((before, ORANGE, "model as it came"), (after, BLUE, "fitted masses")):
-        error = torch.sqrt(torch.mean(((states - measured) / scale) ** 2, dim=1)).clamp(min=1e-9)
+        error = torch.sqrt(torch.mean(((states - measured) / scale) ** 2, dim=1)).clamp(min=1e-16)
         left.semilogy(np.arange(len(error)) * problem.simulator.timestep, error, color=color, lw=1.2, label=label)
-    left.set(xlabel="time in the log (s)", ylabel="next-state error\n(share of the log's spread)", ylim=(1e-10, 30))
+    left.set(xlabel="time in the log (s)", ylabel="next-state error\n(share of the log's spread)")
     left.legend(frameon=False, loc="center right")
     names = list(problem.space.names)
     for row, name in enumerate(names):
