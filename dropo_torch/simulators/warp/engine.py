@@ -69,7 +69,7 @@ class Engine:
         """Bytes that one world keeps for its backward."""
         m = self.tables
         implicit = m.nv + m.nh if m.implicit else 0
-        return 8 * (lag * self.skip + 1) * m.nstage * (m.nq + 2 * m.nv + m.nh + implicit)
+        return 8 * (lag * self.skip + 1) * m.nstage * (m.nq + 3 * m.nv + m.nh + implicit)
 
     def chunks(self, worlds: int) -> list[tuple[int, int]]:
         """``(first, count)`` of the chunks of worlds."""
@@ -180,7 +180,8 @@ class Engine:
     def _rows(self, number: int) -> Rows:
         m, rows = self.tables, Rows()
         soft = number if m.implicit else 1
-        widths = {"qpos": (number, m.nq), "qvel": (number, m.nv), "acc": (number, m.nv), "hess": (number, m.nh),
+        rate = number if m.nstage > 1 else 1
+        widths = {"qpos": (number, m.nq), "qvel": (number, m.nv), "acc": (number, m.nv), "rate": (rate, m.nv), "hess": (number, m.nh),
                   "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}  # fmt: skip
         for name, (count, width) in widths.items():
             setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
@@ -211,7 +212,7 @@ class Engine:
             "total": (vec6, nb), "dual": (vec6, nb), "f_velocity": (vec6, nb), "f_accel": (vec6, nb),
             "f_total": (vec6, nb), "f_dual": (vec6, nb), "f_pose": (vec6, nb), "lam": (real, nv), "tangent": (real, nv),
             "vel_bar": (real, nv), "acc_bar": (real, nv), "stage_vel_bar": (real, 4 * nv),
-            "stage_acc_bar": (real, 4 * nv), "pos_bar": (real, nv), "rate_bar": (real, nv), "pos_bar0": (real, nv),
+            "stage_acc_bar": (real, 4 * nv), "stage_rate_bar": (real, 4 * nv), "pos_bar": (real, nv), "rate_bar": (real, nv), "pos_bar0": (real, nv),
             "grad": (real, self.size),
         }  # fmt: skip
         for name, (dtype, width) in {**sizes, **(backward if adjoint else {})}.items():

@@ -7,7 +7,7 @@ import warp as wp
 from dropo_torch.simulators.warp.forces import actuator_force, control, damping_slope
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
 from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
-from dropo_torch.simulators.warp.spatial import nothing, quat_integrate, quat_mul, right_jacobian_t, turn
+from dropo_torch.simulators.warp.spatial import chart_rate, chart_rate_dual, nothing, quat_integrate, quat_mul, right_jacobian_t, turn
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint, bodies_adjoint, carry_in, carry_out
 from dropo_torch.simulators.warp.types import (
     BALL,
@@ -75,6 +75,48 @@ def move_adjoint(
             for i in range(n):
                 pos_bar[rb, d + i] += bar[rb, d + i]
                 vel_bar[rb, o + d + i] += h * bar[rb, d + i]
+
+
+@wp.func
+def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
+    """rate[r] of a stage that is ``c`` rate[r − 1] away from the start of its step."""
+    for k in range(m.nlink):
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            turned = vec3(rate[r - 1, d], rate[r - 1, d + 1], rate[r - 1, d + 2]) * c
+            w = chart_rate(turned, vec3(qvel[r, d], qvel[r, d + 1], qvel[r, d + 2]))
+            for i in range(3):
+                rate[r, d + i] = w[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                rate[r, d + i] = qvel[r, d + i]
+
+
+@wp.func
+def chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: f64, qvel: Reals2, o: int):
+    """Adjoint of :func:`chart_rates`: from ``s.stage_rate_bar[o:]`` to ``s.vel_bar`` and the rates of the stage before."""
+    _late = wp.grad(nothing)(ONE)
+    for k in range(m.nlink):
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            turned = vec3(rate[r - 1, d], rate[r - 1, d + 1], rate[r - 1, d + 2]) * c
+            w = vec3(qvel[r, d], qvel[r, d + 1], qvel[r, d + 2])
+            bar = vec3(s.stage_rate_bar[t, o + d], s.stage_rate_bar[t, o + d + 1], s.stage_rate_bar[t, o + d + 2])
+            turnedbar, wbar, _bar = wp.grad(chart_rate_dual)(turned, w, bar)
+            for i in range(3):
+                s.vel_bar[t, d + i] += wbar[i]
+                s.stage_rate_bar[t, o - m.nv + d + i] += c * turnedbar[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                s.vel_bar[t, d + i] += s.stage_rate_bar[t, o + d + i]
 
 
 @wp.func
@@ -223,8 +265,8 @@ def warm(m: Tables, acc: Reals2, r: int, source: int):
 
 @wp.func
 def step(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
-    soft_hess: Reals2, r: int, nxt: int, ctrl: Reals2, rc: int,
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
+    hess: Reals2, soft_hess: Reals2, r: int, nxt: int, ctrl: Reals2, rc: int,
 ) -> int:
     """One physics step from row ``r`` (stages in the rows after it) to row ``nxt``; 1 while it is good."""
     h = m.h
@@ -236,20 +278,22 @@ def step(
                 ok = 0
     if ok != 0:
         if m.integrator == RK4:
+            # Munthe-Kaas: stages of a quaternion combine in the chart at the start of the step
+            for i in range(m.nv):
+                rate[r, i] = qvel[r, i]
             for k in range(1, 4):
                 c = h * HALF
                 if k == 3:
                     c = h
-                move(m, qpos, r, qvel, r + k - 1, 0, c, qpos, r + k)
+                move(m, qpos, r, rate, r + k - 1, 0, c, qpos, r + k)
                 for i in range(m.nv):
                     qvel[r + k, i] = qvel[r, i] + c * acc[r + k - 1, i]
+                chart_rates(m, rate, r + k, c, qvel)
                 warm(m, acc, r + k, r + k - 1)
                 accelerate(m, s, t, th, qpos, qvel, acc, hess, r + k, ctrl, rc)
             sixth = h / f64(6.0)
             for i in range(m.nv):
-                s.work[t, i] = (
-                    qvel[r, i] + TWO * qvel[r + 1, i] + TWO * qvel[r + 2, i] + qvel[r + 3, i]
-                ) / f64(6.0)
+                s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
                 qvel[nxt, i] = qvel[r, i] + sixth * (
                     acc[r, i] + TWO * acc[r + 1, i] + TWO * acc[r + 2, i] + acc[r + 3, i]
                 )
@@ -270,8 +314,8 @@ def step(
 
 @wp.func
 def step_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
-    soft_hess: Reals2, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
+    hess: Reals2, soft_hess: Reals2, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
 ):
     """Adjoint of :func:`step`: ``s.pos_bar`` (tangent) and ``s.rate_bar`` of the end become those of the start."""
     _late = wp.grad(nothing)(ONE)
@@ -281,16 +325,17 @@ def step_adjoint(
         s.pos_bar0[t, i] = ZERO
     if m.integrator == RK4:
         for i in range(nv):
-            s.work[t, i] = (qvel[r, i] + TWO * qvel[r + 1, i] + TWO * qvel[r + 2, i] + qvel[r + 3, i]) / f64(6.0)
+            s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
             s.tangent[t, i] = ZERO
         move_adjoint(m, s.work, t, 0, h, s.pos_bar, t, s.pos_bar0, s.tangent, 0)
         for i in range(nv):
             wbar = s.tangent[t, i] / f64(6.0)
             abar = s.rate_bar[t, i] * h / f64(6.0)
-            s.stage_vel_bar[t, i] = s.rate_bar[t, i] + wbar
-            s.stage_vel_bar[t, nv + i] = TWO * wbar
-            s.stage_vel_bar[t, 2 * nv + i] = TWO * wbar
-            s.stage_vel_bar[t, 3 * nv + i] = wbar
+            s.stage_vel_bar[t, i] = s.rate_bar[t, i]
+            s.stage_rate_bar[t, i] = wbar
+            s.stage_rate_bar[t, nv + i] = TWO * wbar
+            s.stage_rate_bar[t, 2 * nv + i] = TWO * wbar
+            s.stage_rate_bar[t, 3 * nv + i] = wbar
             s.stage_acc_bar[t, i] = abar
             s.stage_acc_bar[t, nv + i] = TWO * abar
             s.stage_acc_bar[t, 2 * nv + i] = TWO * abar
@@ -303,12 +348,14 @@ def step_adjoint(
             for i in range(nv):
                 s.acc_bar[t, i] = s.stage_acc_bar[t, k * nv + i]
             accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, r + k, ctrl, rc, ctrl_bar, rb)
+            chart_rates_adjoint(m, s, t, rate, r + k, c, qvel, k * nv)
             for i in range(nv):
-                vbar = s.stage_vel_bar[t, k * nv + i] + s.vel_bar[t, i]
+                vbar = s.vel_bar[t, i]
                 s.stage_vel_bar[t, i] += vbar
                 s.stage_acc_bar[t, (k - 1) * nv + i] += c * vbar
-            move_adjoint(m, qvel, r + k - 1, 0, c, s.tangent, t, s.pos_bar0, s.stage_vel_bar, (k - 1) * nv)
+            move_adjoint(m, rate, r + k - 1, 0, c, s.tangent, t, s.pos_bar0, s.stage_rate_bar, (k - 1) * nv)
         for i in range(nv):
+            s.stage_vel_bar[t, i] += s.stage_rate_bar[t, i]
             s.acc_bar[t, i] = s.stage_acc_bar[t, i]
         accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, r, ctrl, rc, ctrl_bar, rb)
     else:

@@ -9,6 +9,7 @@ from dropo_torch.simulators.warp.cone import contact_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
 from dropo_torch.simulators.warp.rows import row_power
+from dropo_torch.simulators.warp.spatial import chart_rate_dual
 from dropo_torch.simulators.warp.types import (
     ZERO,
     Ints,
@@ -80,7 +81,7 @@ def adjoint_kernel(
             for k in range(skip):
                 r = end - (k + 1) * m.nstage
                 step_adjoint(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.acc, rows.soft, rows.hess, rows.soft_hess, r,
+                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, r,
                     r + m.nstage, controls, tr * lag + logged, control_bar, row,
                 )  # fmt: skip
     from_tangent(m, rows.qpos, base, s.pos_bar, t, state_bar, i)
@@ -118,6 +119,7 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array
     y[4] = cylinder_dual(v, v, r[0], v, 0, v)
     y[5] = ellipsoid_dual(v, v, r[0], v, v)
     y[6] = box_dual(v, r[0], v, v, s, s, v, v)
+    y[7] = chart_rate_dual(v, v, v)
 
 
 @wp.kernel(enable_backward=False)

@@ -207,13 +207,31 @@ def right_jacobian_t(r: vec3, x: vec3) -> vec3:
 @wp.func
 def inverse_right_jacobian_t(r: vec3, x: vec3) -> vec3:
     """J_r(r)⁻ᵀ x = x − ½ r × x + k r × (r × x): what a change of log(q) sees of a local turn of q."""
-    a2 = wp.dot(r, r)
-    k = ONE / f64(12.0) + a2 / f64(720.0)
+    u = wp.cross(r, x)
+    return x - HALF * u + _curl(wp.dot(r, r)) * wp.cross(r, u)
+
+
+@wp.func
+def _curl(a2: f64) -> f64:
+    """1/a² − (1 + cos a) / (2 a sin a), the coefficient of [r]² in J_r(r)⁻¹."""
+    k = ONE / f64(12.0) + a2 / f64(720.0) + a2 * a2 / f64(30240.0)
     if a2 > f64(1.0e-4):
         a = wp.sqrt(a2)
         k = ONE / a2 - (ONE + wp.cos(a)) / (TWO * a * wp.sin(a))
-    u = wp.cross(r, x)
-    return x - HALF * u + k * wp.cross(r, u)
+    return k
+
+
+@wp.func
+def chart_rate(r: vec3, w: vec3) -> vec3:
+    """J_r(r)⁻¹ w: how fast the rotation vector r of q₀⁻¹q changes while q turns at the local rate w."""
+    u = wp.cross(r, w)
+    return w + HALF * u + _curl(wp.dot(r, r)) * wp.cross(r, u)
+
+
+@wp.func
+def chart_rate_dual(r: vec3, w: vec3, bar: vec3) -> f64:
+    """Leaf: the adjoint of :func:`chart_rate` is its gradient."""
+    return wp.dot(chart_rate(r, w), bar)
 
 
 @wp.func

@@ -237,6 +237,7 @@ class Scratch:
     work: Reals2
     stage_vel_bar: Reals2  # of all stages of a step
     stage_acc_bar: Reals2
+    stage_rate_bar: Reals2
     pos_bar: Reals2  # adjoint of the state at the end of a step
     rate_bar: Reals2
     pos_bar0: Reals2  # adjoint of the state at its start
@@ -249,6 +250,7 @@ class Rows:
 
     qpos: Reals2
     qvel: Reals2
+    rate: Reals2  # RK4: rate of the position in the chart at the start of the step
     acc: Reals2
     soft: Reals2  # a' of the implicit integrators
     hess: Reals2  # factor of H
