@@ -80,7 +80,7 @@ class Engine:
     ) -> tuple[torch.Tensor, list[Trace]]:
         """Return the states after each logged step ``(T·K·lag, nq + nv)``, and the traces of the chunks if kept."""
         out = torch.empty(problem.worlds * problem.lag, states.shape[1], dtype=torch.float64, device=states.device)
-        inputs = [wp.from_torch(x.detach()) for x in (theta, states, controls.reshape(-1, controls.shape[-1]))]
+        inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
         traces = []
         for first, count in self.chunks(problem.worlds):
             part = wp.from_torch(out[first * problem.lag : (first + count) * problem.lag])
@@ -94,7 +94,7 @@ class Engine:
         out_bar: torch.Tensor, traces: list[Trace],
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
         """Return the adjoints of θ, states and controls; simulates again where there are no traces."""
-        flat = controls.reshape(-1, controls.shape[-1])
+        flat = _flat(controls)
         inputs = [wp.from_torch(x.detach()) for x in (theta, states, flat)]
         columns = torch.zeros(problem.parameters, len(self.wanted), dtype=torch.float64, device=states.device)
         state_bar, control_bar = torch.zeros_like(states), torch.zeros_like(flat)
@@ -222,6 +222,11 @@ class Engine:
         return scratch
 
 
+def _flat(x: torch.Tensor) -> torch.Tensor:
+    """All but the last axis as one."""
+    return x.reshape(x.shape[:-1].numel(), x.shape[-1])
+
+
 class Simulate(torch.autograd.Function):
     """``(θ, states, controls) → states after each logged step``, with the adjoint kernels as its backward."""
 
@@ -243,6 +248,6 @@ class Simulate(torch.autograd.Function):
     def backward(ctx: Any, out_bar: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
         """Return the adjoints of the inputs."""
         theta, states, controls = ctx.saved_tensors
-        flat = out_bar.reshape(-1, out_bar.shape[-1]).contiguous()
+        flat = _flat(out_bar).contiguous()
         bars = ctx.engine.adjoint(ctx.problem, theta, states, controls, flat, ctx.traces)
         return (*bars, None)

@@ -34,7 +34,7 @@ def impedance(x: f64, solimp: vec5) -> f64:
     mid = _limit(solimp[3])
     p = wp.max(ONE, solimp[4])
     d = HALF * (d0 + d1)
-    if d0 != d1 and width > MINVAL:
+    if width > MINVAL:  # also where d0 = d1: the value is the same, the slopes in d0 and d1 are not
         a = wp.abs(x) / width
         if a >= ONE:
             d = d1
