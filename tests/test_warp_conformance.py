@@ -255,7 +255,8 @@ DRIVES = {
     "bias0": p("actuator_biasprm", "gc", 0), "bias2": p("actuator_biasprm", "gc", 2),
     "forcerange": p("actuator_forcerange", "pa", 1), "ctrlrange": p("actuator_ctrlrange", "vc", 0),
 }  # fmt: skip
-LOSS = {"loss": p("dof_frictionloss", "ja"), "dof_solref": p("dof_solref", "ja", 0)}
+LOSS = {"loss": p("dof_frictionloss", "ja"), "mass": p("body_mass", "b")}
+STUCK = {"dof_solref": p("dof_solref", "ja", 0), "dof_solimp": p("dof_solimp", "ja", 0), "mass": p("body_mass", "b")}
 EQUALITY = '<equality><joint joint1="jc" joint2="ja" polycoef=".01 .05 .1 .02 .03"/></equality>'
 DRAG = {"density": p("opt.density"), "viscosity": p("opt.viscosity"), "wind": p("opt.wind", index=1)}
 
@@ -265,6 +266,7 @@ TREES = [
     Case("implicitfast", arm(integrator="implicitfast"), JOINTS | DRIVES),
     Case("frictionloss", arm(loss="0.8"), JOINTS | LOSS, most=1e-2),
     Case("frictionloss RK4", arm(loss="0.8", integrator="RK4"), JOINTS | LOSS, most=1e-2),
+    Case("stuck", arm(loss="30"), STUCK, most=1e-2),
     Case("equality", arm(extra=EQUALITY), {"c1": p("eq_data", "equality0", 1), "c3": p("eq_data", "equality0", 3),
          "eq_solref": p("eq_solref", "equality0", 0), "mass": p("body_mass", "b")}),  # fmt: skip
     Case("ball", arm(second="ball", limit='limited="true" range="0 25" stiffness="2"'), {"stiffness": p("jnt_stiffness",
@@ -330,7 +332,7 @@ CONTACTS = [
     Case("sphere pushes box", scene(PUSH, slope="0"), contact_parameters("box"), length=40),
     Case("sphere pushes box, elliptic", scene(PUSH, slope="0", cone="elliptic"), contact_parameters("box"), length=40,
          states=1e-8),  # fmt: skip
-    Case("spheres, condim 6", scene(SPHERES, slope=".6", condim="6"), contact_parameters("one"), length=40),
+    Case("spheres, condim 6", scene(SPHERES, slope=".05", condim="6"), contact_parameters("one"), length=40),
     Case("margin, direct solref", scene(BOX, geom='margin=".01" gap=".005" solref="-5000 -90" solimp=".7 .9 .02 .4 3"'),
          {"mass": p("body_mass", "box"), "stiffness": p("geom_solref", "floor", 0),
           "damping": p("geom_solref", "floor", 1), "width": p("geom_solimp", "gbox", 2),

@@ -64,6 +64,7 @@ class Engine:
         self.columns = wp.array(wanted, dtype=wp.int32, device=device)
         self.wanted = torch.from_numpy(wanted.astype(np.int64))
         self._scratch: dict[tuple[int, bool], Scratch] = {}
+        self._free: list[tuple[int, Rows]] = []
 
     def row_bytes(self, lag: int) -> int:
         """Bytes that one world keeps for its backward."""
@@ -178,6 +179,18 @@ class Engine:
                 job.result()
 
     def _rows(self, number: int) -> Rows:
+        """Memory of a number of stages, from those that a backward has given back."""
+        for i, (size, rows) in enumerate(self._free):
+            if size == number:
+                del self._free[i]
+                return rows
+        return self._new_rows(number)
+
+    def release(self, traces: list[Trace]) -> None:
+        """Take the memory of traces back for the next call."""
+        self._free = [(t.rows.qpos.shape[0], t.rows) for t in traces]
+
+    def _new_rows(self, number: int) -> Rows:
         m, rows = self.tables, Rows()
         soft = number if m.implicit else 1
         rate = number if m.nstage > 1 else 1
@@ -185,6 +198,7 @@ class Engine:
                   "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}  # fmt: skip
         for name, (count, width) in widths.items():
             setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
+        rows.held = wp.empty(number, dtype=wp.int32, device=self.device)
         return rows
 
     def _working(self, slots: int, *, adjoint: bool) -> Scratch:
@@ -250,4 +264,7 @@ class Simulate(torch.autograd.Function):
         theta, states, controls = ctx.saved_tensors
         flat = _flat(out_bar).contiguous()
         bars = ctx.engine.adjoint(ctx.problem, theta, states, controls, flat, ctx.traces)
+        # a second backward through the same graph simulates again
+        ctx.engine.release(ctx.traces)
+        ctx.traces = []
         return (*bars, None)

@@ -18,6 +18,7 @@ from dropo_torch.simulators.warp.types import (
     TRANSLATION,
     TWO,
     ZERO,
+    Ints,
     Reals,
     Reals2,
     Scratch,
@@ -220,7 +221,7 @@ def soften_adjoint(
         s.grad[t, m.o_armature + i] += s.lam[t, i] * s.work[t, i]
     carry_out(m, s, t, s.work, t)
     bodies_adjoint(m, s, t, th, 0)
-    carry_in(m, s, t, qvel, r, s.work, t, ZERO)
+    carry_in(m, s, t, qvel, r, s.work, t, ZERO, 0)
     for i in range(m.nv):
         s.pos_bar0[t, i] += s.tangent[t, i]
     # ā = M λ, with M λ = Σ_subtree s · I Λ + armature
@@ -266,13 +267,13 @@ def warm(m: Tables, acc: Reals2, r: int, source: int):
 @wp.func
 def step(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
-    hess: Reals2, soft_hess: Reals2, r: int, nxt: int, ctrl: Reals2, rc: int,
+    hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int,
 ) -> int:
     """One physics step from row ``r`` (stages in the rows after it) to row ``nxt``; 1 while it is good."""
     h = m.h
     ok = good(m, qpos, qvel, r)
     if ok != 0:
-        accelerate(m, s, t, th, qpos, qvel, acc, hess, r, ctrl, rc)
+        accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc)
         for i in range(m.nv):
             if not (wp.abs(acc[r, i]) < LARGE):
                 ok = 0
@@ -290,7 +291,7 @@ def step(
                     qvel[r + k, i] = qvel[r, i] + c * acc[r + k - 1, i]
                 chart_rates(m, rate, r + k, c, qvel)
                 warm(m, acc, r + k, r + k - 1)
-                accelerate(m, s, t, th, qpos, qvel, acc, hess, r + k, ctrl, rc)
+                accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc)
             sixth = h / f64(6.0)
             for i in range(m.nv):
                 s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
@@ -315,7 +316,7 @@ def step(
 @wp.func
 def step_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
-    hess: Reals2, soft_hess: Reals2, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+    hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
 ):
     """Adjoint of :func:`step`: ``s.pos_bar`` (tangent) and ``s.rate_bar`` of the end become those of the start."""
     _late = wp.grad(nothing)(ONE)
@@ -347,7 +348,7 @@ def step_adjoint(
                 c = h
             for i in range(nv):
                 s.acc_bar[t, i] = s.stage_acc_bar[t, k * nv + i]
-            accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, r + k, ctrl, rc, ctrl_bar, rb)
+            accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc, ctrl_bar, rb)
             chart_rates_adjoint(m, s, t, rate, r + k, c, qvel, k * nv)
             for i in range(nv):
                 vbar = s.vel_bar[t, i]
@@ -357,7 +358,7 @@ def step_adjoint(
         for i in range(nv):
             s.stage_vel_bar[t, i] += s.stage_rate_bar[t, i]
             s.acc_bar[t, i] = s.stage_acc_bar[t, i]
-        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, r, ctrl, rc, ctrl_bar, rb)
+        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc, ctrl_bar, rb)
     else:
         # q' = q ⊕ h v', v' = v + h a'
         move_adjoint(m, qvel, nxt, 0, h, s.pos_bar, t, s.pos_bar0, s.rate_bar, 0)
@@ -366,7 +367,7 @@ def step_adjoint(
             s.acc_bar[t, i] = h * s.rate_bar[t, i]
         if m.implicit != 0:
             _soften_here(m, s, t, th, qpos, qvel, acc, soft, soft_hess, r, ctrl, rc, ctrl_bar, rb)
-        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, r, ctrl, rc, ctrl_bar, rb)
+        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc, ctrl_bar, rb)
     for i in range(nv):
         s.pos_bar[t, i] = s.pos_bar0[t, i] + s.tangent[t, i]
         s.rate_bar[t, i] = s.stage_vel_bar[t, i] + s.vel_bar[t, i]

@@ -81,7 +81,7 @@ def adjoint_kernel(
             for k in range(skip):
                 r = end - (k + 1) * m.nstage
                 step_adjoint(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, r,
+                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, rows.held, r,
                     r + m.nstage, controls, tr * lag + logged, control_bar, row,
                 )  # fmt: skip
     from_tangent(m, rows.qpos, base, s.pos_bar, t, state_bar, i)

@@ -56,7 +56,7 @@ def simulate_kernel(
             nxt = base + ((n + 1) % period) * m.nstage
             if ok != 0:
                 ok = step(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, r, nxt,
+                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, rows.held, r, nxt,
                     controls, tr * lag + step_of,
                 )  # fmt: skip
             n += 1

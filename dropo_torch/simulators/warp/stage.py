@@ -38,6 +38,7 @@ from dropo_torch.simulators.warp.types import (
     ONE,
     TRANSLATION,
     ZERO,
+    Ints,
     Reals,
     Reals2,
     Scratch,
@@ -50,8 +51,8 @@ from dropo_torch.simulators.warp.types import (
 
 @wp.func
 def accelerate(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2, r: int,
-    ctrl: Reals2, rc: int,
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2,
+    held: Ints, r: int, ctrl: Reals2, rc: int,
 ):
     """Acceleration of the state in row ``r``, from the guess in ``acc[r]``; leaves the factor of H in ``hess[r]``."""
     sweep_out(m, s, t, th, qpos, qvel, r)
@@ -64,6 +65,7 @@ def accelerate(
     add_actuators(m, s, t, th, qpos, qvel, r, ctrl, rc)
     nrow = make_rows(m, s, t, th, qpos, qvel, r)
     ncon = find_contacts(m, s, t, th)
+    held[r] = nrow + ncon
     if nrow + ncon == 0:
         for i in range(m.nh):
             hess[r, i] = s.mass[t, i]
@@ -78,16 +80,18 @@ def accelerate(
 
 @wp.func
 def accelerate_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2, r: int,
-    ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2,
+    held: Ints, r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
 ):
     """Adjoint of :func:`accelerate`: from ``s.acc_bar`` to ``s.tangent``, ``s.vel_bar``, controls and θ."""
     _late = wp.grad(nothing)(ONE)
     sweep_out(m, s, t, th, qpos, qvel, r)
-    nrow = make_rows(m, s, t, th, qpos, qvel, r)
-    ncon = find_contacts(m, s, t, th)
+    nrow = int(0)
+    ncon = int(0)
     dense = int(0)
-    if nrow + ncon > 0:
+    if held[r] > 0:
+        nrow = make_rows(m, s, t, th, qpos, qvel, r)
+        ncon = find_contacts(m, s, t, th)
         dense = fills_in(m, s, t, ncon)
     for i in range(m.nv):
         s.lam[t, i] = -s.acc_bar[t, i]
@@ -105,7 +109,7 @@ def accelerate_adjoint(
     actuators_adjoint(m, s, t, th, qpos, qvel, r, ctrl, rc, ctrl_bar, rb)
     rows_adjoint(m, s, t, th, qpos, qvel, acc, r, nrow)
     contacts_adjoint(m, s, t, th, ncon)
-    carry_in(m, s, t, qvel, r, acc, r, f64(1.0))
+    carry_in(m, s, t, qvel, r, acc, r, f64(1.0), ncon)
     for i in range(3):
         s.grad[t, m.o_gravity + i] -= s.f_accel[t, 0][3 + i]
 
@@ -182,23 +186,24 @@ def _inertia_adjoint(
     """Gradient of ⟨x, I y⟩ + ⟨z, I v⟩ in mass, moments and centre of mass."""
     rot = s.xmat[t, b]
     c = centre_of_mass(m, s, t, th, b)
-    mass = th[m.o_mass + b]
     xc = at(x, c)
     yc = at(y, c)
     zc = at(z, c)
     vc = at(v, c)
     s.grad[t, m.o_mass + b] += wp.dot(xc, yc) + wp.dot(zc, vc)
-    cbar = (wp.cross(yc, ang(x)) + wp.cross(xc, ang(y)) + wp.cross(vc, ang(z)) + wp.cross(zc, ang(v))) * mass
-    back = wp.transpose(rot)
-    pbar = back * cbar
-    frame = wp.transpose(m.body_imat[b]) * back
-    xw = frame * ang(x)
-    yw = frame * ang(y)
-    zw = frame * ang(z)
-    vw = frame * ang(v)
-    for k in range(3):
-        s.grad[t, m.o_ipos + 3 * b + k] += pbar[k]
-        s.grad[t, m.o_inertia + 3 * b + k] += xw[k] * yw[k] + zw[k] * vw[k]
+    if m.want_ipos != 0:
+        cbar = wp.cross(yc, ang(x)) + wp.cross(xc, ang(y)) + wp.cross(vc, ang(z)) + wp.cross(zc, ang(v))
+        pbar = wp.transpose(rot) * (cbar * th[m.o_mass + b])
+        for k in range(3):
+            s.grad[t, m.o_ipos + 3 * b + k] += pbar[k]
+    if m.want_inertia != 0:
+        frame = wp.transpose(rot * m.body_imat[b])
+        xw = frame * ang(x)
+        yw = frame * ang(y)
+        zw = frame * ang(z)
+        vw = frame * ang(v)
+        for k in range(3):
+            s.grad[t, m.o_inertia + 3 * b + k] += xw[k] * yw[k] + zw[k] * vw[k]
 
 
 @wp.func
@@ -230,13 +235,13 @@ def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v:
 
 @wp.func
 def carry_in(
-    m: Tables, s: Scratch, t: int, qvel: Reals2, rv: int, acc: Reals2, ra: int, moving: f64
+    m: Tables, s: Scratch, t: int, qvel: Reals2, rv: int, acc: Reals2, ra: int, moving: f64, touching: int
 ):
     """Adjoints of positions and velocities, from the leaves to the root.
 
     In a frame that is displaced along s with everything beyond the joint, only what comes from before the joint
     moves: each of V, A, U, Λ there by X × s. So L_q = Σ_X F_X · (X × s) + Y · s and L_v = F_V · s + F_A · (V × s),
-    X before the joint, with F_V += v s ×* F_A between the two.
+    X before the joint, with F_V += v s ×* F_A between the two. ``touching`` 0 says that U was given no F.
     """
     for reverse in range(1, m.nb):
         b = m.nb - reverse
@@ -271,18 +276,22 @@ def carry_in(
             u = u - sa
             l = l - sl
             a = a - sa - cross_motion(v, sv)
-            for i in range(d, d + n):
-                s.vel_bar[t, i] += moving * (
-                    wp.dot(fv, s.motion[t, i]) + wp.dot(fa, cross_motion(v, s.motion[t, i]))
-                )
-            fv = fv + cross_force(sv, fa)
+            if moving != ZERO:
+                # F_A · (V × s) = −s · V ×* F_A
+                g = fv - cross_force(v, fa)
+                for i in range(d, d + n):
+                    s.vel_bar[t, i] += wp.dot(s.motion[t, i], g)
+                fv = fv + cross_force(sv, fa)
             # Σ F_X · (X × s) = −s · Σ X ×* F_X
-            y = fy - cross_force(v, fv) - cross_force(a, fa) - cross_force(u, fu) - cross_force(l, fl)
+            y = fy - cross_force(v, fv) - cross_force(a, fa) - cross_force(l, fl)
+            if touching != 0:
+                y = y - cross_force(u, fu)
             for i in range(d, d + n):
                 s.tangent[t, i] += wp.dot(s.motion[t, i], y)
         s.f_velocity[t, p] = s.f_velocity[t, p] + fv
         s.f_accel[t, p] = s.f_accel[t, p] + fa
-        s.f_total[t, p] = s.f_total[t, p] + fu
+        if touching != 0:
+            s.f_total[t, p] = s.f_total[t, p] + fu
         s.f_dual[t, p] = s.f_dual[t, p] + fl
         s.f_pose[t, p] = s.f_pose[t, p] + fy
 

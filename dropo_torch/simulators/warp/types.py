@@ -86,6 +86,8 @@ class Tables:
     has_gravcomp: wp.int32
     has_fluid: wp.int32
     has_frclimit: wp.int32
+    want_inertia: wp.int32  # gradients wanted of body_inertia, of body_ipos
+    want_ipos: wp.int32
     maxcon: wp.int32
     maxrow: wp.int32
     # bodies
@@ -255,3 +257,4 @@ class Rows:
     soft: Reals2  # a' of the implicit integrators
     hess: Reals2  # factor of H
     soft_hess: Reals2  # factor of M + h B
+    held: Ints  # number of constraints of a stage
