@@ -1,0 +1,26 @@
+"""MuJoCo's physics as NVIDIA Warp kernels, differentiable in states, controls and model parameters.
+
+:class:`~dropo_torch.simulators.warp.simulator.WarpSimulator` is the backend; importing it needs ``warp-lang``.
+
+Where things stand: ``support`` decides what is simulated, ``tables`` and ``fields`` turn a model and parameter
+vectors into arrays, ``kinematics``, ``forces``, ``fluid``, ``rows``, ``collide``, ``contact``, ``cone`` and ``solver``
+are the physics, ``stage`` and ``integrate`` put them together with their adjoints, ``engine`` runs the kernels.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from dropo_torch.simulators.warp.simulator import WarpSimulator
+
+__all__ = ["WarpSimulator"]
+
+
+def __getattr__(name: str) -> Any:
+    """Import the simulator, and Warp with it, on first use."""
+    if name == "WarpSimulator":
+        from dropo_torch.simulators.warp.simulator import WarpSimulator
+
+        return WarpSimulator
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,241 @@
+"""The friction cone: force, Hessian and piece of MuJoCo's contact cost, and the leaf its adjoint is the gradient of.
+
+``w = J a − aref`` has the normal first, then two tangents, then the rotations about the three; ``dim`` of them act.
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
+from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Reals, f64, mat33, vec2, vec5, vec6
+
+#: Piece number of the curved part of an elliptic cone, where the cost is not quadratic.
+CURVED = wp.constant(2)
+
+
+@wp.func
+def normal_d(dim: int, elliptic: int, r: f64, invweight: f64, mu: f64, impratio: f64) -> f64:
+    """D of the normal (frictionless, elliptic) or of every edge of the pyramid, with r = (1 − d)/d."""
+    d = ONE / wp.max(MINVAL, r * invweight)
+    if dim > 1 and elliptic == 0:
+        # Rpy = 2 μ²/impratio · R, with A multiplied by 1 + μ²
+        d = impratio / (TWO * mu * mu * wp.max(MINVAL, r * invweight * (ONE + mu * mu)))
+    return d
+
+
+@wp.func
+def cone_piece(dim: int, elliptic: int, th: Reals, o_mu: int, impratio: f64, w: vec6) -> int:
+    """Which piece of the cost ``w`` is on; equal numbers mean one quadratic, save :data:`CURVED`."""
+    piece = int(0)
+    if dim == 1:
+        if w[0] < ZERO:
+            piece = int(1)
+    elif elliptic == 0:
+        bit = int(1)
+        for k in range(1, dim):
+            y = th[o_mu + k - 1] * w[k]
+            if w[0] + y < ZERO:
+                piece += bit
+            if w[0] - y < ZERO:
+                piece += 2 * bit
+            bit = 4 * bit
+    else:
+        mu = th[o_mu] / wp.sqrt(impratio)
+        tt = ZERO
+        for k in range(1, dim):
+            y = th[o_mu + k - 1] * w[k]
+            tt += y * y
+        tan = wp.sqrt(tt)
+        n = w[0] * mu
+        if n >= mu * tan or (tan <= ZERO and n >= ZERO):
+            piece = int(0)
+        elif mu * n + tan <= ZERO or (tan <= ZERO and n < ZERO):
+            piece = int(1)
+        else:
+            piece = CURVED
+    return piece
+
+
+@wp.func
+def cone_force(dim: int, elliptic: int, d: f64, th: Reals, o_mu: int, impratio: f64, w: vec6) -> vec6:
+    """Contact force −∂s/∂w."""
+    f = vec6()
+    if dim == 1:
+        f[0] = wp.max(ZERO, -d * w[0])
+    elif elliptic == 0:
+        for k in range(1, dim):
+            mu = th[o_mu + k - 1]
+            plus = d * wp.max(ZERO, -(w[0] + mu * w[k]))
+            minus = d * wp.max(ZERO, -(w[0] - mu * w[k]))
+            f[0] += plus + minus
+            f[k] = mu * (plus - minus)
+    else:
+        piece = cone_piece(dim, elliptic, th, o_mu, impratio, w)
+        mu1 = th[o_mu]
+        if piece == 1:
+            f[0] = -d * w[0]
+            for k in range(1, dim):
+                mu = th[o_mu + k - 1]
+                f[k] = -d * impratio * mu * mu / (mu1 * mu1) * w[k]
+        elif piece == CURVED:
+            reg = mu1 / wp.sqrt(impratio)
+            tt = ZERO
+            for k in range(1, dim):
+                y = th[o_mu + k - 1] * w[k]
+                tt += y * y
+            tan = wp.sqrt(tt)
+            dm = d / (reg * reg * (ONE + reg * reg))
+            e = w[0] * reg - reg * tan
+            f[0] = -dm * e * reg
+            for k in range(1, dim):
+                mu = th[o_mu + k - 1]
+                f[k] = -f[0] / tan * mu * mu * w[k]
+    return f
+
+
+@wp.func
+def cone_hessian(dim: int, elliptic: int, d: f64, th: Reals, o_mu: int, impratio: f64, w: vec6):
+    """Hessian of the cost: blocks (directions, directions), (directions, rotations), (rotations, rotations)."""
+    ll = mat33()
+    la = mat33()
+    aa = mat33()
+    piece = cone_piece(dim, elliptic, th, o_mu, impratio, w)
+    if dim == 1:
+        if piece == 1:
+            ll[0, 0] = d
+    elif elliptic == 0:
+        for k in range(1, dim):
+            mu = th[o_mu + k - 1]
+            plus = ZERO
+            minus = ZERO
+            if piece % 2 == 1:
+                plus = d
+            if (piece // 2) % 2 == 1:
+                minus = d
+            piece = piece // 4
+            ll[0, 0] += plus + minus
+            off = mu * (plus - minus)
+            diag = mu * mu * (plus + minus)
+            if k < 3:
+                ll[0, k] = off
+                ll[k, 0] = off
+                ll[k, k] = diag
+            else:
+                la[0, k - 3] = off
+                aa[k - 3, k - 3] = diag
+    else:
+        mu1 = th[o_mu]
+        if piece == 1:
+            ll[0, 0] = d
+            for k in range(1, dim):
+                mu = th[o_mu + k - 1]
+                diag = d * impratio * mu * mu / (mu1 * mu1)
+                if k < 3:
+                    ll[k, k] = diag
+                else:
+                    aa[k - 3, k - 3] = diag
+        elif piece == CURVED:
+            reg = mu1 / wp.sqrt(impratio)
+            u = vec6()
+            tt = ZERO
+            for k in range(1, dim):
+                u[k] = th[o_mu + k - 1] * w[k]
+                tt += u[k] * u[k]
+            tan = wp.sqrt(tt)
+            n = w[0] * reg
+            dm = d / (reg * reg * (ONE + reg * reg))
+            # in cone coordinates: first row (1, −μ/T U), block μN/T³ U Uᵀ + (μ² − μN/T) I
+            ll[0, 0] = dm * reg * reg
+            for i in range(1, dim):
+                ci = th[o_mu + i - 1]
+                off = -dm * reg * ci * reg / tan * u[i]
+                if i < 3:
+                    ll[0, i] = off
+                    ll[i, 0] = off
+                else:
+                    la[0, i - 3] = off
+                for j in range(1, dim):
+                    cj = th[o_mu + j - 1]
+                    y = reg * n / (tan * tan * tan) * u[i] * u[j]
+                    if i == j:
+                        y += reg * reg - reg * n / tan
+                    y = y * dm * ci * cj
+                    if i < 3 and j < 3:
+                        ll[i, j] = y
+                    elif i < 3:
+                        la[i, j - 3] = y
+                    elif j >= 3:
+                        aa[i - 3, j - 3] = y
+    return ll, la, aa
+
+
+@wp.func
+def _edges(w0: f64, wk: f64, l0: f64, lk: f64, mu: f64) -> f64:
+    """Two opposite edges of a pyramid with D = 1: Σ max(0, −jar) · Jλ."""
+    return wp.max(ZERO, -(w0 + mu * wk)) * (l0 + mu * lk) + wp.max(ZERO, -(w0 - mu * wk)) * (l0 - mu * lk)
+
+
+@wp.func
+def _elliptic(dim: int, w: vec6, l: vec6, mu: vec5, d: f64, impratio: f64) -> f64:
+    """f · Jλ of an elliptic cone."""
+    reg = mu[0] / wp.sqrt(impratio)
+    y1 = mu[0] * w[1]
+    y2 = mu[1] * w[2]
+    y3 = ZERO
+    y4 = ZERO
+    y5 = ZERO
+    if dim > 3:
+        y3 = mu[2] * w[3]
+    if dim > 4:
+        y4 = mu[3] * w[4]
+        y5 = mu[4] * w[5]
+    tt = y1 * y1 + y2 * y2 + y3 * y3 + y4 * y4 + y5 * y5
+    n = w[0] * reg
+    out = ZERO
+    if tt > ZERO:
+        tan = wp.sqrt(tt)
+        along = y1 * mu[0] * l[1] + y2 * mu[1] * l[2] + y3 * mu[2] * l[3] + y4 * mu[3] * l[4] + y5 * mu[4] * l[5]
+        if n >= reg * tan:
+            out = ZERO
+        elif reg * n + tan <= ZERO:
+            out = -d * w[0] * l[0] - d * impratio / (mu[0] * mu[0]) * along
+        else:
+            fn = -d / (reg * (ONE + reg * reg)) * (n - reg * tan)
+            out = fn * l[0] - fn / tan * along
+    elif n < ZERO:
+        out = -d * w[0] * l[0]
+        out -= d * impratio * (w[1] * l[1] + mu[1] * mu[1] / (mu[0] * mu[0]) * w[2] * l[2])
+    return out
+
+
+@wp.func
+def contact_power(
+    dim: int, elliptic: int, u: vec6, v: vec6, l: vec6, dist: f64, margin: f64, mu: vec5, solref: vec2,
+    friction_ref: vec2, solimp: vec5, invweight: f64, impratio: f64, h: f64, refsafe: int,
+) -> f64:
+    """−f (Jλ) of a contact with J a = u, J q̇ = v, J λ = l: the leaf whose gradient the adjoint takes."""
+    x = dist - margin
+    imp = impedance(x, solimp)
+    b = damping(solref, solimp, h, refsafe)
+    bf = b
+    if elliptic != 0 and (friction_ref[0] != ZERO or friction_ref[1] != ZERO):
+        bf = damping(friction_ref, solimp, h, refsafe)
+    w0 = u[0] + b * v[0] + stiffness(solref, solimp, h, refsafe) * imp * x
+    d = normal_d(dim, elliptic, regularisation(imp, ONE), invweight, mu[0], impratio)
+    out = ZERO
+    if dim == 1:
+        out = d * wp.max(ZERO, -w0) * l[0]
+    elif elliptic == 0:
+        y = _edges(w0, u[1] + bf * v[1], l[0], l[1], mu[0]) + _edges(w0, u[2] + bf * v[2], l[0], l[2], mu[1])
+        if dim > 3:
+            y += _edges(w0, u[3] + bf * v[3], l[0], l[3], mu[2])
+        if dim > 4:
+            y += _edges(w0, u[4] + bf * v[4], l[0], l[4], mu[3]) + _edges(w0, u[5] + bf * v[5], l[0], l[5], mu[4])
+        out = d * y
+    else:
+        w = vec6(
+            w0, u[1] + bf * v[1], u[2] + bf * v[2], u[3] + bf * v[3], u[4] + bf * v[4], u[5] + bf * v[5]
+        )
+        out = _elliptic(dim, w, l, mu, d, impratio)
+    return -out

@@ -1,0 +1,270 @@
+"""Runs the kernels: memory, chunks of worlds, threads, and the ``torch.autograd.Function``."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+import warp as wp
+
+from dropo_torch.simulators.warp import kernel_backward, kernel_forward
+from dropo_torch.simulators.warp.types import Rows, Scratch, Tables, mat33, vec3, vec6, vec10
+
+#: Stages kept from the forward for the backward, at most; beyond it the backward simulates again, chunk by chunk.
+KEEP_BYTES = 1 << 30
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One call: how many transitions, parameter vectors, logged steps and physics steps of each."""
+
+    transitions: int
+    parameters: int
+    lag: int
+    skip: int
+
+    @property
+    def worlds(self) -> int:
+        """Number of simulations."""
+        return self.transitions * self.parameters
+
+
+@dataclass(frozen=True)
+class Trace:
+    """What the backward needs of a chunk that was simulated."""
+
+    rows: Rows
+    alive: Any
+
+
+class Engine:
+    """Simulates and differentiates worlds of one model on one device.
+
+    Args:
+        tables: the model.
+        size: length of θ.
+        wanted: columns of θ whose gradient is wanted.
+        skip: physics steps of a logged step.
+        chunk_size: worlds in memory at a time.
+        num_threads: threads of a CPU.
+        device: Warp's name of the device.
+    """
+
+    def __init__(
+        self, tables: Tables, size: int, wanted: np.ndarray, *, skip: int, chunk_size: int, num_threads: int,
+        device: str,
+    ) -> None:  # fmt: skip
+        self.tables, self.size, self.skip = tables, size, skip
+        self.chunk_size, self.device = chunk_size, device
+        self.is_cpu = wp.get_device(device).is_cpu
+        self.num_threads = num_threads if self.is_cpu else 1
+        self.columns = wp.array(wanted, dtype=wp.int32, device=device)
+        self.wanted = torch.from_numpy(wanted.astype(np.int64))
+        self._scratch: dict[tuple[int, bool], Scratch] = {}
+        self._free: list[tuple[int, Rows]] = []
+
+    def row_bytes(self, lag: int) -> int:
+        """Bytes that one world keeps for its backward."""
+        m = self.tables
+        implicit = m.nv + m.nh if m.implicit else 0
+        return 8 * (lag * self.skip + 1) * m.nstage * (m.nq + 3 * m.nv + m.nh + implicit)
+
+    def chunks(self, worlds: int) -> list[tuple[int, int]]:
+        """``(first, count)`` of the chunks of worlds."""
+        return [(i, min(self.chunk_size, worlds - i)) for i in range(0, worlds, self.chunk_size)]
+
+    def simulate(
+        self, problem: Problem, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor, keep: bool
+    ) -> tuple[torch.Tensor, list[Trace]]:
+        """Return the states after each logged step ``(T·K·lag, nq + nv)``, and the traces of the chunks if kept."""
+        out = torch.empty(problem.worlds * problem.lag, states.shape[1], dtype=torch.float64, device=states.device)
+        inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
+        traces = []
+        for first, count in self.chunks(problem.worlds):
+            part = wp.from_torch(out[first * problem.lag : (first + count) * problem.lag])
+            trace = self._forward(problem, inputs, part, first, count, keep)
+            if keep:
+                traces.append(trace)
+        return out, traces
+
+    def adjoint(
+        self, problem: Problem, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor,
+        out_bar: torch.Tensor, traces: list[Trace],
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+        """Return the adjoints of θ, states and controls; simulates again where there are no traces."""
+        flat = _flat(controls)
+        inputs = [wp.from_torch(x.detach()) for x in (theta, states, flat)]
+        columns = torch.zeros(problem.parameters, len(self.wanted), dtype=torch.float64, device=states.device)
+        state_bar, control_bar = torch.zeros_like(states), torch.zeros_like(flat)
+        totals = [wp.from_torch(x) for x in (columns, state_bar, control_bar)]
+        for number, (first, count) in enumerate(self.chunks(problem.worlds)):
+            rows = slice(first * problem.lag, (first + count) * problem.lag)
+            if traces:
+                trace = traces[number]
+            else:
+                part = wp.empty((count * problem.lag, states.shape[1]), dtype=wp.float64, device=self.device)
+                trace = self._forward(problem, inputs, part, first, count, keep=True)
+            self._backward(problem, inputs, trace, wp.from_torch(out_bar[rows]), totals, first, count)
+        theta_bar = torch.zeros_like(theta)
+        theta_bar[:, self.wanted.to(theta.device)] = columns
+        return theta_bar, state_bar, control_bar.reshape(controls.shape)
+
+    def _forward(
+        self, problem: Problem, inputs: list[Any], out: Any, first: int, count: int, keep: bool
+    ) -> Trace:
+        period = problem.lag * self.skip + 1 if keep else 2
+        slots = self._slots(count)
+        rows = self._rows((count if keep else slots) * period * self.tables.nstage)
+        alive = wp.empty(count, dtype=wp.int32, device=self.device)
+        scratch = self._working(slots, adjoint=False)
+
+        def launch(local: int, number: int, slot: int) -> None:
+            wp.launch(
+                kernel_forward.simulate_kernel, dim=number, device=self.device,
+                inputs=[self.tables, scratch, rows, *inputs, out, alive, first + local, local, problem.parameters,
+                        problem.lag, self.skip, period, slot, int(not self.is_cpu), int(keep)],
+            )  # fmt: skip
+
+        self._spread(launch, count)
+        return Trace(rows, alive)
+
+    def _backward(
+        self, problem: Problem, inputs: list[Any], trace: Trace, out_bar: Any, totals: list[Any], first: int,
+        count: int,
+    ) -> None:  # fmt: skip
+        theta, states, controls = inputs
+        lag, period = problem.lag, problem.lag * self.skip + 1
+        scratch = self._working(self._slots(count), adjoint=True)
+        state_bar = wp.empty((count, states.shape[1]), dtype=wp.float64, device=self.device)
+        control_bar = wp.zeros((count * lag, controls.shape[1]), dtype=wp.float64, device=self.device)
+        theta_bar = wp.empty((count, len(self.wanted)), dtype=wp.float64, device=self.device)
+
+        def launch(local: int, number: int, slot: int) -> None:
+            wp.launch(
+                kernel_backward.adjoint_kernel, dim=number, device=self.device,
+                inputs=[self.tables, scratch, trace.rows, theta, controls, trace.alive, self.columns, out_bar,
+                        state_bar, control_bar, theta_bar, first + local, local, problem.parameters, lag, self.skip,
+                        period, slot, int(not self.is_cpu)],
+            )  # fmt: skip
+
+        self._spread(launch, count)
+        parameters = problem.parameters
+        touched = (first + count - 1) // parameters - first // parameters + 1
+        wp.launch(
+            kernel_backward.sum_over_transitions, dim=(parameters, len(self.wanted)), device=self.device,
+            inputs=[theta_bar, totals[0], first, count, parameters],
+        )  # fmt: skip
+        for bar, total, width in ((state_bar, totals[1], 1), (control_bar, totals[2], lag)):
+            wp.launch(
+                kernel_backward.sum_over_parameters, dim=(touched, width, bar.shape[1]), device=self.device,
+                inputs=[bar, total, first, count, parameters, width],
+            )  # fmt: skip
+
+    def _slots(self, count: int) -> int:
+        return min(self.num_threads, count) if self.is_cpu else count
+
+    def _spread(self, launch: Any, count: int) -> None:
+        """One contiguous slice of worlds for each thread; a launch on a CPU releases Python's lock."""
+        threads = self._slots(count) if self.is_cpu else 1
+        bounds = [count * i // threads for i in range(threads + 1)]
+        if threads == 1:
+            launch(0, count, 0)
+            return
+        with ThreadPoolExecutor(threads) as pool:
+            jobs = [pool.submit(launch, a, b - a, i) for i, (a, b) in enumerate(zip(bounds, bounds[1:], strict=False))]
+            for job in jobs:
+                job.result()
+
+    def _rows(self, number: int) -> Rows:
+        """Memory of a number of stages, from those that a backward has given back."""
+        for i, (size, rows) in enumerate(self._free):
+            if size == number:
+                del self._free[i]
+                return rows
+        return self._new_rows(number)
+
+    def release(self, traces: list[Trace]) -> None:
+        """Take the memory of traces back for the next call."""
+        self._free = [(t.rows.qpos.shape[0], t.rows) for t in traces]
+
+    def _new_rows(self, number: int) -> Rows:
+        m, rows = self.tables, Rows()
+        soft = number if m.implicit else 1
+        rate = number if m.nstage > 1 else 1
+        widths = {"qpos": (number, m.nq), "qvel": (number, m.nv), "acc": (number, m.nv), "rate": (rate, m.nv), "hess": (number, m.nh),
+                  "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}  # fmt: skip
+        for name, (count, width) in widths.items():
+            setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
+        rows.held = wp.empty(number, dtype=wp.int32, device=self.device)
+        return rows
+
+    def _working(self, slots: int, *, adjoint: bool) -> Scratch:
+        """Scratch memory of a number of slots, made once."""
+        key = (slots, adjoint)
+        if key not in self._scratch:
+            self._scratch[key] = self._new_scratch(slots, adjoint)
+        return self._scratch[key]
+
+    def _new_scratch(self, slots: int, adjoint: bool) -> Scratch:
+        m, scratch = self.tables, Scratch()
+        nb, nv, nh, row, con = m.nb, m.nv, m.nh, m.maxrow, m.maxcon
+        real, number = wp.float64, wp.int32
+        sizes: dict[str, tuple[Any, int]] = {
+            "xpos": (vec3, nb), "xmat": (mat33, nb), "motion": (vec6, nv), "velocity": (vec6, nb), "bias": (vec6, nb),
+            "inertia": (vec10, nb), "composite": (vec10, nb), "force": (vec6, nb), "mass": (real, nh),
+            "load": (real, nv), "step": (real, nv), "product": (real, nv), "work": (real, nv), "row_kind": (number, row),
+            "row_index": (number, row), "row_dof": (number, 3 * row), "row_coef": (vec3, row), "row_x": (real, row),
+            "row_aref": (real, row), "row_d": (real, row), "row_loss": (real, row), "row_jar": (real, row),
+            "row_dir": (real, row), "con_pair": (number, con), "con_which": (number, con), "con_dist": (real, con),
+            "con_point": (vec3, con), "con_frame": (mat33, con), "con_hint": (vec3, con), "con_d": (real, con),
+            "con_aref": (vec6, con), "con_jar": (vec6, con), "con_dir": (vec6, con), "con_jac": (vec6, con * nv),
+        }  # fmt: skip
+        backward: dict[str, tuple[Any, int]] = {
+            "total": (vec6, nb), "dual": (vec6, nb), "f_velocity": (vec6, nb), "f_accel": (vec6, nb),
+            "f_total": (vec6, nb), "f_dual": (vec6, nb), "f_pose": (vec6, nb), "lam": (real, nv), "tangent": (real, nv),
+            "vel_bar": (real, nv), "acc_bar": (real, nv), "stage_vel_bar": (real, 4 * nv),
+            "stage_acc_bar": (real, 4 * nv), "stage_rate_bar": (real, 4 * nv), "pos_bar": (real, nv), "rate_bar": (real, nv), "pos_bar0": (real, nv),
+            "grad": (real, self.size),
+        }  # fmt: skip
+        for name, (dtype, width) in {**sizes, **(backward if adjoint else {})}.items():
+            # a gap between slots, so that no two threads write one cache line
+            array = wp.empty((slots, max(width, 1) + 16), dtype=dtype, device=self.device)
+            setattr(scratch, name, array[:, : max(width, 1)])
+        return scratch
+
+
+def _flat(x: torch.Tensor) -> torch.Tensor:
+    """All but the last axis as one."""
+    return x.reshape(x.shape[:-1].numel(), x.shape[-1])
+
+
+class Simulate(torch.autograd.Function):
+    """``(θ, states, controls) → states after each logged step``, with the adjoint kernels as its backward."""
+
+    @staticmethod
+    def forward(  # type: ignore[override]
+        ctx: Any, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor, engine: Engine
+    ) -> torch.Tensor:
+        """Return ``(T, K, lag, nq + nv)`` of θ ``(K, P)``, states ``(T, nq + nv)`` and controls ``(T, lag, nu)``."""
+        problem = Problem(len(states), len(theta), controls.shape[1], engine.skip)
+        wanted = any(ctx.needs_input_grad[:3])
+        keep = wanted and problem.worlds * engine.row_bytes(problem.lag) <= KEEP_BYTES
+        out, traces = engine.simulate(problem, theta, states, controls, keep)
+        ctx.save_for_backward(theta, states, controls)
+        ctx.engine, ctx.problem, ctx.traces = engine, problem, traces
+        return out.view(problem.transitions, problem.parameters, problem.lag, -1)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, out_bar: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+        """Return the adjoints of the inputs."""
+        theta, states, controls = ctx.saved_tensors
+        flat = _flat(out_bar).contiguous()
+        bars = ctx.engine.adjoint(ctx.problem, theta, states, controls, flat, ctx.traces)
+        # a second backward through the same graph simulates again
+        ctx.engine.release(ctx.traces)
+        ctx.traces = []
+        return (*bars, None)

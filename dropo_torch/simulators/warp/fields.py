@@ -1,0 +1,239 @@
+"""From parameter vectors to θ, differentiably: what MuJoCo derives from a model is derived here in PyTorch.
+
+θ has the model's own numbers, then one set of contact parameters for each pair of geoms (mixed by priority and
+``solmix`` as MuJoCo does), then the inverse weights that ``mj_setConst`` computes at ``qpos0``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+
+from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.simulators.warp.pairs import mixing
+
+#: Sections of θ that are fields of MjModel: name in the tables, field, columns kept of each row (0: all).
+DIRECT = (
+    ("gravity", "opt.gravity", 0), ("density", "opt.density", 0), ("viscosity", "opt.viscosity", 0),
+    ("wind", "opt.wind", 0), ("mass", "body_mass", 0), ("inertia", "body_inertia", 0), ("ipos", "body_ipos", 0),
+    ("gravcomp", "body_gravcomp", 0), ("stiffness", "jnt_stiffness", 0), ("stiffnesspoly", "jnt_stiffnesspoly", 0),
+    ("spring", "qpos_spring", 0), ("range", "jnt_range", 0), ("jnt_margin", "jnt_margin", 0),
+    ("jnt_solref", "jnt_solref", 0), ("jnt_solimp", "jnt_solimp", 0), ("actfrcrange", "jnt_actfrcrange", 0),
+    ("damping", "dof_damping", 0), ("dampingpoly", "dof_dampingpoly", 0), ("armature", "dof_armature", 0),
+    ("frictionloss", "dof_frictionloss", 0), ("dof_solref", "dof_solref", 0), ("dof_solimp", "dof_solimp", 0),
+    ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 1),
+    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 5),
+    ("eq_solref", "eq_solref", 0), ("eq_solimp", "eq_solimp", 0),
+)  # fmt: skip
+#: Fields from which the contact parameters of a pair are mixed.
+MIXED = (
+    "geom_friction", "geom_solref", "geom_solimp", "geom_margin", "pair_friction", "pair_solref",
+    "pair_solreffriction", "pair_solimp", "pair_margin",
+)  # fmt: skip
+_WIDTHS = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 1}
+_INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature"})
+_MINVAL = 1e-15
+_MINMU = 1e-5
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where θ's sections start: name → (offset, size), and the length of θ."""
+
+    sections: dict[str, tuple[int, int]]
+    size: int
+
+    def columns(self, name: str) -> np.ndarray:
+        """Columns of a section."""
+        start, size = self.sections[name]
+        return np.arange(start, start + size)
+
+
+class Fields:
+    """Maps parameter vectors ``(K, d)`` to θ ``(K, P)``.
+
+    Args:
+        model: the model, with everything ``mj_setConst`` derives up to date.
+        space: the parameters.
+        pairs: geoms that may touch, see :func:`candidate_pairs`.
+    """
+
+    def __init__(self, model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> None:
+        self.pairs = pairs
+        base, sections, columns, start = [], {}, {}, 0
+        for name, field, keep in (*DIRECT, *((f, f, 0) for f in MIXED)):
+            array, column = _numbers(model, field, keep)
+            base.append(array)
+            columns[field] = np.where(column >= 0, column + start, -1)
+            sections[name] = (start, array.size)
+            start += array.size
+        self._raw_sections = sections
+        self._raw = torch.from_numpy(np.concatenate(base))
+        self._direct = sum(sections[name][1] for name, _f, _k in DIRECT)
+        self._mixing = _Mixing(model, pairs)
+        self._weights = _Weights(model)
+        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
+            self._raw[:3] = 0.0
+        own = {name: sections[name] for name, _f, _k in DIRECT}
+        start = self._direct
+        for name, width in (*((f"pair_{n}", w) for n, w in _WIDTHS.items()), ("pair_invweight", 1)):
+            own[name] = (start, width * len(pairs))
+            start += width * len(pairs)
+        own["dof_invweight"] = (start, model.nv)
+        self.layout = Layout(own, start + model.nv)
+        self._targets(space, columns)
+
+    def _targets(self, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
+        """Columns that the parameters write, and those of θ whose gradient is wanted."""
+        written, factors, sources, fields = [], [], [], set()
+        for source, parameter in enumerate(space.parameters):
+            for target in parameter.targets:
+                written.append(int(columns[target.field][target.index]))
+                factors.append(target.factor)
+                sources.append(source)
+                fields.add(target.field)
+        self._written = torch.tensor(written)
+        self._factors = torch.tensor(factors, dtype=torch.float64)
+        self._sources = torch.tensor(sources)
+        self._mixes = bool(fields & set(MIXED))
+        self._weighs = bool(fields & _INERTIAL)
+        wanted = [c for c in written if c < self._direct]
+        if self._mixes:
+            wanted += [int(c) for n in _WIDTHS for c in self.layout.columns(f"pair_{n}")]
+        if self._weighs:
+            wanted += [int(c) for n in ("pair_invweight", "dof_invweight") for c in self.layout.columns(n)]
+        self.wanted = np.array(sorted(set(wanted)), dtype=np.int32)
+        with torch.no_grad():
+            self._constant = self._derive(self._raw[None])
+
+    def _derive(self, raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Contact parameters and inverse weights of raw fields ``(K, ...)``."""
+        return self._mix(raw), self._weigh(raw)
+
+    def _section(self, raw: torch.Tensor, name: str, width: int) -> torch.Tensor:
+        start, size = self._raw_sections[name]
+        return raw[:, start : start + size].reshape(len(raw), -1, width)
+
+    def _mix(self, raw: torch.Tensor) -> torch.Tensor:
+        widths = (3, 2, 5, 1, 5, 2, 2, 5, 1)
+        return self._mixing(*(self._section(raw, n, w) for n, w in zip(MIXED, widths, strict=True)))
+
+    def _weigh(self, raw: torch.Tensor) -> torch.Tensor:
+        body, dof = self._weights(
+            self._section(raw, "mass", 1)[..., 0], self._section(raw, "inertia", 3), self._section(raw, "ipos", 3),
+            self._section(raw, "armature", 1)[..., 0],
+        )  # fmt: skip
+        pair = body[:, self._mixing.body1] + body[:, self._mixing.body2]
+        return torch.cat([pair, dof], dim=1)
+
+    def __call__(self, values: torch.Tensor) -> torch.Tensor:
+        """Return θ ``(K, P)`` of parameter vectors ``(K, d)``, differentiable."""
+        count = len(values)
+        raw = self._raw.expand(count, -1)
+        raw = raw.index_copy(1, self._written, values[:, self._sources] * self._factors)
+        mixed = self._mix(raw) if self._mixes else self._constant[0].expand(count, -1)
+        weighed = self._weigh(raw) if self._weighs else self._constant[1].expand(count, -1)
+        return torch.cat([raw[:, : self._direct], mixed, weighed], dim=1)
+
+
+def _numbers(model: mujoco.MjModel, field: str, keep: int) -> tuple[np.ndarray, np.ndarray]:
+    """The numbers of a field that are kept, flat, and the place of each of its numbers among them (or −1)."""
+    array = np.atleast_1d(read_field(model, field)).astype(np.float64)
+    place = np.arange(array.size).reshape(array.shape)
+    if keep:
+        array = array[:, :keep]
+        kept = np.full(place.shape, -1)
+        kept[:, :keep] = np.arange(array.size).reshape(array.shape)
+        place = kept
+    return array.reshape(-1).copy(), place.reshape(-1)
+
+
+class _Mixing:
+    """Contact parameters of geom pairs."""
+
+    def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
+        table = np.array(pairs, dtype=np.int64).reshape(-1, 3)
+        self.g1, self.g2, pair = (torch.from_numpy(table[:, i].copy()) for i in range(3))
+        self.explicit = pair >= 0
+        self.pair = pair.clamp(min=0)
+        body = torch.from_numpy(model.geom_bodyid.astype(np.int64))
+        self.body1, self.body2 = body[self.g1], body[self.g2]
+        self.weight = torch.from_numpy(mixing(model, pairs))[:, None]
+        priority = torch.from_numpy(model.geom_priority.astype(np.int64))
+        self.first, self.second = priority[self.g1] > priority[self.g2], priority[self.g1] < priority[self.g2]
+
+    def __call__(
+        self, friction: torch.Tensor, solref: torch.Tensor, solimp: torch.Tensor, margin: torch.Tensor,
+        pair_friction: torch.Tensor, pair_solref: torch.Tensor, pair_solreffriction: torch.Tensor,
+        pair_solimp: torch.Tensor, pair_margin: torch.Tensor,
+    ) -> torch.Tensor:  # fmt: skip
+        """Return friction, solref, solreffriction, solimp and margin of the pairs, ``(K, 15 n)``."""
+        f1, f2 = friction[:, self.g1], friction[:, self.g2]
+        mu = torch.maximum(f1, f2)
+        mu = torch.where(self.first[:, None], f1, torch.where(self.second[:, None], f2, mu))
+        mu = mu[..., [0, 0, 1, 2, 2]]
+        r1, r2 = solref[:, self.g1], solref[:, self.g2]
+        blend = self.weight * r1 + (1 - self.weight) * r2
+        standard = ((r1[..., :1] > 0) & (r2[..., :1] > 0)) | (self.first | self.second)[:, None]
+        ref = torch.where(standard, blend, torch.minimum(r1, r2))
+        imp = self.weight * solimp[:, self.g1] + (1 - self.weight) * solimp[:, self.g2]
+        inflation = margin[:, self.g1] + margin[:, self.g2]
+        fref = torch.zeros_like(ref)
+        if self.explicit.any():
+            own = self.explicit[:, None]
+            mu = torch.where(own, pair_friction[:, self.pair], mu)
+            ref = torch.where(own, pair_solref[:, self.pair], ref)
+            fref = torch.where(own, pair_solreffriction[:, self.pair], fref)
+            imp = torch.where(own, pair_solimp[:, self.pair], imp)
+            inflation = torch.where(own, pair_margin[:, self.pair], inflation)
+        parts = (mu.clamp(min=_MINMU), ref, fref, imp, inflation)
+        return torch.cat([p.flatten(1) for p in parts], dim=1)
+
+
+class _Weights:
+    """``body_invweight0`` (translation) and ``dof_invweight0`` as functions of the inertial parameters."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        data = mujoco.MjData(model)
+        data.qpos[:] = model.qpos0
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        nv, nb = model.nv, model.nbody
+        jac = np.zeros((nb, 2, 3, nv))
+        for b in range(1, nb):
+            mujoco.mj_jac(model, data, jac[b, 0], jac[b, 1], data.xpos[b], b)
+        self.linear, self.angular = torch.from_numpy(jac[:, 0].copy()), torch.from_numpy(jac[:, 1].copy())
+        self.rotation = torch.from_numpy(data.xmat.reshape(-1, 3, 3).copy())
+        self.principal = torch.from_numpy(data.ximat.reshape(-1, 3, 3).copy())
+        self.moving = torch.from_numpy(model.body_weldid != 0)
+        self.simple = torch.from_numpy(model.body_simple == 2)
+        self.dof_simple = self.simple[torch.from_numpy(model.dof_bodyid.astype(np.int64))]
+        self.dof_body = torch.from_numpy(model.dof_bodyid.astype(np.int64))
+        average = np.eye(nv)
+        for j in range(model.njnt):
+            start = model.jnt_dofadr[j]
+            groups = {0: (start, start + 3), 1: (start,)}.get(int(model.jnt_type[j]), ())
+            for g in groups:
+                average[g : g + 3, g : g + 3] = 1 / 3
+        self.average = torch.from_numpy(average)
+
+    def __call__(
+        self, mass: torch.Tensor, inertia: torch.Tensor, ipos: torch.Tensor, armature: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the weights of bodies ``(K, nbody)`` and dofs ``(K, nv)`` of inertial parameters ``(K, ...)``."""
+        arm = torch.einsum("bij,kbj->kbi", self.rotation, ipos)
+        linear = self.linear + torch.linalg.cross(self.angular.expand(len(arm), -1, -1, -1), arm[..., None], dim=2)
+        local = self.principal.transpose(1, 2) @ self.angular
+        matrix = torch.einsum("kb,kbij,kbil->kjl", mass, linear, linear)
+        matrix = matrix + torch.einsum("kbi,bij,bil->kjl", inertia, local, local) + torch.diag_embed(armature)
+        if matrix.shape[-1] == 0:
+            return mass.new_zeros(mass.shape), armature
+        inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L)
+        body = torch.einsum("kbij,kjl,kbil->kb", linear, inverse, linear) / 3
+        light = 1 / mass.clamp(min=_MINVAL)
+        body = torch.where(self.moving, torch.where(self.simple, light, body), torch.zeros_like(body))
+        dof = torch.diagonal(inverse, dim1=1, dim2=2) @ self.average
+        return body, torch.where(self.dof_simple, light[:, self.dof_body], dof)

@@ -1,0 +1,89 @@
+"""Drag of the inertia box (``opt.density``, ``opt.viscosity``, ``opt.wind``): one body, and its adjoint leaf."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from dropo_torch.simulators.warp.spatial import ang, at, join, wrench
+from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Reals, Scratch, Tables, f64, mat33, vec3, vec6
+
+PI = wp.constant(wp.float64(wp.pi))
+
+
+@wp.func
+def _edge(a: f64, b: f64, c: f64, mass: f64) -> f64:
+    """Edge of the box with the body's inertia, along the axis of moment ``c``."""
+    return wp.sqrt(wp.max(MINVAL, a + b - c) / mass * f64(6.0))
+
+
+@wp.func
+def box_force(v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3:
+    """Force in the inertial frame of a box with moments ``x`` that moves at ``v`` through the medium."""
+    b0 = _edge(x[1], x[2], x[0], mass)
+    b1 = _edge(x[0], x[2], x[1], mass)
+    b2 = _edge(x[0], x[1], x[2], mass)
+    k = THREE * PI * (b0 + b1 + b2) / THREE * viscosity
+    q = HALF * density
+    return vec3(
+        -k * v[0] - q * b1 * b2 * wp.abs(v[0]) * v[0],
+        -k * v[1] - q * b0 * b2 * wp.abs(v[1]) * v[1],
+        -k * v[2] - q * b0 * b1 * wp.abs(v[2]) * v[2],
+    )
+
+
+@wp.func
+def box_torque(w: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3:
+    """Torque in the inertial frame of a box with moments ``x`` that turns at ``w``."""
+    b0 = _edge(x[1], x[2], x[0], mass)
+    b1 = _edge(x[0], x[2], x[1], mass)
+    b2 = _edge(x[0], x[1], x[2], mass)
+    d = (b0 + b1 + b2) / THREE
+    k = PI * d * d * d * viscosity
+    p0 = b0 * b0 * b0 * b0
+    p1 = b1 * b1 * b1 * b1
+    p2 = b2 * b2 * b2 * b2
+    q = density / f64(64.0)
+    return vec3(
+        -k * w[0] - q * b0 * (p1 + p2) * wp.abs(w[0]) * w[0],
+        -k * w[1] - q * b1 * (p0 + p2) * wp.abs(w[1]) * w[1],
+        -k * w[2] - q * b2 * (p0 + p1) * wp.abs(w[2]) * w[2],
+    )
+
+
+@wp.func
+def box_power(
+    w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density: f64, viscosity: f64
+) -> f64:
+    """−(force · lv + torque · lw): what drag adds to λᵀR, all in the inertial frame."""
+    return ZERO - wp.dot(box_force(v, x, mass, density, viscosity), lv) - wp.dot(
+        box_torque(w, x, mass, density, viscosity), lw
+    )
+
+
+@wp.func
+def inertial_frame(m: Tables, s: Scratch, t: int, b: int) -> mat33:
+    """Rotation of the inertial frame of a body."""
+    return s.xmat[t, b] * m.body_imat[b]
+
+
+@wp.func
+def centre_of_mass(m: Tables, s: Scratch, t: int, th: Reals, b: int) -> vec3:
+    """Centre of mass of a body, from the origin of the sweep."""
+    i = m.o_ipos + 3 * b
+    return s.xpos[t, b] + s.xmat[t, b] * vec3(th[i], th[i + 1], th[i + 2])
+
+
+@wp.func
+def fluid_wrench(m: Tables, s: Scratch, t: int, th: Reals, b: int) -> vec6:
+    """The drag on a body as a spatial force."""
+    rot = inertial_frame(m, s, t, b)
+    c = centre_of_mass(m, s, t, th, b)
+    wind = vec3(th[m.o_wind], th[m.o_wind + 1], th[m.o_wind + 2])
+    vel = s.velocity[t, b]
+    back = wp.transpose(rot)
+    i = m.o_inertia + 3 * b
+    x = vec3(th[i], th[i + 1], th[i + 2])
+    mass = th[m.o_mass + b]
+    f = rot * box_force(back * (at(vel, c) - wind), x, mass, th[m.o_density], th[m.o_viscosity])
+    n = rot * box_torque(back * ang(vel), x, mass, th[m.o_density], th[m.o_viscosity])
+    return wrench(f, c) + join(n, vec3())

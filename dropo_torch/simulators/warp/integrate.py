@@ -1,0 +1,424 @@
+"""The integrators Euler (implicit in damping), implicitfast and RK4, and their adjoints."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from dropo_torch.simulators.warp.forces import actuator_force, control, damping_slope
+from dropo_torch.simulators.warp.kinematics import packed, sweep_out
+from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
+from dropo_torch.simulators.warp.spatial import chart_rate, chart_rate_dual, nothing, quat_integrate, quat_mul, right_jacobian_t, turn
+from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint, bodies_adjoint, carry_in, carry_out
+from dropo_torch.simulators.warp.types import (
+    BALL,
+    HALF,
+    ONE,
+    RK4,
+    THREE,
+    TRANSLATION,
+    TWO,
+    ZERO,
+    Ints,
+    Reals,
+    Reals2,
+    Scratch,
+    Tables,
+    f64,
+    vec3,
+    vec4,
+    vec6,
+)
+
+LARGE = wp.constant(wp.float64(1.0e10))  # mjMAXVAL
+
+
+@wp.func
+def move(m: Tables, qpos: Reals2, r: int, vel: Reals2, rv: int, ov: int, h: f64, out: Reals2, ro: int):
+    """out[ro] = qpos[r] ⊕ h vel[rv, ov:]."""
+    for k in range(m.nlink):
+        iq = m.link_qpos[k]
+        d = ov + m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
+            q = quat_integrate(q, vec3(vel[rv, d], vel[rv, d + 1], vel[rv, d + 2]) * h)
+            for i in range(4):
+                out[ro, iq + i] = q[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                out[ro, iq + i] = qpos[r, iq + i] + h * vel[rv, d + i]
+
+
+@wp.func
+def move_adjoint(
+    m: Tables, vel: Reals2, rv: int, ov: int, h: f64, bar: Reals2, rb: int, pos_bar: Reals2, vel_bar: Reals2, o: int
+):
+    """Adjoint of :func:`move`: adds to ``pos_bar[rb]`` and ``vel_bar[rb, o:]`` from ``bar[rb]``."""
+    for k in range(m.nlink):
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            # q' = q exp(r): δ' = exp(−[r]) δ + J_r(r) δr
+            r = vec3(vel[rv, ov + d], vel[rv, ov + d + 1], vel[rv, ov + d + 2]) * h
+            g = vec3(bar[rb, d], bar[rb, d + 1], bar[rb, d + 2])
+            back = turn(r, g)
+            w = right_jacobian_t(r, g) * h
+            for i in range(3):
+                pos_bar[rb, d + i] += back[i]
+                vel_bar[rb, o + d + i] += w[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                pos_bar[rb, d + i] += bar[rb, d + i]
+                vel_bar[rb, o + d + i] += h * bar[rb, d + i]
+
+
+@wp.func
+def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
+    """rate[r] of a stage that is ``c`` rate[r − 1] away from the start of its step."""
+    for k in range(m.nlink):
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            turned = vec3(rate[r - 1, d], rate[r - 1, d + 1], rate[r - 1, d + 2]) * c
+            w = chart_rate(turned, vec3(qvel[r, d], qvel[r, d + 1], qvel[r, d + 2]))
+            for i in range(3):
+                rate[r, d + i] = w[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                rate[r, d + i] = qvel[r, d + i]
+
+
+@wp.func
+def chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: f64, qvel: Reals2, o: int):
+    """Adjoint of :func:`chart_rates`: from ``s.stage_rate_bar[o:]`` to ``s.vel_bar`` and the rates of the stage before."""
+    _late = wp.grad(nothing)(ONE)
+    for k in range(m.nlink):
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            turned = vec3(rate[r - 1, d], rate[r - 1, d + 1], rate[r - 1, d + 2]) * c
+            w = vec3(qvel[r, d], qvel[r, d + 1], qvel[r, d + 2])
+            bar = vec3(s.stage_rate_bar[t, o + d], s.stage_rate_bar[t, o + d + 1], s.stage_rate_bar[t, o + d + 2])
+            turnedbar, wbar, _bar = wp.grad(chart_rate_dual)(turned, w, bar)
+            for i in range(3):
+                s.vel_bar[t, d + i] += wbar[i]
+                s.stage_rate_bar[t, o - m.nv + d + i] += c * turnedbar[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                s.vel_bar[t, d + i] += s.stage_rate_bar[t, o + d + i]
+
+
+@wp.func
+def good(m: Tables, qpos: Reals2, qvel: Reals2, r: int) -> int:
+    """1 while every number of a state is finite and below MuJoCo's limit."""
+    ok = int(1)
+    for i in range(m.nq):
+        if not (wp.abs(qpos[r, i]) < LARGE):
+            ok = 0
+    for i in range(m.nv):
+        if not (wp.abs(qvel[r, i]) < LARGE):
+            ok = 0
+    return ok
+
+
+@wp.func
+def implicit_slope(
+    m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, i: int
+) -> f64:
+    """B of dof ``i``: −∂τ/∂q̇ that the integrator takes implicitly."""
+    b = ZERO
+    if m.has_damper != 0:
+        b = damping_slope(m, th, qvel[r, i], i)
+    if m.implicit_actuators != 0:
+        for a in range(m.nu):
+            if m.act_dof[a] == i:
+                b -= actuator_slope(m, th, qpos, qvel, r, ctrl, rc, a)
+    return b
+
+
+@wp.func
+def actuator_slope(
+    m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, a: int
+) -> f64:
+    """gear² (bias_v + gain_v u), or zero where the force is clamped."""
+    gear = th[m.o_gear + a]
+    u = control(m, th, ctrl, rc, a)
+    y = ZERO
+    if m.act_affine_bias[a] != 0:
+        y += th[m.o_bias + 3 * a + 2]
+    if m.act_affine_gain[a] != 0:
+        y += th[m.o_gain + 3 * a + 2] * u
+    if m.act_frclimited[a] != 0:
+        f = actuator_force(m, th, a, u, gear * qpos[r, m.act_qpos[a]], gear * qvel[r, m.act_dof[a]])
+        o = m.o_forcerange + 2 * a
+        if f <= th[o] or f >= th[o + 1]:
+            y = ZERO
+    return gear * gear * y
+
+
+@wp.func
+def soften(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
+    r: int, ctrl: Reals2, rc: int,
+):
+    """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``hess[r]``."""
+    mass_mul(m, s, t, acc, r, soft, r)
+    for i in range(m.nh):
+        hess[r, i] = s.mass[t, i]
+    for i in range(m.nv):
+        hess[r, packed(i, i)] += m.h * implicit_slope(m, th, qpos, qvel, r, ctrl, rc, i)
+    factor(m, 0, hess, r)
+    solve(m, 0, hess, r, soft, r)
+
+
+@wp.func
+def soften_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
+    r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+):
+    """Adjoint of :func:`soften`, from and to ``s.acc_bar``: the gradient of λᵀ(M (a − a') − h B a').
+
+    Poses and inertias must be those of row ``r``. Adds to ``s.pos_bar0``, ``s.stage_vel_bar`` and θ.
+    """
+    _late = wp.grad(nothing)(ONE)
+    for i in range(m.nv):
+        s.lam[t, i] = s.acc_bar[t, i]
+        s.tangent[t, i] = ZERO
+        s.vel_bar[t, i] = ZERO
+    solve(m, 0, hess, r, s.lam, t)
+    if m.has_damper != 0:
+        for i in range(m.nv):
+            y = -m.h * s.lam[t, i] * soft[r, i]  # ∂/∂B
+            v = qvel[r, i]
+            n = wp.abs(v)
+            ip = m.o_dampingpoly + 2 * i
+            s.grad[t, m.o_damping + i] += y
+            s.grad[t, ip] += TWO * n * y
+            s.grad[t, ip + 1] += THREE * n * n * y
+            s.stage_vel_bar[t, i] += y * (TWO * th[ip] * wp.sign(v) + f64(6.0) * th[ip + 1] * v)
+    if m.implicit_actuators != 0:
+        for a in range(m.nu):
+            _actuator_slope_adjoint(m, s, t, th, qpos, qvel, soft, r, ctrl, rc, ctrl_bar, rb, a)
+    # the part of M: bodies at rest with acceleration a − a'
+    zero = vec6()
+    for b in range(m.nb):
+        s.velocity[t, b] = zero
+        s.bias[t, b] = zero
+    for i in range(m.nv):
+        s.work[t, i] = acc[r, i] - soft[r, i]
+        s.grad[t, m.o_armature + i] += s.lam[t, i] * s.work[t, i]
+    carry_out(m, s, t, s.work, t)
+    bodies_adjoint(m, s, t, th, 0)
+    carry_in(m, s, t, qvel, r, s.work, t, ZERO, 0)
+    for i in range(m.nv):
+        s.pos_bar0[t, i] += s.tangent[t, i]
+    # ā = M λ, with M λ = Σ_subtree s · I Λ + armature
+    for i in range(m.nv):
+        s.acc_bar[t, i] = wp.dot(s.motion[t, i], s.f_accel[t, m.dof_body[i]]) + th[m.o_armature + i] * s.lam[t, i]
+
+
+@wp.func
+def _actuator_slope_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, soft: Reals2, r: int, ctrl: Reals2,
+    rc: int, ctrl_bar: Reals2, rb: int, a: int,
+):
+    """Adjoint of the actuators' part of B (which does not see the position)."""
+    slope = actuator_slope(m, th, qpos, qvel, r, ctrl, rc, a)
+    if slope != ZERO:
+        i = m.act_dof[a]
+        y = m.h * s.lam[t, i] * soft[r, i]
+        gear = th[m.o_gear + a]
+        s.grad[t, m.o_gear + a] += y * TWO * slope / gear
+        if m.act_affine_bias[a] != 0:
+            s.grad[t, m.o_bias + 3 * a + 2] += y * gear * gear
+        if m.act_affine_gain[a] != 0:
+            s.grad[t, m.o_gain + 3 * a + 2] += y * gear * gear * control(m, th, ctrl, rc, a)
+            o = m.o_ctrlrange + 2 * a
+            g = y * gear * gear * th[m.o_gain + 3 * a + 2]
+            if m.clampctrl == 0 or m.act_ctrllimited[a] == 0:
+                ctrl_bar[rb, a] += g
+            elif ctrl[rc, a] < th[o]:
+                s.grad[t, o] += g
+            elif ctrl[rc, a] > th[o + 1]:
+                s.grad[t, o + 1] += g
+            else:
+                ctrl_bar[rb, a] += g
+
+
+@wp.func
+def warm(m: Tables, acc: Reals2, r: int, source: int):
+    """The guess of a stage: the acceleration of the one before."""
+    for i in range(m.nv):
+        acc[r, i] = acc[source, i]
+
+
+@wp.func
+def step(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
+    hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int,
+) -> int:
+    """One physics step from row ``r`` (stages in the rows after it) to row ``nxt``; 1 while it is good."""
+    h = m.h
+    ok = good(m, qpos, qvel, r)
+    if ok != 0:
+        accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc)
+        for i in range(m.nv):
+            if not (wp.abs(acc[r, i]) < LARGE):
+                ok = 0
+    if ok != 0:
+        if m.integrator == RK4:
+            # Munthe-Kaas: stages of a quaternion combine in the chart at the start of the step
+            for i in range(m.nv):
+                rate[r, i] = qvel[r, i]
+            for k in range(1, 4):
+                c = h * HALF
+                if k == 3:
+                    c = h
+                move(m, qpos, r, rate, r + k - 1, 0, c, qpos, r + k)
+                for i in range(m.nv):
+                    qvel[r + k, i] = qvel[r, i] + c * acc[r + k - 1, i]
+                chart_rates(m, rate, r + k, c, qvel)
+                warm(m, acc, r + k, r + k - 1)
+                accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc)
+            sixth = h / f64(6.0)
+            for i in range(m.nv):
+                s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
+                qvel[nxt, i] = qvel[r, i] + sixth * (
+                    acc[r, i] + TWO * acc[r + 1, i] + TWO * acc[r + 2, i] + acc[r + 3, i]
+                )
+            move(m, qpos, r, s.work, t, 0, h, qpos, nxt)
+            warm(m, acc, nxt, r + 3)
+        else:
+            if m.implicit != 0:
+                soften(m, s, t, th, qpos, qvel, acc, soft, soft_hess, r, ctrl, rc)
+                for i in range(m.nv):
+                    qvel[nxt, i] = qvel[r, i] + h * soft[r, i]
+            else:
+                for i in range(m.nv):
+                    qvel[nxt, i] = qvel[r, i] + h * acc[r, i]
+            move(m, qpos, r, qvel, nxt, 0, h, qpos, nxt)
+            warm(m, acc, nxt, r)
+    return ok
+
+
+@wp.func
+def step_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
+    hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+):
+    """Adjoint of :func:`step`: ``s.pos_bar`` (tangent) and ``s.rate_bar`` of the end become those of the start."""
+    _late = wp.grad(nothing)(ONE)
+    h = m.h
+    nv = m.nv
+    for i in range(nv):
+        s.pos_bar0[t, i] = ZERO
+    if m.integrator == RK4:
+        for i in range(nv):
+            s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
+            s.tangent[t, i] = ZERO
+        move_adjoint(m, s.work, t, 0, h, s.pos_bar, t, s.pos_bar0, s.tangent, 0)
+        for i in range(nv):
+            wbar = s.tangent[t, i] / f64(6.0)
+            abar = s.rate_bar[t, i] * h / f64(6.0)
+            s.stage_vel_bar[t, i] = s.rate_bar[t, i]
+            s.stage_rate_bar[t, i] = wbar
+            s.stage_rate_bar[t, nv + i] = TWO * wbar
+            s.stage_rate_bar[t, 2 * nv + i] = TWO * wbar
+            s.stage_rate_bar[t, 3 * nv + i] = wbar
+            s.stage_acc_bar[t, i] = abar
+            s.stage_acc_bar[t, nv + i] = TWO * abar
+            s.stage_acc_bar[t, 2 * nv + i] = TWO * abar
+            s.stage_acc_bar[t, 3 * nv + i] = abar
+        for back in range(3):
+            k = 3 - back
+            c = h * HALF
+            if k == 3:
+                c = h
+            for i in range(nv):
+                s.acc_bar[t, i] = s.stage_acc_bar[t, k * nv + i]
+            accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc, ctrl_bar, rb)
+            chart_rates_adjoint(m, s, t, rate, r + k, c, qvel, k * nv)
+            for i in range(nv):
+                vbar = s.vel_bar[t, i]
+                s.stage_vel_bar[t, i] += vbar
+                s.stage_acc_bar[t, (k - 1) * nv + i] += c * vbar
+            move_adjoint(m, rate, r + k - 1, 0, c, s.tangent, t, s.pos_bar0, s.stage_rate_bar, (k - 1) * nv)
+        for i in range(nv):
+            s.stage_vel_bar[t, i] += s.stage_rate_bar[t, i]
+            s.acc_bar[t, i] = s.stage_acc_bar[t, i]
+        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc, ctrl_bar, rb)
+    else:
+        # q' = q ⊕ h v', v' = v + h a'
+        move_adjoint(m, qvel, nxt, 0, h, s.pos_bar, t, s.pos_bar0, s.rate_bar, 0)
+        for i in range(nv):
+            s.stage_vel_bar[t, i] = s.rate_bar[t, i]
+            s.acc_bar[t, i] = h * s.rate_bar[t, i]
+        if m.implicit != 0:
+            _soften_here(m, s, t, th, qpos, qvel, acc, soft, soft_hess, r, ctrl, rc, ctrl_bar, rb)
+        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc, ctrl_bar, rb)
+    for i in range(nv):
+        s.pos_bar[t, i] = s.pos_bar0[t, i] + s.tangent[t, i]
+        s.rate_bar[t, i] = s.stage_vel_bar[t, i] + s.vel_bar[t, i]
+
+
+@wp.func
+def _soften_here(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
+    r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+):
+    """:func:`soften_adjoint` after bringing poses and inertias of row ``r`` into the scratch memory."""
+    _late = wp.grad(nothing)(ONE)
+    sweep_out(m, s, t, th, qpos, qvel, r)
+    soften_adjoint(m, s, t, th, qpos, qvel, acc, soft, hess, r, ctrl, rc, ctrl_bar, rb)
+
+
+@wp.func
+def to_tangent(m: Tables, qpos: Reals2, r: int, bar: Reals2, rb: int, out: Reals2, t: int):
+    """Add the adjoint of a raw position to its tangent: ½ (q* ⊗ q̄) of a unit quaternion."""
+    for k in range(m.nlink):
+        iq = m.link_qpos[k]
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            q = vec4(qpos[r, iq], -qpos[r, iq + 1], -qpos[r, iq + 2], -qpos[r, iq + 3])
+            g = quat_mul(q, vec4(bar[rb, iq], bar[rb, iq + 1], bar[rb, iq + 2], bar[rb, iq + 3]))
+            for i in range(3):
+                out[t, d + i] += HALF * g[i + 1]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                out[t, d + i] += bar[rb, iq + i]
+
+
+@wp.func
+def from_tangent(m: Tables, qpos: Reals2, r: int, bar: Reals2, t: int, out: Reals2, ro: int):
+    """Write the adjoint of a raw position from its tangent: 2/|q| q̂ ⊗ (0, g)."""
+    for k in range(m.nlink):
+        iq = m.link_qpos[k]
+        d = m.link_dof[k]
+        kind = m.link_kind[k]
+        if kind == BALL:
+            q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
+            g = quat_mul(q, vec4(ZERO, bar[t, d], bar[t, d + 1], bar[t, d + 2])) * (TWO / wp.dot(q, q))
+            for i in range(4):
+                out[ro, iq + i] = g[i]
+        else:
+            n = int(1)
+            if kind == TRANSLATION:
+                n = 3
+            for i in range(n):
+                out[ro, iq + i] = bar[t, d + i]

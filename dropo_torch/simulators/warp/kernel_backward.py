@@ -1,0 +1,147 @@
+"""The kernels of the adjoint: one thread a world, its physics steps from last to first, then the sums over worlds."""
+
+from __future__ import annotations
+
+import warp as wp
+
+from dropo_torch.simulators.warp.collide import box_dual, cylinder_dual, ellipsoid_dual, round_dual
+from dropo_torch.simulators.warp.cone import contact_power
+from dropo_torch.simulators.warp.fluid import box_power
+from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
+from dropo_torch.simulators.warp.rows import row_power
+from dropo_torch.simulators.warp.spatial import chart_rate_dual
+from dropo_torch.simulators.warp.types import (
+    ZERO,
+    Ints,
+    Reals2,
+    Rows,
+    Scratch,
+    Tables,
+    f64,
+    mat33,
+    vec2,
+    vec3,
+    vec5,
+    vec6,
+)
+
+wp.set_module_options({"enable_backward": False})
+
+
+@wp.kernel(enable_backward=False)
+def adjoint_kernel(
+    m: Tables,
+    s: Scratch,
+    rows: Rows,
+    theta: Reals2,
+    controls: Reals2,
+    alive: Ints,
+    columns: Ints,
+    out_bar: Reals2,
+    state_bar: Reals2,
+    control_bar: Reals2,
+    theta_bar: Reals2,
+    first: int,
+    local: int,
+    nparam: int,
+    lag: int,
+    skip: int,
+    period: int,
+    slot: int,
+    slot_stride: int,
+):
+    """Adjoints of start state, controls and the θ ``columns`` of one world, from that of its output."""
+    tid = wp.tid()
+    world = first + tid
+    i = local + tid
+    tr = world // nparam
+    th = theta[world % nparam]
+    t = slot + tid * slot_stride
+    base = i * period * m.nstage
+    for j in range(s.grad.shape[1]):
+        s.grad[t, j] = ZERO
+    for j in range(m.nv):
+        s.pos_bar[t, j] = ZERO
+        s.rate_bar[t, j] = ZERO
+    for j in range(lag):
+        for k in range(m.nu):
+            control_bar[i * lag + j, k] = ZERO
+    seen = ZERO
+    for j in range(lag):
+        for k in range(m.nq + m.nv):
+            seen += wp.abs(out_bar[i * lag + j, k])
+    if alive[i] != 0 and seen != ZERO:
+        for back in range(lag):
+            logged = lag - 1 - back
+            row = i * lag + logged
+            end = base + (logged + 1) * skip * m.nstage
+            to_tangent(m, rows.qpos, end, out_bar, row, s.pos_bar, t)
+            for j in range(m.nv):
+                s.rate_bar[t, j] += out_bar[row, m.nq + j]
+            for k in range(skip):
+                r = end - (k + 1) * m.nstage
+                step_adjoint(
+                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, rows.held, r,
+                    r + m.nstage, controls, tr * lag + logged, control_bar, row,
+                )  # fmt: skip
+    from_tangent(m, rows.qpos, base, s.pos_bar, t, state_bar, i)
+    for j in range(m.nv):
+        state_bar[i, m.nq + j] = s.rate_bar[t, j]
+    for j in range(columns.shape[0]):
+        theta_bar[i, j] = s.grad[t, columns[j]]
+    if alive[i] == 0 and seen != ZERO:
+        nan = f64(wp.nan)
+        for j in range(m.nq + m.nv):
+            state_bar[i, j] = nan
+        for j in range(columns.shape[0]):
+            theta_bar[i, j] = nan
+        for j in range(lag):
+            for k in range(m.nu):
+                control_bar[i * lag + j, k] = nan
+
+
+@wp.kernel(enable_backward=True)
+def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array(dtype=f64)):
+    """Never launched: makes Warp emit the adjoints of the leaves and of all that they call.
+
+    A function that ``wp.grad`` meets after the forward code has used what it calls gets no adjoint of those, and its
+    gradient is silently zero. A kernel with a backward marks them whatever the order.
+    """
+    a = x[0]
+    v = vec3(a[0], a[1], a[2])
+    v2 = vec2(a[0], a[1])
+    v5 = vec5(a[0], a[1], a[2], a[3], a[4])
+    s = a[0]
+    y[0] = row_power(0, s, s, s, s, v2, v5, s, s, s, 1)
+    y[1] = contact_power(3, 0, a, a, a, s, s, v5, v2, v2, v5, s, s, s, 1)
+    y[2] = box_power(v, v, v, v, v, s, s, s)
+    y[3] = round_dual(v, v, s, v, v, s, 0, s, v, v)
+    y[4] = cylinder_dual(v, v, r[0], v, 0, v)
+    y[5] = ellipsoid_dual(v, v, r[0], v, v)
+    y[6] = box_dual(v, r[0], v, v, s, s, v, v)
+    y[7] = chart_rate_dual(v, v, v)
+
+
+@wp.kernel(enable_backward=False)
+def sum_over_transitions(theta_bar: Reals2, total: Reals2, first: int, count: int, nparam: int):
+    """Add the worlds ``first ...`` to their parameter vectors, in the order of transitions whatever the chunks."""
+    k, j = wp.tid()
+    i = (nparam + k - first % nparam) % nparam
+    y = total[k, j]
+    while i < count:
+        y += theta_bar[i, j]
+        i += nparam
+    total[k, j] = y
+
+
+@wp.kernel(enable_backward=False)
+def sum_over_parameters(bar: Reals2, total: Reals2, first: int, count: int, nparam: int, width: int):
+    """Add rows ``world · width + ...`` to their transitions, in the order of parameter vectors."""
+    tr, row, j = wp.tid()
+    tr += first // nparam
+    start = wp.max(tr * nparam, first) - first
+    stop = wp.min((tr + 1) * nparam, first + count) - first
+    y = total[tr * width + row, j]
+    for i in range(start, stop):
+        y += bar[i * width + row, j]
+    total[tr * width + row, j] = y

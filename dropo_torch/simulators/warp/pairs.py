@@ -1,0 +1,95 @@
+"""Which geoms may touch: MuJoCo's filters, once, for all configurations."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+
+
+def candidate_pairs(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
+    """Return the geom pairs that may touch, as ``(geom1, geom2, pair)``.
+
+    The geom of the smaller type comes first, as in MuJoCo; ``pair`` is the number of an explicit contact pair,
+    or −1.
+    """
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT):
+        return []
+    found: dict[tuple[int, int], int] = {}
+    for i in range(model.npair):
+        found[_ordered(model, int(model.pair_geom1[i]), int(model.pair_geom2[i]))] = i
+    excluded = {int(s) for s in model.exclude_signature}
+    for g1 in range(model.ngeom):
+        for g2 in range(g1 + 1, model.ngeom):
+            key = _ordered(model, g1, g2)
+            if key not in found and _dynamic(model, g1, g2, excluded):
+                found[key] = -1
+    plane = [all(model.geom_type[g] == _PLANE for g in key) for key in found]
+    moving = [any(model.body_weldid[model.geom_bodyid[g]] for g in key) for key in found]
+    return [(*key, i) for (key, i), p, m in zip(found.items(), plane, moving, strict=True) if m and not p]
+
+
+def _ordered(model: mujoco.MjModel, g1: int, g2: int) -> tuple[int, int]:
+    return (g1, g2) if model.geom_type[g1] <= model.geom_type[g2] else (g2, g1)
+
+
+def _dynamic(model: mujoco.MjModel, g1: int, g2: int, excluded: set[int]) -> bool:
+    """Whether two geoms without an explicit pair pass MuJoCo's filters."""
+    one = model.geom_contype[g1] & model.geom_conaffinity[g2]
+    two = model.geom_contype[g2] & model.geom_conaffinity[g1]
+    if not (one or two):
+        return False
+    b1, b2 = sorted((int(model.geom_bodyid[g1]), int(model.geom_bodyid[g2])))
+    if (b1 << 16) + b2 in excluded:
+        return False
+    w1, w2 = int(model.body_weldid[b1]), int(model.body_weldid[b2])
+    if w1 == w2:
+        return False
+    parents = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_FILTERPARENT)
+    p1, p2 = (int(model.body_weldid[model.body_parentid[w]]) for w in (w1, w2))
+    return not (parents and w1 and w2 and (w1 == p2 or w2 == p1))
+
+
+def joins_branches(model: mujoco.MjModel, body1: int, body2: int) -> bool:
+    """Whether a constraint between two bodies couples dofs that are not on one chain to the root."""
+
+    def chain(body: int) -> set[int]:
+        dofs = set()
+        while body:
+            first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
+            dofs |= set(range(first, first + count))
+            body = int(model.body_parentid[body])
+        return dofs
+
+    one, two = chain(body1), chain(body2)
+    return bool(one - two) and bool(two - one)
+
+
+def condim(model: mujoco.MjModel, g1: int, g2: int, pair: int) -> int:
+    """Dimension of a contact: the pair's own, the higher priority's or the larger."""
+    if pair >= 0:
+        return int(model.pair_dim[pair])
+    p1, p2 = model.geom_priority[g1], model.geom_priority[g2]
+    d1, d2 = int(model.geom_condim[g1]), int(model.geom_condim[g2])
+    if p1 != p2:
+        return d1 if p1 > p2 else d2
+    return max(d1, d2)
+
+
+def mixing(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> np.ndarray:
+    """Weight of the first geom in each pair's solref and solimp, ``(n,)``."""
+    weights = []
+    for g1, g2, _pair in pairs:
+        p1, p2 = model.geom_priority[g1], model.geom_priority[g2]
+        s1, s2 = float(model.geom_solmix[g1]), float(model.geom_solmix[g2])
+        tiny = 1e-15
+        if p1 != p2:
+            weights.append(float(p1 > p2))
+        elif s1 >= tiny and s2 >= tiny:
+            weights.append(s1 / (s1 + s2))
+        elif s1 < tiny and s2 < tiny:
+            weights.append(0.5)
+        else:
+            weights.append(float(s1 >= tiny))
+    return np.array(weights)

@@ -1,0 +1,314 @@
+"""Scalar constraint rows: friction loss, joint limits and joint equalities.
+
+A row has at most three dofs. Its force f minimises MuJoCo's cost at J a − aref: quadratic (equality), one-sided
+(limit) or Huber's (friction loss).
+"""
+
+from __future__ import annotations
+
+import warp as wp
+
+from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
+from dropo_torch.simulators.warp.spatial import inverse_right_jacobian_t, quat_log
+from dropo_torch.simulators.warp.types import (
+    BALL,
+    ONE,
+    ROW_EQUALITY,
+    ROW_FRICTION,
+    ROW_LIMIT,
+    THREE,
+    TWO,
+    ZERO,
+    Reals,
+    Reals2,
+    Scratch,
+    Tables,
+    f64,
+    vec2,
+    vec3,
+    vec4,
+    vec5,
+)
+
+FOUR = wp.constant(wp.float64(4.0))
+
+
+@wp.func
+def theta_vec2(th: Reals, i: int) -> vec2:
+    """Two consecutive numbers of θ."""
+    return vec2(th[i], th[i + 1])
+
+
+@wp.func
+def theta_vec5(th: Reals, i: int) -> vec5:
+    """Five consecutive numbers of θ."""
+    return vec5(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4])
+
+
+@wp.func
+def row_force(kind: int, jar: f64, d: f64, loss: f64) -> f64:
+    """Constraint force at J a − aref = ``jar``."""
+    f = -d * jar
+    if kind == ROW_LIMIT:
+        f = wp.max(ZERO, f)
+    elif kind == ROW_FRICTION:
+        f = wp.min(loss, wp.max(-loss, f))
+    return f
+
+
+@wp.func
+def row_state(kind: int, jar: f64, d: f64, loss: f64) -> int:
+    """Which piece of the cost ``jar`` is on; 1 is the quadratic one."""
+    state = int(1)
+    if kind == ROW_LIMIT:
+        if jar >= ZERO:
+            state = int(0)
+    elif kind == ROW_FRICTION:
+        if d * jar <= -loss:
+            state = int(2)
+        elif d * jar >= loss:
+            state = int(3)
+    return state
+
+
+@wp.func
+def row_power(
+    kind: int, u: f64, v: f64, l: f64, x: f64, solref: vec2, solimp: vec5, invweight: f64, loss: f64, h: f64,
+    refsafe: int,
+) -> f64:
+    """−f (Jλ) of a row with J a = u, J q̇ = v, J λ = l: the leaf whose gradient the adjoint takes."""
+    imp = impedance(x, solimp)
+    aref = -damping(solref, solimp, h, refsafe) * v
+    if kind != ROW_FRICTION:
+        aref -= stiffness(solref, solimp, h, refsafe) * imp * x
+    return -row_force(kind, u - aref, ONE / regularisation(imp, invweight), loss) * l
+
+
+@wp.func
+def _push(
+    m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int, n: int, kind: int, index: int, dof: int, dof2: int,
+    coef: vec3, x: f64, o_ref: int, o_imp: int, invweight: f64, loss: f64,
+) -> int:
+    """Write row ``n`` and return the number of rows."""
+    dof3 = int(-1)
+    v = coef[0] * qvel[r, dof]
+    if dof2 >= 0:
+        v += coef[1] * qvel[r, dof2]
+        if coef[2] != ZERO and kind == ROW_LIMIT:
+            dof3 = dof + 2
+            v += coef[2] * qvel[r, dof3]
+    s.row_kind[t, n] = kind
+    s.row_index[t, n] = index
+    s.row_dof[t, 3 * n] = dof
+    s.row_dof[t, 3 * n + 1] = dof2
+    s.row_dof[t, 3 * n + 2] = dof3
+    s.row_coef[t, n] = coef
+    s.row_x[t, n] = x
+    s.row_loss[t, n] = loss
+    solimp = theta_vec5(th, o_imp)
+    solref = theta_vec2(th, o_ref)
+    imp = impedance(x, solimp)
+    aref = -damping(solref, solimp, m.h, m.refsafe) * v
+    if kind != ROW_FRICTION:
+        aref -= stiffness(solref, solimp, m.h, m.refsafe) * imp * x
+    s.row_aref[t, n] = aref
+    s.row_d[t, n] = ONE / regularisation(imp, invweight)
+    return n + 1
+
+
+@wp.func
+def equality_position(m: Tables, th: Reals, qpos: Reals2, r: int, e: int) -> vec3:
+    """(q1 − p(q2), p'(q2), p''(q2)) of a joint equality, both measured from their references."""
+    c = m.o_eq_data + 5 * m.eq_id[e]
+    x = qpos[r, m.eq_qpos[2 * e]] - m.eq_ref[2 * e] - th[c]
+    slope = ZERO
+    curve = ZERO
+    if m.eq_dof[2 * e + 1] >= 0:
+        y = qpos[r, m.eq_qpos[2 * e + 1]] - m.eq_ref[2 * e + 1]
+        x -= y * (th[c + 1] + y * (th[c + 2] + y * (th[c + 3] + y * th[c + 4])))
+        slope = th[c + 1] + y * (TWO * th[c + 2] + y * (THREE * th[c + 3] + y * FOUR * th[c + 4]))
+        curve = TWO * th[c + 2] + y * (f64(6.0) * th[c + 3] + y * f64(12.0) * th[c + 4])
+    return vec3(x, slope, curve)
+
+
+@wp.func
+def make_rows(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int) -> int:
+    """Instantiate the scalar rows of a state and return their number."""
+    n = int(0)
+    for e in range(m.neq):
+        p = equality_position(m, th, qpos, r, e)
+        d1 = m.eq_dof[2 * e]
+        d2 = m.eq_dof[2 * e + 1]
+        w = th[m.o_dof_invweight + d1]
+        if d2 >= 0:
+            w += th[m.o_dof_invweight + d2]
+        i = m.eq_id[e]
+        o = m.o_eq_solref + 2 * i
+        n = _push(m, s, t, th, qvel, r, n, ROW_EQUALITY, e, d1, d2, vec3(ONE, -p[1], ZERO), p[0], o,
+                  m.o_eq_solimp + 5 * i, w, ZERO)  # fmt: skip
+    for i in range(m.nfriction):
+        d = m.friction_dof[i]
+        loss = th[m.o_frictionloss + d]
+        if loss > ZERO:
+            n = _push(m, s, t, th, qvel, r, n, ROW_FRICTION, d, d, -1, vec3(ONE, ZERO, ZERO), ZERO,
+                      m.o_dof_solref + 2 * d, m.o_dof_solimp + 5 * d, th[m.o_dof_invweight + d], loss)  # fmt: skip
+    for i in range(m.nlimit):
+        k = m.limit_link[i]
+        j = m.link_jnt[k]
+        d = m.link_dof[k]
+        iq = m.link_qpos[k]
+        margin = th[m.o_jnt_margin + j]
+        o = m.o_range + 2 * j
+        w = th[m.o_dof_invweight + d]
+        if m.link_kind[k] == BALL:
+            q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
+            rot = quat_log(q / wp.length(q))
+            angle = wp.length(rot)
+            x = wp.max(th[o], th[o + 1]) - angle - margin
+            if x < ZERO:
+                n = _push(m, s, t, th, qvel, r, n, ROW_LIMIT, i, d, d + 1, -rot / angle, x,
+                          m.o_jnt_solref + 2 * j, m.o_jnt_solimp + 5 * j, w, ZERO)  # fmt: skip
+        else:
+            x = qpos[r, iq] - th[o] - margin
+            if x < ZERO:
+                n = _push(m, s, t, th, qvel, r, n, ROW_LIMIT, i, d, -1, vec3(ONE, ZERO, ZERO), x,
+                          m.o_jnt_solref + 2 * j, m.o_jnt_solimp + 5 * j, w, ZERO)  # fmt: skip
+            x = th[o + 1] - qpos[r, iq] - margin
+            if x < ZERO:
+                n = _push(m, s, t, th, qvel, r, n, ROW_LIMIT, i, d, -1, vec3(-ONE, ZERO, ZERO), x,
+                          m.o_jnt_solref + 2 * j, m.o_jnt_solimp + 5 * j, w, ZERO)  # fmt: skip
+    return n
+
+
+@wp.func
+def row_dot(s: Scratch, t: int, n: int, x: Reals2, r: int) -> f64:
+    """J x of row ``n``."""
+    c = s.row_coef[t, n]
+    y = c[0] * x[r, s.row_dof[t, 3 * n]]
+    d = s.row_dof[t, 3 * n + 1]
+    if d >= 0:
+        y += c[1] * x[r, d]
+        d = s.row_dof[t, 3 * n + 2]
+        if d >= 0:
+            y += c[2] * x[r, d]
+    return y
+
+
+@wp.func
+def row_add(s: Scratch, t: int, n: int, y: f64, x: Reals2, r: int):
+    """x += Jᵀ y of row ``n``."""
+    c = s.row_coef[t, n]
+    x[r, s.row_dof[t, 3 * n]] += c[0] * y
+    d = s.row_dof[t, 3 * n + 1]
+    if d >= 0:
+        x[r, d] += c[1] * y
+        d = s.row_dof[t, 3 * n + 2]
+        if d >= 0:
+            x[r, d] += c[2] * y
+
+
+@wp.func
+def rows_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, nrow: int
+):
+    """Adjoint of the rows: the gradient of Σ −f Jλ, with J where it moves."""
+    for n in range(nrow):
+        kind = s.row_kind[t, n]
+        index = s.row_index[t, n]
+        d = s.row_dof[t, 3 * n]
+        d2 = s.row_dof[t, 3 * n + 1]
+        u = row_dot(s, t, n, acc, r)
+        v = row_dot(s, t, n, qvel, r)
+        l = row_dot(s, t, n, s.lam, t)
+        o_ref = m.o_dof_solref + 2 * d
+        o_imp = m.o_dof_solimp + 5 * d
+        w = th[m.o_dof_invweight + d]
+        if kind == ROW_LIMIT:
+            j = m.link_jnt[m.limit_link[index]]
+            o_ref = m.o_jnt_solref + 2 * j
+            o_imp = m.o_jnt_solimp + 5 * j
+        elif kind == ROW_EQUALITY:
+            o_ref = m.o_eq_solref + 2 * m.eq_id[index]
+            o_imp = m.o_eq_solimp + 5 * m.eq_id[index]
+            if d2 >= 0:
+                w += th[m.o_dof_invweight + d2]
+        _kind, ubar, vbar, lbar, xbar, refbar, impbar, wbar, lossbar, _h, _safe = wp.grad(row_power)(
+            kind, u, v, l, s.row_x[t, n], theta_vec2(th, o_ref), theta_vec5(th, o_imp), w, s.row_loss[t, n], m.h,
+            m.refsafe,
+        )  # fmt: skip
+        row_add(s, t, n, vbar, s.vel_bar, t)
+        s.grad[t, m.o_dof_invweight + d] += wbar
+        for i in range(2):
+            s.grad[t, o_ref + i] += refbar[i]
+        for i in range(5):
+            s.grad[t, o_imp + i] += impbar[i]
+        if kind == ROW_FRICTION:
+            s.grad[t, m.o_frictionloss + d] += lossbar
+        elif kind == ROW_LIMIT:
+            _limit_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, vbar, lbar)
+        else:
+            if d2 >= 0:
+                s.grad[t, m.o_dof_invweight + d2] += wbar
+            _equality_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, vbar, lbar)
+
+
+@wp.func
+def _limit_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, n: int, xbar: f64,
+    ubar: f64, vbar: f64, lbar: f64,
+):
+    """Where a limit's position and axis come from."""
+    k = m.limit_link[s.row_index[t, n]]
+    j = m.link_jnt[k]
+    d = m.link_dof[k]
+    o = m.o_range + 2 * j
+    c = s.row_coef[t, n]
+    s.grad[t, m.o_jnt_margin + j] -= xbar
+    if m.link_kind[k] == BALL:
+        iq = m.link_qpos[k]
+        q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
+        rot = quat_log(q / wp.length(q))
+        angle = wp.length(rot)
+        if th[o] >= th[o + 1]:
+            s.grad[t, o] += xbar
+        else:
+            s.grad[t, o + 1] += xbar
+        cbar = (
+            vec3(acc[r, d], acc[r, d + 1], acc[r, d + 2]) * ubar
+            + vec3(qvel[r, d], qvel[r, d + 1], qvel[r, d + 2]) * vbar
+            + vec3(s.lam[t, d], s.lam[t, d + 1], s.lam[t, d + 2]) * lbar
+        )
+        # c = −φ/|φ|, x = ... − |φ|
+        g = c * xbar - (cbar - c * wp.dot(c, cbar)) / angle
+        g = inverse_right_jacobian_t(rot, g)
+        for i in range(3):
+            s.tangent[t, d + i] += g[i]
+    else:
+        s.tangent[t, d] += c[0] * xbar
+        if c[0] > ZERO:
+            s.grad[t, o] -= xbar
+        else:
+            s.grad[t, o + 1] += xbar
+
+
+@wp.func
+def _equality_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, n: int, xbar: f64,
+    ubar: f64, vbar: f64, lbar: f64,
+):
+    """Where an equality's position and slope come from."""
+    e = s.row_index[t, n]
+    d1 = m.eq_dof[2 * e]
+    d2 = m.eq_dof[2 * e + 1]
+    o = m.o_eq_data + 5 * m.eq_id[e]
+    s.tangent[t, d1] += xbar
+    s.grad[t, o] -= xbar
+    if d2 >= 0:
+        p = equality_position(m, th, qpos, r, e)
+        y = qpos[r, m.eq_qpos[2 * e + 1]] - m.eq_ref[2 * e + 1]
+        slopebar = -(acc[r, d2] * ubar + qvel[r, d2] * vbar + s.lam[t, d2] * lbar)
+        s.tangent[t, d2] += slopebar * p[2] - xbar * p[1]
+        power = ONE
+        for i in range(1, 5):
+            s.grad[t, o + i] += slopebar * f64(float(i)) * power - xbar * power * y
+            power = power * y

@@ -1,0 +1,104 @@
+"""The simulator: MuJoCo's physics with gradients of states, controls and model parameters."""
+
+from __future__ import annotations
+
+import copy
+import os
+import threading
+from typing import ClassVar
+
+import mujoco
+import torch
+import warp as wp
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.warp.engine import Engine, Simulate
+from dropo_torch.simulators.warp.fields import Fields
+from dropo_torch.simulators.warp.pairs import candidate_pairs
+from dropo_torch.simulators.warp.support import check_support
+from dropo_torch.simulators.warp.tables import build_tables
+
+_LOADING = threading.Lock()
+
+
+class WarpSimulator(Simulator):
+    """Simulates transitions with MuJoCo's own physics, written as NVIDIA Warp kernels in float64.
+
+    The constraint problem of every step is solved to convergence, and the gradient is exact at that solution. A
+    parameter vector means a copy of the model with the numbers written and ``mj_setConst`` run, as for the
+    MuJoCo backend; the gradient includes what that derives.
+
+    Args:
+        model: the model, of the subset in ``docs/warp.md``.
+        parameters: what varies.
+        frame_skip: physics steps of one logged transition, each under the same control.
+        chunk_size: simulations in memory at a time; results do not depend on it.
+        num_threads: threads on a CPU, all cores by default; results do not depend on it.
+        device: ``"cpu"`` or a CUDA device such as ``"cuda:0"``.
+
+    Raises:
+        InputError: the model or a parameter is outside the subset (all reasons in one message), or a number
+            is below 1.
+    """
+
+    differentiable: ClassVar[bool] = True
+    name: ClassVar[str] = "warp"
+
+    def __init__(
+        self,
+        model: mujoco.MjModel,
+        *,
+        parameters: ParameterSpace,
+        frame_skip: int,
+        chunk_size: int = 4096,
+        num_threads: int | None = None,
+        device: str = "cpu",
+    ) -> None:
+        threads = os.cpu_count() or 1 if num_threads is None else num_threads
+        for option, value in (("frame_skip", frame_skip), ("chunk_size", chunk_size), ("num_threads", threads)):
+            if value < 1:
+                raise InputError(f"{option}: {value} given; expected 1 or more")
+        model = copy.copy(model)
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+        pairs = candidate_pairs(model)
+        check_support(model, parameters, pairs)
+        self.parameters, self.frame_skip = parameters, frame_skip
+        self.num_states, self.num_controls = model.nq + model.nv, model.nu
+        self.timestep = model.opt.timestep * frame_skip
+        self._fields = Fields(model, parameters, pairs)
+        with _LOADING:
+            wp.config.quiet = True
+            wp.init()
+            try:
+                wp.get_device(device)
+            except Exception:
+                names = ", ".join(str(d) for d in wp.get_devices())
+                raise InputError(f"device: Warp has no {device!r}; there are: {names}") from None
+            layout = self._fields.layout
+            self._engine = Engine(
+                build_tables(model, parameters, pairs, layout, device), layout.size, self._fields.wanted,
+                skip=frame_skip, chunk_size=chunk_size, num_threads=threads, device=device,
+            )  # fmt: skip
+        self._device = wp.device_to_torch(device)
+
+    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after ``lag`` transitions, differentiable in all three arguments.
+
+        A quaternion in ``states`` need not be normalised; those returned are. Arguments and result as in
+        :meth:`Simulator.simulate`.
+        """
+        return self.rollout(states, controls, values)[:, :, -1]
+
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        """Return the states after each transition ``(T, K, lag, nq + nv)``; NaN from a divergence on."""
+        self.check_arguments(states, controls, values)
+        origin = states.device
+        shape = (len(states), len(values), controls.shape[1], self.num_states)
+        if 0 in shape[:2]:
+            return states.new_zeros(shape, dtype=torch.float64)
+        theta = self._fields(values.to("cpu", torch.float64)).to(self._device)
+        start, inputs = (x.to(self._device, torch.float64).contiguous() for x in (states, controls))
+        out: torch.Tensor = Simulate.apply(theta.contiguous(), start, inputs, self._engine)
+        return out.to(origin)

@@ -1,0 +1,219 @@
+"""What of a model this backend simulates, as one strict check: whatever is not listed here is refused by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import mujoco
+import numpy as np
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace, object_names, read_field
+
+#: θ fields that a parameter may write and the adjoint differentiates.
+DIFFERENTIABLE = frozenset(
+    {
+        "opt.gravity", "opt.density", "opt.viscosity", "opt.wind", "body_mass", "body_inertia", "body_ipos",
+        "body_gravcomp", "jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "jnt_range", "jnt_margin", "jnt_solref",
+        "jnt_solimp", "jnt_actfrcrange", "dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss",
+        "dof_solref", "dof_solimp", "actuator_gainprm", "actuator_biasprm", "actuator_gear", "actuator_forcerange",
+        "actuator_ctrlrange", "eq_data", "eq_solref", "eq_solimp", "geom_friction", "geom_solref", "geom_solimp",
+        "geom_margin", "pair_friction", "pair_solref", "pair_solreffriction", "pair_solimp", "pair_margin",
+    }
+)  # fmt: skip
+# compared with numpy integers, which do not equal MuJoCo's enumerations from the right
+_TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
+_BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+_GEOM = mujoco.mjtGeom
+_ROUND = (int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CAPSULE))
+#: Pairs of geom types, the smaller first, that the backend collides.
+COLLIDES = frozenset(
+    {(int(_GEOM.mjGEOM_PLANE), int(g)) for g in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX,
+                                                 _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_ELLIPSOID)}
+    | {(a, b) for a in _ROUND for b in _ROUND if a <= b}
+    | {(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_BOX))}
+)  # fmt: skip
+
+
+def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> None:
+    """Raise one error that names everything in ``model`` and ``space`` that the backend does not simulate.
+
+    Args:
+        model: the model.
+        space: the parameters that will vary.
+        pairs: geoms that may touch, ``(geom1, geom2, pair or -1)``, the smaller geom type first.
+
+    Raises:
+        InputError: the list of all offending elements.
+    """
+    reasons = [
+        *_options(model), *_structure(model), *_joints(model), *_actuators(model), *_equalities(model),
+        *_contacts(model, pairs), *_parameters(model, space),
+    ]  # fmt: skip
+    if reasons:
+        raise InputError("backend warp does not simulate: " + "; ".join(reasons) + ". Use backend mujoco")
+
+
+def _options(model: mujoco.MjModel) -> Iterator[str]:
+    opt = model.opt
+    disable, enable = mujoco.mjtDisableBit, mujoco.mjtEnableBit
+    if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+        yield "option integrator=implicit (use implicitfast, Euler or RK4)"
+    if opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
+        yield f"option solver={mujoco.mjtSolver(opt.solver).name[6:]} (Newton is solved to convergence)"
+    elif opt.iterations < 10 and model.nv:
+        yield f"option iterations={opt.iterations} (Newton is solved to convergence; allow 10 or more)"
+    if opt.noslip_iterations > 0:
+        yield f"option noslip_iterations={opt.noslip_iterations}"
+    harmless = (
+        disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EQUALITY | disable.mjDSBL_FRICTIONLOSS | disable.mjDSBL_LIMIT
+        | disable.mjDSBL_CONTACT | disable.mjDSBL_SPRING | disable.mjDSBL_DAMPER | disable.mjDSBL_GRAVITY
+        | disable.mjDSBL_CLAMPCTRL | disable.mjDSBL_WARMSTART | disable.mjDSBL_FILTERPARENT | disable.mjDSBL_ACTUATION
+        | disable.mjDSBL_REFSAFE | disable.mjDSBL_SENSOR | disable.mjDSBL_MIDPHASE | disable.mjDSBL_EULERDAMP
+        | disable.mjDSBL_AUTORESET | disable.mjDSBL_NATIVECCD | disable.mjDSBL_ISLAND | disable.mjDSBL_MULTICCD
+    )  # fmt: skip
+    for bit in disable.__members__.values():
+        if opt.disableflags & int(bit) & ~int(harmless) and bit != disable.mjNDISABLE:
+            yield f"flag {bit.name[7:].lower()} disabled"
+    inert = int(enable.mjENBL_ENERGY) | int(enable.mjENBL_FWDINV)
+    for bit in enable.__members__.values():
+        if bit.name != "mjNENABLE" and opt.enableflags & int(bit) & ~inert:
+            yield f"flag {bit.name[7:].lower()} enabled"
+    if opt.disableactuator:
+        yield "option actuatorgroupdisable"
+    if (opt.density or opt.viscosity) and opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+        yield "implicitfast with density or viscosity"
+
+
+def _structure(model: mujoco.MjModel) -> Iterator[str]:
+    counts = {"nflex": "flex", "nplugin": "plugin", "nmocap": "mocap body", "nhistory": "delay or history buffer",
+              "nplastic": "plastic spring", "na": "actuator activation (dynamics) state"}  # fmt: skip
+    for field, what in counts.items():
+        number = int(getattr(model, field, 0))
+        if number:
+            yield f"{what} ({number})"
+    if not (model.nu == model.nactuator == model.nout):
+        yield "actuators with several controls or outputs"
+    for flag, what in (("flg_surfacevel", "surface velocity"), ("flg_adhesion", "adhesion")):
+        if getattr(model, flag, False):
+            yield f"geom {what}"
+    for i in range(model.ntendon):
+        acts = (
+            model.tendon_limited[i] or model.tendon_stiffness[i] or model.tendon_damping[i]
+            or model.tendon_frictionloss[i] or model.tendon_armature[i] or model.tendon_stiffnesspoly[i].any()
+            or model.tendon_dampingpoly[i].any()
+        )  # fmt: skip
+        if acts:
+            yield f"tendon {model.tendon(i).name or i!r}"
+    fluid = model.geom_fluid.reshape(model.ngeom, -1)
+    for i in np.flatnonzero(fluid[:, 0] > 0):
+        yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[i]!r}"
+    for i in range(1, model.nbody):
+        moving = model.body_weldid[i] != 0
+        if moving and model.body_gravcomp[i] and _actgravcomp(model, i):
+            yield f"actuatorgravcomp on body {model.body(i).name!r}"
+
+
+def _actgravcomp(model: mujoco.MjModel, body: int) -> bool:
+    """Whether any joint above a body applies its gravity compensation through actuators."""
+    while body:
+        first, count = model.body_jntadr[body], model.body_jntnum[body]
+        if count and model.jnt_actgravcomp[first : first + count].any():
+            return True
+        body = model.body_parentid[body]
+    return False
+
+
+def _joints(model: mujoco.MjModel) -> Iterator[str]:
+    names = object_names(model, "jnt")
+    for j in range(model.njnt):
+        kind = model.jnt_type[j]
+        if kind == _FREE:
+            root = model.jnt_bodyid[j]
+            alone = not any(model.body_dofnum[b] for b in range(root + 1, model.nbody) if model.body_rootid[b] == root)
+            if alone and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
+                yield f"free body of joint {names[j]!r} under implicitfast (its gyroscopic derivative)"
+            if model.jnt_limited[j]:
+                yield f"limit of free joint {names[j]!r}"
+        if kind in (_FREE, _BALL) and model.jnt_actfrclimited[j]:
+            yield f"actuatorfrcrange of joint {names[j]!r}"
+    for i in range(model.nv):
+        if model.dof_frictionloss[i] < 0:
+            yield f"negative frictionloss of dof {i}"
+
+
+def _actuators(model: mujoco.MjModel) -> Iterator[str]:
+    if model.nu != model.nactuator:
+        return
+    names = object_names(model, "actuator")
+    for i in range(model.nu):
+        where = f"actuator {names[i]!r}"
+        if model.actuator_trntype[i] not in _TRANSMISSIONS:
+            yield f"{where}: transmission {mujoco.mjtTrn(model.actuator_trntype[i]).name[6:].lower()}"
+        elif model.jnt_type[model.actuator_trnid[i, 0]] in (_FREE, _BALL):
+            yield f"{where}: transmission to a free or ball joint"
+        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
+            yield f"{where}: dynamics {mujoco.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()}"
+        if model.actuator_gaintype[i] not in _GAINS:
+            yield f"{where}: gain {mujoco.mjtGain(model.actuator_gaintype[i]).name[7:].lower()}"
+        if model.actuator_biastype[i] not in _BIASES:
+            yield f"{where}: bias {mujoco.mjtBias(model.actuator_biastype[i]).name[7:].lower()}"
+        if model.actuator_damping[i] or model.actuator_dampingpoly[i].any() or model.actuator_armature[i]:
+            yield f"{where}: damping or armature"
+
+
+def _equalities(model: mujoco.MjModel) -> Iterator[str]:
+    for i in range(model.neq):
+        if not model.eq_active0[i]:
+            continue
+        name = model.equality(i).name or i
+        if model.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT:
+            yield f"equality {name!r}: {mujoco.mjtEq(model.eq_type[i]).name[5:].lower()}"
+            continue
+        for j in (model.eq_obj1id[i], model.eq_obj2id[i]):
+            if j >= 0 and model.jnt_type[j] in (_FREE, _BALL):
+                yield f"equality {name!r} of a free or ball joint"
+
+
+def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Iterator[str]:
+    names = object_names(model, "geom")
+    for g1, g2, _pair in pairs:
+        kinds = (int(model.geom_type[g1]), int(model.geom_type[g2]))
+        if kinds not in COLLIDES:
+            a, b = (_GEOM(k).name[7:].lower() for k in kinds)
+            yield f"contact of {a} {names[g1]!r} with {b} {names[g2]!r}"
+
+
+def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[str]:
+    for parameter in space.parameters:
+        for field in {t.field for t in parameter.targets}:
+            if field not in DIFFERENTIABLE:
+                yield f"parameter {parameter.name!r}: {field} has no gradient here"
+        for target in parameter.targets:
+            reason = _dead(model, target.field, target.index)
+            if reason:
+                yield f"parameter {parameter.name!r}: {reason}"
+                break
+
+
+def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
+    """Why the number cannot reach the dynamics here, or an empty string."""
+    if field not in DIFFERENTIABLE:
+        return ""
+    width = max(1, int(np.prod(read_field(model, field).shape[1:], dtype=int)))
+    column = index % width
+    if field in ("actuator_gainprm", "actuator_biasprm") and column > 2:
+        return f"{field}[{column}] is not used by fixed or affine actuators"
+    if field == "actuator_gear" and column > 0:
+        return "only gear[0] of a joint's actuator acts"
+    if field == "eq_data" and column > 4:
+        return f"eq_data[{column}] is not used by joint equalities"
+    if field == "qpos_spring":
+        for j in range(model.njnt):
+            start = model.jnt_qposadr[j]
+            quaternion = {_FREE: range(start + 3, start + 7), _BALL: range(start, start + 4)}
+            if index in quaternion.get(int(model.jnt_type[j]), ()):
+                return "qpos_spring of a quaternion has no gradient here"
+    return ""

@@ -1,0 +1,351 @@
+"""The Warp backend against C MuJoCo: the same states, and gradients against central differences of MuJoCo.
+
+The reference is stepped with the solver's tolerance at zero, so that what differs is the backend.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from pathlib import Path
+
+import gymnasium
+import mujoco
+import numpy as np
+import pytest
+import torch
+
+from dropo_torch.parameters import ParameterSpace, object_names
+from dropo_torch.simulators.warp import WarpSimulator
+
+ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+POISON = 1e300
+
+
+def reference(space: ParameterSpace, states: np.ndarray, controls: np.ndarray, values: np.ndarray, skip: int):
+    """States after the transitions ``(T, n)`` of states ``(T, n)``, controls ``(T, lag, nu)`` under one vector."""
+    model = space.apply(values)
+    model.opt.tolerance, model.opt.ls_tolerance = 0.0, 1e-12
+    model.opt.iterations, model.opt.ls_iterations = 200, 200
+    data = mujoco.MjData(model)
+    out = np.full(states.shape, POISON)
+    for i in range(len(states)):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:] = states[i, : model.nq], states[i, model.nq :]
+        for control in controls[i]:
+            data.ctrl[:] = control
+            for _ in range(skip):
+                mujoco.mj_step(model, data)
+        out[i] = np.r_[data.qpos, data.qvel]
+    assert not np.any(out == POISON)
+    return out
+
+
+def rollouts(
+    model: mujoco.MjModel, count: int, *, seed: int = 0, length: int = 25, every: int = 4, spread: float = 0.1,
+    push: float = 1.0,
+) -> tuple[np.ndarray, np.ndarray]:
+    """States ``(count, nq + nv)`` on the way of random controls from random starts, and controls ``(count, 1, nu)``."""
+    rng = np.random.default_rng(seed)
+    model = copy.copy(model)
+    data = mujoco.MjData(model)
+    states, controls = [], []
+    while len(states) < count:
+        mujoco.mj_resetData(model, data)
+        mujoco.mj_integratePos(model, data.qpos, rng.uniform(-spread, spread, model.nv), 1.0)
+        data.qvel[:] = rng.uniform(-10 * spread, 10 * spread, model.nv)
+        for k in range(length):
+            control = push * rng.uniform(-1, 1, model.nu)
+            data.ctrl[:] = control
+            if k % every == every - 1:
+                states.append(np.r_[data.qpos, data.qvel])
+                controls.append(control)
+            for _ in range(4):
+                mujoco.mj_step(model, data)
+    return np.array(states[:count]), np.array(controls[:count]).reshape(count, 1, model.nu)
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """Gradients of random functions of the end states, per transition: ``(T, ...)`` each."""
+
+    values: np.ndarray
+    states: np.ndarray
+    controls: np.ndarray
+
+
+def of_warp(simulator: WarpSimulator, states, controls, values, weights) -> Gradients:
+    rows = []
+    for s, u, w in zip(states, controls, weights, strict=True):
+        leaves = [torch.tensor(x[None], requires_grad=True) for x in (s, u, values)]
+        (simulator.simulate(*leaves) * torch.tensor(w)).sum().backward()
+        rows.append([leaf.grad[0].numpy() for leaf in leaves])
+    return Gradients(*(np.array([r[i] for r in rows]) for i in (2, 0, 1)))
+
+
+def of_reference(space: ParameterSpace, states, controls, values, weights, skip: int, eps: float) -> Gradients:
+    def slope(at) -> np.ndarray:
+        plus, minus = (reference(space, *at(sign), skip) for sign in (1, -1))
+        return ((plus - minus) * weights).sum(1)
+
+    def unit(array: np.ndarray, j: int, size: float) -> np.ndarray:
+        out = np.zeros_like(array)
+        out[..., j] = size
+        return out
+
+    columns = []
+    for j in range(len(values)):
+        size = eps * (abs(values[j]) or 1.0)
+        columns.append(slope(lambda g, j=j, z=size: (states, controls, values + g * unit(values, j, z))) / (2 * size))
+    wrt_values = np.stack(columns, 1) if columns else np.zeros((len(states), 0))
+    wrt_states = [
+        slope(lambda g, j=j: (states + g * unit(states, j, eps), controls, values)) for j in range(states.shape[1])
+    ]
+    wrt_controls = [
+        slope(lambda g, j=j: (states, controls + g * unit(controls, j, eps), values)) for j in range(controls.shape[2])
+    ]
+    shape = (len(states), 1, controls.shape[2])
+    controls_bar = np.stack(wrt_controls, 1).reshape(shape) if wrt_controls else np.zeros(shape)
+    return Gradients(wrt_values, np.stack(wrt_states, 1) / (2 * eps), controls_bar / (2 * eps))
+
+
+@dataclass(frozen=True)
+class Case:
+    """A system, what varies, and how closely it must agree."""
+
+    name: str
+    xml: str
+    parameters: dict
+    skip: int = 2
+    states: float = 1e-9
+    median: float = 1e-6
+    most: float = 1e-3  # nine in ten
+    spread: float = 0.3
+    push: float = 1.0
+    length: int = 25
+    seed: int = 0
+    floor: float = 1e-6
+    idle: tuple[str, ...] = ()  # parameters without effect on this motion
+
+    def model(self) -> mujoco.MjModel:
+        if self.xml.endswith(".xml"):
+            return mujoco.MjModel.from_xml_path(str(ASSETS / self.xml))
+        return mujoco.MjModel.from_xml_string(self.xml)
+
+
+def check(case: Case, count: int = 12, eps: float = 1e-5) -> None:
+    model = case.model()
+    space = ParameterSpace(model, case.parameters)
+    states, controls = rollouts(
+        model, count, spread=case.spread, push=case.push, length=case.length, seed=case.seed
+    )
+    simulator = WarpSimulator(model, parameters=space, frame_skip=case.skip, num_threads=1)
+    values = space.nominal
+    got = simulator.simulate(*(torch.tensor(x) for x in (states, controls, values[None])))[:, 0].numpy()
+    want = reference(space, states, controls, values, case.skip)
+    error = np.abs(got - want).max(1)
+    assert np.quantile(error, 0.9) < case.states, f"states {error}"
+    assert error.max() < 1e3 * case.states, f"states {error}"
+    weights = np.random.default_rng(1).normal(size=states.shape)
+    ours = of_warp(simulator, states, controls, values, weights)
+    theirs = of_reference(space, states, controls, values, weights, case.skip, eps)
+    for name in ("values", "states", "controls"):
+        a, b = getattr(ours, name), getattr(theirs, name)
+        if not a.size:
+            continue
+        scale = np.abs(b) + case.floor * (1 + np.abs(b).max(0))
+        relative = np.abs(a - b) / scale
+        labels = space.names if name == "values" else range(a.shape[-1])
+        report = dict(zip(labels, np.median(relative, 0).reshape(-1), strict=True))
+        assert np.median(relative) < case.median, f"{name}: {report}"
+        assert np.quantile(relative, 0.9) < case.most, f"{name}: {np.quantile(relative, 0.9)} {report}"
+        if name == "values":
+            for column, label in enumerate(space.names):
+                assert np.median(relative[:, column]) < 30 * case.median, f"{label}: {report}"
+                assert label in case.idle or np.abs(b[:, column]).max() > 0, f"{label} has no effect in the reference: a test of nothing"
+
+
+def gym_parameters(file: str) -> dict:
+    """All masses and dampings of a Gymnasium model, each pair of bodies and joints thinned to keep the test quick."""
+    model = mujoco.MjModel.from_xml_path(str(ASSETS / file))
+    out = {}
+    for b in range(1, model.nbody):
+        name = object_names(model, "body")[b]
+        out[f"mass_{name}"] = {"field": "body_mass", "name": name, "bounds": [0.001, 100]}
+    for j in range(model.njnt):
+        name = object_names(model, "jnt")[j]
+        if model.jnt_type[j] >= 2 and model.dof_damping[model.jnt_dofadr[j]] > 0:
+            out[f"damping_{name}"] = {"field": "dof_damping", "name": name, "bounds": [0, 10]}
+    return out
+
+
+GYMNASIUM = [
+    "hopper.xml", "walker2d_v5.xml", "half_cheetah.xml", "inverted_pendulum.xml", "inverted_double_pendulum.xml",
+    "ant.xml", "reacher.xml", "swimmer.xml",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("file", GYMNASIUM)
+def test_gymnasium_models(file, capfd):
+    idle = ("mass_target",)
+    check(Case(file, file, gym_parameters(file), spread=0.1, states=1e-10, idle=idle), count=8)
+
+
+HOPPER = {
+    "damping": {"field": "dof_damping", "name": "leg_joint", "bounds": [0.1, 3]},
+    "armature": {"field": "dof_armature", "name": "leg_joint", "bounds": [0.1, 3]},
+    "gear": {"field": "actuator_gear", "name": "leg_joint", "bounds": [100, 300]},
+    "gain": {"field": "actuator_gainprm", "name": "foot_joint", "bounds": [0.1, 3]},
+    "inertia": {"field": "body_inertia", "name": "leg", "index": 1, "bounds": [0.01, 1]},
+    "ipos": {"field": "body_ipos", "name": "leg", "index": 0, "bounds": [-1, 1]},
+    "friction": {"field": "geom_friction", "name": "foot_geom", "bounds": [0.5, 3]},
+    "gravity": {"field": "opt.gravity", "index": 2, "bounds": [-12, -8]},
+    "solref": {"field": "geom_solref", "name": "foot_geom", "index": 0, "bounds": [0.01, 0.1]},
+    "solimp": {"field": "geom_solimp", "name": "foot_geom", "index": 0, "bounds": [0.5, 0.95]},
+    "margin": {"field": "geom_margin", "name": "foot_geom", "bounds": [0, 0.1]},
+}
+
+
+def test_hopper_through_four_substeps():
+    check(Case("hopper", "hopper.xml", HOPPER, skip=4, states=1e-10, spread=0.05, length=100), count=24)
+
+
+ARM = """<mujoco><option integrator="{integrator}" timestep="0.004" {option}/>
+<default><geom contype="0" conaffinity="0"/></default><worldbody>
+ <body name="a" pos="0 0 1" gravcomp="0.3"><joint name="ja" type="hinge" axis="0 1 0.2" damping="0.3"
+   stiffness="3" springref="20" frictionloss="{loss}" limited="true" range="-12 12"/>
+  <geom type="capsule" fromto="0 0 0 .3 0 .1" size=".03" mass="1.2"/>
+  <body name="b" pos=".3 0 .1" gravcomp="0.6"><joint name="jb" type="{second}" axis="0.3 1 0" armature=".02"
+    damping="0.1" {limit}/>
+   <geom type="box" pos=".1 .02 0" size=".1 .03 .02" mass=".7"/>
+   <body name="c" pos=".2 0 0" quat="0.9 0.1 0.3 0.2"><joint name="jc" type="slide" axis="0 0 1" pos=".1 0 .05"
+     damping="2" stiffness="50"/>
+    <geom type="ellipsoid" size=".05 .04 .08" mass=".4"/></body></body></body>
+</worldbody>
+<actuator>{actuators}</actuator>{extra}</mujoco>"""
+SERVOS = """<position name="pa" joint="ja" kp="20" kv="1.5" ctrlrange="-.6 .6" forcerange="-4 4"/>
+<velocity name="vc" joint="jc" kv="3" gear="2" ctrllimited="true" ctrlrange="-.5 .5"/>
+<general name="gc" joint="jc" gaintype="affine" biastype="affine" gainprm="2 .5 -.3" biasprm=".2 -1 -.5" gear="1.5"/>"""
+
+
+def arm(**changes: str) -> str:
+    settings = {"integrator": "Euler", "option": "", "loss": "0", "second": "hinge", "limit": "", "extra": "",
+                "actuators": SERVOS} | changes  # fmt: skip
+    return ARM.format(**settings)
+
+
+def p(field_: str, name: str | None = None, index: int | None = None, bounds=(-1e3, 1e3)) -> dict:
+    low = 0 if field_.startswith(("dof_", "actuator_k", "jnt_stiffness", "body_gravcomp", "geom_fric", "opt.d", "opt.v")) else bounds[0]
+    low = 1e-6 if field_ in ("body_mass", "body_inertia", "pair_friction") else low
+    out = {"field": field_, "bounds": [low, bounds[1]]}
+    return out | ({"name": name} if name else {}) | ({"index": index} if index is not None else {})
+
+
+JOINTS = {
+    "mass": p("body_mass", "b"), "inertia": p("body_inertia", "b", 0), "ipos": p("body_ipos", "b", 1),
+    "gravcomp": p("body_gravcomp", "b"), "stiffness": p("jnt_stiffness", "ja"),
+    "poly": p("jnt_stiffnesspoly", "ja", 1), "springref": p("qpos_spring", "ja"), "damping": p("dof_damping", "jc"),
+    "dpoly0": p("dof_dampingpoly", "ja", 0), "dpoly1": p("dof_dampingpoly", "ja", 1),
+    "armature": p("dof_armature", "jc"), "range": p("jnt_range", "ja", 1), "jnt_solref": p("jnt_solref", "ja", 0),
+    "gravity": p("opt.gravity", index=0),
+}  # fmt: skip
+DRIVES = {
+    "kp": p("actuator_kp", "pa"), "kv": p("actuator_kv", "pa"), "gear": p("actuator_gear", "gc"),
+    "gain1": p("actuator_gainprm", "gc", 1), "gain2": p("actuator_gainprm", "gc", 2),
+    "bias0": p("actuator_biasprm", "gc", 0), "bias2": p("actuator_biasprm", "gc", 2),
+    "forcerange": p("actuator_forcerange", "pa", 1), "ctrlrange": p("actuator_ctrlrange", "vc", 0),
+}  # fmt: skip
+LOSS = {"loss": p("dof_frictionloss", "ja"), "mass": p("body_mass", "b")}
+STUCK = {"dof_solref": p("dof_solref", "ja", 0), "dof_solimp": p("dof_solimp", "ja", 0), "mass": p("body_mass", "b")}
+EQUALITY = '<equality><joint joint1="jc" joint2="ja" polycoef=".01 .05 .1 .02 .03"/></equality>'
+DRAG = {"density": p("opt.density"), "viscosity": p("opt.viscosity"), "wind": p("opt.wind", index=1)}
+
+TREES = [
+    Case("Euler", arm(), JOINTS | DRIVES),
+    Case("RK4", arm(integrator="RK4"), JOINTS | DRIVES),
+    Case("implicitfast", arm(integrator="implicitfast"), JOINTS | DRIVES),
+    Case("frictionloss", arm(loss="0.8"), JOINTS | LOSS, most=1e-2),
+    Case("frictionloss RK4", arm(loss="0.8", integrator="RK4"), JOINTS | LOSS, most=1e-2),
+    Case("stuck", arm(loss="30"), STUCK, most=1e-2),
+    Case("equality", arm(extra=EQUALITY), {"c1": p("eq_data", "equality0", 1), "c3": p("eq_data", "equality0", 3),
+         "eq_solref": p("eq_solref", "equality0", 0), "mass": p("body_mass", "b")}),  # fmt: skip
+    Case("ball", arm(second="ball", limit='limited="true" range="0 25" stiffness="2"'), {"stiffness": p("jnt_stiffness",
+         "jb"), "damping": p("dof_damping", "jb"), "range": p("jnt_range", "jb", 1), "mass": p("body_mass", "b")}),  # fmt: skip
+    Case("ball RK4", arm(second="ball", integrator="RK4", limit='stiffness="2"'), {"stiffness": p("jnt_stiffness", "jb"),
+         "poly": p("jnt_stiffnesspoly", "jb", 0), "inertia": p("body_inertia", "b", 2)}),  # fmt: skip
+    Case("drag", arm(option='density="200" viscosity="2" wind="1 2 -3"'), DRAG | {"mass": p("body_mass", "b"),
+         "inertia": p("body_inertia", "b", 2), "ipos": p("body_ipos", "b", 0)}),  # fmt: skip
+    Case("total force", arm(actuators=SERVOS).replace('stiffness="50"', 'stiffness="50" actuatorfrcrange="-3 3"'),
+         {"frcrange": p("jnt_actfrcrange", "jc", 0), "gear": p("actuator_gear", "gc")}, push=3.0),  # fmt: skip
+]
+
+
+@pytest.mark.parametrize("case", TREES, ids=lambda c: c.name)
+def test_trees(case):
+    check(case)
+
+
+SCENE = """<mujoco><option timestep="0.004" cone="{cone}" integrator="{integrator}" impratio="{impratio}"/>
+<default><geom condim="{condim}" friction=".6 .02 .003" {geom}/></default>
+<worldbody><geom name="floor" type="plane" size="5 5 1" zaxis="{slope} 0 1" friction=".5 .01 .001"/>
+{bodies}</worldbody>{extra}</mujoco>"""
+FREE = '<body name="{name}" pos="{pos}" quat="{quat}"><freejoint/><geom name="g{name}" {geom}/></body>'
+
+
+def free(name: str, pos: str, geom: str, quat: str = "1 0 0 0") -> str:
+    return FREE.format(name=name, pos=pos, geom=geom, quat=quat)
+
+
+def scene(bodies: str, **changes: str) -> str:
+    settings = {"cone": "pyramidal", "integrator": "Euler", "impratio": "1", "condim": "3", "geom": "", "slope": ".1",
+                "extra": ""} | changes  # fmt: skip
+    return SCENE.format(bodies=bodies, **settings)
+
+
+BOX = free("box", "0 0 .11", 'type="box" size=".15 .1 .1"')
+CYLINDER = free("cylinder", "0 0 .13", 'type="cylinder" size=".1 .12"', "0.9 0.2 0 0.1")
+ELLIPSOID = free("ellipsoid", "0 0 .1", 'type="ellipsoid" size=".15 .1 .08"', "0.9 0.2 0.1 0.1")
+CAPSULES = free("one", "0 0 .1", 'type="capsule" size=".1 .15"', "0.7 0.7 0 0.1") + free(
+    "two", "0.05 0 .28", 'type="capsule" size=".08 .1"', "0.7 0 0.7 0.2"
+)
+PUSH = free("ball", "0 0 .1", 'type="sphere" size=".1"') + free("box", ".23 0 .1", 'type="box" size=".13 .1 .1"')
+SPHERES = free("one", "0 0 .1", 'type="sphere" size=".1"') + free("two", ".15 0 .1", 'type="sphere" size=".07"')
+
+
+def contact_parameters(body: str) -> dict:
+    return {"mass": p("body_mass", body), "friction": p("geom_friction", f"g{body}"),
+            "solref": p("geom_solref", "floor", 0), "margin": p("geom_margin", "floor"),
+            "inertia": p("body_inertia", body, 1)}  # fmt: skip
+
+
+CONTACTS = [
+    Case("box slides", scene(BOX), contact_parameters("box"), length=40),
+    Case("box, elliptic", scene(BOX, cone="elliptic", impratio="3"), contact_parameters("box"), length=40, states=1e-8),
+    Case("box, condim 4", scene(BOX, condim="4"), contact_parameters("box"), length=40),
+    Case("box, condim 6 elliptic", scene(BOX, condim="6", cone="elliptic"), contact_parameters("box"), length=40,
+         states=1e-8),  # fmt: skip
+    Case("box, frictionless RK4", scene(BOX, condim="1", integrator="RK4"), {"mass": p("body_mass", "box")}, length=40),
+    Case("cylinder", scene(CYLINDER), contact_parameters("cylinder"), length=40),
+    Case("ellipsoid", scene(ELLIPSOID), contact_parameters("ellipsoid"), length=40),
+    Case("capsules", scene(CAPSULES), contact_parameters("one"), length=40),
+    Case("capsules, elliptic", scene(CAPSULES, cone="elliptic"), contact_parameters("two"), length=40, states=1e-8),
+    Case("sphere pushes box", scene(PUSH, slope="0"), contact_parameters("box"), length=40),
+    Case("sphere pushes box, elliptic", scene(PUSH, slope="0", cone="elliptic"), contact_parameters("box"), length=40,
+         states=1e-8),  # fmt: skip
+    Case("spheres, condim 6", scene(SPHERES, slope=".05", condim="6"), contact_parameters("one"), length=40),
+    Case("margin, direct solref", scene(BOX, geom='margin=".01" gap=".005" solref="-5000 -90" solimp=".7 .9 .02 .4 3"'),
+         {"mass": p("body_mass", "box"), "stiffness": p("geom_solref", "floor", 0),
+          "damping": p("geom_solref", "floor", 1), "width": p("geom_solimp", "gbox", 2),
+          "power": p("geom_solimp", "gbox", 4)}, length=40),  # fmt: skip
+    Case("priority", scene(BOX.replace("<geom", '<geom priority="1" solmix="3" friction=".2 .01 .01"')),
+         {"friction": p("geom_friction", "gbox"), "solref": p("geom_solref", "gbox", 0)}, length=40),  # fmt: skip
+    Case("explicit pair", scene(BOX, cone="elliptic", extra='<contact><pair name="contact" geom1="floor" geom2="gbox" '
+         'condim="4" friction=".4 .7 .01 .001 .001" solref=".03 .9" solreffriction=".05 .8" margin=".002"/></contact>'),
+         {"mu1": p("pair_friction", "contact", 0), "mu2": p("pair_friction", "contact", 1),
+          "solreffriction": p("pair_solreffriction", "contact", 0)}, length=40, states=1e-8),  # fmt: skip
+]
+
+
+@pytest.mark.parametrize("case", CONTACTS, ids=lambda c: c.name)
+def test_contacts(case):
+    check(case)
