@@ -37,8 +37,8 @@ class Config(pydantic.BaseModel):
     parameters: dict[str, dict[str, Any]] | None = pydantic.Field(
         None, description="name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
     )
-    backend: Literal["mujoco", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
-    optimizer: Literal["fisher", "cma"] = pydantic.Field("fisher", description="how φ is searched")
+    backend: Literal["mujoco", "warp", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
+    optimizer: Literal["fisher", "cma", "adam"] = pydantic.Field("fisher", description="how φ is searched")
     epsilon: float | list[float] = pydantic.Field(1e-5, description="ε, variance added to every column, or one each")
     noise: float | list[float] | None = pydantic.Field(
         None, description="standard deviation of the measurement, or one per column; starts are then uncertain"
@@ -51,6 +51,10 @@ class Config(pydantic.BaseModel):
     budget: int = pydantic.Field(1000, ge=1, description="with cma: evaluations of the objective")
     population: int | None = pydantic.Field(None, ge=2, description="with cma: φ per generation")
     common_random_numbers: bool = pydantic.Field(False, description="with cma: the same samples in every generation")
+    adam: dict[str, Any] = pydantic.Field(
+        {}, description="with adam: steps, batch, samples, learning_rate, clip, plateau, common_random_numbers"
+    )
+    device: str = pydantic.Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
     threads: int = pydantic.Field(0, ge=0, description="threads of the simulator, 0 for all processors")
     chunk_size: int = pydantic.Field(10_000, ge=1, description="simulations held in memory at once")
 
@@ -82,7 +86,7 @@ class Config(pydantic.BaseModel):
 
     def document(self) -> dict[str, Any]:
         """Return the config as plain data, as it would stand in a file."""
-        return {k: v for k, v in self.model_dump(mode="json").items() if v is not None and v != []}
+        return {k: v for k, v in self.model_dump(mode="json").items() if v is not None and v != [] and v != {}}
 
     def fingerprint(self, *ignored: str) -> str:
         """Return a digest of everything that decides a run's result; threads and chunks do not."""

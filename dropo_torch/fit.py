@@ -18,10 +18,10 @@ import numpy as np
 from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError, choices
 from dropo_torch.objective import Objective, draw_uniforms, no_effect
-from dropo_torch.optimizers import CMAOptimizer, FisherOptimizer, Optimizer, Progress
+from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer, Progress
 
 SCHEMA = "dropo-torch/fit/1"
-OPTIMIZERS = ("fisher", "cma")
+OPTIMIZERS = ("fisher", "cma", "adam")
 
 
 @dataclass(frozen=True)
@@ -114,6 +114,7 @@ def fit(
     budget: int = 1000,
     population: int | None = None,
     common_random_numbers: bool = False,
+    adam: AdamSettings | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     fingerprint: str = "",
@@ -123,10 +124,11 @@ def fit(
 
     Args:
         objective: the likelihood of the log.
-        optimizer: ``"fisher"`` or ``"cma"``.
+        optimizer: ``"fisher"``, ``"cma"`` or, on a differentiable simulator, ``"adam"``.
         samples: K, parameter vectors of each φ.
         seed: seeds every random number.
         budget, population, common_random_numbers: options of CMA-ES; see :class:`CMAOptimizer`.
+        adam: how Adam steps.
         checkpoint: file in which the fit's state is kept after every batch.
         resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
         fingerprint: identifies the config and log; a checkpoint of another one is refused.
@@ -147,6 +149,8 @@ def fit(
             population=population,
             common_random_numbers=common_random_numbers,
         )
+    elif optimizer == "adam":
+        search = AdamOptimizer(objective, settings=adam or AdamSettings(), seed=seed)
     else:
         search = FisherOptimizer(
             objective.simulator.parameters, samples=samples, seed=seed, noisy=objective.noise is not None
@@ -189,7 +193,10 @@ def _run(
         at = request.linearise_at
         if at is not None and (objective.linearised_at is None or not np.array_equal(at, objective.linearised_at)):
             objective.linearise(at)
-        search.tell(objective.map(request.values, request.reduce))
+        if request.gradient:
+            search.tell(*objective.gradient(request.values, request.reduce, request.rows))
+        else:
+            search.tell(objective.map(request.values, request.reduce))
         evaluations += request.evaluations
         progress = search.progress
         mean, std = search.candidates()[0]

@@ -271,6 +271,35 @@ class Objective:
         assert total is not None
         return total
 
+    def gradient(
+        self, values: np.ndarray | torch.Tensor, reduce: Reduce, rows: np.ndarray | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return the sums of ``reduce`` and the gradient of the first one in ``values`` ``(P, d)``.
+
+        Args:
+            values: parameter values in their units, ``(P, d)``.
+            reduce: as for :meth:`map`.
+            rows: the transitions to simulate; ``None`` for all of them.
+
+        Raises:
+            InputError: a simulator without gradients.
+        """
+        if not self.simulator.differentiable:
+            raise InputError(f"backend: {self.simulator.name} has no gradients; use warp")
+        leaf = torch.as_tensor(np.asarray(values), dtype=torch.float64).requires_grad_(True)
+        chosen = torch.arange(len(self)) if rows is None else torch.as_tensor(rows)
+        total: torch.Tensor | None = None
+        slope = torch.zeros_like(leaf)
+        for block in _blocks(len(chosen), max(1, self._chunk_size // len(leaf))):
+            part = chosen[block]
+            features = self._simulate(self._states[part], part, leaf)
+            with single_thread():
+                sums = reduce(features, self.target(part), self.base_covariance(part))
+            slope += torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0])
+            total = sums.detach() if total is None else total + sums.detach()
+        assert total is not None
+        return total, slope
+
     def evaluate(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> list[Evaluation]:
         """Evaluate the sampled objective at several φ as one batch.
 
@@ -312,17 +341,18 @@ class Objective:
 
         return reduce
 
-    def target(self, block: slice) -> torch.Tensor:
+    def target(self, block: slice | torch.Tensor) -> torch.Tensor:
         """Return the measured features ``(t, m)``, less the shift that the start noise gives the prediction."""
         return self.measured[block] if self._noise_shift is None else self.measured[block] - self._noise_shift[block]
 
-    def base_covariance(self, block: slice) -> torch.Tensor:
+    def base_covariance(self, block: slice | torch.Tensor) -> torch.Tensor:
         """Return the covariance of features that no parameter explains, ``(t, m, m)``: ε and the noise."""
         fixed = torch.diag(self.epsilon)
+        count = block.stop - block.start if isinstance(block, slice) else len(block)
         if self.noise is None:
-            return fixed.expand(block.stop - block.start, -1, -1)
+            return fixed.expand(count, -1, -1)
         if self._noise_covariance is None:  # not yet linearised: the measured ends' own noise
-            return (fixed + torch.diag(self._end_variance())).expand(block.stop - block.start, -1, -1)
+            return (fixed + torch.diag(self._end_variance())).expand(count, -1, -1)
         return fixed + self._noise_covariance[block]
 
     def linearise(self, mean: np.ndarray) -> None:
@@ -369,7 +399,9 @@ class Objective:
         """Number of rotation vectors at the end of the features."""
         return len(self._quaternions)
 
-    def _simulate(self, states: torch.Tensor, block: slice, values: torch.Tensor, copies: int = 1) -> torch.Tensor:
+    def _simulate(
+        self, states: torch.Tensor, block: slice | torch.Tensor, values: torch.Tensor, copies: int = 1
+    ) -> torch.Tensor:
         """Features ``(t * copies, P, m)`` after the controls of a block of transitions, NaN where diverged."""
         controls, raw = self._controls[block], self._raw[block]
         if copies > 1:

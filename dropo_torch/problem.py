@@ -77,6 +77,7 @@ def make_problem(config: Config) -> Problem:
         frame_skip=frame_skip,
         num_threads=config.threads,
         chunk_size=config.chunk_size,
+        device=config.device,
     )
     _check_log(trajectories, simulator, frame_skip)
     width = trajectories.observations.shape[1]

@@ -21,6 +21,7 @@ from dropo_torch.diagnostics import diagnose
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit, write_atomically
+from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.progress import FitProgress
 from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
@@ -129,6 +130,7 @@ def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Co
             budget=config.budget,
             population=config.population,
             common_random_numbers=config.common_random_numbers,
+            adam=adam_settings(config.adam),
             checkpoint=checkpoint,
             resume=resume,
             fingerprint=problem.fingerprint,

@@ -21,12 +21,16 @@ class Request:
         reduce: what to sum over transitions, handed to :meth:`Objective.map`.
         evaluations: how many evaluations of the objective this counts as.
         linearise_at: μ in coordinates at which the start noise is propagated first, or ``None``.
+        rows: the transitions to simulate, ascending; ``None`` for all of them.
+        gradient: whether ``tell`` wants the gradient of the first sum in ``values``.
     """
 
     values: np.ndarray
     reduce: Reduce
     evaluations: int
     linearise_at: np.ndarray | None = None
+    rows: np.ndarray | None = None
+    gradient: bool = False
 
 
 @dataclass(frozen=True)
@@ -58,8 +62,8 @@ class Optimizer(abc.ABC):
         """Return the next batch; the same one again until it was told."""
 
     @abc.abstractmethod
-    def tell(self, sums: torch.Tensor) -> None:
-        """Take the sums that the batch's reduction gave."""
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Take the sums that the batch's reduction gave, and their gradient ``(P, d)`` where it was asked for."""
 
     @property
     @abc.abstractmethod

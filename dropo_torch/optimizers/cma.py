@@ -91,7 +91,7 @@ class CMAOptimizer(Optimizer):
             linearise_at=self._center() if self._noisy else None,
         )
 
-    def tell(self, sums: torch.Tensor) -> None:
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its log-likelihoods."""
         assert self._asked is not None
         values = sums[: len(self._asked)].numpy()

@@ -224,7 +224,7 @@ class FisherOptimizer(Optimizer):
             linearise_at=self._linearised,
         )
 
-    def tell(self, sums: torch.Tensor) -> None:
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Hand the sums to the stage at work, and change stages when it has finished."""
         if self._sampled is not None:
             self._sampled.tell(sums)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.model import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.simulators.gymnasium import Adapter, GymnasiumSimulator, MujocoEnvAdapter
@@ -12,7 +13,7 @@ from dropo_torch.simulators.mujoco import MujocoSimulator
 
 __all__ = ["Adapter", "GymnasiumSimulator", "MujocoEnvAdapter", "MujocoSimulator", "Simulator", "make_simulator"]
 
-BACKENDS = ("mujoco", "gymnasium")
+BACKENDS = ("mujoco", "warp", "gymnasium")
 
 
 def make_simulator(
@@ -23,17 +24,19 @@ def make_simulator(
     frame_skip: int = 1,
     num_threads: int = 0,
     chunk_size: int = 10_000,
+    device: str = "cpu",
 ) -> Simulator:
     """Return the simulator of a backend.
 
     Args:
-        backend: ``"mujoco"`` or ``"gymnasium"``.
+        backend: ``"mujoco"``, ``"warp"`` (differentiable) or ``"gymnasium"``.
         model: the model or its path; for ``"gymnasium"`` an adapter, or a function of the parameter
             space that makes one.
         parameters: what varies.
         frame_skip: physics steps (for ``"gymnasium"``: the adapter's steps) per logged transition.
         num_threads: threads, 0 for all processors.
         chunk_size: simulations held in memory at once.
+        device: of the ``"warp"`` backend, ``"cpu"`` or a GPU such as ``"cuda:0"``.
 
     Raises:
         InputError: an unknown backend, or a model that it does not support.
@@ -42,6 +45,28 @@ def make_simulator(
         return MujocoSimulator(
             model, parameters=parameters, frame_skip=frame_skip, num_threads=num_threads, chunk_size=chunk_size
         )
+    if backend == "warp":
+        return _warp_simulator(model, parameters, frame_skip, num_threads, chunk_size, device)
     if backend == "gymnasium":
         return GymnasiumSimulator(model, parameters=parameters, frame_skip=frame_skip)
     raise InputError(f"backend: unknown {backend!r}" + choices(backend, BACKENDS))
+
+
+def _warp_simulator(
+    model: Any, parameters: ParameterSpace, frame_skip: int, num_threads: int, chunk_size: int, device: str
+) -> Simulator:
+    """The Warp backend, imported only where it is asked for."""
+    try:
+        from dropo_torch.simulators.warp import WarpSimulator
+    except ImportError as error:
+        if error.name != "warp":
+            raise
+        raise InputError("backend: warp-lang is not installed; pip install warp-lang") from None
+    return WarpSimulator(
+        load_model(model),
+        parameters=parameters,
+        frame_skip=frame_skip,
+        chunk_size=min(chunk_size, 4096) if device == "cpu" else chunk_size,
+        num_threads=num_threads or None,
+        device=device,
+    )
