@@ -46,8 +46,8 @@ def distribution_row(axis: Axis, values: np.ndarray, density: np.ndarray, center
         center: the mean.
         nominal: the model's own value; NaN where there is none.
     """
-    figure = _figure(320, 64)
-    axes = _axes(figure, (12, 20, 12, 4))
+    figure = new_figure(320, 64)
+    axes = new_axes(figure, (12, 20, 12, 4))
     for side in ("left", "top", "right"):
         axes.spines[side].set_visible(False)
     if axis.is_log:
@@ -79,8 +79,8 @@ def trace_panel(
         measured, simulated, expected: next states and expected deviation, ``(n,)`` each.
         breaks: whether a point does not follow on the one before, ``(n,)`` bool.
     """
-    figure = _figure(320, 200)
-    upper, lower = _axes(figure, (46, 92, 14, 6)), _axes(figure, (46, 20, 14, 120))
+    figure = new_figure(320, 200)
+    upper, lower = new_axes(figure, (46, 92, 14, 6)), new_axes(figure, (46, 20, 14, 120))
     lower.sharex(upper)
     upper.tick_params(labelbottom=False)
     joined = _insert_breaks(breaks, position, simulated, expected)
@@ -111,8 +111,8 @@ def residual_panel(position: np.ndarray, standardised: np.ndarray) -> str:
         position: place in the log, ``(T,)``.
         standardised: residual over expected deviation, ``(T,)``; what is not finite is left out.
     """
-    figure = _figure(320, 130)
-    along, across = _axes(figure, (34, 20, 92, 6)), _axes(figure, (236, 20, 8, 6))
+    figure = new_figure(320, 130)
+    along, across = new_axes(figure, (34, 20, 92, 6)), new_axes(figure, (236, 20, 8, 6))
     finite = np.isfinite(standardised)
     x, z = position[finite], standardised[finite]
     reach = _reach(z)
@@ -159,8 +159,8 @@ def progress_panel(
         marks: horizontal guides.
         limits: of the vertical axis.
     """
-    figure = _figure(340, 225)
-    axes = _axes(figure, (58, 36, 12, 34))
+    figure = new_figure(340, 225)
+    axes = new_axes(figure, (58, 36, 12, 34))
     keep = _thinned(len(cost), MAX_POINTS)
     lines = np.where(np.isfinite(lines) & ((lines > 0) | (not log)), lines, np.nan)
     for column, colour in sorted(enumerate(colours), key=lambda pair: pair[1] != FAINT):
@@ -221,8 +221,8 @@ def heat_map(
     cell, right = ((40, 24), 70) if roomy else ((small, small), 8)
     rows, columns = [shorten(r) for r in rows], [shorten(c) for c in columns]
     left, top = (12 + 5.6 * max(map(len, names), default=1) for names in (rows, columns))
-    figure = _figure(left + cell[0] * width + right, top + cell[1] * count + 6)
-    axes = _axes(figure, (left, 6, right, top))
+    figure = new_figure(left + cell[0] * width + right, top + cell[1] * count + 6)
+    axes = new_axes(figure, (left, 6, right, top))
     shown = np.where(np.tri(count, width, dtype=bool) | (not lower), matrix, np.nan)
     colours = heat_colours(shown, diverging)
     axes.imshow(colours, aspect="auto", interpolation="none")
@@ -283,8 +283,8 @@ def log_log(x: np.ndarray, y: np.ndarray, *, chosen: float, x_label: str, y_labe
         x_label, y_label: of the axes.
         y_log: whether the vertical axis is logarithmic, too.
     """
-    figure = _figure(460, 300)
-    axes = _axes(figure, (62, 42, 14, 12))
+    figure = new_figure(460, 300)
+    axes = new_axes(figure, (62, 42, 14, 12))
     usable = np.isfinite(x) & (x > 0) & np.isfinite(y) & ((y > 0) | (not y_log))
     if usable.any():
         axes.set_xscale("log")
@@ -339,7 +339,7 @@ def _reach(standardised: np.ndarray) -> float:
     return float(1.05 * size.max()) if size.max() <= 12 else max(4.0, 1.1 * float(np.quantile(size, 0.995)))
 
 
-def _figure(width: float, height: float) -> Any:
+def new_figure(width: float, height: float) -> Any:
     """An empty figure of a size in CSS pixels; the SVG's points are scaled to that."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -350,7 +350,7 @@ def _figure(width: float, height: float) -> Any:
     return figure
 
 
-def _axes(figure: Any, margins: tuple[float, float, float, float]) -> Any:
+def new_axes(figure: Any, margins: tuple[float, float, float, float]) -> Any:
     """Axes with margins left, bottom, right and top, in pixels, in the style of all figures."""
     width, height = figure.get_size_inches() * 72
     left, bottom, right, top = margins

@@ -70,7 +70,7 @@ def write_fit_report(
         "config": config_yaml(config),
         "versions": dict(versions or {}),
     }
-    write_atomically(Path(path), _render("fit.html", content))
+    write_atomically(Path(path), render("fit.html", content))
 
 
 def write_sweep_report(
@@ -120,7 +120,7 @@ def write_sweep_report(
         "config": config_yaml(config),
         "versions": dict(versions or {}),
     }
-    write_atomically(Path(path), _render("sweep.html", content))
+    write_atomically(Path(path), render("sweep.html", content))
 
 
 def shown_columns(diagnostics: Diagnostics, most: int = MAX_COLUMNS) -> list[int]:
@@ -159,7 +159,7 @@ def nats(value: float) -> str:
     return f"{value:,.1f}".replace("-", "−") if abs(value) < 1e9 else words.number(value)
 
 
-def _render(template: str, content: Mapping[str, Any]) -> bytes:
+def render(template: str, content: Mapping[str, Any]) -> bytes:
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,

@@ -1,0 +1,186 @@
+"""One objective, one log, several optimizers and backends: what each finds, and what it costs."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.errors import InputError, choices
+from dropo_torch.fit import Fit, write_atomically
+from dropo_torch.objective import Objective, draw_uniforms
+
+SCHEMA = "dropo-torch/compare/1"
+#: optimizer-backend pairs that are compared.
+METHODS = ("fisher-mujoco", "fisher-warp", "adam-warp", "cma-mujoco", "cma-warp")
+#: Points of a run's history whose sampled likelihood is computed for the curves.
+CURVE_POINTS = 12
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """A run at one moment.
+
+    Attributes:
+        simulated_transitions: logged steps simulated so far.
+        seconds: time spent so far.
+        log_likelihood: the sampled objective at the φ of that moment, on draws common to all methods.
+        error: largest error of a mean, as a share of its value in the reference; NaN without one.
+    """
+
+    simulated_transitions: int
+    seconds: float
+    log_likelihood: float
+    error: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """One method on one seed.
+
+    Attributes:
+        method: ``optimizer-backend``.
+        seed: of the optimizer's random numbers.
+        log_likelihood, simulated_transitions, seconds, stop_reason: of the fit.
+        mean, std: what was found, name → value in its unit.
+        to_percent: simulated transitions until every mean was, and stayed, within 1 % of the reference; or ``None``.
+        to_permille: the same for 0.1 %.
+        curve: the run's history, thinned.
+    """
+
+    method: str
+    seed: int
+    log_likelihood: float
+    simulated_transitions: int
+    seconds: float
+    stop_reason: str
+    mean: dict[str, float]
+    std: dict[str, float]
+    to_percent: int | None
+    to_permille: int | None
+    curve: tuple[CurvePoint, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All runs, and the values that errors are measured against."""
+
+    runs: tuple[Run, ...]
+    reference: dict[str, float]
+    reference_is: str
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of ``compare.json``."""
+        return {"schema": SCHEMA, "reference": self.reference, "reference_is": self.reference_is} | {
+            "runs": [asdict(run) for run in self.runs]
+        }
+
+
+def compare(
+    fit_with: Callable[[str, str, int], tuple[Fit, Objective]],
+    *,
+    methods: Sequence[str],
+    seeds: Sequence[int],
+    reference: dict[str, float] | None,
+    store: Path | None = None,
+    fingerprint: str = "",
+    on_run: Callable[[Run], None] | None = None,
+) -> Comparison:
+    """Run every method on every seed.
+
+    Args:
+        fit_with: ``(optimizer, backend, seed)`` → the fit and the objective it maximised.
+        methods: of :data:`METHODS`.
+        seeds: of the optimizers' random numbers.
+        reference: known values of the parameters; ``None`` for the means of the run with the best likelihood.
+        store: file in which finished runs are kept; those of the same fingerprint are not repeated.
+        fingerprint: identifies config and log.
+        on_run: called after each run.
+
+    Raises:
+        InputError: an unknown method.
+    """
+    for method in methods:
+        if method not in METHODS:
+            raise InputError(f"methods: unknown {method!r}" + choices(method, METHODS))
+    kept = _stored(store, fingerprint)
+    raw: list[dict[str, Any]] = []
+    for method in methods:
+        for seed in seeds:
+            key = f"{method}/{seed}"
+            if key not in kept:
+                optimizer, backend = method.split("-")
+                kept[key] = _record(method, seed, *fit_with(optimizer, backend, seed))
+                if store is not None:
+                    write_atomically(store, json.dumps({"fingerprint": fingerprint, "runs": kept}).encode())
+                if on_run is not None:
+                    on_run(_judge(kept[key], reference or kept[key]["mean"]))
+            raw.append(kept[key])
+    best = max(raw, key=lambda r: r["log_likelihood"])
+    values = reference or best["mean"]
+    known = "the values the log was recorded with" if reference else f"the means of {best['method']}, the likeliest run"
+    return Comparison(tuple(_judge(r, values) for r in raw), values, known)
+
+
+def _record(method: str, seed: int, fit: Fit, objective: Objective) -> dict[str, Any]:
+    """A run as plain data, with the likelihood along its history on draws common to all methods."""
+    history = fit.history
+    picked = np.unique(np.geomspace(1, len(history), min(CURVE_POINTS, len(history))).astype(int)) - 1
+    uniforms = draw_uniforms(fit.samples, len(fit.distribution), fit.seed, 0)
+    likelihood = {}
+    for i in picked:
+        objective.linearise(history[i].mean)
+        std = np.maximum(history[i].std, objective.box.min_std)
+        found = objective.evaluate(history[i].mean[None], std[None], uniforms)[0]
+        likelihood[int(i)] = found.log_likelihood
+    summary = fit.distribution.summary()
+    centers = [type(fit.distribution).over(objective.simulator.parameters, h.mean, h.std).center for h in history]
+    return {
+        "method": method,
+        "seed": seed,
+        "log_likelihood": fit.log_likelihood,
+        "simulated_transitions": fit.simulated_transitions,
+        "seconds": fit.seconds,
+        "stop_reason": fit.stop_reason,
+        "mean": {n: e["mean"] for n, e in summary.items()},
+        "std": {n: e["std"] for n, e in summary.items()},
+        "history": [[h.simulated_transitions, h.seconds, *c.tolist()] for h, c in zip(history, centers, strict=True)],
+        "likelihood": {str(i): v for i, v in likelihood.items()},
+    }
+
+
+def _judge(raw: dict[str, Any], reference: dict[str, float]) -> Run:
+    """A recorded run with its errors against a reference."""
+    values = np.array([reference[name] for name in raw["mean"]])
+    history = np.array(raw["history"])
+    error = np.max(np.abs(history[:, 2:] - values) / np.maximum(np.abs(values), 1e-12), axis=1)
+    curve = tuple(
+        CurvePoint(int(history[int(i), 0]), float(history[int(i), 1]), value, float(error[int(i)]))
+        for i, value in raw["likelihood"].items()
+    )
+    plain = {k: v for k, v in raw.items() if k not in ("history", "likelihood")}
+    return Run(**plain, to_percent=_reached(history, error, 1e-2), to_permille=_reached(history, error, 1e-3), curve=curve)
+
+
+def _reached(history: np.ndarray, error: np.ndarray, limit: float) -> int | None:
+    """Simulated transitions from which the error stays within a limit."""
+    outside = np.flatnonzero(error > limit)
+    first = outside[-1] + 1 if outside.size else 0
+    return int(history[first, 0]) if first < len(history) else None
+
+
+def _stored(store: Path | None, fingerprint: str) -> dict[str, dict[str, Any]]:
+    if store is None or not store.is_file():
+        return {}
+    try:
+        content = json.loads(store.read_text())
+        owner, runs = content["fingerprint"], dict(content["runs"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"resume: {store} is no record of a comparison ({error}); start again without --resume") from None
+    if owner != fingerprint:
+        raise InputError(f"resume: {store} belongs to another config or log; start again without --resume")
+    return runs
