@@ -60,10 +60,16 @@ def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, st
 
     Args:
         epsilons: rising values.
-        errors: mean squared errors of the fits at them.
+        errors: mean squared errors of the fits at them; one that is not finite never counts as small.
+
+    Raises:
+        InputError: no error is finite.
     """
-    slack = TOLERANCE * min(errors) + 0.01 * min(epsilons)
+    errors = [e if math.isfinite(e) else math.inf for e in errors]
     best = min(errors)
+    if math.isinf(best):
+        raise InputError("epsilons: no fit at any of them predicts the log; see what `dropo fit` says about it")
+    slack = TOLERANCE * best + 0.01 * min(epsilons)
     first = next(i for i, error in enumerate(errors) if error <= best + slack)
     chosen = epsilons[first]
     if first == 0:
