@@ -88,7 +88,7 @@ class Config(pydantic.BaseModel):
 
     def fingerprint(self, *ignored: str) -> str:
         """Return a digest of everything that decides a run's result; threads and chunks do not."""
-        document = {k: v for k, v in self.document().items() if k not in {"threads", *ignored}}
+        document = {k: v for k, v in self.document().items() if k not in {"threads", "chunk_size", *ignored}}
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:16]
 
 
