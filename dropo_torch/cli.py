@@ -1,8 +1,10 @@
-"""The command line: ``dropo fit``, ``dropo sweep-epsilon``, ``dropo demo``."""
+"""The command line: ``dropo fit``, ``dropo sweep-epsilon``, ``dropo compare``, ``dropo demo``."""
 
 from __future__ import annotations
 
 import argparse
+import io
+import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,27 +12,49 @@ from typing import NoReturn
 
 from dropo_torch.errors import InputError, choices
 
-COMMANDS = ("fit", "sweep-epsilon", "demo")
+COMMANDS = ("fit", "sweep-epsilon", "compare", "demo")
 
 
 class _Parser(argparse.ArgumentParser):
     """Says what is wrong in one line."""
 
     def error(self, message: str) -> NoReturn:
-        raise InputError(message)
+        usage = self.format_usage().removeprefix("usage: ").replace("[-h] ", "")
+        raise InputError(f"{message}; usage: {usage}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command; return 0 on success, 2 on bad input, 130 when interrupted."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal without Greek letters is no reason to stop
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
         return _dispatch(given)
     except InputError as error:
-        print(f"dropo: {' '.join(str(error).split())}", file=sys.stderr)
-        return 2
+        return _fail(str(error), 2)
     except KeyboardInterrupt:
-        print("dropo: interrupted; the same command with --resume goes on where it stopped", file=sys.stderr)
-        return 130
+        return _fail("interrupted; the same command with --resume goes on where it stopped", 130)
+    except BrokenPipeError:  # the reader of help or results has seen enough
+        _silence()
+        return 0
+    except OSError as error:
+        if error.strerror is None:
+            raise
+        return _fail(f"{error.filename or 'output'}: {error.strerror}", 2)
+
+
+def _fail(message: str, code: int) -> int:
+    """Say in one line why the command ends, and return its exit code."""
+    print(f"dropo: {' '.join(message.split())}", file=sys.stderr)
+    return code
+
+
+def _silence() -> None:
+    """Send what is still printed nowhere: a fit whose reader has gone is finished all the same."""
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)
+    os.close(nowhere)
 
 
 def _dispatch(given: list[str]) -> int:
@@ -38,23 +62,36 @@ def _dispatch(given: list[str]) -> int:
         raise InputError(f"unknown command {given[0]!r}" + choices(given[0], COMMANDS))
     parsed, rest = _parser().parse_known_args(given)
     if parsed.command is None:
+        if rest:
+            raise InputError(f"{rest[0]} stands before a command; expected dropo {'|'.join(COMMANDS)} first")
         _parser().print_help()
         return 0
     from rich.console import Console
 
     from dropo_torch import runs
+    from dropo_torch.compare import METHODS
     from dropo_torch.config import load_config, parse_overrides
 
-    console = Console()
+    class Output(Console):
+        def on_broken_pipe(self) -> None:
+            _silence()
+
+    console = Output()
     overrides = parse_overrides(rest)
     if parsed.command == "demo":
-        runs.run_demo(parsed.out, console=console, overrides=overrides)
+        runs.run_demo(parsed.out, console=console, overrides=overrides, resume=parsed.resume)
         return 0
     config = load_config(parsed.config, overrides)
     if parsed.command == "fit":
         runs.run_fit(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
+    elif parsed.command == "compare":
+        methods = METHODS if parsed.methods is None else [m.strip() for m in parsed.methods.split(",")]
+        runs.run_compare(
+            config, parsed.out, console=console, methods=methods, seeds=_count(parsed.seeds), resume=parsed.resume
+        )
     else:
-        runs.run_sweep(config, parsed.out, console=console, epsilons=parsed.epsilons, resume=parsed.resume)
+        epsilons = None if parsed.epsilons is None else _numbers(parsed.epsilons)
+        runs.run_sweep(config, parsed.out, console=console, epsilons=epsilons, resume=parsed.resume)
     return 0
 
 
@@ -69,9 +106,13 @@ def _parser() -> argparse.ArgumentParser:
     fit = _command(commands, "fit", "fit the distribution to the log")
     fit.add_argument("--log", metavar="tensorboard", help="write the history as TensorBoard events, too")
     sweep = _command(commands, "sweep-epsilon", "fit at several ε and choose one by the elbow")
-    sweep.add_argument("--epsilons", type=_numbers, metavar="1e-6,1e-5,...", help="the values to try")
+    sweep.add_argument("--epsilons", metavar="1e-6,1e-5,...", help="the values to try")
+    comparison = _command(commands, "compare", "fit by several optimizers and backends, side by side")
+    comparison.add_argument("--methods", metavar="fisher-warp,...", help="optimizer-backend pairs, all by default")
+    comparison.add_argument("--seeds", metavar="N", default="3", help="seeds of each (default 3)")
     demo = commands.add_parser("demo", help="fit the bundled Hopper's masses", allow_abbrev=False)
-    demo.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR", help="folder of the results")
+    demo.add_argument("--out", type=_folder, default=Path("out/demo"), metavar="DIR", help="folder of the results")
+    demo.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
     return parser
 
 
@@ -85,7 +126,7 @@ def _command(commands: argparse._SubParsersAction, name: str, summary: str) -> a
         epilog=_keys_help(),
     )
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the results")
+    parser.add_argument("--out", type=_folder, required=True, metavar="DIR", help="folder of the results")
     parser.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
     return parser
 
@@ -100,6 +141,18 @@ def _keys_help() -> str:
             default = "" if entry.default in (None, []) else f" (default {entry.default})"
             lines.append(f"  --{name:<22} {entry.description}{default}")
     return "\n".join(lines)
+
+
+def _folder(text: str) -> Path:
+    if not text:
+        raise argparse.ArgumentTypeError("no folder given")
+    return Path(text)
+
+
+def _count(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise InputError(f"--seeds: {text!r} given; expected a whole number, 1 or more")
+    return int(text)
 
 
 def _numbers(text: str) -> list[float]:

@@ -163,7 +163,9 @@ def _judge(raw: dict[str, Any], reference: dict[str, float]) -> Run:
         for i, value in raw["likelihood"].items()
     )
     plain = {k: v for k, v in raw.items() if k not in ("history", "likelihood")}
-    return Run(**plain, to_percent=_reached(history, error, 1e-2), to_permille=_reached(history, error, 1e-3), curve=curve)
+    return Run(
+        **plain, to_percent=_reached(history, error, 1e-2), to_permille=_reached(history, error, 1e-3), curve=curve
+    )
 
 
 def _reached(history: np.ndarray, error: np.ndarray, limit: float) -> int | None:
@@ -180,7 +182,9 @@ def _stored(store: Path | None, fingerprint: str) -> dict[str, dict[str, Any]]:
         content = json.loads(store.read_text())
         owner, runs = content["fingerprint"], dict(content["runs"])
     except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"resume: {store} is no record of a comparison ({error}); start again without --resume") from None
+        raise InputError(
+            f"resume: {store} is no record of a comparison ({error}); start again without --resume"
+        ) from None
     if owner != fingerprint:
         raise InputError(f"resume: {store} belongs to another config or log; start again without --resume")
     return runs

@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import pydantic
 import yaml
@@ -27,10 +27,10 @@ class Config(pydantic.BaseModel):
         description="with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter",
     )
     data: Any = pydantic.Field(None, description="path of the log, a list of paths, or path and reading options")
-    trajectories: int | list[int] | None = pydantic.Field(
+    trajectories: int | Annotated[list[int], pydantic.Field(min_length=1)] | None = pydantic.Field(
         None, description="how many of the log's episodes to use (the first ones), or which, counted from 0"
     )
-    frame_skip: int | None = pydantic.Field(None, ge=1, description="physics steps per logged transition")
+    frame_skip: int | None = pydantic.Field(None, ge=1, le=1_000_000, description="physics steps per logged transition")
     observation: list[str] | None = pydantic.Field(
         None, description="what the log's columns are, such as [qpos[1:], qvel]"
     )
@@ -43,7 +43,7 @@ class Config(pydantic.BaseModel):
     noise: float | list[float] | None = pydantic.Field(
         None, description="standard deviation of the measurement, or one per column; starts are then uncertain"
     )
-    samples: int = pydantic.Field(100, ge=2, description="K, parameter vectors per transition")
+    samples: int = pydantic.Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
     lag: int = pydantic.Field(1, ge=1, description="λ, logged steps per window")
     seed: int = pydantic.Field(0, ge=0, description="seed of everything that is random")
     mask: list[str | int] = pydantic.Field([], description="observed columns which the likelihood leaves out")
@@ -55,7 +55,7 @@ class Config(pydantic.BaseModel):
         {}, description="with adam: steps, batch, samples, learning_rate, clip, plateau, common_random_numbers"
     )
     device: str = pydantic.Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
-    threads: int = pydantic.Field(0, ge=0, description="threads of the simulator, 0 for all processors")
+    threads: int = pydantic.Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")
     chunk_size: int = pydantic.Field(10_000, ge=1, description="simulations held in memory at once")
 
     #: Folder that relative paths start from; not a key of the file.
@@ -65,32 +65,34 @@ class Config(pydantic.BaseModel):
         """Return a path of the config as one that can be opened."""
         return self.base / Path(given).expanduser()
 
-    def absolute(self) -> Config:
-        """Return the same config with absolute paths, valid from any folder."""
-        changes: dict[str, Any] = {"base": Path()}
-        if self.model is not None:
-            changes["model"] = str(self.path(self.model).resolve())
-        if self.environment is not None and ".py:" in self.environment:
-            changes["environment"] = str(self.path(self.environment).resolve())
-        changes["data"] = self._absolute_data(self.data)
-        return self.model_copy(update=changes)
-
-    def _absolute_data(self, source: Any) -> Any:
-        if isinstance(source, list):
-            return [self._absolute_data(entry) for entry in source]
-        if isinstance(source, dict) and "path" in source:
-            return {**source, "path": self._absolute_data(source["path"])}
-        if isinstance(source, str) and not source.startswith("minari:"):
-            return str(self.path(source).absolute())
-        return source
-
     def document(self) -> dict[str, Any]:
         """Return the config as plain data, as it would stand in a file."""
         return {k: v for k, v in self.model_dump(mode="json").items() if v is not None and v != [] and v != {}}
 
+    def portable(self) -> dict[str, Any]:
+        """Return the config as :meth:`document` does, with absolute paths: it means the same in any folder."""
+        document = self.document()
+        if self.model is not None:
+            document["model"] = str(self.path(self.model).resolve())
+        if self.data is not None:
+            document["data"] = self._absolute(self.data)
+        if self.environment is not None and ".py:" in self.environment:
+            where, _, function = self.environment.rpartition(":")
+            document["environment"] = f"{self.path(where).resolve()}:{function}"
+        return document
+
+    def _absolute(self, source: Any) -> Any:
+        if isinstance(source, list):
+            return [self._absolute(entry) for entry in source]
+        if isinstance(source, dict):
+            return {k: self._absolute(v) if k == "path" else v for k, v in source.items()}
+        if not isinstance(source, str) or source.startswith("minari:"):
+            return source
+        return str(self.path(source).resolve())
+
     def fingerprint(self, *ignored: str) -> str:
         """Return a digest of everything that decides a run's result; threads and chunks do not."""
-        document = {k: v for k, v in self.document().items() if k not in {"threads", *ignored}}
+        document = {k: v for k, v in self.document().items() if k not in {"threads", "chunk_size", *ignored}}
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -107,7 +109,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
     if not path.is_file():
         raise InputError(f"config: no file {path}; expected a YAML file with keys such as model, data and parameters")
     try:
-        document = yaml.load(path.read_text(), Loader=_Loader)
+        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise InputError(f"config: {path} is no valid YAML: {' '.join(str(error).split())}") from None
     if not isinstance(document, Mapping):
@@ -123,19 +125,57 @@ def make_config(
     source: str = "config",
 ) -> Config:
     """Return the config of a mapping, with dotted overrides; errors are those of :func:`load_config`."""
-    merged = json.loads(json.dumps(dict(document), default=str))
+    try:
+        merged = json.loads(json.dumps(dict(document), default=str))
+    except ValueError:
+        raise InputError(f"{source}: an entry contains itself; expected plain keys and values") from None
     for dotted, value in (overrides or {}).items():
         _override(merged, dotted, value)
-    for key in merged:
+    for key, value in merged.items():
         if key not in KEYS:
             raise InputError(f"{source}: unknown key {key!r}" + choices(key, KEYS))
+        if isinstance(value, bool) and Config.model_fields[key].annotation is not bool:
+            raise InputError(
+                f"{source}: {key} is {str(value).lower()}; expected {Config.model_fields[key].description}"
+            )
     try:
         return Config(**merged, base=base)
     except pydantic.ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"] if not str(part).endswith("]"))
-        given = first.get("input")
-        raise InputError(f"{source}: {key} is {given!r}: {first['msg'][0].lower() + first['msg'][1:]}") from None
+        raise InputError(f"{source}: {_explained(error, merged)}") from None
+
+
+def _explained(error: pydantic.ValidationError, document: Mapping[str, Any]) -> str:
+    """Which entry is wrong, what it is, and what it should be."""
+    found = error.errors()
+    deepest = max(len(e["loc"]) for e in found)  # of a union's alternatives, the one that fits furthest
+    first = next(e for e in found if len(e["loc"]) == deepest)
+    alternatives = [e for e in found if len(e["loc"]) == deepest and e["loc"][0] == first["loc"][0]]
+    expected = list(dict.fromkeys(_expectation(e) for e in alternatives))
+    place: Any = dict(document)
+    key = []
+    for part in first["loc"]:  # pydantic also names the alternative of a union, which is no entry
+        if isinstance(place, dict | list) and part in (place if isinstance(place, dict) else range(len(place))):
+            place = place[part]  # type: ignore[index]
+            key.append(str(part))
+    near = (
+        choices(place, first["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", "))
+        if (first["type"] == "literal_error")
+        else ""
+    )
+    return f"{'.'.join(key)} is {place!r}; expected {' or '.join(expected)}{near}"
+
+
+def _expectation(error: Any) -> str:
+    """One of pydantic's messages, as what is expected."""
+    if error["type"] == "greater_than_equal":
+        return f"{error['ctx']['ge']} or more"
+    if error["type"] == "less_than_equal":
+        return f"{error['ctx']['le']} or less"
+    text = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
+    text = {"a integer": "a whole number", "a dictionary": "keys and values"}.get(
+        text.split(",")[0], text.split(",")[0]
+    )
+    return text
 
 
 def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
@@ -155,18 +195,30 @@ def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
         if key.split(".")[0] not in KEYS:
             raise InputError(f"unknown option --{key}" + choices(key, KEYS))
         if not equals:
-            if not waiting:
-                raise InputError(f"--{key}: no value given")
+            if not waiting or waiting[0].startswith("--"):
+                raise InputError(f"--{key}: no value given; expected --{key} VALUE")
             value = waiting.pop(0)
         try:
             found[key] = yaml.load(value, Loader=_Loader)
         except yaml.YAMLError:
-            raise InputError(f"--{key}: {value!r} is no valid value") from None
+            raise InputError(f"--{key}: {value!r} is no valid value; expected YAML, such as '[1, 2]'") from None
     return found
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML as people write numbers: 1e-5 is one, although YAML 1.1 wants 1.0e-5."""
+    """YAML as people write numbers: 1e-5 is one, although YAML 1.1 wants 1.0e-5. No key may stand twice."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Refuse a key that would silently replace an earlier one."""
+        seen: set[str] = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in seen:
+                    raise yaml.constructor.ConstructorError(
+                        None, None, f"key {key.value!r} stands there twice", key.start_mark
+                    )
+                seen.add(key.value)
+        return super().construct_mapping(node, deep)
 
 
 _Loader.add_implicit_resolver(
@@ -183,7 +235,9 @@ def _override(document: dict[str, Any], dotted: str, value: Any) -> None:
     *parents, last = dotted.split(".")
     place = document
     for parent in parents:
-        if not isinstance(place.get(parent), dict):
+        if parent not in place:
             raise InputError(f"--{dotted}: the config has no {parent!r} to change" + choices(parent, place))
+        if not isinstance(place[parent], dict):
+            raise InputError(f"--{dotted}: {parent} is {place[parent]!r}, which has no keys; expected --{parent} VALUE")
         place = place[parent]
     place[last] = value

@@ -10,8 +10,11 @@ class InputError(ValueError):
     """A config, log, model or option that cannot be used as given.
 
     The message is one line: what is wrong, where it stands, and what would be right. The command
-    line prints it and exits with code 2.
+    line prints it and exits with code 2. Line breaks and runs of spaces in it become one space.
     """
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(" ".join(str(message).split()))
 
 
 def choices(name: object, available: Iterable[object]) -> str:

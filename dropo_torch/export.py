@@ -26,7 +26,10 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     source, path = Path(source).resolve(), Path(path)
     if source.suffix not in (".xml", ".urdf", ".mjcf"):
         raise InputError(f"export: {source} is no XML model; only those can be written as MJCF")
-    spec = mujoco.MjSpec.from_file(str(source))
+    try:
+        spec = mujoco.MjSpec.from_file(str(source))
+    except ValueError as error:
+        raise InputError(f"export: MuJoCo does not read {source}: {error}") from None
     for folder in ("meshdir", "texturedir"):
         setattr(spec, folder, str((source.parent / getattr(spec, folder)).resolve()))
     if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
@@ -38,7 +41,7 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     try:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         spec.copy_back(model)
-        path.write_text(spec.to_xml())
+        path.write_text(spec.to_xml(), encoding="utf-8")
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"export: MJCF cannot express these parameters: {' '.join(str(error).split())}") from None
     _compare(path, space, values)

@@ -6,7 +6,11 @@ import hashlib
 import importlib
 import importlib.util
 import re
-from collections.abc import Callable
+import sys
+import traceback
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,13 +21,13 @@ import numpy as np
 
 from dropo_torch.bundled import BundledSim, bundled_sim
 from dropo_torch.config import Config
-from dropo_torch.errors import InputError
+from dropo_torch.errors import InputError, choices
 from dropo_torch.model import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.observation import Observation, generic_observation, parse_observation
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.readers import read_trajectories
-from dropo_torch.simulators import MujocoEnvAdapter, Simulator, make_simulator
+from dropo_torch.simulators import Adapter, MujocoEnvAdapter, Simulator, make_simulator
 from dropo_torch.trajectory import Trajectories, make_transitions
 
 #: Relative difference between the log's time step and the simulator's that is still called equal.
@@ -63,8 +67,10 @@ def make_problem(config: Config) -> Problem:
     """
     sim = None if config.sim is None else bundled_sim(config.sim)
     if config.backend == "gymnasium":
-        model_path, space, source = _gymnasium_source(config)
+        model_path, space, source = _gymnasium_source(config, sim)
     else:
+        if config.environment is not None:
+            raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
         model_path = _model_path(config, sim)
         space = _space(load_model(model_path), config, sim)
         source = space.model
@@ -119,39 +125,113 @@ def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None)
     return ParameterSpace(model, given)
 
 
-def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]:
+def _gymnasium_source(config: Config, sim: BundledSim | None) -> tuple[Path | None, ParameterSpace, Any]:
     """The parameter space and the adapter (or its maker) of a Gymnasium environment or of the user's own."""
     name = config.environment
     if name is None:
         raise InputError("config: backend gymnasium needs environment: an id such as Hopper-v5, or file.py:function")
     if re.search(r"-v\d+$", name):
+        if config.model is not None:
+            raise InputError(f"config: both model and environment {name} are given; the environment has its own model")
         try:
-            environment = gymnasium.make(name)
-        except (gymnasium.error.Error, ImportError) as error:
-            raise InputError(f"environment: Gymnasium cannot make {name!r}: {' '.join(str(error).split())}") from None
-        space = _space(getattr(environment.unwrapped, "model", None), config, None)
+            with warnings.catch_warnings(action="ignore"):  # an outdated version says so on several lines
+                environment = gymnasium.make(name)
+        except Exception as error:  # whatever the maker of a registered environment raises
+            raise InputError(f"environment: Gymnasium cannot make {name!r}: {error}") from None
+        space = _space(getattr(environment.unwrapped, "model", None), config, sim)
         return None, space, MujocoEnvAdapter(environment, space)
     maker = _load_function(config, name)
-    model = None if config.model is None else load_model(config.path(config.model))
-    return None if config.model is None else config.path(config.model), _space(model, config, None), maker
+    path = None if config.model is None else config.path(config.model)
+    space = _space(None if path is None else load_model(path), config, sim if path is not None else None)
+    with _user_code(name):
+        adapter = maker(space)
+    return path, space, _CheckedAdapter(adapter, name)
+
+
+class _CheckedAdapter:
+    """An adapter of the user's own: what it lacks, raises or returns amiss is told in one line."""
+
+    def __init__(self, adapter: Adapter, name: str) -> None:
+        for method in ("set_parameters", "set_state", "step"):
+            if not callable(getattr(adapter, method, None)):
+                raise InputError(
+                    f"environment: {name} gives {type(adapter).__name__}, which has no method {method}; an adapter has "
+                    "num_states, num_controls, timestep, set_parameters(values), set_state(state) and step(control)"
+                )
+        for width in ("num_states", "num_controls"):
+            if not isinstance(getattr(adapter, width, None), int | np.integer):
+                raise InputError(
+                    f"environment: {width} of {name} is {getattr(adapter, width, None)!r}; expected a number"
+                )
+        timestep = getattr(adapter, "timestep", None)
+        if timestep is not None and not (isinstance(timestep, int | float | np.number) and timestep > 0):
+            raise InputError(f"environment: timestep of {name} is {timestep!r}; expected seconds of a step, or None")
+        self._adapter, self._name = adapter, name
+        self.num_states, self.num_controls = int(adapter.num_states), int(adapter.num_controls)
+        self.timestep = None if timestep is None else float(timestep)
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        with _user_code(self._name):
+            self._adapter.set_parameters(values)
+
+    def set_state(self, state: np.ndarray) -> None:
+        with _user_code(self._name):
+            self._adapter.set_state(state)
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        with _user_code(self._name):
+            given: Any = self._adapter.step(control)
+        try:
+            after = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            after = np.empty(0)
+        if given is None or after.shape != (self.num_states,):
+            shape = f"shape {after.shape}" if after.size else repr(given)
+            raise InputError(
+                f"environment: step of {self._name} returns {shape}; expected ({self.num_states},) numbers"
+            )
+        return after
+
+
+@contextmanager
+def _user_code(name: str) -> Iterator[None]:
+    """Turn what the user's own code raises into an :class:`InputError` that says where."""
+    try:
+        yield
+    except InputError:
+        raise
+    except (Exception, SystemExit) as error:
+        ours = str(Path(__file__).parent)
+        frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith((ours, "<"))]
+        place = f", {frames[-1].filename} line {frames[-1].lineno}" if frames else ""
+        raise InputError(f"environment: {name} fails{place}: {type(error).__name__}: {error}") from error
 
 
 def _load_function(config: Config, name: str) -> Callable[..., Any]:
     """Load ``file.py:function`` or ``module:function``."""
     where, _, function = name.rpartition(":")
-    if where.endswith(".py"):
-        path = config.path(where)
-        if not path.is_file():
-            raise InputError(f"environment: no file {path}; expected file.py:function of an adapter")
-        spec = importlib.util.spec_from_file_location(path.stem, path)
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        spec.loader.exec_module(module)
-    else:
-        module = importlib.import_module(where)
+    if not where:
+        raise InputError(f"environment: {name!r} given; expected an id such as Hopper-v5, or file.py:function")
+    with _user_code(name):
+        if where.endswith(".py"):
+            path = config.path(where).resolve()
+            if not path.is_file():
+                raise InputError(f"environment: no file {path}; expected file.py:function of an adapter")
+            if str(path.parent) not in sys.path:
+                sys.path.append(str(path.parent))  # as for a script: it may import what lies beside it
+            spec = importlib.util.spec_from_file_location(f"dropo_adapter_{path.stem}", path)
+            assert spec is not None
+            assert spec.loader is not None
+            module = importlib.util.module_from_spec(spec)
+            sys.modules[spec.name] = module
+            spec.loader.exec_module(module)
+        else:
+            module = importlib.import_module(where)
     if not callable(getattr(module, function, None)):
-        raise InputError(f"environment: {where} has no function {function!r} that makes an adapter")
+        functions = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
+        raise InputError(
+            f"environment: {where} has no function {function!r} that makes an adapter" + choices(function, functions)
+        )
     return getattr(module, function)
 
 
@@ -221,10 +301,10 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
 def _observation(
     config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, simulator: Simulator, width: int
 ) -> Observation:
-    entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
     if model is not None and simulator.num_states == model.nq + model.nv:
+        entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
         return parse_observation(model, entries, width)
-    if entries is not None:
+    if config.observation is not None:
         raise InputError("observation: this simulator's states have no names; leave the key out")
     if width != simulator.num_states:
         raise InputError(f"data: {width} observed columns, but the simulator's state has {simulator.num_states}")
@@ -240,6 +320,9 @@ def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Tra
         trajectories.terminals,
     ):
         digest.update(np.ascontiguousarray(array).tobytes())
+    where, _, _ = (config.environment or "").rpartition(":")
+    if where.endswith(".py"):
+        digest.update(config.path(where).read_bytes())
     if model is not None:
         buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
         mujoco.mj_saveModel(model, None, buffer)

@@ -6,6 +6,7 @@ import functools
 import json
 import platform
 import shutil
+import tempfile
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -16,17 +17,27 @@ from rich.console import Console
 from rich.table import Table
 
 from dropo_torch.bundled import bundled_sim
+from dropo_torch.compare import Comparison, Run, compare
 from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit, write_atomically
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.progress import FitProgress
 from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
 
-_PACKAGES = ("dropo_torch", "torch", "mujoco", "numpy", "scipy", "cma", "gymnasium")
+#: What runs write to their folder; an earlier run's are moved aside together.
+_RESULTS = (
+    "fit.json", "sweep.json", "compare.json", "checkpoint.pkl", "sweep-progress.json", "compare-progress.json",
+    "distribution.yaml", "config.yaml",
+    "model.xml", "report.html", "tensorboard",
+)  # fmt: skip
+#: The first of them: a folder with none of these holds no run.
+_MARKS = _RESULTS[:6]
+_PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")
 
 
 def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None) -> Fit:
@@ -41,8 +52,9 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     """
     _check_log_option(log)
     problem = make_problem(config)
-    _prepare(out, "fit.json", resume=resume)
+    _prepare(out, problem, resume=resume and (out / "checkpoint.pkl").exists())
     result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
+    _refuse_lost(problem, result)
     _write_fit(problem, result, out)
     if log == "tensorboard":
         _write_tensorboard(result, out / "tensorboard")
@@ -50,7 +62,7 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     return result
 
 
-def run_demo(out: Path, *, console: Console, overrides: Mapping[str, Any] | None = None) -> Fit:
+def run_demo(out: Path, *, console: Console, overrides: Mapping[str, Any] | None = None, resume: bool = False) -> Fit:
     """Fit the bundled Hopper's masses to its log and compare them with the masses it was recorded with."""
     config = make_config({"sim": "hopper"}, overrides)
     sim = bundled_sim(str(config.sim))
@@ -58,10 +70,12 @@ def run_demo(out: Path, *, console: Console, overrides: Mapping[str, Any] | None
         "The demo fits four link masses of a simulated Hopper to 200 logged transitions "
         "(sims/hopper/log.npz),\nrecorded with masses that the model does not have."
     )
-    result = run_fit(config, out, console=console)
+    result = run_fit(config, out, console=console, resume=resume)
     table = Table("parameter", "recorded with", "found", "error", title="Against the truth", title_justify="left")
     for name, entry in result.distribution.summary().items():
-        truth = sim.truth[name]
+        truth = sim.truth.get(name)
+        if truth is None:
+            continue
         error = 100 * (entry["mean"] / truth - 1)
         table.add_row(name, f"{truth:.4g} {entry['unit']}", f"{entry['mean']:.4g}", f"{error:+.3f} %")
     console.print(table)
@@ -75,10 +89,8 @@ def run_sweep(
     from dropo_torch.report import write_sweep_report
 
     problem = make_problem(config)
-    _prepare(out, "sweep.json", resume=resume)
     store = out / "sweep-progress.json"
-    if not resume:
-        store.unlink(missing_ok=True)
+    _prepare(out, problem, resume=resume and store.exists())
     values = default_epsilons(problem.objective.measured.numpy()) if epsilons is None else list(epsilons)
 
     def fit_at(epsilon: float) -> Fit:
@@ -104,8 +116,46 @@ def run_sweep(
         config=config.document(),
         versions=versions(),
     )
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True)
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return sweep
+
+
+def run_compare(
+    config: Config, out: Path, *, console: Console, methods: Sequence[str], seeds: int, resume: bool = False
+) -> Comparison:
+    """Fit by several optimizers and backends, and write ``compare.json`` and ``report.html`` to ``out``."""
+    from dropo_torch.report import write_compare_report
+
+    problem = make_problem(config)
+    store = out / "compare-progress.json"
+    _prepare(out, problem, resume=resume and store.exists())
+
+    def fit_with(optimizer: str, backend: str, seed: int) -> tuple[Fit, Objective]:
+        part = make_problem(config.model_copy(update={"optimizer": optimizer, "backend": backend, "seed": seed}))
+        label = f"{optimizer} on {backend}, seed {seed}"
+        return _fit(part, None, resume=False, console=console, label=label), part.objective
+
+    def show(run: Run) -> None:
+        console.print(
+            f"{run.method}, seed {run.seed}: log-likelihood {run.log_likelihood:.1f}, "
+            f"{run.simulated_transitions} simulated transitions, {run.seconds:.1f} s",
+            highlight=False,
+        )
+
+    truth = dict(bundled_sim(config.sim).truth) if config.sim and config.data is None else {}
+    comparison = compare(
+        fit_with,
+        methods=methods,
+        seeds=range(config.seed, config.seed + seeds),
+        reference={n: truth[n] for n in problem.space.names} if truth else None,
+        store=store,
+        fingerprint=problem.fingerprint,
+        on_run=show,
+    )
+    write_atomically(out / "compare.json", json.dumps(comparison.document(), indent=2).encode() + b"\n")
+    write_compare_report(out / "report.html", comparison, config=config.document(), versions=versions())
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+    return comparison
 
 
 def versions() -> dict[str, str]:
@@ -138,22 +188,40 @@ def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Co
         )
 
 
-def _prepare(out: Path, result: str, *, resume: bool) -> None:
-    """Make the folder; move an earlier, finished run aside unless it is to be continued."""
-    if out.exists() and not out.is_dir():
-        raise InputError(f"--out: {out} is a file; expected a folder")
+def _prepare(out: Path, problem: Problem, *, resume: bool) -> None:
+    """Make the folder; move an earlier run's files aside unless it is to be continued. Nothing else is touched."""
     try:
+        if out.exists() and not out.is_dir():
+            raise InputError(f"--out: {out} is a file; expected a folder")
         out.mkdir(parents=True, exist_ok=True)
+        tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
-        raise InputError(f"--out: cannot make folder {out}: {error.strerror}") from None
-    if resume or not (out / result).exists():
+        raise InputError(f"--out: cannot write to folder {out}: {error.strerror}") from None
+    present = [name for name in _RESULTS if (out / name).exists()]
+    source = problem.model_path
+    if source is not None and source.name in present and source.resolve() == (out / source.name).resolve():
+        raise InputError(
+            f"--out: {out / source.name} is the model of this run, which would replace it; name another folder"
+        )
+    if resume or not present:
         return
+    if not any(mark in present for mark in _MARKS):
+        raise InputError(f"--out: {out / present[0]} is no result of an earlier run; name another folder, or move it")
     number = next(i for i in range(1, 10_000) if not (out / f"previous-{i}").exists())
     aside = out / f"previous-{number}"
     aside.mkdir()
-    for item in out.iterdir():
-        if not item.name.startswith("previous-"):
-            shutil.move(str(item), aside / item.name)
+    for name in reversed(present):  # the marks last: what is cut short here is still known as a run
+        shutil.move(str(out / name), aside / name)
+
+
+def _refuse_lost(problem: Problem, result: Fit) -> None:
+    """Raise an :class:`InputError` if no simulation of the final evaluation survived."""
+    if result.diverged < len(problem.objective) * result.samples:
+        return
+    raise InputError(
+        "parameters: every simulation of this log diverges, wherever in the bounds; "
+        "check the log's units, the order of its columns (observation), frame_skip and the bounds"
+    )
 
 
 def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
@@ -162,7 +230,8 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
     result.save(out / "fit.json")
     result.distribution.save(out / "distribution.yaml")
     document = problem.config.document()
-    (out / "config.yaml").write_text(yaml.safe_dump(problem.config.absolute().document(), sort_keys=False))
+    portable = yaml.safe_dump(problem.config.portable(), sort_keys=False, allow_unicode=True)
+    write_atomically(out / "config.yaml", portable.encode())
     notes = []
     if problem.model_path is not None:
         try:
@@ -194,7 +263,10 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
         soft_wrap=True,
         highlight=False,
     )
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False)
+    if result.diverged:
+        share = 100 * result.diverged / (len(problem.objective) * result.samples)
+        console.print(f"{result.diverged} simulations ({share:.2g} %) diverged under the fitted distribution")
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
 
 
 def _check_log_option(log: str | None) -> None:

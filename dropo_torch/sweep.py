@@ -60,10 +60,16 @@ def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, st
 
     Args:
         epsilons: rising values.
-        errors: mean squared errors of the fits at them.
+        errors: mean squared errors of the fits at them; one that is not finite never counts as small.
+
+    Raises:
+        InputError: no error is finite.
     """
-    slack = TOLERANCE * min(errors) + 0.01 * min(epsilons)
+    errors = [e if math.isfinite(e) else math.inf for e in errors]
     best = min(errors)
+    if math.isinf(best):
+        raise InputError("epsilons: no fit at any of them predicts the log; see what `dropo fit` says about it")
+    slack = TOLERANCE * best + 0.01 * min(epsilons)
     first = next(i for i, error in enumerate(errors) if error <= best + slack)
     chosen = epsilons[first]
     if first == 0:
@@ -109,7 +115,7 @@ def sweep_epsilon(
         InputError: fewer than three values, or one that is not positive.
     """
     values = sorted({float(e) for e in epsilons})
-    if len(values) < 3 or values[0] <= 0 or not math.isfinite(values[-1]):
+    if len(values) < 3 or not all(0 < value < math.inf for value in values):
         raise InputError(f"epsilons: {list(epsilons)} given; expected three or more positive numbers")
     done = _stored(store, fingerprint)
     for value in values:
@@ -138,7 +144,11 @@ def _stored(store: Path | None, fingerprint: str) -> dict[float, SweepPoint]:
     """Finished fits of an earlier, interrupted sweep of the same config and log."""
     if store is None or not store.is_file():
         return {}
-    content = json.loads(store.read_text())
-    if content.get("fingerprint") != fingerprint:
+    try:
+        content = json.loads(store.read_text())
+        owner, points = content["fingerprint"], [SweepPoint(**p) for p in content["points"]]
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"resume: {store} is no record of a sweep ({error}); start again without --resume") from None
+    if owner != fingerprint:
         raise InputError(f"resume: {store} belongs to another config or log; start again without --resume")
-    return {p["epsilon"]: SweepPoint(**p) for p in content["points"]}
+    return {p.epsilon: p for p in points}

@@ -19,7 +19,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dropo_torch.errors import InputError
+from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
 from sims.hopper import LINKS, SIM
 
@@ -50,13 +50,14 @@ class HopperLog:
 
     def save(self, path: str | Path) -> None:
         """Write the log as ``.npz``, without the masses: a robot does not log those."""
-        np.savez_compressed(
-            path,
-            observations=self.observations,
-            next_observations=self.next_observations,
-            actions=self.actions,
-            terminals=self.terminals,
-        )
+        with open(path, "wb") as stream:  # numpy would append .npz to a path without it
+            np.savez_compressed(
+                stream,
+                observations=self.observations,
+                next_observations=self.next_observations,
+                actions=self.actions,
+                terminals=self.terminals,
+            )
 
 
 def nominal_masses() -> dict[str, float]:
@@ -83,8 +84,13 @@ def record(
         masses: name → kg of the recorded Hopper; the model's own where absent.
 
     Raises:
-        InputError: an unknown variant.
+        InputError: an unknown variant, mass or number.
     """
+    if episodes < 1 or steps < 1 or seed < 0:
+        raise InputError(f"episodes {episodes}, steps {steps}, seed {seed}: expected 1 or more, 1 or more, 0 or more")
+    for name in masses or {}:
+        if name not in SIM.parameters:
+            raise InputError(f"masses: unknown name {name!r}" + choices(name, SIM.parameters))
     if variant not in VARIANTS:
         raise InputError(f"variant: unknown {variant!r}; expected one of {', '.join(VARIANTS)}")
     generator = np.random.default_rng(seed)
@@ -152,14 +158,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", action="store_true", help="the masses of the bundled log instead of the model's")
     given = parser.parse_args(arguments)
-    log = record(
-        variant=given.variant,
-        episodes=given.episodes,
-        steps=given.steps,
-        seed=given.seed,
-        masses=SIM.truth if given.robot else None,
-    )
-    log.save(given.path)
+    try:
+        log = record(
+            variant=given.variant,
+            episodes=given.episodes,
+            steps=given.steps,
+            seed=given.seed,
+            masses=SIM.truth if given.robot else None,
+        )
+        log.save(given.path)
+    except (InputError, OSError) as error:
+        parser.error(str(error))
     print(f"{len(log.actions)} transitions in {given.path}")
 
 
