@@ -60,10 +60,10 @@ def _silence() -> None:
 def _dispatch(given: list[str]) -> int:
     if given and not given[0].startswith("-") and given[0] not in COMMANDS:
         raise InputError(f"unknown command {given[0]!r}" + choices(given[0], COMMANDS))
+    if given and given[0].startswith("-") and given[0] not in ("-h", "--help", "--version"):
+        raise InputError(f"{given[0]} stands before a command; expected {'|'.join(COMMANDS)} first")
     parsed, rest = _parser().parse_known_args(given)
     if parsed.command is None:
-        if rest:
-            raise InputError(f"{rest[0]} stands before a command; expected dropo {'|'.join(COMMANDS)} first")
         _parser().print_help()
         return 0
     from rich.console import Console

@@ -186,7 +186,7 @@ class _CheckedAdapter:
         except (TypeError, ValueError):
             after = np.empty(0)
         if given is None or after.shape != (self.num_states,):
-            shape = f"shape {after.shape}" if after.size else repr(given)
+            shape = repr(given) if given is None or isinstance(given, str) else f"shape {np.shape(given)}"
             raise InputError(
                 f"environment: step of {self._name} returns {shape}; expected ({self.num_states},) numbers"
             )

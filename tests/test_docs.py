@@ -1,0 +1,283 @@
+"""The documentation is run: its configs, Python, commands, links and examples."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import h5py
+import mujoco
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import yaml
+
+from dropo_torch import cli
+from dropo_torch.config import _Loader, make_config, parse_overrides
+from dropo_torch.fit import refuse_dead_parameters
+from dropo_torch.problem import make_problem
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+ROWS = 120
+
+#: The robot that the pages speak of: a two-joint arm whose fingers slide over the floor.
+ROBOT_XML = """
+<mujoco>
+  <option timestep="0.002"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="2 2 .1"/>
+    <body name="upper_arm" pos="0 0 .22">
+      <joint name="shoulder" axis="0 0 1" damping=".3"/>
+      <geom name="upper_arm" type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1"/>
+      <body name="forearm" pos=".3 0 0">
+        <joint name="elbow" axis="0 1 0" damping=".2"/>
+        <geom name="forearm" type="capsule" fromto="0 0 0 .2 0 -.15" size=".02" mass=".8"/>
+        <body name="hand" pos=".2 0 -.2">
+          <geom name="left_finger" type="sphere" pos="0 .03 0" size=".02" mass=".1" friction=".8"/>
+          <geom name="right_finger" type="sphere" pos="0 -.03 0" size=".02" mass=".1" friction=".8"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder_servo" joint="shoulder" kp="20" kv="1"/>
+    <position name="elbow_servo" joint="elbow" kp="20" kv="1"/>
+  </actuator>
+</mujoco>"""
+
+BASE: dict[str, Any] = {
+    "model": "robot.xml",
+    "data": "log.npz",
+    "frame_skip": 5,
+    "parameters": {"forearm_mass": {"field": "body_mass", "name": "forearm", "bounds": [0.5, 3.0]}},
+    "threads": 1,
+}
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.MULTILINE | re.DOTALL)
+
+
+def every(language: str) -> list[Any]:
+    numbered = ((page, i, text) for page in PAGES for i, text in enumerate(blocks(page, language)))
+    return [pytest.param(page, text, id=f"{page.stem}-{i}") for page, i, text in numbered]
+
+
+def commands() -> list[str]:
+    """Every ``dropo ...`` of the pages, in code blocks and in sentences."""
+    found = []
+    for page in PAGES:
+        text = page.read_text()
+        lines = [line.split("#")[0].strip() for block in blocks(page, "sh") for line in block.splitlines()]
+        inline = re.findall(r"(?<!`)`(dropo [^`]+)`(?!`)", text)
+        found += [line for line in lines if line.startswith("dropo ")] + [c for c in inline if "..." not in c]
+    return sorted(set(found))
+
+
+def load_example(path: Path) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the model and with its log in every format that the pages name."""
+    folder = tmp_path_factory.mktemp("robot")
+    (folder / "robot.xml").write_text(ROBOT_XML)
+    time = 0.01 * np.arange(ROWS)
+    controls = np.stack([0.8 * np.sin(9 * time), 0.25 * np.sin(14 * time) - 0.1], 1)
+    model = mujoco.MjModel.from_xml_string(ROBOT_XML)
+    data = mujoco.MjData(model)
+    states = []
+    for u in controls:
+        states.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = u
+        mujoco.mj_step(model, data, nstep=5)
+    write_logs(folder, time, np.array(states), controls)
+    shutil.copy(ROOT / "sims" / "hopper" / "log.npz", folder / "hopper.npz")
+    (folder / "cart.py").write_text(blocks(ROOT / "docs" / "adapters.md", "python")[0])
+    (folder / "robot.yaml").write_text(blocks(ROOT / "README.md", "yaml")[0])
+    return folder
+
+
+def write_logs(folder: Path, time: np.ndarray, states: np.ndarray, controls: np.ndarray) -> None:
+    ends = np.arange(len(time) - 1) == len(time) - 2
+    arrays = {
+        "observations": states[:-1], "next_observations": states[1:], "actions": controls[:-1], "terminals": ends,
+    }  # fmt: skip
+    (folder / "runs").mkdir()
+    (folder / "log_folder").mkdir()
+    for path in ("log.npz", "runs/1.npz"):
+        np.savez(folder / path, **arrays)
+    for name, array in arrays.items():
+        np.save(folder / "log_folder" / f"x_{name.replace('_', '')}.npy", array)
+    with h5py.File(folder / "d4rl.hdf5", "w") as file:
+        for name in ("observations", "actions", "terminals"):
+            file[name] = arrays[name]
+    with h5py.File(folder / "robomimic.hdf5", "w") as file:
+        for demo in range(2):
+            group = file.create_group(f"data/demo_{demo}")
+            group["obs/q"], group["obs/dq"], group["actions"] = states[:, :2], states[:, 2:], controls
+    columns = ["q1", "q2", "dq1", "dq2", "u1", "u2"]
+    frame = pd.DataFrame(np.concatenate([states, controls], 1), columns=columns)
+    frame.to_csv(folder / "german.csv", sep=";", index=False)
+    frame.insert(0, "stamp", time)
+    frame["run"] = np.arange(len(time)) // 60
+    frame["q1_deg"], frame["q2_deg"] = np.rad2deg(states[:, 0]), np.rad2deg(states[:, 1])
+    frame.to_csv(folder / "log.csv", index=False)
+    lists = {"stamp": time, "q": list(states[:, :2]), "dq": list(states[:, 2:]), "u": list(controls)}
+    pd.DataFrame(lists).to_parquet(folder / "log.parquet")
+    variables = {"t": time, "q": states[:, :2].T, "dq": states[:, 2:].T, "log": {"u": controls}}
+    scipy.io.savemat(folder / "log.mat", variables)
+    velocity = np.cumsum(0.01 * np.append(0, controls[:-1, 0]) / 2)
+    position = np.cumsum(0.01 * velocity)
+    cart = {"stamp": time, "x": position, "v": velocity, "force": controls[:, 0]}
+    pd.DataFrame(cart).to_csv(folder / "cart.csv", index=False)
+
+
+def write_minari(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(folder / "minari"))
+    if (folder / "minari").exists():
+        return
+    from gymnasium.spaces import Box
+    from minari.data_collector import EpisodeBuffer
+
+    with np.load(folder / "log.npz") as log:
+        observations = np.concatenate([log["observations"], log["next_observations"][-1:]])
+        actions = log["actions"]
+    length = len(actions)
+    buffer = EpisodeBuffer(
+        observations=observations, actions=actions, rewards=np.zeros(length),
+        terminations=np.zeros(length, dtype=bool), truncations=np.arange(length) == length - 1,
+    )  # fmt: skip
+    minari.create_dataset_from_buffers(
+        "arm/random-v0",
+        buffer=[buffer],
+        observation_space=Box(-np.inf, np.inf, (4,), np.float64),
+        action_space=Box(-np.inf, np.inf, (2,), np.float64),
+    )
+
+
+def completed(document: Mapping[str, Any]) -> dict[str, Any]:
+    """A fragment of a config with what it leaves out; a complete one as it is."""
+    if "sim" in document or document.get("backend") == "gymnasium" or {"model", "parameters"} <= set(document):
+        return dict(document)
+    return {**BASE, **document}
+
+
+@pytest.mark.parametrize(("page", "text"), every("yaml"))
+@pytest.mark.filterwarnings("ignore")
+def test_yaml_is_a_config_that_a_fit_accepts(
+    page: Path, text: str, robot: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if "minari:" in text:
+        write_minari(robot, monkeypatch)
+    document = completed(yaml.load(text, Loader=_Loader))
+    problem = make_problem(make_config(document, base=robot))
+    assert len(problem.objective) > 20
+    refuse_dead_parameters(problem.objective)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if blocks(p, "python")], ids=lambda p: p.stem)
+def test_python_runs(page: Path, robot: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "robot"
+    shutil.copytree(robot, folder)
+    monkeypatch.chdir(folder)
+    names: dict[str, Any] = {"__name__": "documentation"}
+    for text in blocks(page, "python"):
+        exec(compile(text, page.name, "exec"), names)
+
+
+def test_readme_config_is_fitted_by_its_command(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    out = tmp_path / "out"
+    assert cli.main(["fit", str(robot / "robot.yaml"), "--out", str(out), "--samples", "10", "--threads", "1"]) == 0
+    written = {p.name for p in out.iterdir()}
+    assert written == {
+        "fit.json", "distribution.yaml", "model.xml", "config.yaml", "report.html", "checkpoint.pkl",
+    }  # fmt: skip
+    documented = (ROOT / "docs" / "config.md").read_text()
+    assert not [name for name in written if f"`{name}`" not in documented]
+    keys = yaml.safe_load((out / "fit.json").read_text())
+    assert not [key for key in keys if f"`{key}`" not in documented]
+
+
+def test_every_key_is_documented() -> None:
+    from dropo_torch.config import KEYS
+    from dropo_torch.parameters import _KEYS
+    from dropo_torch.preprocess import Preprocess
+    from dropo_torch.readers import ReadOptions
+
+    config, data = ((ROOT / "docs" / name).read_text() for name in ("config.md", "data.md"))
+    assert not [key for key in (*KEYS, *_KEYS) if f"`{key}`" not in config]
+    options = (*ReadOptions.__dataclass_fields__, *Preprocess.__dataclass_fields__)
+    assert not [key for key in options if f"`{key}`" not in data]
+
+
+@pytest.mark.parametrize("command", commands())
+def test_command_parses(command: str) -> None:
+    words = shlex.split(command)[1:]
+    assert words[0] in cli.COMMANDS
+    if len(words) > 1 or words[0] == "demo":  # otherwise it is named in passing
+        _, rest = cli._parser().parse_known_args(words)
+        parse_overrides(rest)
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda p: p.stem)
+def test_links_and_files_exist(page: Path) -> None:
+    text = page.read_text()
+    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+        if "://" in target:
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name} links to {target}"
+        headings = re.findall(r"^#+ (.+)$", file.read_text(), re.MULTILINE) if anchor else []
+        assert not anchor or anchor in {h.lower().replace(" ", "-") for h in headings}, f"{page.name}: {target}"
+    for name in re.findall(r"\b(?:examples|benchmarks|sims|tests|dropo_torch)/[\w./-]+\.\w+", text):
+        assert (ROOT / name).exists(), f"{page.name} names {name}"
+
+
+def test_recover_hopper(capsys: pytest.CaptureFixture) -> None:
+    load_example(ROOT / "examples" / "recover_hopper.py").main(["point", "--steps", "30", "--seeds", "1"])
+    assert "torso_mass" in capsys.readouterr().out
+
+
+def test_demo_figure(tmp_path: Path) -> None:
+    load_example(ROOT / "examples" / "demo_figure.py").main(["--out", str(tmp_path / "demo.png")])
+    assert (tmp_path / "demo.png").stat().st_size > 10_000
+
+
+def test_own_simulator(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    example = load_example(ROOT / "examples" / "own_simulator" / "pendulum.py")
+    example.main(["--out", str(tmp_path), "--samples", "60"])
+    found = yaml.safe_load((tmp_path / "fit" / "fit.json").read_text())["parameters"]
+    for name, truth in example.TRUTH.items():
+        assert found[name]["mean"] == pytest.approx(truth, rel=1e-3)
+
+
+@pytest.mark.skipif("DROPO_DATA" not in os.environ, reason="DROPO_DATA names no folder with DATA_EMPS.mat")
+def test_emps(capsys: pytest.CaptureFixture) -> None:
+    found = sorted(Path(os.environ["DROPO_DATA"]).rglob("DATA_EMPS.mat"))
+    if not found:
+        pytest.skip("no DATA_EMPS.mat in DROPO_DATA")
+    load_example(ROOT / "examples" / "emps" / "emps.py").main([str(found[0])])
+    assert "open-loop error" in capsys.readouterr().out
+
+
+def test_authors_hopper_is_a_config() -> None:
+    text = (ROOT / "examples" / "authors_hopper.yaml").read_text()
+    make_config({**yaml.load(text, Loader=_Loader), "data": "hopper10000"})
