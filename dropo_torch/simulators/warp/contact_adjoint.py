@@ -49,7 +49,7 @@ def _row(frame: mat33, i: int) -> vec3:
     return vec3(frame[i, 0], frame[i, 1], frame[i, 2])
 
 
-@wp.func
+@wp.func(inline=True)
 def contacts_adjoint(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
     """Add the gradient of Σ −f Jλ over the contacts to the bodies' F and Y and to θ."""
     for c in range(ncon):
@@ -131,7 +131,7 @@ def _turned(r: mat33, rbar: mat33) -> vec3:
     )
 
 
-@wp.func
+@wp.func(inline=True)
 def _geometry_adjoint(
     m: Tables, s: Scratch, t: int, c: int, distbar: f64, pbar: vec3, nbar0: vec3, t1bar0: vec3, t2bar: vec3
 ):

@@ -193,8 +193,7 @@ class Engine:
     def _new_rows(self, number: int) -> Rows:
         m, rows = self.tables, Rows()
         soft = number if m.implicit else 1
-        rate = number if m.nstage > 1 else 1
-        widths = {"qpos": (number, m.nq), "qvel": (number, m.nv), "acc": (number, m.nv), "rate": (rate, m.nv), "hess": (number, m.nh),
+        widths = {"qpos": (number, m.nq), "qvel": (number, m.nv), "acc": (number, m.nv), "rate": (number, m.nv), "hess": (number, m.nh),
                   "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}  # fmt: skip
         for name, (count, width) in widths.items():
             setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
@@ -224,7 +223,7 @@ class Engine:
         }  # fmt: skip
         backward: dict[str, tuple[Any, int]] = {
             "total": (vec6, nb), "dual": (vec6, nb), "f_velocity": (vec6, nb), "f_accel": (vec6, nb),
-            "f_total": (vec6, nb), "f_dual": (vec6, nb), "f_pose": (vec6, nb), "lam": (real, nv), "tangent": (real, nv),
+            "f_total": (vec6, nb), "f_dual": (vec6, nb), "f_pose": (vec6, nb), "lam": (real, nv), "qacc": (real, nv), "qd": (real, nv), "tangent": (real, nv),
             "vel_bar": (real, nv), "acc_bar": (real, nv), "stage_vel_bar": (real, 4 * nv),
             "stage_acc_bar": (real, 4 * nv), "stage_rate_bar": (real, 4 * nv), "pos_bar": (real, nv), "rate_bar": (real, nv), "pos_bar0": (real, nv),
             "grad": (real, self.size),

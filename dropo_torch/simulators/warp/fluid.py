@@ -60,20 +60,20 @@ def box_power(
     )
 
 
-@wp.func
+@wp.func(inline=True)
 def inertial_frame(m: Tables, s: Scratch, t: int, b: int) -> mat33:
     """Rotation of the inertial frame of a body."""
     return s.xmat[t, b] * m.body_imat[b]
 
 
-@wp.func
+@wp.func(inline=True)
 def centre_of_mass(m: Tables, s: Scratch, t: int, th: Reals, b: int) -> vec3:
     """Centre of mass of a body, from the origin of the sweep."""
     i = m.o_ipos + 3 * b
     return s.xpos[t, b] + s.xmat[t, b] * vec3(th[i], th[i + 1], th[i + 2])
 
 
-@wp.func
+@wp.func(inline=True)
 def fluid_wrench(m: Tables, s: Scratch, t: int, th: Reals, b: int) -> vec6:
     """The drag on a body as a spatial force."""
     rot = inertial_frame(m, s, t, b)

@@ -28,7 +28,7 @@ from dropo_torch.simulators.warp.types import (
 )
 
 
-@wp.func
+@wp.func(inline=True)
 def spring_deflection(m: Tables, th: Reals, qpos: Reals2, r: int, k: int) -> vec3:
     """Deflection of spring ``k`` (a joint, or a half of a free joint): x, or a vector of three."""
     iq = m.link_qpos[k]
@@ -43,7 +43,7 @@ def spring_deflection(m: Tables, th: Reals, qpos: Reals2, r: int, k: int) -> vec
     return vec3(qpos[r, iq] - th[o], ZERO, ZERO)
 
 
-@wp.func
+@wp.func(inline=True)
 def add_springs(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: int):
     """Load from springs: F = −x (k + p0 |x| + p1 |x|²); a hinge's or slide's |x| is signed."""
     for k in range(m.nlink):
@@ -64,7 +64,7 @@ def add_springs(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: int):
                     s.load[t, d + i] += f[i]
 
 
-@wp.func
+@wp.func(inline=True)
 def springs_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: int):
     """Adjoint of :func:`add_springs`."""
     for k in range(m.nlink):
@@ -105,7 +105,7 @@ def springs_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: i
                     s.tangent[t, d + i] += g[i]
 
 
-@wp.func
+@wp.func(inline=True)
 def add_dampers(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int):
     """Load from dampers: F = −v (b + p0 |v| + p1 v²)."""
     for i in range(m.nv):
@@ -115,7 +115,7 @@ def add_dampers(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int):
         s.load[t, i] += v * (th[m.o_damping + i] + n * (th[ip] + n * th[ip + 1]))
 
 
-@wp.func
+@wp.func(inline=True)
 def damping_slope(m: Tables, th: Reals, v: f64, i: int) -> f64:
     """B = b + 2 p0 |v| + 3 p1 v²: what the implicit integrators take of the damper."""
     n = wp.abs(v)
@@ -123,7 +123,7 @@ def damping_slope(m: Tables, th: Reals, v: f64, i: int) -> f64:
     return th[m.o_damping + i] + n * (TWO * th[ip] + THREE * n * th[ip + 1])
 
 
-@wp.func
+@wp.func(inline=True)
 def dampers_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int):
     """Adjoint of :func:`add_dampers`."""
     for i in range(m.nv):
@@ -137,7 +137,7 @@ def dampers_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: i
         s.grad[t, ip + 1] += l * v * n * n
 
 
-@wp.func
+@wp.func(inline=True)
 def control(m: Tables, th: Reals, ctrl: Reals2, w: int, i: int) -> f64:
     """Control of an actuator, clamped to its range."""
     u = ctrl[w, i]
@@ -147,7 +147,7 @@ def control(m: Tables, th: Reals, ctrl: Reals2, w: int, i: int) -> f64:
     return u
 
 
-@wp.func
+@wp.func(inline=True)
 def actuator_force(m: Tables, th: Reals, i: int, u: f64, length: f64, rate: f64) -> f64:
     """gain(l, l̇) u + bias(l, l̇), before the force range."""
     og = m.o_gain + 3 * i
@@ -161,7 +161,7 @@ def actuator_force(m: Tables, th: Reals, i: int, u: f64, length: f64, rate: f64)
     return force
 
 
-@wp.func
+@wp.func(inline=True)
 def add_actuators(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, w: int):
     """Load from actuators: τ = gear · force, clamped per joint where the joint says so."""
     if m.has_frclimit != 0:
@@ -189,7 +189,7 @@ def add_actuators(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: 
                 s.load[t, d] -= f
 
 
-@wp.func
+@wp.func(inline=True)
 def actuators_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, w: int, ctrl_bar: Reals2, wb: int,
 ):
@@ -250,7 +250,7 @@ def actuators_adjoint(
         ctrl_bar[wb, i] += ubar
 
 
-@wp.func
+@wp.func(inline=True)
 def _frclimit_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, w: int
 ):

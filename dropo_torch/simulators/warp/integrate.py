@@ -8,7 +8,7 @@ from dropo_torch.simulators.warp.forces import actuator_force, control, damping_
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
 from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
 from dropo_torch.simulators.warp.spatial import chart_rate, chart_rate_dual, nothing, quat_integrate, quat_mul, right_jacobian_t, turn
-from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint, bodies_adjoint, carry_in, carry_out
+from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
 from dropo_torch.simulators.warp.types import (
     BALL,
     HALF,
@@ -26,18 +26,17 @@ from dropo_torch.simulators.warp.types import (
     f64,
     vec3,
     vec4,
-    vec6,
 )
 
 LARGE = wp.constant(wp.float64(1.0e10))  # mjMAXVAL
 
 
-@wp.func
-def move(m: Tables, qpos: Reals2, r: int, vel: Reals2, rv: int, ov: int, h: f64, out: Reals2, ro: int):
-    """out[ro] = qpos[r] ⊕ h vel[rv, ov:]."""
+@wp.func(inline=True)
+def move(m: Tables, qpos: Reals2, r: int, vel: Reals2, rv: int, h: f64, out: Reals2, ro: int):
+    """out[ro] = qpos[r] ⊕ h vel[rv]."""
     for k in range(m.nlink):
         iq = m.link_qpos[k]
-        d = ov + m.link_dof[k]
+        d = m.link_dof[k]
         kind = m.link_kind[k]
         if kind == BALL:
             q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
@@ -52,9 +51,9 @@ def move(m: Tables, qpos: Reals2, r: int, vel: Reals2, rv: int, ov: int, h: f64,
                 out[ro, iq + i] = qpos[r, iq + i] + h * vel[rv, d + i]
 
 
-@wp.func
+@wp.func(inline=True)
 def move_adjoint(
-    m: Tables, vel: Reals2, rv: int, ov: int, h: f64, bar: Reals2, rb: int, pos_bar: Reals2, vel_bar: Reals2, o: int
+    m: Tables, vel: Reals2, rv: int, h: f64, bar: Reals2, rb: int, pos_bar: Reals2, vel_bar: Reals2, o: int
 ):
     """Adjoint of :func:`move`: adds to ``pos_bar[rb]`` and ``vel_bar[rb, o:]`` from ``bar[rb]``."""
     for k in range(m.nlink):
@@ -62,7 +61,7 @@ def move_adjoint(
         kind = m.link_kind[k]
         if kind == BALL:
             # q' = q exp(r): δ' = exp(−[r]) δ + J_r(r) δr
-            r = vec3(vel[rv, ov + d], vel[rv, ov + d + 1], vel[rv, ov + d + 2]) * h
+            r = vec3(vel[rv, d], vel[rv, d + 1], vel[rv, d + 2]) * h
             g = vec3(bar[rb, d], bar[rb, d + 1], bar[rb, d + 2])
             back = turn(r, g)
             w = right_jacobian_t(r, g) * h
@@ -78,7 +77,7 @@ def move_adjoint(
                 vel_bar[rb, o + d + i] += h * bar[rb, d + i]
 
 
-@wp.func
+@wp.func(inline=True)
 def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
     """rate[r] of a stage that is ``c`` rate[r − 1] away from the start of its step."""
     for k in range(m.nlink):
@@ -97,7 +96,7 @@ def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
                 rate[r, d + i] = qvel[r, d + i]
 
 
-@wp.func
+@wp.func(inline=True)
 def chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: f64, qvel: Reals2, o: int):
     """Adjoint of :func:`chart_rates`: from ``s.stage_rate_bar[o:]`` to ``s.vel_bar`` and the rates of the stage before."""
     _late = wp.grad(nothing)(ONE)
@@ -120,7 +119,7 @@ def chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: 
                 s.vel_bar[t, d + i] += s.stage_rate_bar[t, o + d + i]
 
 
-@wp.func
+@wp.func(inline=True)
 def good(m: Tables, qpos: Reals2, qvel: Reals2, r: int) -> int:
     """1 while every number of a state is finite and below MuJoCo's limit."""
     ok = int(1)
@@ -133,7 +132,7 @@ def good(m: Tables, qpos: Reals2, qvel: Reals2, r: int) -> int:
     return ok
 
 
-@wp.func
+@wp.func(inline=True)
 def implicit_slope(
     m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, i: int
 ) -> f64:
@@ -148,7 +147,7 @@ def implicit_slope(
     return b
 
 
-@wp.func
+@wp.func(inline=True)
 def actuator_slope(
     m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, a: int
 ) -> f64:
@@ -168,7 +167,7 @@ def actuator_slope(
     return gear * gear * y
 
 
-@wp.func
+@wp.func(inline=True)
 def soften(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
     r: int, ctrl: Reals2, rc: int,
@@ -183,21 +182,12 @@ def soften(
     solve(m, 0, hess, r, soft, r)
 
 
-@wp.func
-def soften_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
-    r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+@wp.func(inline=True)
+def slope_adjoint(
+    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, soft: Reals2, r: int, ctrl: Reals2,
+    rc: int, ctrl_bar: Reals2, rb: int,
 ):
-    """Adjoint of :func:`soften`, from and to ``s.acc_bar``: the gradient of λᵀ(M (a − a') − h B a').
-
-    Poses and inertias must be those of row ``r``. Adds to ``s.pos_bar0``, ``s.stage_vel_bar`` and θ.
-    """
-    _late = wp.grad(nothing)(ONE)
-    for i in range(m.nv):
-        s.lam[t, i] = s.acc_bar[t, i]
-        s.tangent[t, i] = ZERO
-        s.vel_bar[t, i] = ZERO
-    solve(m, 0, hess, r, s.lam, t)
+    """The part of B in the adjoint of :func:`soften`: the gradient of −h λᵀ B a', into ``s.stage_vel_bar`` and θ."""
     if m.has_damper != 0:
         for i in range(m.nv):
             y = -m.h * s.lam[t, i] * soft[r, i]  # ∂/∂B
@@ -211,25 +201,9 @@ def soften_adjoint(
     if m.implicit_actuators != 0:
         for a in range(m.nu):
             _actuator_slope_adjoint(m, s, t, th, qpos, qvel, soft, r, ctrl, rc, ctrl_bar, rb, a)
-    # the part of M: bodies at rest with acceleration a − a'
-    zero = vec6()
-    for b in range(m.nb):
-        s.velocity[t, b] = zero
-        s.bias[t, b] = zero
-    for i in range(m.nv):
-        s.work[t, i] = acc[r, i] - soft[r, i]
-        s.grad[t, m.o_armature + i] += s.lam[t, i] * s.work[t, i]
-    carry_out(m, s, t, s.work, t)
-    bodies_adjoint(m, s, t, th, 0)
-    carry_in(m, s, t, qvel, r, s.work, t, ZERO, 0)
-    for i in range(m.nv):
-        s.pos_bar0[t, i] += s.tangent[t, i]
-    # ā = M λ, with M λ = Σ_subtree s · I Λ + armature
-    for i in range(m.nv):
-        s.acc_bar[t, i] = wp.dot(s.motion[t, i], s.f_accel[t, m.dof_body[i]]) + th[m.o_armature + i] * s.lam[t, i]
 
 
-@wp.func
+@wp.func(inline=True)
 def _actuator_slope_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, soft: Reals2, r: int, ctrl: Reals2,
     rc: int, ctrl_bar: Reals2, rb: int, a: int,
@@ -257,14 +231,7 @@ def _actuator_slope_adjoint(
                 ctrl_bar[rb, a] += g
 
 
-@wp.func
-def warm(m: Tables, acc: Reals2, r: int, source: int):
-    """The guess of a stage: the acceleration of the one before."""
-    for i in range(m.nv):
-        acc[r, i] = acc[source, i]
-
-
-@wp.func
+@wp.func(inline=True)
 def step(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
     hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int,
@@ -272,48 +239,50 @@ def step(
     """One physics step from row ``r`` (stages in the rows after it) to row ``nxt``; 1 while it is good."""
     h = m.h
     ok = good(m, qpos, qvel, r)
-    if ok != 0:
-        accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc)
-        for i in range(m.nv):
-            if not (wp.abs(acc[r, i]) < LARGE):
-                ok = 0
-    if ok != 0:
-        if m.integrator == RK4:
-            # Munthe-Kaas: stages of a quaternion combine in the chart at the start of the step
-            for i in range(m.nv):
-                rate[r, i] = qvel[r, i]
-            for k in range(1, 4):
+    for k in range(m.nstage):
+        if ok != 0:
+            if k > 0:
                 c = h * HALF
                 if k == 3:
                     c = h
-                move(m, qpos, r, rate, r + k - 1, 0, c, qpos, r + k)
+                # Munthe-Kaas: stages of a quaternion combine in the chart at the start of the step
+                move(m, qpos, r, rate, r + k - 1, c, qpos, r + k)
                 for i in range(m.nv):
                     qvel[r + k, i] = qvel[r, i] + c * acc[r + k - 1, i]
+                    acc[r + k, i] = acc[r + k - 1, i]  # the guess of a stage
                 chart_rates(m, rate, r + k, c, qvel)
-                warm(m, acc, r + k, r + k - 1)
-                accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc)
-            sixth = h / f64(6.0)
+            else:
+                for i in range(m.nv):
+                    rate[r, i] = qvel[r, i]
+            accelerate(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc)
+            if k == 0:
+                for i in range(m.nv):
+                    if not (wp.abs(acc[r, i]) < LARGE):
+                        ok = 0
+    if ok != 0:
+        if m.integrator == RK4:
             for i in range(m.nv):
                 s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
-                qvel[nxt, i] = qvel[r, i] + sixth * (
+                qvel[nxt, i] = qvel[r, i] + h / f64(6.0) * (
                     acc[r, i] + TWO * acc[r + 1, i] + TWO * acc[r + 2, i] + acc[r + 3, i]
                 )
-            move(m, qpos, r, s.work, t, 0, h, qpos, nxt)
-            warm(m, acc, nxt, r + 3)
         else:
             if m.implicit != 0:
                 soften(m, s, t, th, qpos, qvel, acc, soft, soft_hess, r, ctrl, rc)
-                for i in range(m.nv):
-                    qvel[nxt, i] = qvel[r, i] + h * soft[r, i]
-            else:
-                for i in range(m.nv):
-                    qvel[nxt, i] = qvel[r, i] + h * acc[r, i]
-            move(m, qpos, r, qvel, nxt, 0, h, qpos, nxt)
-            warm(m, acc, nxt, r)
+            for i in range(m.nv):
+                a = acc[r, i]
+                if m.implicit != 0:
+                    a = soft[r, i]
+                v = qvel[r, i] + h * a
+                qvel[nxt, i] = v
+                s.work[t, i] = v
+        move(m, qpos, r, s.work, t, h, qpos, nxt)
+        for i in range(m.nv):
+            acc[nxt, i] = acc[r + m.nstage - 1, i]
     return ok
 
 
-@wp.func
+@wp.func(inline=True)
 def step_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
     hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
@@ -322,69 +291,87 @@ def step_adjoint(
     _late = wp.grad(nothing)(ONE)
     h = m.h
     nv = m.nv
-    for i in range(nv):
-        s.pos_bar0[t, i] = ZERO
-    if m.integrator == RK4:
+    _end_adjoint(m, s, t, qvel, rate, r, nxt)
+    for back in range(m.nstage + m.implicit):
+        softening = int(0)
+        k = int(0)
+        if m.nstage > 1:
+            k = m.nstage - 1 - back
+            for i in range(nv):
+                s.acc_bar[t, i] = s.stage_acc_bar[t, k * nv + i]
+        elif m.implicit != 0 and back == 0:
+            softening = 1
         for i in range(nv):
-            s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
             s.tangent[t, i] = ZERO
-        move_adjoint(m, s.work, t, 0, h, s.pos_bar, t, s.pos_bar0, s.tangent, 0)
-        for i in range(nv):
-            wbar = s.tangent[t, i] / f64(6.0)
-            abar = s.rate_bar[t, i] * h / f64(6.0)
-            s.stage_vel_bar[t, i] = s.rate_bar[t, i]
-            s.stage_rate_bar[t, i] = wbar
-            s.stage_rate_bar[t, nv + i] = TWO * wbar
-            s.stage_rate_bar[t, 2 * nv + i] = TWO * wbar
-            s.stage_rate_bar[t, 3 * nv + i] = wbar
-            s.stage_acc_bar[t, i] = abar
-            s.stage_acc_bar[t, nv + i] = TWO * abar
-            s.stage_acc_bar[t, 2 * nv + i] = TWO * abar
-            s.stage_acc_bar[t, 3 * nv + i] = abar
-        for back in range(3):
-            k = 3 - back
+            s.vel_bar[t, i] = ZERO
+        sweep_out(m, s, t, th, qpos, qvel, r + k)
+        if softening != 0:
+            # λ = (M + h B)⁻¹ ā', then the gradient of λᵀ (M (a − a') − h B a')
+            for i in range(nv):
+                s.lam[t, i] = s.acc_bar[t, i]
+                s.qacc[t, i] = acc[r, i] - soft[r, i]
+                s.qd[t, i] = ZERO
+        else:
+            for i in range(nv):
+                s.lam[t, i] = -s.acc_bar[t, i]
+                s.qacc[t, i] = acc[r + k, i]
+                s.qd[t, i] = qvel[r + k, i]
+        accelerate_adjoint(
+            m, s, t, th, qpos, qvel, acc, hess, soft_hess, held, r + k, ctrl, rc, ctrl_bar, rb, softening
+        )
+        if softening != 0:
+            slope_adjoint(m, s, t, th, qpos, qvel, soft, r, ctrl, rc, ctrl_bar, rb)
+            for i in range(nv):
+                s.pos_bar0[t, i] += s.tangent[t, i]
+                # ā = M λ, with M λ = Σ_subtree s · I Λ + armature
+                inertial = wp.dot(s.motion[t, i], s.f_accel[t, m.dof_body[i]])
+                s.acc_bar[t, i] = inertial + th[m.o_armature + i] * s.lam[t, i]
+        elif k > 0:
             c = h * HALF
             if k == 3:
                 c = h
-            for i in range(nv):
-                s.acc_bar[t, i] = s.stage_acc_bar[t, k * nv + i]
-            accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r + k, ctrl, rc, ctrl_bar, rb)
             chart_rates_adjoint(m, s, t, rate, r + k, c, qvel, k * nv)
             for i in range(nv):
-                vbar = s.vel_bar[t, i]
-                s.stage_vel_bar[t, i] += vbar
-                s.stage_acc_bar[t, (k - 1) * nv + i] += c * vbar
-            move_adjoint(m, rate, r + k - 1, 0, c, s.tangent, t, s.pos_bar0, s.stage_rate_bar, (k - 1) * nv)
-        for i in range(nv):
-            s.stage_vel_bar[t, i] += s.stage_rate_bar[t, i]
-            s.acc_bar[t, i] = s.stage_acc_bar[t, i]
-        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc, ctrl_bar, rb)
-    else:
-        # q' = q ⊕ h v', v' = v + h a'
-        move_adjoint(m, qvel, nxt, 0, h, s.pos_bar, t, s.pos_bar0, s.rate_bar, 0)
-        for i in range(nv):
-            s.stage_vel_bar[t, i] = s.rate_bar[t, i]
-            s.acc_bar[t, i] = h * s.rate_bar[t, i]
-        if m.implicit != 0:
-            _soften_here(m, s, t, th, qpos, qvel, acc, soft, soft_hess, r, ctrl, rc, ctrl_bar, rb)
-        accelerate_adjoint(m, s, t, th, qpos, qvel, acc, hess, held, r, ctrl, rc, ctrl_bar, rb)
+                s.stage_vel_bar[t, i] += s.vel_bar[t, i]
+                s.stage_acc_bar[t, (k - 1) * nv + i] += c * s.vel_bar[t, i]
+            move_adjoint(m, rate, r + k - 1, c, s.tangent, t, s.pos_bar0, s.stage_rate_bar, (k - 1) * nv)
     for i in range(nv):
         s.pos_bar[t, i] = s.pos_bar0[t, i] + s.tangent[t, i]
-        s.rate_bar[t, i] = s.stage_vel_bar[t, i] + s.vel_bar[t, i]
+        s.rate_bar[t, i] = s.stage_vel_bar[t, i] + s.stage_rate_bar[t, i] + s.vel_bar[t, i]
 
 
-@wp.func
-def _soften_here(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
-    r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
-):
-    """:func:`soften_adjoint` after bringing poses and inertias of row ``r`` into the scratch memory."""
-    _late = wp.grad(nothing)(ONE)
-    sweep_out(m, s, t, th, qpos, qvel, r)
-    soften_adjoint(m, s, t, th, qpos, qvel, acc, soft, hess, r, ctrl, rc, ctrl_bar, rb)
+@wp.func(inline=True)
+def _end_adjoint(m: Tables, s: Scratch, t: int, qvel: Reals2, rate: Reals2, r: int, nxt: int):
+    """Adjoint of the last line of a step: what its end gives to start, stages and accelerations."""
+    h = m.h
+    nv = m.nv
+    for i in range(nv):
+        s.pos_bar0[t, i] = ZERO
+        s.tangent[t, i] = ZERO
+        s.stage_vel_bar[t, i] = s.rate_bar[t, i]
+        s.stage_rate_bar[t, i] = ZERO
+        if m.integrator == RK4:
+            s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
+        else:
+            s.work[t, i] = qvel[nxt, i]
+    move_adjoint(m, s.work, t, h, s.pos_bar, t, s.pos_bar0, s.tangent, 0)
+    for i in range(nv):
+        g = s.tangent[t, i]
+        if m.integrator == RK4:
+            abar = s.rate_bar[t, i] * h / f64(6.0)
+            for k in range(4):
+                weight = TWO
+                if k == 0 or k == 3:
+                    weight = ONE
+                s.stage_rate_bar[t, k * nv + i] = weight * g / f64(6.0)
+                s.stage_acc_bar[t, k * nv + i] = weight * abar
+        else:
+            # q' = q ⊕ h v', v' = v + h a'
+            s.stage_vel_bar[t, i] += g
+            s.acc_bar[t, i] = h * (s.rate_bar[t, i] + g)
 
 
-@wp.func
+@wp.func(inline=True)
 def to_tangent(m: Tables, qpos: Reals2, r: int, bar: Reals2, rb: int, out: Reals2, t: int):
     """Add the adjoint of a raw position to its tangent: ½ (q* ⊗ q̄) of a unit quaternion."""
     for k in range(m.nlink):
@@ -404,7 +391,7 @@ def to_tangent(m: Tables, qpos: Reals2, r: int, bar: Reals2, rb: int, out: Reals
                 out[t, d + i] += bar[rb, iq + i]
 
 
-@wp.func
+@wp.func(inline=True)
 def from_tangent(m: Tables, qpos: Reals2, r: int, bar: Reals2, t: int, out: Reals2, ro: int):
     """Write the adjoint of a raw position from its tangent: 2/|q| q̂ ⊗ (0, g)."""
     for k in range(m.nlink):

@@ -46,7 +46,7 @@ def packed(i: int, j: int) -> int:
     return (i * (i + 1)) // 2 + j
 
 
-@wp.func
+@wp.func(inline=True)
 def sweep_out(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int):
     """Poses, motion axes s, velocities V, bias accelerations A (q̈ = 0, gravity in the root) and inertias I."""
     o = m.origin_base
@@ -117,7 +117,7 @@ def sweep_out(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Real
             s.inertia[t, b] = vec10()
 
 
-@wp.func
+@wp.func(inline=True)
 def inertial_forces(m: Tables, s: Scratch, t: int, th: Reals):
     """F = I A + V ×* I V of each body, less gravity compensation and drag."""
     for b in range(1, m.nb):
@@ -136,7 +136,7 @@ def inertial_forces(m: Tables, s: Scratch, t: int, th: Reals):
             s.force[t, b] = vec6()
 
 
-@wp.func
+@wp.func(inline=True)
 def sweep_in(m: Tables, s: Scratch, t: int, th: Reals):
     """Mass matrix M with armature, and the bias force c, from subtree sums of I and F."""
     for i in range(m.nh):

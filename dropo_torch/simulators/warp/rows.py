@@ -12,6 +12,7 @@ from dropo_torch.simulators.warp.impedance import damping, impedance, regularisa
 from dropo_torch.simulators.warp.spatial import inverse_right_jacobian_t, quat_log
 from dropo_torch.simulators.warp.types import (
     BALL,
+    MINVAL,
     ONE,
     ROW_EQUALITY,
     ROW_FRICTION,
@@ -84,39 +85,7 @@ def row_power(
     return -row_force(kind, u - aref, ONE / regularisation(imp, invweight), loss) * l
 
 
-@wp.func
-def _push(
-    m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int, n: int, kind: int, index: int, dof: int, dof2: int,
-    coef: vec3, x: f64, o_ref: int, o_imp: int, invweight: f64, loss: f64,
-) -> int:
-    """Write row ``n`` and return the number of rows."""
-    dof3 = int(-1)
-    v = coef[0] * qvel[r, dof]
-    if dof2 >= 0:
-        v += coef[1] * qvel[r, dof2]
-        if coef[2] != ZERO and kind == ROW_LIMIT:
-            dof3 = dof + 2
-            v += coef[2] * qvel[r, dof3]
-    s.row_kind[t, n] = kind
-    s.row_index[t, n] = index
-    s.row_dof[t, 3 * n] = dof
-    s.row_dof[t, 3 * n + 1] = dof2
-    s.row_dof[t, 3 * n + 2] = dof3
-    s.row_coef[t, n] = coef
-    s.row_x[t, n] = x
-    s.row_loss[t, n] = loss
-    solimp = theta_vec5(th, o_imp)
-    solref = theta_vec2(th, o_ref)
-    imp = impedance(x, solimp)
-    aref = -damping(solref, solimp, m.h, m.refsafe) * v
-    if kind != ROW_FRICTION:
-        aref -= stiffness(solref, solimp, m.h, m.refsafe) * imp * x
-    s.row_aref[t, n] = aref
-    s.row_d[t, n] = ONE / regularisation(imp, invweight)
-    return n + 1
-
-
-@wp.func
+@wp.func(inline=True)
 def equality_position(m: Tables, th: Reals, qpos: Reals2, r: int, e: int) -> vec3:
     """(q1 − p(q2), p'(q2), p''(q2)) of a joint equality, both measured from their references."""
     c = m.o_eq_data + 5 * m.eq_id[e]
@@ -131,56 +100,94 @@ def equality_position(m: Tables, th: Reals, qpos: Reals2, r: int, e: int) -> vec
     return vec3(x, slope, curve)
 
 
-@wp.func
+@wp.func(inline=True)
 def make_rows(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int) -> int:
     """Instantiate the scalar rows of a state and return their number."""
     n = int(0)
-    for e in range(m.neq):
-        p = equality_position(m, th, qpos, r, e)
-        d1 = m.eq_dof[2 * e]
-        d2 = m.eq_dof[2 * e + 1]
-        w = th[m.o_dof_invweight + d1]
-        if d2 >= 0:
-            w += th[m.o_dof_invweight + d2]
-        i = m.eq_id[e]
-        o = m.o_eq_solref + 2 * i
-        n = _push(m, s, t, th, qvel, r, n, ROW_EQUALITY, e, d1, d2, vec3(ONE, -p[1], ZERO), p[0], o,
-                  m.o_eq_solimp + 5 * i, w, ZERO)  # fmt: skip
-    for i in range(m.nfriction):
-        d = m.friction_dof[i]
-        loss = th[m.o_frictionloss + d]
-        if loss > ZERO:
-            n = _push(m, s, t, th, qvel, r, n, ROW_FRICTION, d, d, -1, vec3(ONE, ZERO, ZERO), ZERO,
-                      m.o_dof_solref + 2 * d, m.o_dof_solimp + 5 * d, th[m.o_dof_invweight + d], loss)  # fmt: skip
-    for i in range(m.nlimit):
-        k = m.limit_link[i]
-        j = m.link_jnt[k]
-        d = m.link_dof[k]
-        iq = m.link_qpos[k]
-        margin = th[m.o_jnt_margin + j]
-        o = m.o_range + 2 * j
-        w = th[m.o_dof_invweight + d]
-        if m.link_kind[k] == BALL:
-            q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
-            rot = quat_log(q / wp.length(q))
-            angle = wp.length(rot)
-            x = wp.max(th[o], th[o + 1]) - angle - margin
-            if x < ZERO:
-                n = _push(m, s, t, th, qvel, r, n, ROW_LIMIT, i, d, d + 1, -rot / angle, x,
-                          m.o_jnt_solref + 2 * j, m.o_jnt_solimp + 5 * j, w, ZERO)  # fmt: skip
+    for candidate in range(m.neq + m.nfriction + 2 * m.nlimit):
+        kind = int(ROW_LIMIT)
+        index = int(candidate - m.neq)
+        x = f64(1.0)
+        loss = f64(0.0)
+        coef = vec3()
+        dof = int(0)
+        dof2 = int(-1)
+        o_ref = int(0)
+        o_imp = int(0)
+        if candidate < m.neq:
+            kind = ROW_EQUALITY
+            index = candidate
+            p = equality_position(m, th, qpos, r, index)
+            x = p[0]
+            dof = m.eq_dof[2 * index]
+            dof2 = m.eq_dof[2 * index + 1]
+            coef = vec3(ONE, -p[1], ZERO)
+            o_ref = m.o_eq_solref + 2 * m.eq_id[index]
+            o_imp = m.o_eq_solimp + 5 * m.eq_id[index]
+        elif candidate < m.neq + m.nfriction:
+            kind = ROW_FRICTION
+            dof = m.friction_dof[index]
+            x = f64(0.0)
+            loss = th[m.o_frictionloss + dof]
+            coef = vec3(ONE, ZERO, ZERO)
+            o_ref = m.o_dof_solref + 2 * dof
+            o_imp = m.o_dof_solimp + 5 * dof
         else:
-            x = qpos[r, iq] - th[o] - margin
-            if x < ZERO:
-                n = _push(m, s, t, th, qvel, r, n, ROW_LIMIT, i, d, -1, vec3(ONE, ZERO, ZERO), x,
-                          m.o_jnt_solref + 2 * j, m.o_jnt_solimp + 5 * j, w, ZERO)  # fmt: skip
-            x = th[o + 1] - qpos[r, iq] - margin
-            if x < ZERO:
-                n = _push(m, s, t, th, qvel, r, n, ROW_LIMIT, i, d, -1, vec3(-ONE, ZERO, ZERO), x,
-                          m.o_jnt_solref + 2 * j, m.o_jnt_solimp + 5 * j, w, ZERO)  # fmt: skip
+            side = (index - m.nfriction) % 2
+            index = (index - m.nfriction) // 2
+            k = m.limit_link[index]
+            j = m.link_jnt[k]
+            iq = m.link_qpos[k]
+            dof = m.link_dof[k]
+            o = m.o_range + 2 * j
+            o_ref = m.o_jnt_solref + 2 * j
+            o_imp = m.o_jnt_solimp + 5 * j
+            if m.link_kind[k] == BALL:
+                if side == 0:
+                    q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
+                    rot = quat_log(q / wp.length(q))
+                    angle = wp.length(rot)
+                    x = wp.max(th[o], th[o + 1]) - angle - th[m.o_jnt_margin + j]
+                    coef = -rot / wp.max(angle, MINVAL)
+                    dof2 = dof + 1
+            elif side == 0:
+                x = qpos[r, iq] - th[o] - th[m.o_jnt_margin + j]
+                coef = vec3(ONE, ZERO, ZERO)
+            else:
+                x = th[o + 1] - qpos[r, iq] - th[m.o_jnt_margin + j]
+                coef = vec3(-ONE, ZERO, ZERO)
+        if kind == ROW_EQUALITY or (kind == ROW_FRICTION and loss > ZERO) or (kind == ROW_LIMIT and x < ZERO):
+            dof3 = int(-1)
+            v = coef[0] * qvel[r, dof]
+            w = th[m.o_dof_invweight + dof]
+            if dof2 >= 0:
+                v += coef[1] * qvel[r, dof2]
+                if kind == ROW_LIMIT:
+                    dof3 = dof + 2
+                    v += coef[2] * qvel[r, dof3]
+                else:
+                    w += th[m.o_dof_invweight + dof2]
+            s.row_kind[t, n] = kind
+            s.row_index[t, n] = index
+            s.row_dof[t, 3 * n] = dof
+            s.row_dof[t, 3 * n + 1] = dof2
+            s.row_dof[t, 3 * n + 2] = dof3
+            s.row_coef[t, n] = coef
+            s.row_x[t, n] = x
+            s.row_loss[t, n] = loss
+            solimp = theta_vec5(th, o_imp)
+            solref = theta_vec2(th, o_ref)
+            imp = impedance(x, solimp)
+            aref = -damping(solref, solimp, m.h, m.refsafe) * v
+            if kind != ROW_FRICTION:
+                aref -= stiffness(solref, solimp, m.h, m.refsafe) * imp * x
+            s.row_aref[t, n] = aref
+            s.row_d[t, n] = ONE / regularisation(imp, w)
+            n += 1
     return n
 
 
-@wp.func
+@wp.func(inline=True)
 def row_dot(s: Scratch, t: int, n: int, x: Reals2, r: int) -> f64:
     """J x of row ``n``."""
     c = s.row_coef[t, n]
@@ -194,7 +201,7 @@ def row_dot(s: Scratch, t: int, n: int, x: Reals2, r: int) -> f64:
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def row_add(s: Scratch, t: int, n: int, y: f64, x: Reals2, r: int):
     """x += Jᵀ y of row ``n``."""
     c = s.row_coef[t, n]
@@ -207,7 +214,7 @@ def row_add(s: Scratch, t: int, n: int, y: f64, x: Reals2, r: int):
             x[r, d] += c[2] * y
 
 
-@wp.func
+@wp.func(inline=True)
 def rows_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, nrow: int
 ):
@@ -252,7 +259,7 @@ def rows_adjoint(
             _equality_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, vbar, lbar)
 
 
-@wp.func
+@wp.func(inline=True)
 def _limit_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, n: int, xbar: f64,
     ubar: f64, vbar: f64, lbar: f64,
@@ -291,7 +298,7 @@ def _limit_adjoint(
             s.grad[t, o + 1] += xbar
 
 
-@wp.func
+@wp.func(inline=True)
 def _equality_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, n: int, xbar: f64,
     ubar: f64, vbar: f64, lbar: f64,

@@ -17,7 +17,7 @@ ITERATIONS = wp.constant(60)
 LINE_STEPS = wp.constant(50)
 
 
-@wp.func
+@wp.func(inline=True)
 def factor(m: Tables, dense: int, hess: Reals2, r: int):
     """H = Lᵀ D L in place, from the last dof to the first: no fill-in along the tree (dense = 0)."""
     for back in range(m.nv):
@@ -36,7 +36,7 @@ def factor(m: Tables, dense: int, hess: Reals2, r: int):
             i = m.dof_parent[dense, i]
 
 
-@wp.func
+@wp.func(inline=True)
 def solve(m: Tables, dense: int, hess: Reals2, r: int, x: Reals2, rx: int):
     """x ← H⁻¹ x with the factor of :func:`factor`."""
     for back in range(m.nv):
@@ -57,7 +57,7 @@ def solve(m: Tables, dense: int, hess: Reals2, r: int, x: Reals2, rx: int):
         x[rx, i] = xi
 
 
-@wp.func
+@wp.func(inline=True)
 def mass_mul(m: Tables, s: Scratch, t: int, x: Reals2, rx: int, y: Reals2, ry: int):
     """y ← M x."""
     for i in range(m.nv):
@@ -75,7 +75,7 @@ def mass_mul(m: Tables, s: Scratch, t: int, x: Reals2, rx: int, y: Reals2, ry: i
         y[ry, i] += yi
 
 
-@wp.func
+@wp.func(inline=True)
 def contact_dot(m: Tables, s: Scratch, t: int, c: int, x: Reals2, r: int) -> vec6:
     """J x of contact ``c``."""
     y = vec6()
@@ -85,7 +85,7 @@ def contact_dot(m: Tables, s: Scratch, t: int, c: int, x: Reals2, r: int) -> vec
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def _add_contact_hessian(m: Tables, s: Scratch, t: int, dense: int, c: int, ll: mat33, la: mat33, aa: mat33,
                          dim: int, hess: Reals2, r: int):  # fmt: skip
     """H += Jᵀ C J of one contact."""
@@ -122,7 +122,7 @@ def _add_contact_hessian(m: Tables, s: Scratch, t: int, dense: int, c: int, ll: 
         i = m.dof_parent[which, i]
 
 
-@wp.func
+@wp.func(inline=True)
 def _add_row_hessian(m: Tables, s: Scratch, t: int, n: int, hess: Reals2, r: int):
     """H += Jᵀ D J of one scalar row."""
     d = s.row_d[t, n]
@@ -136,7 +136,7 @@ def _add_row_hessian(m: Tables, s: Scratch, t: int, n: int, hess: Reals2, r: int
                     hess[r, packed(i, 0) + j] += d * c[a] * c[b]
 
 
-@wp.func
+@wp.func(inline=True)
 def assemble(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int, dense: int, hess: Reals2, r: int):
     """H = M + Jᵀ C J and the gradient M a + c − τ − Jᵀ f at the current J a − aref, into ``s.step``."""
     for i in range(m.nh):
@@ -224,7 +224,7 @@ def _line_search(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int,
     return alpha
 
 
-@wp.func
+@wp.func(inline=True)
 def newton(
     m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int, dense: int, acc: Reals2, hess: Reals2, r: int
 ):
@@ -283,7 +283,7 @@ def newton(
         _advance(m, s, t, nrow, ncon, alpha, acc, r)
 
 
-@wp.func
+@wp.func(inline=True)
 def _advance(m: Tables, s: Scratch, t: int, nrow: int, ncon: int, alpha: f64, acc: Reals2, r: int):
     """Move ``alpha`` steps."""
     for i in range(m.nv):

@@ -43,13 +43,12 @@ from dropo_torch.simulators.warp.types import (
     Reals2,
     Scratch,
     Tables,
-    f64,
     vec3,
     vec6,
 )
 
 
-@wp.func
+@wp.func(inline=True)
 def accelerate(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2,
     held: Ints, r: int, ctrl: Reals2, rc: int,
@@ -78,44 +77,55 @@ def accelerate(
         newton(m, s, t, th, nrow, ncon, fills_in(m, s, t, ncon), acc, hess, r)
 
 
-@wp.func
+@wp.func(inline=True)
 def accelerate_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2,
-    held: Ints, r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+    soft_hess: Reals2, held: Ints, r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int, softening: int,
 ):
-    """Adjoint of :func:`accelerate`: from ``s.acc_bar`` to ``s.tangent``, ``s.vel_bar``, controls and θ."""
+    """Adjoint of :func:`accelerate`: adds to ``s.tangent``, ``s.vel_bar``, controls and θ.
+
+    Poses of row ``r`` are in the scratch memory, minus the adjoint of the acceleration in ``s.lam``, its acceleration
+    and velocity in ``s.qacc`` and ``s.qd``. With ``softening`` it is instead the part of M in the adjoint of an
+    implicit integrator: λᵀ M a alone, of bodies at rest without gravity, with λ solved with ``soft_hess``.
+    """
     _late = wp.grad(nothing)(ONE)
-    sweep_out(m, s, t, th, qpos, qvel, r)
     nrow = int(0)
     ncon = int(0)
     dense = int(0)
-    if held[r] > 0:
-        nrow = make_rows(m, s, t, th, qpos, qvel, r)
-        ncon = find_contacts(m, s, t, th)
-        dense = fills_in(m, s, t, ncon)
+    if softening != 0:
+        for b in range(m.nb):
+            s.velocity[t, b] = vec6()
+            s.bias[t, b] = vec6()
+        for i in range(m.nh):
+            s.mass[t, i] = soft_hess[r, i]
+    else:
+        if held[r] > 0:
+            nrow = make_rows(m, s, t, th, qpos, qvel, r)
+            ncon = find_contacts(m, s, t, th)
+            dense = fills_in(m, s, t, ncon)
+        for i in range(m.nh):
+            s.mass[t, i] = hess[r, i]
+    solve(m, dense, s.mass, t, s.lam, t)
+    carry_out(m, s, t)
+    bodies_adjoint(m, s, t, th, 1 - softening)
     for i in range(m.nv):
-        s.lam[t, i] = -s.acc_bar[t, i]
-        s.tangent[t, i] = ZERO
-        s.vel_bar[t, i] = ZERO
-    solve(m, dense, hess, r, s.lam, t)
-    carry_out(m, s, t, acc, r)
-    bodies_adjoint(m, s, t, th, 1)
-    for i in range(m.nv):
-        s.grad[t, m.o_armature + i] += s.lam[t, i] * acc[r, i]
-    if m.has_damper != 0:
-        dampers_adjoint(m, s, t, th, qvel, r)
-    if m.has_spring != 0:
-        springs_adjoint(m, s, t, th, qpos, r)
-    actuators_adjoint(m, s, t, th, qpos, qvel, r, ctrl, rc, ctrl_bar, rb)
-    rows_adjoint(m, s, t, th, qpos, qvel, acc, r, nrow)
-    contacts_adjoint(m, s, t, th, ncon)
-    carry_in(m, s, t, qvel, r, acc, r, f64(1.0), ncon)
-    for i in range(3):
-        s.grad[t, m.o_gravity + i] -= s.f_accel[t, 0][3 + i]
+        s.grad[t, m.o_armature + i] += s.lam[t, i] * s.qacc[t, i]
+    if softening == 0:
+        if m.has_damper != 0:
+            dampers_adjoint(m, s, t, th, qvel, r)
+        if m.has_spring != 0:
+            springs_adjoint(m, s, t, th, qpos, r)
+        actuators_adjoint(m, s, t, th, qpos, qvel, r, ctrl, rc, ctrl_bar, rb)
+        rows_adjoint(m, s, t, th, qpos, qvel, acc, r, nrow)
+        contacts_adjoint(m, s, t, th, ncon)
+    carry_in(m, s, t, ncon)
+    if softening == 0:
+        for i in range(3):
+            s.grad[t, m.o_gravity + i] -= s.f_accel[t, 0][3 + i]
 
 
-@wp.func
-def carry_out(m: Tables, s: Scratch, t: int, acc: Reals2, r: int):
+@wp.func(inline=True)
+def carry_out(m: Tables, s: Scratch, t: int):
     """U = Σ s a and Λ = Σ s λ of each body, and A completed to the acceleration with joint accelerations."""
     s.total[t, 0] = vec6()
     s.dual[t, 0] = vec6()
@@ -126,14 +136,14 @@ def carry_out(m: Tables, s: Scratch, t: int, acc: Reals2, r: int):
         first = m.body_dof[b]
         for i in range(first, first + m.body_ndof[b]):
             sd = s.motion[t, i]
-            u += sd * acc[r, i]
+            u += sd * s.qacc[t, i]
             l += sd * s.lam[t, i]
         s.total[t, b] = u
         s.dual[t, b] = l
         s.bias[t, b] = s.bias[t, b] + u
 
 
-@wp.func
+@wp.func(inline=True)
 def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
     """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
 
@@ -179,7 +189,7 @@ def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
                 _fluid_adjoint(m, s, t, th, b, l, v)
 
 
-@wp.func
+@wp.func(inline=True)
 def _inertia_adjoint(
     m: Tables, s: Scratch, t: int, th: Reals, b: int, x: vec6, y: vec6, z: vec6, v: vec6
 ):
@@ -206,7 +216,7 @@ def _inertia_adjoint(
             s.grad[t, m.o_inertia + 3 * b + k] += xw[k] * yw[k] + zw[k] * vw[k]
 
 
-@wp.func
+@wp.func(inline=True)
 def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v: vec6):
     """Gradient of −λ · (drag on the body)."""
     rot = inertial_frame(m, s, t, b)
@@ -233,10 +243,8 @@ def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v:
         s.grad[t, m.o_ipos + 3 * b + k] += cbar[k]
 
 
-@wp.func
-def carry_in(
-    m: Tables, s: Scratch, t: int, qvel: Reals2, rv: int, acc: Reals2, ra: int, moving: f64, touching: int
-):
+@wp.func(inline=True)
+def carry_in(m: Tables, s: Scratch, t: int, touching: int):
     """Adjoints of positions and velocities, from the leaves to the root.
 
     In a frame that is displaced along s with everything beyond the joint, only what comes from before the joint
@@ -268,25 +276,22 @@ def carry_in(
             sl = vec6()
             for i in range(d, d + n):
                 sd = s.motion[t, i]
-                if moving != ZERO:
-                    sv += sd * qvel[rv, i]
-                sa += sd * acc[ra, i]
+                sv += sd * s.qd[t, i]
+                sa += sd * s.qacc[t, i]
                 sl += sd * s.lam[t, i]
             v = v - sv
             u = u - sa
             l = l - sl
             a = a - sa - cross_motion(v, sv)
-            if moving != ZERO:
-                # F_A · (V × s) = −s · V ×* F_A
-                g = fv - cross_force(v, fa)
-                for i in range(d, d + n):
-                    s.vel_bar[t, i] += wp.dot(s.motion[t, i], g)
-                fv = fv + cross_force(sv, fa)
+            # F_A · (V × s) = −s · V ×* F_A
+            g = fv - cross_force(v, fa)
+            fv = fv + cross_force(sv, fa)
             # Σ F_X · (X × s) = −s · Σ X ×* F_X
             y = fy - cross_force(v, fv) - cross_force(a, fa) - cross_force(l, fl)
             if touching != 0:
                 y = y - cross_force(u, fu)
             for i in range(d, d + n):
+                s.vel_bar[t, i] += wp.dot(s.motion[t, i], g)
                 s.tangent[t, i] += wp.dot(s.motion[t, i], y)
         s.f_velocity[t, p] = s.f_velocity[t, p] + fv
         s.f_accel[t, p] = s.f_accel[t, p] + fa

@@ -233,6 +233,8 @@ class Scratch:
     f_dual: Vec6s2
     f_pose: Vec6s2
     lam: Reals2
+    qacc: Reals2
+    qd: Reals2
     tangent: Reals2  # adjoint of a stage's position, in the tangent space
     vel_bar: Reals2  # adjoint of a stage's velocity
     acc_bar: Reals2  # adjoint of a stage's acceleration
