@@ -17,6 +17,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dropo_torch.bundled import bundled_sim
+from dropo_torch.certify import Certificate, certify
 from dropo_torch.compare import Comparison, Run, compare
 from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
@@ -31,12 +32,12 @@ from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
-    "fit.json", "sweep.json", "compare.json", "checkpoint.pkl", "sweep-progress.json", "compare-progress.json",
+    "fit.json", "sweep.json", "compare.json", "certificate.json", "checkpoint.pkl", "sweep-progress.json", "compare-progress.json",
     "distribution.yaml", "config.yaml",
     "model.xml", "report.html", "tensorboard",
 )  # fmt: skip
 #: The first of them: a folder with none of these holds no run.
-_MARKS = _RESULTS[:6]
+_MARKS = _RESULTS[:7]
 _PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")
 
 
@@ -120,6 +121,34 @@ def run_sweep(
     return sweep
 
 
+def run_certify(config: Config, out: Path, *, console: Console) -> Certificate:
+    """Certify the gradients of every parameter on this model and log, and write ``certificate.json`` to ``out``.
+
+    Raises:
+        InputError: a gradient that is dead or wrong; the certificate is written all the same.
+    """
+    problem = make_problem(config.model_copy(update={"backend": "warp"}))
+    _prepare(out, problem, resume=False)
+    found = certify(problem.objective, seed=config.seed)
+    write_atomically(out / "certificate.json", json.dumps(found.document(), indent=2).encode() + b"\n")
+    table = Table("parameter", "derivative", "median error", "99 %", "active set moved", "verdict")
+    for p in found.parameters:
+        numbers = (
+            f"{p.magnitude:.3g}",
+            f"{p.median_error:.1e}",
+            f"{p.worst_error:.1e}",
+            f"{100 * p.disagreeing:.2f} %",
+        )
+        table.add_row(p.name, *numbers, p.verdict)
+    console.print(table)
+    console.print(
+        f"{found.transitions} transitions; next states differ from MuJoCo's by at most {found.state_error:.1e}",
+        highlight=False,
+    )
+    found.check()
+    return found
+
+
 def run_compare(
     config: Config, out: Path, *, console: Console, methods: Sequence[str], seeds: int, resume: bool = False
 ) -> Comparison:
@@ -171,6 +200,8 @@ def versions() -> dict[str, str]:
 
 def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Console, label: str = "fit") -> Fit:
     config = problem.config
+    if config.optimizer == "adam" and not resume:
+        certify(problem.objective, max_transitions=20, points=1, seed=config.seed).check()
     with FitProgress(console, label) as progress:
         return fit(
             problem.objective,

@@ -112,6 +112,39 @@ class Engine:
         theta_bar[:, self.wanted.to(theta.device)] = columns
         return theta_bar, state_bar, control_bar.reshape(controls.shape)
 
+    def per_world(
+        self, problem: Problem, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor,
+        directions: torch.Tensor,
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+        """Return last states and, of every world on its own, vector-Jacobian products.
+
+        Args:
+            problem: with ``lag`` logged steps.
+            theta, states, controls: as for :meth:`simulate`.
+            directions: covectors of the last states, ``(J, nq + nv)``, the same for every world.
+
+        Returns:
+            States ``(T·K, nq + nv)``, and products with the Jacobians by the wanted columns of θ
+            ``(T·K, J, wanted)`` and by the start states ``(T·K, J, nq + nv)``.
+        """
+        inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
+        width, lag = states.shape[1], problem.lag
+        after, by_theta, by_state = [], [], []
+        for first, count in self.chunks(problem.worlds):
+            out = torch.empty(count * lag, width, dtype=torch.float64, device=states.device)
+            trace = self._forward(problem, inputs, wp.from_torch(out), first, count, keep=True)
+            after.append(out[lag - 1 :: lag])
+            columns = []
+            for direction in directions:
+                bar = torch.zeros_like(out)
+                bar[lag - 1 :: lag] = direction
+                theta_bar, state_bar, _ = self._worlds(problem, inputs, trace, wp.from_torch(bar), first, count)
+                columns.append((wp.to_torch(theta_bar).clone(), wp.to_torch(state_bar).clone()))
+            self.release([trace])
+            by_theta.append(torch.stack([c[0] for c in columns], 1))
+            by_state.append(torch.stack([c[1] for c in columns], 1))
+        return torch.cat(after), torch.cat(by_theta), torch.cat(by_state)
+
     def _forward(
         self, problem: Problem, inputs: list[Any], out: Any, first: int, count: int, keep: bool
     ) -> Trace:
@@ -135,6 +168,23 @@ class Engine:
         self, problem: Problem, inputs: list[Any], trace: Trace, out_bar: Any, totals: list[Any], first: int,
         count: int,
     ) -> None:  # fmt: skip
+        lag, parameters = problem.lag, problem.parameters
+        theta_bar, state_bar, control_bar = self._worlds(problem, inputs, trace, out_bar, first, count)
+        touched = (first + count - 1) // parameters - first // parameters + 1
+        wp.launch(
+            kernel_backward.sum_over_transitions, dim=(parameters, len(self.wanted)), device=self.device,
+            inputs=[theta_bar, totals[0], first, count, parameters],
+        )  # fmt: skip
+        for bar, total, width in ((state_bar, totals[1], 1), (control_bar, totals[2], lag)):
+            wp.launch(
+                kernel_backward.sum_over_parameters, dim=(touched, width, bar.shape[1]), device=self.device,
+                inputs=[bar, total, first, count, parameters, width],
+            )  # fmt: skip
+
+    def _worlds(
+        self, problem: Problem, inputs: list[Any], trace: Trace, out_bar: Any, first: int, count: int
+    ) -> tuple[Any, Any, Any]:
+        """Adjoints of θ, states and controls, a row for every world (and logged step) of a chunk."""
         theta, states, controls = inputs
         lag, period = problem.lag, problem.lag * self.skip + 1
         scratch = self._working(self._slots(count), adjoint=True)
@@ -151,17 +201,7 @@ class Engine:
             )  # fmt: skip
 
         self._spread(launch, count)
-        parameters = problem.parameters
-        touched = (first + count - 1) // parameters - first // parameters + 1
-        wp.launch(
-            kernel_backward.sum_over_transitions, dim=(parameters, len(self.wanted)), device=self.device,
-            inputs=[theta_bar, totals[0], first, count, parameters],
-        )  # fmt: skip
-        for bar, total, width in ((state_bar, totals[1], 1), (control_bar, totals[2], lag)):
-            wp.launch(
-                kernel_backward.sum_over_parameters, dim=(touched, width, bar.shape[1]), device=self.device,
-                inputs=[bar, total, first, count, parameters, width],
-            )  # fmt: skip
+        return theta_bar, state_bar, control_bar
 
     def _slots(self, count: int) -> int:
         return min(self.num_threads, count) if self.is_cpu else count

@@ -109,6 +109,14 @@ class Fields:
         with torch.no_grad():
             self._constant = self._derive(self._raw[None])
 
+    def with_derivative(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return θ ``(K, P)`` and the derivative of its wanted columns by each of the values ``(K, wanted, d)``."""
+        leaf = values.detach().requires_grad_(True)
+        with torch.enable_grad():
+            theta = self(leaf)
+            slopes = [torch.autograd.grad(theta[:, c].sum(), leaf, retain_graph=True)[0] for c in self.wanted.tolist()]
+        return theta.detach(), torch.stack(slopes, 1)
+
     def _derive(self, raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Contact parameters and inverse weights of raw fields ``(K, ...)``."""
         return self._mix(raw), self._weigh(raw)

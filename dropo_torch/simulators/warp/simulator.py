@@ -14,7 +14,7 @@ import warp as wp
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
-from dropo_torch.simulators.warp.engine import Engine, Simulate
+from dropo_torch.simulators.warp.engine import Engine, Problem, Simulate
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
 from dropo_torch.simulators.warp.support import check_support
@@ -102,3 +102,30 @@ class WarpSimulator(Simulator):
         start, inputs = (x.to(self._device, torch.float64).contiguous() for x in (states, controls))
         out: torch.Tensor = Simulate.apply(theta.contiguous(), start, inputs, self._engine)
         return out.to(origin)
+
+    def jacobian(
+        self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, directions: torch.Tensor | None = None
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the states after ``lag`` transitions and each transition's own derivatives.
+
+        One backward pass a direction; with none given, one a state column.
+
+        Args:
+            states, controls, values: as for :meth:`simulate`.
+            directions: covectors of the states, ``(J, nq + nv)``; by default the unit vectors.
+
+        Returns:
+            States ``(T, K, nq + nv)``, and the directions' products with the derivatives by the values
+            ``(T, K, J, d)`` and by the start states ``(T, K, J, nq + nv)``.
+        """
+        self.check_arguments(states, controls, values)
+        width, num_values = self.num_states, len(values)
+        rows = torch.eye(width, dtype=torch.float64) if directions is None else directions
+        theta, slope = self._fields.with_derivative(values.detach().to("cpu", torch.float64))
+        start, inputs = (x.detach().to(self._device, torch.float64).contiguous() for x in (states, controls))
+        problem = Problem(len(states), num_values, controls.shape[1], self.frame_skip)
+        moved = [x.to(self._device).contiguous() for x in (theta, rows)]
+        after, by_theta, by_state = self._engine.per_world(problem, moved[0], start, inputs, moved[1])
+        shape = (len(states), num_values)
+        by_values = torch.einsum("tkjw,kwd->tkjd", by_theta.cpu().unflatten(0, shape), slope)
+        return after.cpu().unflatten(0, shape), by_values, by_state.cpu().unflatten(0, shape)
