@@ -153,7 +153,11 @@ def fit(
         search = AdamOptimizer(objective, settings=adam or AdamSettings(), seed=seed)
     else:
         search = FisherOptimizer(
-            objective.simulator.parameters, samples=samples, seed=seed, noisy=objective.noise is not None
+            objective.simulator.parameters,
+            samples=samples,
+            seed=seed,
+            noisy=objective.noise is not None,
+            differentiable=objective.simulator.differentiable,
         )
     path = None if checkpoint is None else Path(checkpoint)
     history = _restore(path, fingerprint, search, objective) if resume and path is not None else None
@@ -195,6 +199,8 @@ def _run(
             objective.linearise(at)
         if request.gradient:
             search.tell(*objective.gradient(request.values, request.reduce, request.rows))
+        elif request.is_stencil and objective.has_cheaper_jacobian:
+            search.tell(objective.map_linear(request.values, request.reduce))
         else:
             search.tell(objective.map(request.values, request.reduce))
         evaluations += request.evaluations

@@ -22,6 +22,7 @@ class Request:
         evaluations: how many evaluations of the objective this counts as.
         linearise_at: μ in coordinates at which the start noise is propagated first, or ``None``.
         rows: the transitions to simulate, ascending; ``None`` for all of them.
+        is_stencil: whether all vectors lie so close to the first that the simulation is linear between them.
         gradient: whether ``tell`` wants the gradient of the first sum in ``values``.
     """
 
@@ -31,6 +32,7 @@ class Request:
     linearise_at: np.ndarray | None = None
     rows: np.ndarray | None = None
     gradient: bool = False
+    is_stencil: bool = False
 
 
 @dataclass(frozen=True)

@@ -197,13 +197,23 @@ class FisherOptimizer(Optimizer):
 
     On a log whose start states are noisy, the noise is propagated at the current μ and the means are
     refitted until they rest; the scoring then works on that covariance. Where the
-    simulation bends within the distribution, the scoring goes on over ``samples`` samples.
+    simulation bends within the distribution, the scoring goes on over ``samples`` samples; with exact
+    gradients of their likelihood where the simulator is ``differentiable``.
     """
 
     name = "fisher"
 
-    def __init__(self, space: ParameterSpace, *, samples: int = 100, seed: int = 0, noisy: bool = False) -> None:
+    def __init__(
+        self,
+        space: ParameterSpace,
+        *,
+        samples: int = 100,
+        seed: int = 0,
+        noisy: bool = False,
+        differentiable: bool = False,
+    ) -> None:
         self._space = space
+        self._differentiable = differentiable
         self._noisy = noisy
         self._box = SearchBox.of(space)
         self._limits = coordinate_limits(space.limits, space.is_log)
@@ -222,17 +232,24 @@ class FisherOptimizer(Optimizer):
             reduce=stage.reduction(),
             evaluations=1,
             linearise_at=self._linearised,
+            gradient=self._differentiable and stage is self._sampled,
+            is_stencil=stage is self._means,
         )
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Hand the sums to the stage at work, and change stages when it has finished."""
         if self._sampled is not None:
-            self._sampled.tell(sums)
+            self._sampled.tell(sums, gradient)
         elif self._scoring is not None:
             self._scoring.tell(sums)
             if self._scoring.reason is not None and self._misleads(self._scoring):
                 self._sampled = SampledStage(
-                    self._box, self._limits, self._uniforms, self._scoring.mean, self._scoring.std
+                    self._box,
+                    self._limits,
+                    self._uniforms,
+                    self._scoring.mean,
+                    self._scoring.std,
+                    is_log=self._space.is_log,
                 )
         else:
             self._means.tell(sums)
@@ -282,7 +299,9 @@ class FisherOptimizer(Optimizer):
         if state["scoring"] is not None:
             self._scoring = ScoringStage(self._box, self._limits, **state["scoring"])
         if state["sampled"] is not None:
-            self._sampled = SampledStage(self._box, self._limits, self._uniforms, **state["sampled"])
+            self._sampled = SampledStage(
+                self._box, self._limits, self._uniforms, is_log=self._space.is_log, **state["sampled"]
+            )
         self._round, self._linearised = state["round"], state["linearised"]
 
     def _after_means(self) -> None:

@@ -32,6 +32,7 @@ class SampledStage:
         limits: physical limits in coordinates, low and high, ``(d,)`` each.
         uniforms: base uniforms, ``(K, d)``.
         mean, std: the best φ so far, ``(d,)`` each.
+        is_log: which parameters are searched by their logarithm, ``(d,)`` bool.
     """
 
     box: SearchBox
@@ -39,6 +40,7 @@ class SampledStage:
     uniforms: torch.Tensor
     mean: np.ndarray
     std: np.ndarray
+    is_log: np.ndarray
     damping: float = 1e-2
     log_likelihood: float = -np.inf
     iterations: int = 0
@@ -64,9 +66,16 @@ class SampledStage:
 
         return reduce
 
-    def tell(self, sums: torch.Tensor) -> None:
-        """Accept or reject the candidate, and propose the next one."""
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Accept or reject the candidate, and propose the next one.
+
+        Args:
+            sums: of :meth:`reduction`.
+            gradient: of the log-likelihood in the samples' values, ``(K, d)``; replaces the regressed scores.
+        """
         value = float(sums[0])
+        if gradient is not None:
+            sums = self._with_exact_scores(sums, gradient)
         if np.isfinite(value) and value > self.log_likelihood:
             gain = value - self.log_likelihood
             self.mean, self.std = self.candidate or (self.mean, self.std)
@@ -88,8 +97,18 @@ class SampledStage:
             self.candidate = scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
 
     def state(self) -> dict[str, Any]:
-        """Return everything but the box, the limits and the uniforms."""
-        return {k: v for k, v in vars(self).items() if k not in ("box", "limits", "uniforms")}
+        """Return everything but the box, the limits, the uniforms and the scales."""
+        return {k: v for k, v in vars(self).items() if k not in ("box", "limits", "uniforms", "is_log")}
+
+    def _with_exact_scores(self, sums: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+        """Put the chain rule's scores of (μ, log σ) in the place of the regressed ones."""
+        mean, std = (torch.as_tensor(x).clone().requires_grad_(True) for x in self.candidate or (self.mean, self.std))
+        low, high = (torch.as_tensor(x) for x in self.limits)
+        x = truncated_normal_icdf(self.uniforms, mean, std, low, high)
+        values = torch.where(torch.as_tensor(self.is_log), torch.exp(x), x) if self.is_log.any() else x
+        by_mean, by_std = torch.autograd.grad(values, (mean, std), gradient)
+        d = len(mean)
+        return torch.cat([sums[:1], by_mean, by_std * std.detach(), sums[1 + 2 * d :]])
 
 
 def scoring_step(
