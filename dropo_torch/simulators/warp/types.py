@@ -4,6 +4,9 @@ A model is two things: integer tables and fixed geometry (:class:`Tables`, share
 vector θ of real parameters per world, whose sections start at the ``o_...`` offsets in the tables.
 """
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 from typing import Any
