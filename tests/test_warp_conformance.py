@@ -393,7 +393,7 @@ CONTACTS = [
         length=40,
         states=1e-8,
     ),
-    Case("spheres, condim 6", scene(SPHERES, slope=".05", condim="6"), contact_parameters("one"), length=40),
+    Case("spheres, condim 6", scene(SPHERES, slope=".1", condim="6"), contact_parameters("one"), spread=0.02),
     Case(
         "margin, direct solref",
         scene(BOX, geom='margin=".01" gap=".005" solref="-5000 -90" solimp=".7 .9 .02 .4 3"'),
