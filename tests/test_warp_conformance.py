@@ -101,7 +101,7 @@ def of_reference(space: ParameterSpace, states, controls, values, weights, skip:
 
     columns = []
     for j in range(len(values)):
-        size = eps * (abs(values[j]) or 1.0)
+        size = eps * (abs(values[j]) or 0.1)
         columns.append(slope(lambda g, j=j, z=size: (states, controls, values + g * unit(values, j, z))) / (2 * size))
     wrt_values = np.stack(columns, 1) if columns else np.zeros((len(states), 0))
     wrt_states = [

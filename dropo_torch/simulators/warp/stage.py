@@ -129,7 +129,8 @@ def accelerate_adjoint(
             ncon = find_contacts(m, s, t, th)
         solve(m, fills_in(m, s, t, ncon), hess, r, s.lam, t)
     carry_out(m, s, t)
-    bodies_adjoint(m, s, t, th, 1 - softening)
+    posed = ncon + m.has_gravcomp + m.has_fluid
+    bodies_adjoint(m, s, t, th, 1 - softening, posed)
     for i in range(m.nv):
         s.grad[t, m.o_armature + i] += s.lam[t, i] * s.qacc[t, i]
     if softening == 0:
@@ -140,7 +141,7 @@ def accelerate_adjoint(
         actuators_adjoint(m, s, t, th, qpos, qvel, r, ctrl, rc, ctrl_bar, rb)
         rows_adjoint(m, s, t, th, qpos, qvel, acc, r, nrow)
         contacts_adjoint(m, s, t, th, ncon)
-    carry_in(m, s, t, ncon)
+    carry_in(m, s, t, posed)
     if softening == 0:
         for i in range(3):
             s.grad[t, m.o_gravity + i] -= s.f_accel[t, 0][3 + i]
@@ -166,7 +167,7 @@ def carry_out(m: Tables, s: Scratch, t: int):
 
 
 @wp.func(inline=True)
-def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
+def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int, posed: int):
     """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
 
     ``moving`` 0 leaves out V, gravity compensation and drag: the adjoint of λᵀ M a alone.
@@ -175,15 +176,16 @@ def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
     zero = vec6()
     s.f_velocity[t, 0] = zero
     s.f_accel[t, 0] = zero
-    s.f_total[t, 0] = zero
     s.f_dual[t, 0] = zero
-    s.f_pose[t, 0] = zero
+    if posed != 0:
+        for b in range(m.nb):
+            s.f_total[t, b] = zero
+            s.f_pose[t, b] = zero
     for b in range(1, m.nb):
-        s.f_total[t, b] = zero
-        s.f_pose[t, b] = zero
-        s.f_velocity[t, b] = zero
-        s.f_accel[t, b] = zero
-        s.f_dual[t, b] = zero
+        if m.body_massive[b] == 0:
+            s.f_velocity[t, b] = zero
+            s.f_accel[t, b] = zero
+            s.f_dual[t, b] = zero
         if m.body_massive[b] != 0:
             i = s.inertia[t, b]
             dual = s.dual[t, b]
@@ -204,9 +206,11 @@ def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
                 s.f_velocity[t, b] = inertia_mul(i, lv) - cross_force(dual, iv)
                 s.f_dual[t, b] = inertia_mul(i, a) + cross_force(v, iv)
             else:
+                s.f_velocity[t, b] = zero
                 s.f_dual[t, b] = inertia_mul(i, a)
             s.f_accel[t, b] = fa
-            _inertia_adjoint(m, s, t, th, b, dual, a, lv, v)
+            if m.want_inertial != 0:
+                _inertia_adjoint(m, s, t, th, b, dual, a, lv, v)
             if moving != 0 and m.has_fluid != 0:
                 _fluid_adjoint(m, s, t, th, b, dual, v)
 
@@ -264,21 +268,24 @@ def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, dual: vec6,
 
 
 @wp.func(inline=True)
-def carry_in(m: Tables, s: Scratch, t: int, touching: int):
+def carry_in(m: Tables, s: Scratch, t: int, posed: int):
     """Adjoints of positions and velocities, from the leaves to the root.
 
     In a frame that is displaced along s with everything beyond the joint, only what comes from before the joint
     moves: each of V, A, U, Λ there by X × s. So L_q = Σ_X F_X · (X × s) + Y · s and L_v = F_V · s + F_A · (V × s),
-    X before the joint, with F_V += v s ×* F_A between the two. ``touching`` 0 says that U was given no F.
+    X before the joint, with F_V += v s ×* F_A between the two. ``posed`` 0 says that there is no F_U and no Y.
     """
     for reverse in range(1, m.nb):
         b = m.nb - reverse
         p = m.body_parent[b]
         fv = s.f_velocity[t, b]
         fa = s.f_accel[t, b]
-        fu = s.f_total[t, b]
         fl = s.f_dual[t, b]
-        fy = s.f_pose[t, b]
+        fu = vec6()
+        fy = vec6()
+        if posed != 0:
+            fu = s.f_total[t, b]
+            fy = s.f_pose[t, b]
         v = s.velocity[t, b]
         a = s.bias[t, b]
         u = s.total[t, b]
@@ -308,14 +315,14 @@ def carry_in(m: Tables, s: Scratch, t: int, touching: int):
             fv = fv + cross_force(sv, fa)
             # Σ F_X · (X × s) = −s · Σ X ×* F_X
             y = fy - cross_force(v, fv) - cross_force(a, fa) - cross_force(dual, fl)
-            if touching != 0:
+            if posed != 0:
                 y = y - cross_force(u, fu)
             for i in range(d, d + n):
                 s.vel_bar[t, i] += wp.dot(s.motion[t, i], g)
                 s.tangent[t, i] += wp.dot(s.motion[t, i], y)
         s.f_velocity[t, p] = s.f_velocity[t, p] + fv
         s.f_accel[t, p] = s.f_accel[t, p] + fa
-        if touching != 0:
+        if posed != 0:
             s.f_total[t, p] = s.f_total[t, p] + fu
+            s.f_pose[t, p] = s.f_pose[t, p] + fy
         s.f_dual[t, p] = s.f_dual[t, p] + fl
-        s.f_pose[t, p] = s.f_pose[t, p] + fy

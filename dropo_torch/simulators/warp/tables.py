@@ -211,6 +211,7 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
     fluid = acts("opt.density", np.array(model.opt.density)) or acts("opt.viscosity", np.array(model.opt.viscosity))
     implicit = integrator == 2 or (integrator == 0 and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP))
     return {
+        "want_inertial": int(any(_targets(space, f) for f in ("body_mass", "body_inertia", "body_ipos"))),
         "want_inertia": int(bool(_targets(space, "body_inertia"))),
         "want_ipos": int(bool(_targets(space, "body_ipos"))),
         "integrator": integrator, "nstage": 4 if integrator == 1 else 1, "h": model.opt.timestep,

@@ -89,7 +89,8 @@ class Tables:
     has_gravcomp: wp.int32
     has_fluid: wp.int32
     has_frclimit: wp.int32
-    want_inertia: wp.int32  # gradients wanted of body_inertia, of body_ipos
+    want_inertial: wp.int32  # gradients wanted of mass, body_inertia or body_ipos; of the second; of the third
+    want_inertia: wp.int32
     want_ipos: wp.int32
     maxcon: wp.int32
     maxrow: wp.int32
