@@ -42,7 +42,13 @@ def reference(space: ParameterSpace, states: np.ndarray, controls: np.ndarray, v
 
 
 def rollouts(
-    model: mujoco.MjModel, count: int, *, seed: int = 0, length: int = 25, every: int = 4, spread: float = 0.1,
+    model: mujoco.MjModel,
+    count: int,
+    *,
+    seed: int = 0,
+    length: int = 25,
+    every: int = 4,
+    spread: float = 0.1,
     push: float = 1.0,
 ) -> tuple[np.ndarray, np.ndarray]:
     """States ``(count, nq + nv)`` on the way of random controls from random starts, and controls ``(count, 1, nu)``."""
@@ -95,7 +101,7 @@ def of_reference(space: ParameterSpace, states, controls, values, weights, skip:
 
     columns = []
     for j in range(len(values)):
-        size = eps * (abs(values[j]) or 1.0)
+        size = eps * (abs(values[j]) or 0.1)
         columns.append(slope(lambda g, j=j, z=size: (states, controls, values + g * unit(values, j, z))) / (2 * size))
     wrt_values = np.stack(columns, 1) if columns else np.zeros((len(states), 0))
     wrt_states = [
@@ -136,9 +142,7 @@ class Case:
 def check(case: Case, count: int = 12, eps: float = 1e-5) -> None:
     model = case.model()
     space = ParameterSpace(model, case.parameters)
-    states, controls = rollouts(
-        model, count, spread=case.spread, push=case.push, length=case.length, seed=case.seed
-    )
+    states, controls = rollouts(model, count, spread=case.spread, push=case.push, length=case.length, seed=case.seed)
     simulator = WarpSimulator(model, parameters=space, frame_skip=case.skip, num_threads=1)
     values = space.nominal
     got = simulator.simulate(*(torch.tensor(x) for x in (states, controls, values[None])))[:, 0].numpy()
@@ -162,7 +166,9 @@ def check(case: Case, count: int = 12, eps: float = 1e-5) -> None:
         if name == "values":
             for column, label in enumerate(space.names):
                 assert np.median(relative[:, column]) < 30 * case.median, f"{label}: {report}"
-                assert label in case.idle or np.abs(b[:, column]).max() > 0, f"{label} has no effect in the reference: a test of nothing"
+                assert label in case.idle or np.abs(b[:, column]).max() > 0, (
+                    f"{label} has no effect in the reference: a test of nothing"
+                )
 
 
 def gym_parameters(file: str) -> dict:
@@ -235,7 +241,11 @@ def arm(**changes: str) -> str:
 
 
 def p(field_: str, name: str | None = None, index: int | None = None, bounds=(-1e3, 1e3)) -> dict:
-    low = 0 if field_.startswith(("dof_", "actuator_k", "jnt_stiffness", "body_gravcomp", "geom_fric", "opt.d", "opt.v")) else bounds[0]
+    low = (
+        0
+        if field_.startswith(("dof_", "actuator_k", "jnt_stiffness", "body_gravcomp", "geom_fric", "opt.d", "opt.v"))
+        else bounds[0]
+    )
     low = 1e-6 if field_ in ("body_mass", "body_inertia", "pair_friction") else low
     out = {"field": field_, "bounds": [low, bounds[1]]}
     return out | ({"name": name} if name else {}) | ({"index": index} if index is not None else {})
@@ -267,16 +277,46 @@ TREES = [
     Case("frictionloss", arm(loss="0.8"), JOINTS | LOSS, most=1e-2),
     Case("frictionloss RK4", arm(loss="0.8", integrator="RK4"), JOINTS | LOSS, most=1e-2),
     Case("stuck", arm(loss="30"), STUCK, most=1e-2),
-    Case("equality", arm(extra=EQUALITY), {"c1": p("eq_data", "equality0", 1), "c3": p("eq_data", "equality0", 3),
-         "eq_solref": p("eq_solref", "equality0", 0), "mass": p("body_mass", "b")}),  # fmt: skip
-    Case("ball", arm(second="ball", limit='limited="true" range="0 25" stiffness="2"'), {"stiffness": p("jnt_stiffness",
-         "jb"), "damping": p("dof_damping", "jb"), "range": p("jnt_range", "jb", 1), "mass": p("body_mass", "b")}),  # fmt: skip
-    Case("ball RK4", arm(second="ball", integrator="RK4", limit='stiffness="2"'), {"stiffness": p("jnt_stiffness", "jb"),
-         "poly": p("jnt_stiffnesspoly", "jb", 0), "inertia": p("body_inertia", "b", 2)}),  # fmt: skip
-    Case("drag", arm(option='density="200" viscosity="2" wind="1 2 -3"'), DRAG | {"mass": p("body_mass", "b"),
-         "inertia": p("body_inertia", "b", 2), "ipos": p("body_ipos", "b", 0)}),  # fmt: skip
-    Case("total force", arm(actuators=SERVOS).replace('stiffness="50"', 'stiffness="50" actuatorfrcrange="-3 3"'),
-         {"frcrange": p("jnt_actfrcrange", "jc", 0), "gear": p("actuator_gear", "gc")}, push=3.0),  # fmt: skip
+    Case(
+        "equality",
+        arm(extra=EQUALITY),
+        {
+            "c1": p("eq_data", "equality0", 1),
+            "c3": p("eq_data", "equality0", 3),
+            "eq_solref": p("eq_solref", "equality0", 0),
+            "mass": p("body_mass", "b"),
+        },
+    ),
+    Case(
+        "ball",
+        arm(second="ball", limit='limited="true" range="0 25" stiffness="2"'),
+        {
+            "stiffness": p("jnt_stiffness", "jb"),
+            "damping": p("dof_damping", "jb"),
+            "range": p("jnt_range", "jb", 1),
+            "mass": p("body_mass", "b"),
+        },
+    ),
+    Case(
+        "ball RK4",
+        arm(second="ball", integrator="RK4", limit='stiffness="2"'),
+        {
+            "stiffness": p("jnt_stiffness", "jb"),
+            "poly": p("jnt_stiffnesspoly", "jb", 0),
+            "inertia": p("body_inertia", "b", 2),
+        },
+    ),
+    Case(
+        "drag",
+        arm(option='density="200" viscosity="2" wind="1 2 -3"'),
+        DRAG | {"mass": p("body_mass", "b"), "inertia": p("body_inertia", "b", 2), "ipos": p("body_ipos", "b", 0)},
+    ),
+    Case(
+        "total force",
+        arm(actuators=SERVOS).replace('stiffness="50"', 'stiffness="50" actuatorfrcrange="-3 3"'),
+        {"frcrange": p("jnt_actfrcrange", "jc", 0), "gear": p("actuator_gear", "gc")},
+        push=3.0,
+    ),
 ]
 
 
@@ -297,8 +337,15 @@ def free(name: str, pos: str, geom: str, quat: str = "1 0 0 0") -> str:
 
 
 def scene(bodies: str, **changes: str) -> str:
-    settings = {"cone": "pyramidal", "integrator": "Euler", "impratio": "1", "condim": "3", "geom": "", "slope": ".1",
-                "extra": ""} | changes  # fmt: skip
+    settings = {
+        "cone": "pyramidal",
+        "integrator": "Euler",
+        "impratio": "1",
+        "condim": "3",
+        "geom": "",
+        "slope": ".1",
+        "extra": "",
+    } | changes
     return SCENE.format(bodies=bodies, **settings)
 
 
@@ -313,36 +360,75 @@ SPHERES = free("one", "0 0 .1", 'type="sphere" size=".1"') + free("two", ".15 0 
 
 
 def contact_parameters(body: str) -> dict:
-    return {"mass": p("body_mass", body), "friction": p("geom_friction", f"g{body}"),
-            "solref": p("geom_solref", "floor", 0), "margin": p("geom_margin", "floor"),
-            "inertia": p("body_inertia", body, 1)}  # fmt: skip
+    return {
+        "mass": p("body_mass", body),
+        "friction": p("geom_friction", f"g{body}"),
+        "solref": p("geom_solref", "floor", 0),
+        "margin": p("geom_margin", "floor"),
+        "inertia": p("body_inertia", body, 1),
+    }
 
 
 CONTACTS = [
     Case("box slides", scene(BOX), contact_parameters("box"), length=40),
     Case("box, elliptic", scene(BOX, cone="elliptic", impratio="3"), contact_parameters("box"), length=40, states=1e-8),
     Case("box, condim 4", scene(BOX, condim="4"), contact_parameters("box"), length=40),
-    Case("box, condim 6 elliptic", scene(BOX, condim="6", cone="elliptic"), contact_parameters("box"), length=40,
-         states=1e-8),  # fmt: skip
+    Case(
+        "box, condim 6 elliptic",
+        scene(BOX, condim="6", cone="elliptic"),
+        contact_parameters("box"),
+        length=40,
+        states=1e-8,
+    ),
     Case("box, frictionless RK4", scene(BOX, condim="1", integrator="RK4"), {"mass": p("body_mass", "box")}, length=40),
     Case("cylinder", scene(CYLINDER), contact_parameters("cylinder"), length=40),
     Case("ellipsoid", scene(ELLIPSOID), contact_parameters("ellipsoid"), length=40),
     Case("capsules", scene(CAPSULES), contact_parameters("one"), length=40),
     Case("capsules, elliptic", scene(CAPSULES, cone="elliptic"), contact_parameters("two"), length=40, states=1e-8),
     Case("sphere pushes box", scene(PUSH, slope="0"), contact_parameters("box"), length=40),
-    Case("sphere pushes box, elliptic", scene(PUSH, slope="0", cone="elliptic"), contact_parameters("box"), length=40,
-         states=1e-8),  # fmt: skip
-    Case("spheres, condim 6", scene(SPHERES, slope=".05", condim="6"), contact_parameters("one"), length=40),
-    Case("margin, direct solref", scene(BOX, geom='margin=".01" gap=".005" solref="-5000 -90" solimp=".7 .9 .02 .4 3"'),
-         {"mass": p("body_mass", "box"), "stiffness": p("geom_solref", "floor", 0),
-          "damping": p("geom_solref", "floor", 1), "width": p("geom_solimp", "gbox", 2),
-          "power": p("geom_solimp", "gbox", 4)}, length=40),  # fmt: skip
-    Case("priority", scene(BOX.replace("<geom", '<geom priority="1" solmix="3" friction=".2 .01 .01"')),
-         {"friction": p("geom_friction", "gbox"), "solref": p("geom_solref", "gbox", 0)}, length=40),  # fmt: skip
-    Case("explicit pair", scene(BOX, cone="elliptic", extra='<contact><pair name="contact" geom1="floor" geom2="gbox" '
-         'condim="4" friction=".4 .7 .01 .001 .001" solref=".03 .9" solreffriction=".05 .8" margin=".002"/></contact>'),
-         {"mu1": p("pair_friction", "contact", 0), "mu2": p("pair_friction", "contact", 1),
-          "solreffriction": p("pair_solreffriction", "contact", 0)}, length=40, states=1e-8),  # fmt: skip
+    Case(
+        "sphere pushes box, elliptic",
+        scene(PUSH, slope="0", cone="elliptic"),
+        contact_parameters("box"),
+        length=40,
+        states=1e-8,
+    ),
+    Case("spheres, condim 6", scene(SPHERES, slope=".1", condim="6"), contact_parameters("one"), spread=0.02),
+    Case(
+        "margin, direct solref",
+        scene(BOX, geom='margin=".01" gap=".005" solref="-5000 -90" solimp=".7 .9 .02 .4 3"'),
+        {
+            "mass": p("body_mass", "box"),
+            "stiffness": p("geom_solref", "floor", 0),
+            "damping": p("geom_solref", "floor", 1),
+            "width": p("geom_solimp", "gbox", 2),
+            "power": p("geom_solimp", "gbox", 4),
+        },
+        length=40,
+    ),
+    Case(
+        "priority",
+        scene(BOX.replace("<geom", '<geom priority="1" solmix="3" friction=".2 .01 .01"')),
+        {"friction": p("geom_friction", "gbox"), "solref": p("geom_solref", "gbox", 0)},
+        length=40,
+    ),
+    Case(
+        "explicit pair",
+        scene(
+            BOX,
+            cone="elliptic",
+            extra='<contact><pair name="contact" geom1="floor" geom2="gbox" '
+            'condim="4" friction=".4 .7 .01 .001 .001" solref=".03 .9" solreffriction=".05 .8" margin=".002"/>'
+            "</contact>",
+        ),
+        {
+            "mu1": p("pair_friction", "contact", 0),
+            "mu2": p("pair_friction", "contact", 1),
+            "solreffriction": p("pair_solreffriction", "contact", 0),
+        },
+        length=40,
+        states=1e-8,
+    ),
 ]
 
 

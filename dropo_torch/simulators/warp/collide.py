@@ -5,6 +5,10 @@ its geometry is then one of two shapes. Against a plane it is decided by a point
 the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments.
 """
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 from typing import Any
@@ -241,8 +245,6 @@ def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
 
 
 @wp.func
-def box_dual(
-    c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64, dbar: f64, pbar: vec3, nbar: vec3
-) -> f64:
+def box_dual(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64, dbar: f64, pbar: vec3, nbar: vec3) -> f64:
     """Leaf: the adjoint of :func:`box_closest` is its gradient."""
     return pair7(box_closest(c, rot, size, x, radius), dbar, pbar, nbar)

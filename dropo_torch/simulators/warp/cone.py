@@ -3,6 +3,10 @@
 ``w = J a − aref`` has the normal first, then two tangents, then the rotations about the three; ``dim`` of them act.
 """
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
@@ -177,7 +181,7 @@ def _edges(w0: f64, wk: f64, l0: f64, lk: f64, mu: f64) -> f64:
 
 
 @wp.func
-def _elliptic(dim: int, w: vec6, l: vec6, mu: vec5, d: f64, impratio: f64) -> f64:
+def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f64:
     """f · Jλ of an elliptic cone."""
     reg = mu[0] / wp.sqrt(impratio)
     y1 = mu[0] * w[1]
@@ -195,26 +199,39 @@ def _elliptic(dim: int, w: vec6, l: vec6, mu: vec5, d: f64, impratio: f64) -> f6
     out = ZERO
     if tt > ZERO:
         tan = wp.sqrt(tt)
-        along = y1 * mu[0] * l[1] + y2 * mu[1] * l[2] + y3 * mu[2] * l[3] + y4 * mu[3] * l[4] + y5 * mu[4] * l[5]
+        along = y1 * mu[0] * jl[1] + y2 * mu[1] * jl[2] + y3 * mu[2] * jl[3] + y4 * mu[3] * jl[4] + y5 * mu[4] * jl[5]
         if n >= reg * tan:
             out = ZERO
         elif reg * n + tan <= ZERO:
-            out = -d * w[0] * l[0] - d * impratio / (mu[0] * mu[0]) * along
+            out = -d * w[0] * jl[0] - d * impratio / (mu[0] * mu[0]) * along
         else:
             fn = -d / (reg * (ONE + reg * reg)) * (n - reg * tan)
-            out = fn * l[0] - fn / tan * along
+            out = fn * jl[0] - fn / tan * along
     elif n < ZERO:
-        out = -d * w[0] * l[0]
-        out -= d * impratio * (w[1] * l[1] + mu[1] * mu[1] / (mu[0] * mu[0]) * w[2] * l[2])
+        out = -d * w[0] * jl[0]
+        out -= d * impratio * (w[1] * jl[1] + mu[1] * mu[1] / (mu[0] * mu[0]) * w[2] * jl[2])
     return out
 
 
 @wp.func
 def contact_power(
-    dim: int, elliptic: int, u: vec6, v: vec6, l: vec6, dist: f64, margin: f64, mu: vec5, solref: vec2,
-    friction_ref: vec2, solimp: vec5, invweight: f64, impratio: f64, h: f64, refsafe: int,
+    dim: int,
+    elliptic: int,
+    u: vec6,
+    v: vec6,
+    jl: vec6,
+    dist: f64,
+    margin: f64,
+    mu: vec5,
+    solref: vec2,
+    friction_ref: vec2,
+    solimp: vec5,
+    invweight: f64,
+    impratio: f64,
+    h: f64,
+    refsafe: int,
 ) -> f64:
-    """−f (Jλ) of a contact with J a = u, J q̇ = v, J λ = l: the leaf whose gradient the adjoint takes."""
+    """−f (Jλ) of a contact with J a = u, J q̇ = v, J λ = jl: the leaf whose gradient the adjoint takes."""
     x = dist - margin
     imp = impedance(x, solimp)
     b = damping(solref, solimp, h, refsafe)
@@ -225,17 +242,15 @@ def contact_power(
     d = normal_d(dim, elliptic, regularisation(imp, ONE), invweight, mu[0], impratio)
     out = ZERO
     if dim == 1:
-        out = d * wp.max(ZERO, -w0) * l[0]
+        out = d * wp.max(ZERO, -w0) * jl[0]
     elif elliptic == 0:
-        y = _edges(w0, u[1] + bf * v[1], l[0], l[1], mu[0]) + _edges(w0, u[2] + bf * v[2], l[0], l[2], mu[1])
+        y = _edges(w0, u[1] + bf * v[1], jl[0], jl[1], mu[0]) + _edges(w0, u[2] + bf * v[2], jl[0], jl[2], mu[1])
         if dim > 3:
-            y += _edges(w0, u[3] + bf * v[3], l[0], l[3], mu[2])
+            y += _edges(w0, u[3] + bf * v[3], jl[0], jl[3], mu[2])
         if dim > 4:
-            y += _edges(w0, u[4] + bf * v[4], l[0], l[4], mu[3]) + _edges(w0, u[5] + bf * v[5], l[0], l[5], mu[4])
+            y += _edges(w0, u[4] + bf * v[4], jl[0], jl[4], mu[3]) + _edges(w0, u[5] + bf * v[5], jl[0], jl[5], mu[4])
         out = d * y
     else:
-        w = vec6(
-            w0, u[1] + bf * v[1], u[2] + bf * v[2], u[3] + bf * v[3], u[4] + bf * v[4], u[5] + bf * v[5]
-        )
-        out = _elliptic(dim, w, l, mu, d, impratio)
+        w = vec6(w0, u[1] + bf * v[1], u[2] + bf * v[2], u[3] + bf * v[3], u[4] + bf * v[4], u[5] + bf * v[5])
+        out = _elliptic(dim, w, jl, mu, d, impratio)
     return -out

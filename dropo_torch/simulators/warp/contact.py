@@ -1,5 +1,9 @@
 """Contacts: finding them, their Jacobians, the friction cone's force, and the adjoint of all three."""
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
@@ -24,14 +28,13 @@ from dropo_torch.simulators.warp.collide import (
 from dropo_torch.simulators.warp.cone import normal_d
 from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
 from dropo_torch.simulators.warp.rows import theta_vec2, theta_vec5
-from dropo_torch.simulators.warp.spatial import ang, at, join
+from dropo_torch.simulators.warp.spatial import ang, at
 from dropo_torch.simulators.warp.types import (
     HALF,
     MINVAL,
     ONE,
     ZERO,
     Reals,
-    Reals2,
     Scratch,
     Tables,
     f64,
@@ -80,9 +83,7 @@ def _add(s: Scratch, t: int, n: int, k: int, which: int, x: vec7, hint: vec3):
     if length > MINVAL:
         t1 = y / length
     t2 = wp.cross(normal, t1)
-    s.con_frame[t, n] = mat33(
-        normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2]
-    )
+    s.con_frame[t, n] = mat33(normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2])
 
 
 @wp.func(inline=True)
@@ -94,9 +95,7 @@ def pair_count(m: Tables, k: int, parallel: bool) -> int:
         n = 2
     elif kind == PLANE_BOX:
         n = 8
-    elif kind == PLANE_CYLINDER:
-        n = 4
-    elif kind == ROUND and parallel:
+    elif kind == PLANE_CYLINDER or (kind == ROUND and parallel):
         n = 4
     return n
 
@@ -239,4 +238,3 @@ def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
         s.con_d[t, c] = normal_d(
             m.pair_dim[k], m.elliptic, regularisation(imp, ONE), th[m.o_pair_invweight + k], mu, m.impratio
         )
-

@@ -5,6 +5,9 @@ frame hang on the bodies. A quantity fixed in the world (Y, ``f_pose``) takes X 
 the sweep inwards can treat all bodies beyond a joint as displaced together.
 """
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp
@@ -60,7 +63,7 @@ def contacts_adjoint(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
         p = s.con_point[t, c]
         u = s.total[t, b2] - s.total[t, b1]
         v = s.velocity[t, b2] - s.velocity[t, b1]
-        l = s.dual[t, b2] - s.dual[t, b1]
+        dual = s.dual[t, b2] - s.dual[t, b1]
         o_mu = m.o_pair_friction + 5 * k
         o_ref = m.o_pair_solref + 2 * k
         o_fref = m.o_pair_solreffriction + 2 * k
@@ -68,7 +71,7 @@ def contacts_adjoint(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
         _d, _e, ub, vb, lb, distbar, marginbar, mubar, refbar, frefbar, impbar, wbar, _r, _h, _s = wp.grad(
             contact_power
         )(
-            m.pair_dim[k], m.elliptic, in_frame(frame, u, p), in_frame(frame, v, p), in_frame(frame, l, p),
+            m.pair_dim[k], m.elliptic, in_frame(frame, u, p), in_frame(frame, v, p), in_frame(frame, dual, p),
             s.con_dist[t, c], th[m.o_pair_margin + k], theta_vec5(th, o_mu), theta_vec2(th, o_ref),
             theta_vec2(th, o_fref), theta_vec5(th, o_imp), th[m.o_pair_invweight + k], m.impratio, m.h, m.refsafe,
         )  # fmt: skip
@@ -88,14 +91,14 @@ def contacts_adjoint(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
         pbar = (
             wp.cross(back * vec3(ub[0], ub[1], ub[2]), ang(u))
             + wp.cross(back * vec3(vb[0], vb[1], vb[2]), ang(v))
-            + wp.cross(back * vec3(lb[0], lb[1], lb[2]), ang(l))
+            + wp.cross(back * vec3(lb[0], lb[1], lb[2]), ang(dual))
         )
         xu = vec3(u[3], u[4], u[5]) + wp.cross(ang(u), p)
         xv = vec3(v[3], v[4], v[5]) + wp.cross(ang(v), p)
-        xl = vec3(l[3], l[4], l[5]) + wp.cross(ang(l), p)
-        nbar = xu * ub[0] + xv * vb[0] + xl * lb[0] + ang(u) * ub[3] + ang(v) * vb[3] + ang(l) * lb[3]
-        t1bar = xu * ub[1] + xv * vb[1] + xl * lb[1] + ang(u) * ub[4] + ang(v) * vb[4] + ang(l) * lb[4]
-        t2bar = xu * ub[2] + xv * vb[2] + xl * lb[2] + ang(u) * ub[5] + ang(v) * vb[5] + ang(l) * lb[5]
+        xl = vec3(dual[3], dual[4], dual[5]) + wp.cross(ang(dual), p)
+        nbar = xu * ub[0] + xv * vb[0] + xl * lb[0] + ang(u) * ub[3] + ang(v) * vb[3] + ang(dual) * lb[3]
+        t1bar = xu * ub[1] + xv * vb[1] + xl * lb[1] + ang(u) * ub[4] + ang(v) * vb[4] + ang(dual) * lb[4]
+        t2bar = xu * ub[2] + xv * vb[2] + xl * lb[2] + ang(u) * ub[5] + ang(v) * vb[5] + ang(dual) * lb[5]
         y = _geometry_adjoint(m, s, t, c, distbar, pbar, nbar, t1bar, t2bar)
         y1 = y[0]
         y2 = y[1]
@@ -201,9 +204,7 @@ def _geometry_adjoint(
         y1 = wrench(n * -slope, c1) + join(wp.cross(n, nbar), vec3())
     elif kind == SPHERE_BOX:
         rot = geom_rotation(m, s, t, g2)
-        cb, rb, _sb, xb, _rb, _d, _p, _n = wp.grad(box_dual)(
-            c2, rot, size, c1, m.geom_size[g1][0], distbar, pbar, nbar
-        )
+        cb, rb, _sb, xb, _rb, _d, _p, _n = wp.grad(box_dual)(c2, rot, size, c1, m.geom_size[g1][0], distbar, pbar, nbar)
         y1 = wrench(xb, c1)
         y2 = wrench(cb, c2) + join(_turned(rot, rb), vec3())
     else:

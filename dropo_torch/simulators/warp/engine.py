@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -145,9 +146,7 @@ class Engine:
             by_state.append(torch.stack([c[1] for c in columns], 1))
         return torch.cat(after), torch.cat(by_theta), torch.cat(by_state)
 
-    def _forward(
-        self, problem: Problem, inputs: list[Any], out: Any, first: int, count: int, keep: bool
-    ) -> Trace:
+    def _forward(self, problem: Problem, inputs: list[Any], out: Any, first: int, count: int, keep: bool) -> Trace:
         period = problem.lag * self.skip + 1 if keep else 2
         slots = self._slots(count)
         rows = self._rows((count if keep else slots) * period * self.tables.nstage)
@@ -214,7 +213,7 @@ class Engine:
             launch(0, count, 0)
             return
         with ThreadPoolExecutor(threads) as pool:
-            jobs = [pool.submit(launch, a, b - a, i) for i, (a, b) in enumerate(zip(bounds, bounds[1:], strict=False))]
+            jobs = [pool.submit(launch, a, b - a, i) for i, (a, b) in enumerate(pairwise(bounds))]
             for job in jobs:
                 job.result()
 
@@ -233,8 +232,8 @@ class Engine:
     def _new_rows(self, number: int) -> Rows:
         m, rows = self.tables, Rows()
         soft = number if m.implicit else 1
-        widths = {"qpos": (number, m.nq), "qvel": (number, m.nv), "acc": (number, m.nv), "rate": (number, m.nv), "hess": (number, m.nh),
-                  "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}  # fmt: skip
+        widths = dict.fromkeys(("qvel", "rate", "acc"), (number, m.nv))
+        widths |= {"qpos": (number, m.nq), "hess": (number, m.nh), "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}
         for name, (count, width) in widths.items():
             setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
         rows.held = wp.empty(number, dtype=wp.int32, device=self.device)
@@ -249,26 +248,29 @@ class Engine:
 
     def _new_scratch(self, slots: int, adjoint: bool) -> Scratch:
         m, scratch = self.tables, Scratch()
-        nb, nv, nh, row, con = m.nb, m.nv, m.nh, m.maxrow, m.maxcon
+        nb, nv, row, con = m.nb, m.nv, m.maxrow, m.maxcon
         real, number = wp.float64, wp.int32
         sizes: dict[str, tuple[Any, int]] = {
-            "xpos": (vec3, nb), "xmat": (mat33, nb), "motion": (vec6, nv), "velocity": (vec6, nb), "bias": (vec6, nb),
-            "inertia": (vec10, nb), "composite": (vec10, nb), "force": (vec6, nb), "mass": (real, nh),
-            "load": (real, nv), "step": (real, nv), "product": (real, nv), "work": (real, nv), "row_kind": (number, row),
-            "row_index": (number, row), "row_dof": (number, 3 * row), "row_coef": (vec3, row), "row_x": (real, row),
-            "row_aref": (real, row), "row_d": (real, row), "row_loss": (real, row), "row_jar": (real, row),
-            "row_dir": (real, row), "con_pair": (number, con), "con_which": (number, con), "con_dist": (real, con),
-            "con_point": (vec3, con), "con_frame": (mat33, con), "con_hint": (vec3, con), "con_d": (real, con),
-            "con_aref": (vec6, con), "con_jar": (vec6, con), "con_dir": (vec6, con), "con_jac": (vec6, con * nv),
+            "xpos": (vec3, nb), "xmat": (mat33, nb), "motion": (vec6, nv), "mass": (real, m.nh),
+            "row_dof": (number, 3 * row), "row_coef": (vec3, row), "con_jac": (vec6, con * nv),
+            "con_point": (vec3, con), "con_frame": (mat33, con), "con_hint": (vec3, con),
         }  # fmt: skip
-        backward: dict[str, tuple[Any, int]] = {
-            "total": (vec6, nb), "dual": (vec6, nb), "f_velocity": (vec6, nb), "f_accel": (vec6, nb),
-            "f_total": (vec6, nb), "f_dual": (vec6, nb), "f_pose": (vec6, nb), "lam": (real, nv), "qacc": (real, nv), "qd": (real, nv), "tangent": (real, nv),
-            "vel_bar": (real, nv), "acc_bar": (real, nv), "stage_vel_bar": (real, 4 * nv),
-            "stage_acc_bar": (real, 4 * nv), "stage_rate_bar": (real, 4 * nv), "pos_bar": (real, nv), "rate_bar": (real, nv), "pos_bar0": (real, nv),
-            "grad": (real, self.size),
-        }  # fmt: skip
-        for name, (dtype, width) in {**sizes, **(backward if adjoint else {})}.items():
+        sizes |= dict.fromkeys(("velocity", "bias", "force"), (vec6, nb))
+        sizes |= dict.fromkeys(("inertia", "composite"), (vec10, nb))
+        sizes |= dict.fromkeys(("load", "step", "product", "work"), (real, nv))
+        sizes |= dict.fromkeys(("row_kind", "row_index"), (number, row))
+        sizes |= dict.fromkeys(("row_x", "row_aref", "row_d", "row_loss", "row_jar", "row_dir"), (real, row))
+        sizes |= dict.fromkeys(("con_pair", "con_which"), (number, con))
+        sizes |= dict.fromkeys(("con_dist", "con_d"), (real, con))
+        sizes |= dict.fromkeys(("con_aref", "con_jar", "con_dir"), (vec6, con))
+        if adjoint:
+            forces = ("f_velocity", "f_accel", "f_total", "f_dual", "f_pose")
+            sizes |= dict.fromkeys(("total", "dual", *forces), (vec6, nb))
+            ends = ("pos_bar", "rate_bar", "pos_bar0")
+            sizes |= dict.fromkeys(("lam", "qacc", "qd", "tangent", "vel_bar", "acc_bar", *ends), (real, nv))
+            sizes |= dict.fromkeys(("stage_vel_bar", "stage_acc_bar", "stage_rate_bar"), (real, 4 * nv))
+            sizes["grad"] = (real, self.size)
+        for name, (dtype, width) in sizes.items():
             # a gap between slots, so that no two threads write one cache line
             array = wp.empty((slots, max(width, 1) + 16), dtype=dtype, device=self.device)
             setattr(scratch, name, array[:, : max(width, 1)])
@@ -284,7 +286,7 @@ class Simulate(torch.autograd.Function):
     """``(θ, states, controls) → states after each logged step``, with the adjoint kernels as its backward."""
 
     @staticmethod
-    def forward(  # type: ignore[override]
+    def forward(
         ctx: Any, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor, engine: Engine
     ) -> torch.Tensor:
         """Return ``(T, K, lag, nq + nv)`` of θ ``(K, P)``, states ``(T, nq + nv)`` and controls ``(T, lag, nu)``."""
@@ -298,7 +300,7 @@ class Simulate(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, out_bar: torch.Tensor) -> tuple[torch.Tensor | None, ...]:  # type: ignore[override]
+    def backward(ctx: Any, out_bar: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Return the adjoints of the inputs."""
         theta, states, controls = ctx.saved_tensors
         flat = _flat(out_bar).contiguous()

@@ -1,5 +1,8 @@
 """Drag of the inertia box (``opt.density``, ``opt.viscosity``, ``opt.wind``): one body, and its adjoint leaf."""
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp
@@ -51,12 +54,12 @@ def box_torque(w: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec
 
 
 @wp.func
-def box_power(
-    w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density: f64, viscosity: f64
-) -> f64:
+def box_power(w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> f64:
     """−(force · lv + torque · lw): what drag adds to λᵀR, all in the inertial frame."""
-    return ZERO - wp.dot(box_force(v, x, mass, density, viscosity), lv) - wp.dot(
-        box_torque(w, x, mass, density, viscosity), lw
+    return (
+        ZERO
+        - wp.dot(box_force(v, x, mass, density, viscosity), lv)
+        - wp.dot(box_torque(w, x, mass, density, viscosity), lw)
     )
 
 

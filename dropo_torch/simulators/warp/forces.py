@@ -4,6 +4,9 @@ Every ``..._adjoint`` adds the derivatives of −λ·τ to the adjoints of posit
 control and θ.
 """
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp
@@ -11,7 +14,6 @@ import warp as wp
 from dropo_torch.simulators.warp.spatial import inverse_right_jacobian_t, quat_log, quat_mul
 from dropo_torch.simulators.warp.types import (
     BALL,
-    HINGE,
     MINVAL,
     SLIDE,
     THREE,
@@ -55,7 +57,7 @@ def add_springs(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: int):
             d = m.link_dof[k]
             x = spring_deflection(m, th, qpos, r, k)
             kind = m.link_kind[k]
-            if kind == HINGE or kind == SLIDE:
+            if kind <= SLIDE:
                 s.load[t, d] += x[0] * (stiff + x[0] * (p0 + x[0] * p1))
             else:
                 n = wp.length(x)
@@ -76,15 +78,15 @@ def springs_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: i
         d = m.link_dof[k]
         x = spring_deflection(m, th, qpos, r, k)
         kind = m.link_kind[k]
-        if kind == HINGE or kind == SLIDE:
+        if kind <= SLIDE:
             y = x[0]
-            l = s.lam[t, d]
-            slope = l * (stiff + y * (TWO * p0 + y * THREE * p1))
+            jl = s.lam[t, d]
+            slope = jl * (stiff + y * (TWO * p0 + y * THREE * p1))
             s.tangent[t, d] += slope
             s.grad[t, m.o_spring + m.link_qpos[k]] -= slope
-            s.grad[t, m.o_stiffness + j] += l * y
-            s.grad[t, ip] += l * y * y
-            s.grad[t, ip + 1] += l * y * y * y
+            s.grad[t, m.o_stiffness + j] += jl * y
+            s.grad[t, ip] += jl * y * y
+            s.grad[t, ip + 1] += jl * y * y * y
         else:
             lam = vec3(s.lam[t, d], s.lam[t, d + 1], s.lam[t, d + 2])
             n = wp.length(x)
@@ -129,12 +131,12 @@ def dampers_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: i
     for i in range(m.nv):
         v = qvel[r, i]
         n = wp.abs(v)
-        l = s.lam[t, i]
+        jl = s.lam[t, i]
         ip = m.o_dampingpoly + 2 * i
-        s.vel_bar[t, i] += l * damping_slope(m, th, v, i)
-        s.grad[t, m.o_damping + i] += l * v
-        s.grad[t, ip] += l * v * n
-        s.grad[t, ip + 1] += l * v * n * n
+        s.vel_bar[t, i] += jl * damping_slope(m, th, v, i)
+        s.grad[t, m.o_damping + i] += jl * v
+        s.grad[t, ip] += jl * v * n
+        s.grad[t, ip + 1] += jl * v * n * n
 
 
 @wp.func(inline=True)
@@ -149,7 +151,7 @@ def control(m: Tables, th: Reals, ctrl: Reals2, w: int, i: int) -> f64:
 
 @wp.func(inline=True)
 def actuator_force(m: Tables, th: Reals, i: int, u: f64, length: f64, rate: f64) -> f64:
-    """gain(l, l̇) u + bias(l, l̇), before the force range."""
+    """gain(jl, jl̇) u + bias(jl, jl̇), before the force range."""
     og = m.o_gain + 3 * i
     ob = m.o_bias + 3 * i
     gain = th[og]
@@ -180,7 +182,7 @@ def add_actuators(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: 
             s.load[t, d] -= gear * f
     if m.has_frclimit != 0:
         for j in range(m.nlink):
-            if m.link_kind[j] == HINGE or m.link_kind[j] == SLIDE:
+            if m.link_kind[j] <= SLIDE:
                 d = m.link_dof[j]
                 f = s.work[t, d]
                 if m.link_frclimited[j] != 0:
@@ -191,7 +193,17 @@ def add_actuators(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: 
 
 @wp.func(inline=True)
 def actuators_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, w: int, ctrl_bar: Reals2, wb: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    r: int,
+    ctrl: Reals2,
+    w: int,
+    ctrl_bar: Reals2,
+    wb: int,
 ):
     """Adjoint of :func:`add_actuators`; ``s.work`` holds ∂(−λτ)/∂τ after the joints' clamps."""
     for i in range(m.nv):

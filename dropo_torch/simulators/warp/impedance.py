@@ -1,5 +1,8 @@
 """MuJoCo's soft constraint: impedance, reference acceleration, regularisation. Pure functions, safe for ``wp.grad``."""
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp

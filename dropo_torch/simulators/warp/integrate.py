@@ -1,5 +1,9 @@
 """The integrators Euler (implicit in damping), implicitfast and RK4, and their adjoints."""
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
@@ -7,7 +11,15 @@ import warp as wp
 from dropo_torch.simulators.warp.forces import actuator_force, control, damping_slope
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
 from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
-from dropo_torch.simulators.warp.spatial import chart_rate, chart_rate_dual, nothing, quat_integrate, quat_mul, right_jacobian_t, turn
+from dropo_torch.simulators.warp.spatial import (
+    chart_rate,
+    chart_rate_dual,
+    nothing,
+    quat_integrate,
+    quat_mul,
+    right_jacobian_t,
+    turn,
+)
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
 from dropo_torch.simulators.warp.types import (
     BALL,
@@ -98,7 +110,7 @@ def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
 
 @wp.func(inline=True)
 def chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: f64, qvel: Reals2, o: int):
-    """Adjoint of :func:`chart_rates`: from ``s.stage_rate_bar[o:]`` to ``s.vel_bar`` and the rates of the stage before."""
+    """Adjoint of :func:`chart_rates`: ``s.stage_rate_bar[o:]`` to ``s.vel_bar`` and the stage before."""
     _late = wp.grad(nothing)(ONE)
     for k in range(m.nlink):
         d = m.link_dof[k]
@@ -133,9 +145,7 @@ def good(m: Tables, qpos: Reals2, qvel: Reals2, r: int) -> int:
 
 
 @wp.func(inline=True)
-def implicit_slope(
-    m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, i: int
-) -> f64:
+def implicit_slope(m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, i: int) -> f64:
     """B of dof ``i``: −∂τ/∂q̇ that the integrator takes implicitly."""
     b = ZERO
     if m.has_damper != 0:
@@ -148,9 +158,7 @@ def implicit_slope(
 
 
 @wp.func(inline=True)
-def actuator_slope(
-    m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, a: int
-) -> f64:
+def actuator_slope(m: Tables, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, rc: int, a: int) -> f64:
     """gear² (bias_v + gain_v u), or zero where the force is clamped."""
     gear = th[m.o_gear + a]
     u = control(m, th, ctrl, rc, a)
@@ -169,8 +177,18 @@ def actuator_slope(
 
 @wp.func(inline=True)
 def soften(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, soft: Reals2, hess: Reals2,
-    r: int, ctrl: Reals2, rc: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    acc: Reals2,
+    soft: Reals2,
+    hess: Reals2,
+    r: int,
+    ctrl: Reals2,
+    rc: int,
 ):
     """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``hess[r]``."""
     mass_mul(m, s, t, acc, r, soft, r)
@@ -184,8 +202,18 @@ def soften(
 
 @wp.func(inline=True)
 def slope_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, soft: Reals2, r: int, ctrl: Reals2,
-    rc: int, ctrl_bar: Reals2, rb: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    soft: Reals2,
+    r: int,
+    ctrl: Reals2,
+    rc: int,
+    ctrl_bar: Reals2,
+    rb: int,
 ):
     """The part of B in the adjoint of :func:`soften`: the gradient of −h λᵀ B a', into ``s.stage_vel_bar`` and θ."""
     if m.has_damper != 0:
@@ -205,8 +233,19 @@ def slope_adjoint(
 
 @wp.func(inline=True)
 def _actuator_slope_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, soft: Reals2, r: int, ctrl: Reals2,
-    rc: int, ctrl_bar: Reals2, rb: int, a: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    soft: Reals2,
+    r: int,
+    ctrl: Reals2,
+    rc: int,
+    ctrl_bar: Reals2,
+    rb: int,
+    a: int,
 ):
     """Adjoint of the actuators' part of B (which does not see the position)."""
     slope = actuator_slope(m, th, qpos, qvel, r, ctrl, rc, a)
@@ -233,8 +272,22 @@ def _actuator_slope_adjoint(
 
 @wp.func(inline=True)
 def step(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
-    hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    rate: Reals2,
+    acc: Reals2,
+    soft: Reals2,
+    hess: Reals2,
+    soft_hess: Reals2,
+    held: Ints,
+    r: int,
+    nxt: int,
+    ctrl: Reals2,
+    rc: int,
 ) -> int:
     """One physics step from row ``r`` (stages in the rows after it) to row ``nxt``; 1 while it is good."""
     h = m.h
@@ -284,8 +337,24 @@ def step(
 
 @wp.func(inline=True)
 def step_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, rate: Reals2, acc: Reals2, soft: Reals2,
-    hess: Reals2, soft_hess: Reals2, held: Ints, r: int, nxt: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    rate: Reals2,
+    acc: Reals2,
+    soft: Reals2,
+    hess: Reals2,
+    soft_hess: Reals2,
+    held: Ints,
+    r: int,
+    nxt: int,
+    ctrl: Reals2,
+    rc: int,
+    ctrl_bar: Reals2,
+    rb: int,
 ):
     """Adjoint of :func:`step`: ``s.pos_bar`` (tangent) and ``s.rate_bar`` of the end become those of the start."""
     _late = wp.grad(nothing)(ONE)

@@ -1,5 +1,8 @@
 """The kernels of the adjoint: one thread a world, its physics steps from last to first, then the sums over worlds."""
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp
@@ -25,7 +28,8 @@ from dropo_torch.simulators.warp.types import (
     vec6,
 )
 
-wp.set_module_options({"enable_backward": False})
+# LLVM's own thresholds: what must be inlined says so, and more makes this kernel slower
+wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
 
 
 @wp.kernel(enable_backward=False)
@@ -81,7 +85,8 @@ def adjoint_kernel(
             for k in range(skip):
                 r = end - (k + 1) * m.nstage
                 step_adjoint(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, rows.held, r,
+                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess,
+                    rows.soft_hess, rows.held, r,
                     r + m.nstage, controls, tr * lag + logged, control_bar, row,
                 )  # fmt: skip
     from_tangent(m, rows.qpos, base, s.pos_bar, t, state_bar, i)

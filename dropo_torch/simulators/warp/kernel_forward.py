@@ -1,5 +1,9 @@
 """The kernel that simulates: one thread a world, all its physics steps."""
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
@@ -56,7 +60,8 @@ def simulate_kernel(
             nxt = base + ((n + 1) % period) * m.nstage
             if ok != 0:
                 ok = step(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess, rows.soft_hess, rows.held, r, nxt,
+                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess,
+                    rows.soft_hess, rows.held, r, nxt,
                     controls, tr * lag + step_of,
                 )  # fmt: skip
             n += 1
@@ -66,9 +71,6 @@ def simulate_kernel(
         for j in range(m.nq + m.nv):
             y = f64(wp.nan)
             if ok != 0:
-                if j < m.nq:
-                    y = rows.qpos[r, j]
-                else:
-                    y = rows.qvel[r, j - m.nq]
+                y = rows.qpos[r, j] if j < m.nq else rows.qvel[r, j - m.nq]
             out[i * lag + step_of, j] = y
     alive[i] = ok

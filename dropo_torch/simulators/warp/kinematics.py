@@ -4,6 +4,9 @@ All spatial vectors are in world axes about one origin that travels with the fir
 from the world's origin loses no digits; no result depends on where that origin is.
 """
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp
@@ -160,4 +163,3 @@ def sweep_in(m: Tables, s: Scratch, t: int, th: Reals):
             while j >= 0:
                 s.mass[t, row + j] = wp.dot(s.motion[t, j], g)
                 j = m.dof_parent[0, j]
-

@@ -4,6 +4,10 @@ A row has at most three dofs. Its force f minimises MuJoCo's cost at J a − are
 (limit) or Huber's (friction loss).
 """
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
@@ -74,15 +78,24 @@ def row_state(kind: int, jar: f64, d: f64, loss: f64) -> int:
 
 @wp.func
 def row_power(
-    kind: int, u: f64, v: f64, l: f64, x: f64, solref: vec2, solimp: vec5, invweight: f64, loss: f64, h: f64,
+    kind: int,
+    u: f64,
+    v: f64,
+    jl: f64,
+    x: f64,
+    solref: vec2,
+    solimp: vec5,
+    invweight: f64,
+    loss: f64,
+    h: f64,
     refsafe: int,
 ) -> f64:
-    """−f (Jλ) of a row with J a = u, J q̇ = v, J λ = l: the leaf whose gradient the adjoint takes."""
+    """−f (Jλ) of a row with J a = u, J q̇ = v, J λ = jl: the leaf whose gradient the adjoint takes."""
     imp = impedance(x, solimp)
     aref = -damping(solref, solimp, h, refsafe) * v
     if kind != ROW_FRICTION:
         aref -= stiffness(solref, solimp, h, refsafe) * imp * x
-    return -row_force(kind, u - aref, ONE / regularisation(imp, invweight), loss) * l
+    return -row_force(kind, u - aref, ONE / regularisation(imp, invweight), loss) * jl
 
 
 @wp.func(inline=True)
@@ -215,9 +228,7 @@ def row_add(s: Scratch, t: int, n: int, y: f64, x: Reals2, r: int):
 
 
 @wp.func(inline=True)
-def rows_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, nrow: int
-):
+def rows_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, nrow: int):
     """Adjoint of the rows: the gradient of Σ −f Jλ, with J where it moves."""
     for n in range(nrow):
         kind = s.row_kind[t, n]
@@ -226,7 +237,7 @@ def rows_adjoint(
         d2 = s.row_dof[t, 3 * n + 1]
         u = row_dot(s, t, n, acc, r)
         v = row_dot(s, t, n, qvel, r)
-        l = row_dot(s, t, n, s.lam, t)
+        jl = row_dot(s, t, n, s.lam, t)
         o_ref = m.o_dof_solref + 2 * d
         o_imp = m.o_dof_solimp + 5 * d
         w = th[m.o_dof_invweight + d]
@@ -240,7 +251,7 @@ def rows_adjoint(
             if d2 >= 0:
                 w += th[m.o_dof_invweight + d2]
         _kind, ubar, vbar, lbar, xbar, refbar, impbar, wbar, lossbar, _h, _safe = wp.grad(row_power)(
-            kind, u, v, l, s.row_x[t, n], theta_vec2(th, o_ref), theta_vec5(th, o_imp), w, s.row_loss[t, n], m.h,
+            kind, u, v, jl, s.row_x[t, n], theta_vec2(th, o_ref), theta_vec5(th, o_imp), w, s.row_loss[t, n], m.h,
             m.refsafe,
         )  # fmt: skip
         row_add(s, t, n, vbar, s.vel_bar, t)
@@ -261,8 +272,19 @@ def rows_adjoint(
 
 @wp.func(inline=True)
 def _limit_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, n: int, xbar: f64,
-    ubar: f64, vbar: f64, lbar: f64,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    acc: Reals2,
+    r: int,
+    n: int,
+    xbar: f64,
+    ubar: f64,
+    vbar: f64,
+    lbar: f64,
 ):
     """Where a limit's position and axis come from."""
     k = m.limit_link[s.row_index[t, n]]
@@ -300,8 +322,19 @@ def _limit_adjoint(
 
 @wp.func(inline=True)
 def _equality_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, n: int, xbar: f64,
-    ubar: f64, vbar: f64, lbar: f64,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    acc: Reals2,
+    r: int,
+    n: int,
+    xbar: f64,
+    ubar: f64,
+    vbar: f64,
+    lbar: f64,
 ):
     """Where an equality's position and slope come from."""
     e = s.row_index[t, n]

@@ -4,14 +4,18 @@ Minimises ½ aᵀMa + aᵀ(c − τ) + Σ s(J a − aref). With pyramidal cones 
 step that stays on one piece is exact, so the iteration ends after finitely many.
 """
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
 
 from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_piece
+from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.rows import row_add, row_dot, row_force, row_state
 from dropo_torch.simulators.warp.types import ONE, ZERO, Reals, Reals2, Scratch, Tables, f64, mat33, vec3, vec6
-from dropo_torch.simulators.warp.kinematics import packed
 
 ITERATIONS = wp.constant(60)
 LINE_STEPS = wp.constant(50)
@@ -214,10 +218,7 @@ def _line_search(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int,
             high = alpha
         nxt = alpha - d1 / d2
         if nxt <= low or (high > ZERO and nxt >= high):
-            if high > ZERO:
-                nxt = f64(0.5) * (low + high)
-            else:
-                nxt = f64(2.0) * alpha
+            nxt = f64(0.5) * (low + high) if high > ZERO else f64(2.0) * alpha
         if nxt == alpha:
             break
         alpha = nxt

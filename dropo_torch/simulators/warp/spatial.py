@@ -1,5 +1,8 @@
 """Spatial algebra on ``vec6`` (angular first) and rigid rotations, as pure Warp functions."""
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 import warp as wp

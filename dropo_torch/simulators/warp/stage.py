@@ -5,6 +5,10 @@ H = ∂R/∂a, then the gradient of λᵀR, in which λ and a stand fixed. That 
 constraints of quantities carried outwards, so its gradient needs one sweep inwards and no solver.
 """
 
+# mypy: ignore-errors
+# ruff: noqa: UP018
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
 from __future__ import annotations
 
 import warp as wp
@@ -37,7 +41,6 @@ from dropo_torch.simulators.warp.types import (
     BALL,
     ONE,
     TRANSLATION,
-    ZERO,
     Ints,
     Reals,
     Reals2,
@@ -50,8 +53,18 @@ from dropo_torch.simulators.warp.types import (
 
 @wp.func(inline=True)
 def accelerate(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2,
-    held: Ints, r: int, ctrl: Reals2, rc: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    acc: Reals2,
+    hess: Reals2,
+    held: Ints,
+    r: int,
+    ctrl: Reals2,
+    rc: int,
 ):
     """Acceleration of the state in row ``r``, from the guess in ``acc[r]``; leaves the factor of H in ``hess[r]``."""
     sweep_out(m, s, t, th, qpos, qvel, r)
@@ -79,8 +92,22 @@ def accelerate(
 
 @wp.func(inline=True)
 def accelerate_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, hess: Reals2,
-    soft_hess: Reals2, held: Ints, r: int, ctrl: Reals2, rc: int, ctrl_bar: Reals2, rb: int, softening: int,
+    m: Tables,
+    s: Scratch,
+    t: int,
+    th: Reals,
+    qpos: Reals2,
+    qvel: Reals2,
+    acc: Reals2,
+    hess: Reals2,
+    soft_hess: Reals2,
+    held: Ints,
+    r: int,
+    ctrl: Reals2,
+    rc: int,
+    ctrl_bar: Reals2,
+    rb: int,
+    softening: int,
 ):
     """Adjoint of :func:`accelerate`: adds to ``s.tangent``, ``s.vel_bar``, controls and θ.
 
@@ -91,23 +118,19 @@ def accelerate_adjoint(
     _late = wp.grad(nothing)(ONE)
     nrow = int(0)
     ncon = int(0)
-    dense = int(0)
     if softening != 0:
         for b in range(m.nb):
             s.velocity[t, b] = vec6()
             s.bias[t, b] = vec6()
-        for i in range(m.nh):
-            s.mass[t, i] = soft_hess[r, i]
+        solve(m, 0, soft_hess, r, s.lam, t)
     else:
         if held[r] > 0:
             nrow = make_rows(m, s, t, th, qpos, qvel, r)
             ncon = find_contacts(m, s, t, th)
-            dense = fills_in(m, s, t, ncon)
-        for i in range(m.nh):
-            s.mass[t, i] = hess[r, i]
-    solve(m, dense, s.mass, t, s.lam, t)
+        solve(m, fills_in(m, s, t, ncon), hess, r, s.lam, t)
     carry_out(m, s, t)
-    bodies_adjoint(m, s, t, th, 1 - softening)
+    posed = ncon + m.has_gravcomp + m.has_fluid
+    bodies_adjoint(m, s, t, th, 1 - softening, posed)
     for i in range(m.nv):
         s.grad[t, m.o_armature + i] += s.lam[t, i] * s.qacc[t, i]
     if softening == 0:
@@ -118,7 +141,7 @@ def accelerate_adjoint(
         actuators_adjoint(m, s, t, th, qpos, qvel, r, ctrl, rc, ctrl_bar, rb)
         rows_adjoint(m, s, t, th, qpos, qvel, acc, r, nrow)
         contacts_adjoint(m, s, t, th, ncon)
-    carry_in(m, s, t, ncon)
+    carry_in(m, s, t, posed)
     if softening == 0:
         for i in range(3):
             s.grad[t, m.o_gravity + i] -= s.f_accel[t, 0][3 + i]
@@ -132,19 +155,19 @@ def carry_out(m: Tables, s: Scratch, t: int):
     for b in range(1, m.nb):
         p = m.body_parent[b]
         u = s.total[t, p]
-        l = s.dual[t, p]
+        dual = s.dual[t, p]
         first = m.body_dof[b]
         for i in range(first, first + m.body_ndof[b]):
             sd = s.motion[t, i]
             u += sd * s.qacc[t, i]
-            l += sd * s.lam[t, i]
+            dual += sd * s.lam[t, i]
         s.total[t, b] = u
-        s.dual[t, b] = l
+        s.dual[t, b] = dual
         s.bias[t, b] = s.bias[t, b] + u
 
 
 @wp.func(inline=True)
-def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
+def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int, posed: int):
     """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
 
     ``moving`` 0 leaves out V, gravity compensation and drag: the adjoint of λᵀ M a alone.
@@ -153,22 +176,23 @@ def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
     zero = vec6()
     s.f_velocity[t, 0] = zero
     s.f_accel[t, 0] = zero
-    s.f_total[t, 0] = zero
     s.f_dual[t, 0] = zero
-    s.f_pose[t, 0] = zero
+    if posed != 0:
+        for b in range(m.nb):
+            s.f_total[t, b] = zero
+            s.f_pose[t, b] = zero
     for b in range(1, m.nb):
-        s.f_total[t, b] = zero
-        s.f_pose[t, b] = zero
-        s.f_velocity[t, b] = zero
-        s.f_accel[t, b] = zero
-        s.f_dual[t, b] = zero
+        if m.body_massive[b] == 0:
+            s.f_velocity[t, b] = zero
+            s.f_accel[t, b] = zero
+            s.f_dual[t, b] = zero
         if m.body_massive[b] != 0:
             i = s.inertia[t, b]
-            l = s.dual[t, b]
+            dual = s.dual[t, b]
             v = s.velocity[t, b]
             a = s.bias[t, b]
-            fa = inertia_mul(i, l)
-            lv = cross_motion(l, v)
+            fa = inertia_mul(i, dual)
+            lv = cross_motion(dual, v)
             if moving != 0:
                 if m.has_gravcomp != 0:
                     gc = th[m.o_gravcomp + b]
@@ -179,20 +203,20 @@ def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int):
                     for k in range(3):
                         s.grad[t, m.o_gravity + k] += gc * fa[3 + k]
                 iv = inertia_mul(i, v)
-                s.f_velocity[t, b] = inertia_mul(i, lv) - cross_force(l, iv)
+                s.f_velocity[t, b] = inertia_mul(i, lv) - cross_force(dual, iv)
                 s.f_dual[t, b] = inertia_mul(i, a) + cross_force(v, iv)
             else:
+                s.f_velocity[t, b] = zero
                 s.f_dual[t, b] = inertia_mul(i, a)
             s.f_accel[t, b] = fa
-            _inertia_adjoint(m, s, t, th, b, l, a, lv, v)
+            if m.want_inertial != 0:
+                _inertia_adjoint(m, s, t, th, b, dual, a, lv, v)
             if moving != 0 and m.has_fluid != 0:
-                _fluid_adjoint(m, s, t, th, b, l, v)
+                _fluid_adjoint(m, s, t, th, b, dual, v)
 
 
 @wp.func(inline=True)
-def _inertia_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, b: int, x: vec6, y: vec6, z: vec6, v: vec6
-):
+def _inertia_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, x: vec6, y: vec6, z: vec6, v: vec6):
     """Gradient of ⟨x, I y⟩ + ⟨z, I v⟩ in mass, moments and centre of mass."""
     rot = s.xmat[t, b]
     c = centre_of_mass(m, s, t, th, b)
@@ -217,7 +241,7 @@ def _inertia_adjoint(
 
 
 @wp.func(inline=True)
-def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v: vec6):
+def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, dual: vec6, v: vec6):
     """Gradient of −λ · (drag on the body)."""
     rot = inertial_frame(m, s, t, b)
     back = wp.transpose(rot)
@@ -225,7 +249,7 @@ def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v:
     wind = theta_vec3(th, m.o_wind)
     x = theta_vec3(th, m.o_inertia + 3 * b)
     wbar, vbar, lwbar, lvbar, xbar, massbar, denbar, visbar = wp.grad(box_power)(
-        back * ang(v), back * (at(v, c) - wind), back * ang(l), back * at(l, c), x, th[m.o_mass + b],
+        back * ang(v), back * (at(v, c) - wind), back * ang(dual), back * at(dual, c), x, th[m.o_mass + b],
         th[m.o_density], th[m.o_viscosity],
     )  # fmt: skip
     fv = rot * vbar
@@ -233,7 +257,7 @@ def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v:
     s.f_velocity[t, b] = s.f_velocity[t, b] + wrench(fv, c) + join(rot * wbar, vec3())
     s.f_dual[t, b] = s.f_dual[t, b] + wrench(fl, c) + join(rot * lwbar, vec3())
     s.f_pose[t, b] = s.f_pose[t, b] - join(wp.cross(fv, wind), vec3())
-    cbar = wp.transpose(s.xmat[t, b]) * (wp.cross(fv, ang(v)) + wp.cross(fl, ang(l)))
+    cbar = wp.transpose(s.xmat[t, b]) * (wp.cross(fv, ang(v)) + wp.cross(fl, ang(dual)))
     s.grad[t, m.o_mass + b] += massbar
     s.grad[t, m.o_density] += denbar
     s.grad[t, m.o_viscosity] += visbar
@@ -244,25 +268,28 @@ def _fluid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, b: int, l: vec6, v:
 
 
 @wp.func(inline=True)
-def carry_in(m: Tables, s: Scratch, t: int, touching: int):
+def carry_in(m: Tables, s: Scratch, t: int, posed: int):
     """Adjoints of positions and velocities, from the leaves to the root.
 
     In a frame that is displaced along s with everything beyond the joint, only what comes from before the joint
     moves: each of V, A, U, Λ there by X × s. So L_q = Σ_X F_X · (X × s) + Y · s and L_v = F_V · s + F_A · (V × s),
-    X before the joint, with F_V += v s ×* F_A between the two. ``touching`` 0 says that U was given no F.
+    X before the joint, with F_V += v s ×* F_A between the two. ``posed`` 0 says that there is no F_U and no Y.
     """
     for reverse in range(1, m.nb):
         b = m.nb - reverse
         p = m.body_parent[b]
         fv = s.f_velocity[t, b]
         fa = s.f_accel[t, b]
-        fu = s.f_total[t, b]
         fl = s.f_dual[t, b]
-        fy = s.f_pose[t, b]
+        fu = vec6()
+        fy = vec6()
+        if posed != 0:
+            fu = s.f_total[t, b]
+            fy = s.f_pose[t, b]
         v = s.velocity[t, b]
         a = s.bias[t, b]
         u = s.total[t, b]
-        l = s.dual[t, b]
+        dual = s.dual[t, b]
         first = m.body_link[b]
         count = m.body_nlink[b]
         for step in range(count):
@@ -281,22 +308,21 @@ def carry_in(m: Tables, s: Scratch, t: int, touching: int):
                 sl += sd * s.lam[t, i]
             v = v - sv
             u = u - sa
-            l = l - sl
+            dual = dual - sl
             a = a - sa - cross_motion(v, sv)
             # F_A · (V × s) = −s · V ×* F_A
             g = fv - cross_force(v, fa)
             fv = fv + cross_force(sv, fa)
             # Σ F_X · (X × s) = −s · Σ X ×* F_X
-            y = fy - cross_force(v, fv) - cross_force(a, fa) - cross_force(l, fl)
-            if touching != 0:
+            y = fy - cross_force(v, fv) - cross_force(a, fa) - cross_force(dual, fl)
+            if posed != 0:
                 y = y - cross_force(u, fu)
             for i in range(d, d + n):
                 s.vel_bar[t, i] += wp.dot(s.motion[t, i], g)
                 s.tangent[t, i] += wp.dot(s.motion[t, i], y)
         s.f_velocity[t, p] = s.f_velocity[t, p] + fv
         s.f_accel[t, p] = s.f_accel[t, p] + fa
-        if touching != 0:
+        if posed != 0:
             s.f_total[t, p] = s.f_total[t, p] + fu
+            s.f_pose[t, p] = s.f_pose[t, p] + fy
         s.f_dual[t, p] = s.f_dual[t, p] + fl
-        s.f_pose[t, p] = s.f_pose[t, p] + fy
-

@@ -107,9 +107,8 @@ def _structure(model: mujoco.MjModel) -> Iterator[str]:
         )  # fmt: skip
         if acts:
             yield f"tendon {model.tendon(i).name or i!r}"
-    fluid = model.geom_fluid.reshape(model.ngeom, -1)
-    for i in np.flatnonzero(fluid[:, 0] > 0):
-        yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[i]!r}"
+    for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
+        yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[g]!r}"
     for i in range(1, model.nbody):
         moving = model.body_weldid[i] != 0
         if moving and model.body_gravcomp[i] and _actgravcomp(model, i):
@@ -122,7 +121,7 @@ def _actgravcomp(model: mujoco.MjModel, body: int) -> bool:
         first, count = model.body_jntadr[body], model.body_jntnum[body]
         if count and model.jnt_actgravcomp[first : first + count].any():
             return True
-        body = model.body_parentid[body]
+        body = int(model.body_parentid[body])
     return False
 
 

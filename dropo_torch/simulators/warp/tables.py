@@ -82,7 +82,8 @@ def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
     moving = model.body_weldid != 0
     return {
         "nb": model.nbody, "nv": model.nv, "nq": model.nq, "nh": model.nv * (model.nv + 1) // 2,
-        "body_parent": model.body_parentid, "body_dof": np.maximum(model.body_dofadr, 0), "body_ndof": model.body_dofnum,
+        "body_parent": model.body_parentid, "body_ndof": model.body_dofnum,
+        "body_dof": np.maximum(model.body_dofadr, 0),
         "body_lastdof": last, "body_massive": moving.astype(np.int32), "body_pos": pos, "body_mat": _matrices(quat),
         "body_imat": _matrices(model.body_iquat), "dof_body": model.dof_bodyid,
         "dof_parent": np.stack([model.dof_parentid, np.arange(model.nv) - 1]),
@@ -210,7 +211,9 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
     fluid = acts("opt.density", np.array(model.opt.density)) or acts("opt.viscosity", np.array(model.opt.viscosity))
     implicit = integrator == 2 or (integrator == 0 and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP))
     return {
-        "want_inertia": int(bool(_targets(space, "body_inertia"))), "want_ipos": int(bool(_targets(space, "body_ipos"))),
+        "want_inertial": int(any(_targets(space, f) for f in ("body_mass", "body_inertia", "body_ipos"))),
+        "want_inertia": int(bool(_targets(space, "body_inertia"))),
+        "want_ipos": int(bool(_targets(space, "body_ipos"))),
         "integrator": integrator, "nstage": 4 if integrator == 1 else 1, "h": model.opt.timestep,
         "impratio": max(model.opt.impratio, 1e-15), "elliptic": int(model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC),
         "refsafe": int(not _disabled(model, _DISABLE.mjDSBL_REFSAFE)), "implicit": int(implicit),

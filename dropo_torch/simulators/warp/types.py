@@ -4,6 +4,9 @@ A model is two things: integer tables and fixed geometry (:class:`Tables`, share
 vector θ of real parameters per world, whose sections start at the ``o_...`` offsets in the tables.
 """
 
+# mypy: ignore-errors
+# kernel code: Warp reads these functions with types of its own
+
 from __future__ import annotations
 
 from typing import Any
@@ -86,7 +89,8 @@ class Tables:
     has_gravcomp: wp.int32
     has_fluid: wp.int32
     has_frclimit: wp.int32
-    want_inertia: wp.int32  # gradients wanted of body_inertia, of body_ipos
+    want_inertial: wp.int32  # gradients wanted of mass, body_inertia or body_ipos; of the second; of the third
+    want_inertia: wp.int32
     want_ipos: wp.int32
     maxcon: wp.int32
     maxrow: wp.int32
