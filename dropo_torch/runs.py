@@ -154,6 +154,9 @@ def _prepare(out: Path, problem: Problem, *, resume: bool) -> None:
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise InputError(f"--out: cannot write to folder {out}: {error.strerror}") from None
+    for name in _RESULTS:
+        for stale in out.glob(f".{name}.*.tmp"):  # a write that kill -9 cut short
+            stale.unlink()
     present = [name for name in _RESULTS if (out / name).exists()]
     source = problem.model_path
     if source is not None and source.name in present and source.resolve() == (out / source.name).resolve():

@@ -1,0 +1,106 @@
+"""Run a fit whole, then again and again with kills until it is done: ``killed.py CONFIG OUT KILLS SEED``.
+
+Every attempt is a process of its own, forked where all is imported. A kill falls at a seeded moment of the
+attempt's run time, or around a seeded write of the checkpoint: just before or just after the temporary file
+takes the checkpoint's name. The last line of the output tells, as JSON, what happened.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+from dropo_torch.cli import main
+
+RESULTS = ("distribution.yaml", "model.xml", "fitted_config.yaml")
+
+
+def attempt(config: str, out: Path, plan: dict[str, Any] | None) -> tuple[int, str]:
+    """Run ``dropo fit --resume`` in a child that the plan kills; return its exit code and stderr."""
+    with tempfile.TemporaryFile("w+") as errors:
+        child = os.fork()
+        if child == 0:
+            os.dup2(errors.fileno(), 2)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+            if plan is not None and "write" in plan:
+                die_at_write(plan)
+            os._exit(main(["fit", config, "--out", str(out), "--resume"]))
+        timer = None
+        if plan is not None and "after" in plan:
+            timer = threading.Timer(plan["after"], os.kill, (child, signal.Signals[plan["signal"]]))
+            timer.start()
+        status = os.waitpid(child, 0)[1]
+        if timer is not None:
+            timer.cancel()
+        errors.seek(0)
+        return os.waitstatus_to_exitcode(status), errors.read()
+
+
+def die_at_write(plan: dict[str, Any]) -> None:
+    """Make the n-th replacement of a file in this process the last thing it does, or the first it does not do."""
+    replace, count = os.replace, 0
+
+    def deadly(source: Any, target: Any) -> None:
+        nonlocal count
+        count += 1
+        if count == plan["write"] and plan["before"]:
+            os.kill(os.getpid(), signal.Signals[plan["signal"]])
+        replace(source, target)
+        if count == plan["write"] and not plan["before"]:
+            os.kill(os.getpid(), signal.Signals[plan["signal"]])
+
+    os.replace = deadly
+
+
+def run(config: str, out: Path, kills: int, seed: int) -> dict[str, Any]:
+    """The uninterrupted run, and one that is killed ``kills`` times unless it finishes before."""
+    rng = random.Random(seed)
+    shutil.rmtree(out, ignore_errors=True)
+    begun = time.monotonic()
+    code, error = attempt(config, out / "whole", None)
+    assert (code, error) == (0, ""), error
+    duration = time.monotonic() - begun
+    deaths, resumed, part = [], 0, 0
+    for number in range(kills):
+        plan: dict[str, Any] = {"signal": rng.choice(["SIGKILL", "SIGINT"])}
+        if number % 2:
+            plan["after"] = rng.uniform(0.2, 1.0) * duration
+        else:
+            plan |= {"write": rng.randint(1, 4), "before": rng.random() < 0.5}
+        pieces = out / f"pieces-{part}"
+        resumed += (pieces / "checkpoint.pkl").exists()
+        code, error = attempt(config, pieces, plan)
+        if code == 0:  # it was quicker than its death: the next kills fall on another run
+            compare(out / "whole", pieces)
+            part += 1
+        else:
+            deaths.append({**plan, "code": code, "stderr": error})
+    pieces = out / f"pieces-{part}"
+    code, error = attempt(config, pieces, None)
+    assert (code, error) == (0, ""), error
+    return {
+        "whole": json.loads((out / "whole" / "fit.json").read_text()),
+        "pieced": json.loads((pieces / "fit.json").read_text()),
+        "same_files": {name: (out / "whole" / name).read_bytes() == (pieces / name).read_bytes() for name in RESULTS},
+        "leftovers": [p.name for p in pieces.iterdir() if p.name.startswith((".", "previous"))],
+        "deaths": deaths,
+        "resumed": resumed,
+    }
+
+
+def compare(whole: Path, pieces: Path) -> None:
+    first, second = (json.loads((folder / "fit.json").read_text()) for folder in (whole, pieces))
+    assert {**first, "seconds": 0} == {**second, "seconds": 0}
+
+
+if __name__ == "__main__":
+    print(json.dumps(run(sys.argv[1], Path(sys.argv[2]), int(sys.argv[3]), int(sys.argv[4]))))
