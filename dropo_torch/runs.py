@@ -21,14 +21,14 @@ from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
-from dropo_torch.fit import Fit, fit, write_atomically
+from dropo_torch.fit import Fit, fit, refuse_dead_parameters, write_atomically
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.progress import FitProgress
 from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
-    "fit.json", "sweep.json", "checkpoint.pkl", "sweep-progress.json", "distribution.yaml", "config.yaml",
+    "fit.json", "sweep.json", "checkpoint.pkl", "sweep-progress.json", "distribution.yaml", "fitted_config.yaml",
     "model.xml", "report.html", "tensorboard",
 )  # fmt: skip
 #: The first of them: a folder with none of these holds no run.
@@ -48,7 +48,10 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     """
     _check_log_option(log)
     problem = make_problem(config)
-    _prepare(out, problem, resume=resume and (out / "checkpoint.pkl").exists())
+    continued = resume and (out / "checkpoint.pkl").exists()
+    if not continued:
+        refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
+    _prepare(out, problem, resume=continued)
     result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
     _refuse_lost(problem, result)
     _write_fit(problem, result, out)
@@ -191,7 +194,7 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
     result.distribution.save(out / "distribution.yaml")
     document = problem.config.document()
     portable = yaml.safe_dump(problem.config.portable(), sort_keys=False, allow_unicode=True)
-    write_atomically(out / "config.yaml", portable.encode())
+    write_atomically(out / "fitted_config.yaml", portable.encode())
     notes = []
     if problem.model_path is not None:
         try:
