@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import os
+import pickle
 import random
 import shutil
 import signal
@@ -92,6 +93,7 @@ def run(config: str, out: Path, kills: int, seed: int) -> dict[str, Any]:
         "pieced": json.loads((pieces / "fit.json").read_text()),
         "same_files": {name: (out / "whole" / name).read_bytes() == (pieces / name).read_bytes() for name in RESULTS},
         "leftovers": [p.name for p in pieces.iterdir() if p.name.startswith((".", "previous"))],
+        "same_history": history(out / "whole") == history(pieces),
         "deaths": deaths,
         "resumed": resumed,
     }
@@ -100,6 +102,13 @@ def run(config: str, out: Path, kills: int, seed: int) -> dict[str, Any]:
 def compare(whole: Path, pieces: Path) -> None:
     first, second = (json.loads((folder / "fit.json").read_text()) for folder in (whole, pieces))
     assert {**first, "seconds": 0} == {**second, "seconds": 0}
+    assert history(whole) == history(pieces)
+
+
+def history(folder: Path) -> list[str]:
+    """Every batch of a fit, but for the time it took, to the last digit."""
+    entries = pickle.loads((folder / "checkpoint.pkl").read_bytes())["history"]
+    return [repr({k: getattr(v, "tolist", lambda v=v: v)() for k, v in e.items() if k != "seconds"}) for e in entries]
 
 
 if __name__ == "__main__":
