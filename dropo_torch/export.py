@@ -60,7 +60,11 @@ def _write_inertials(spec: mujoco.MjSpec) -> None:
 
 def _compare(path: Path, space: ParameterSpace, values: np.ndarray) -> None:
     """Raise an :class:`InputError` unless the written model holds the parameters."""
-    written = mujoco.MjModel.from_xml_path(str(path))
+    try:
+        written = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        path.unlink()
+        raise InputError(f"export: MuJoCo refuses the model with these parameters: {error}") from None
     for column, parameter in enumerate(space.parameters):
         for target in parameter.targets:
             wanted = target.factor * values[column]

@@ -130,8 +130,8 @@ def test_the_hopper_at_its_truth_is_exported(tmp_path: Path) -> None:
 
 
 def test_what_mjcf_cannot_express_is_said_and_leaves_no_file(source: Path, tmp_path: Path) -> None:
-    space = ParameterSpace(source, {"p": {"field": "body_invweight0", "name": "pole", "index": 0, "bounds": [0.1, 9]}})
-    with pytest.raises(InputError, match="export"):
+    space = ParameterSpace(source, {"p": {"field": "body_inertia[0]", "name": "pole", "bounds": [0.1, 9]}})
+    with pytest.raises(InputError, match="export"):  # no body has one moment of inertia above the sum of the others
         export_model(source, space, np.array([5.0]), tmp_path / "model.xml")
     assert not (tmp_path / "model.xml").exists()
     binary = tmp_path / "sledge.mjb"
