@@ -191,7 +191,8 @@ def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
         if not argument.startswith("--"):
             raise InputError(f"argument {argument!r} is not understood; expected --key value, such as --epsilon 1e-4")
         key, equals, value = argument[2:].partition("=")
-        key = key.replace("-", "_")
+        first, dot, rest = key.partition(".")
+        key = first.replace("-", "_") + dot + rest
         if key.split(".")[0] not in KEYS:
             raise InputError(f"unknown option --{key}" + choices(key, KEYS))
         if not equals:

@@ -165,9 +165,9 @@ class Distribution:
         document: dict[str, Any] = {"schema": SCHEMA, "parameters": self.summary()}
         path = Path(path)
         if path.suffix in (".yaml", ".yml"):
-            path.write_text(yaml.safe_dump(document, sort_keys=False))
+            path.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
         else:
-            path.write_text(json.dumps(document, indent=2) + "\n")
+            path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> Distribution:
@@ -180,7 +180,7 @@ class Distribution:
         if not path.is_file():
             raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
         try:
-            text = path.read_text()  # JSON is not quite YAML 1.1, which reads 1e-05 as text
+            text = path.read_text(encoding="utf-8")  # JSON is not quite YAML 1.1, which reads 1e-05 as text
             document = yaml.safe_load(text) if path.suffix in (".yaml", ".yml") else json.loads(text)
         except (yaml.YAMLError, ValueError) as error:
             raise InputError(f"distribution: {path} cannot be read: {' '.join(str(error).split())}") from None

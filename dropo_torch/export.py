@@ -30,7 +30,7 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
         spec = mujoco.MjSpec.from_file(str(source))
     except ValueError as error:
         raise InputError(f"export: MuJoCo does not read {source}: {error}") from None
-    for folder in ("meshdir", "texturedir"):
+    for folder in ("meshdir", "texturedir") if spec.meshes or spec.textures or spec.hfields or spec.skins else ():
         setattr(spec, folder, str((source.parent / getattr(spec, folder)).resolve()))
     if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
         _write_inertials(spec)
@@ -60,7 +60,11 @@ def _write_inertials(spec: mujoco.MjSpec) -> None:
 
 def _compare(path: Path, space: ParameterSpace, values: np.ndarray) -> None:
     """Raise an :class:`InputError` unless the written model holds the parameters."""
-    written = mujoco.MjModel.from_xml_path(str(path))
+    try:
+        written = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        path.unlink()
+        raise InputError(f"export: MuJoCo refuses the model with these parameters: {error}") from None
     for column, parameter in enumerate(space.parameters):
         for target in parameter.targets:
             wanted = target.factor * values[column]

@@ -275,6 +275,10 @@ def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objecti
     try:
         state = pickle.loads(path.read_bytes())
         owner, stored = (state["fingerprint"], state["optimizer"])
+        if owner == fingerprint and stored == search.name:
+            search.restore(state["state"])
+            history = [HistoryEntry(**entry) for entry in state["history"]]
+            simulated, linearised_at = state["simulated_transitions"], state["linearised_at"]
     except Exception as error:
         raise InputError(f"resume: {path} is no checkpoint of a fit ({error}); start again without --resume") from None
     if owner != fingerprint or stored != search.name:
@@ -282,11 +286,10 @@ def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objecti
             f"resume: {path} belongs to another config, log or optimizer; restore those, "
             "or start again without --resume"
         )
-    search.restore(state["state"])
-    if state["linearised_at"] is not None:
-        objective.linearise(state["linearised_at"])
-    objective.simulated_transitions = state["simulated_transitions"]
-    return [HistoryEntry(**entry) for entry in state["history"]]
+    if linearised_at is not None:
+        objective.linearise(linearised_at)
+    objective.simulated_transitions = simulated
+    return history
 
 
 def write_atomically(path: Path, content: bytes) -> None:

@@ -67,9 +67,10 @@ def load_model(model: mujoco.MjModel | str | Path) -> mujoco.MjModel:
     if not path.is_file():
         raise InputError(f"model: no file {path}; expected the path of an MJCF (.xml), URDF or .mjb file")
     try:
-        if path.suffix == ".mjb":
-            return mujoco.MjModel.from_binary_path(str(path))
-        return mujoco.MjModel.from_xml_path(str(path))
+        with quiet_mujoco():
+            if path.suffix == ".mjb":
+                return mujoco.MjModel.from_binary_path(str(path))
+            return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"model: MuJoCo does not compile {path}: {reason}") from None

@@ -236,6 +236,9 @@ def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> 
     for key in spec:
         if key not in _KEYS:
             raise InputError(f"{where}: unknown key {key!r}" + choices(key, _KEYS))
+    for key in ("relative", "scale_inertia"):
+        if not isinstance(spec.get(key, False), bool):
+            raise InputError(f"{where}: {key} is {spec[key]!r}; expected true or false")
     field, index = _field_and_index(where, spec)
     if model is None and field:
         raise InputError(f"{where}: field {field!r} needs a MuJoCo model; this simulator has none")
@@ -340,7 +343,9 @@ def _select_objects(where: str, spec: Mapping[str, Any], names: Sequence[str], k
     wanted = spec.get("name")
     if wanted is None or wanted == []:
         raise InputError(f"{where}: no name given; expected a {kind}" + choices("", names).replace("; ", " ", 1))
-    entries = [wanted] if isinstance(wanted, (str, int)) else list(wanted)
+    if not isinstance(wanted, (str, list, tuple)):
+        raise InputError(f"{where}: name is {wanted!r}; expected a {kind}'s name, or a list of them")
+    entries = [wanted] if isinstance(wanted, str) else list(wanted)
     found: dict[str, int] = {}
     for entry in map(str, entries):
         matches = fnmatch.filter(names, entry) if "*" in entry else [n for n in names if n == entry]
@@ -398,10 +403,13 @@ def _with_inertia(
 
 
 def _interval(where: str, key: str, pair: Any) -> tuple[float, float]:
-    try:
-        low, high = (float(x) for x in pair)
-    except (TypeError, ValueError):
-        raise InputError(f"{where}: {key} is {pair!r}; expected [low, high]") from None
+    if (
+        not isinstance(pair, (list, tuple, np.ndarray))
+        or len(pair) != 2
+        or any(isinstance(x, (bool, str)) or not np.isscalar(x) for x in pair)
+    ):
+        raise InputError(f"{where}: {key} is {pair!r}; expected [low, high]")
+    low, high = (float(x) for x in pair)
     if np.isnan(low) or np.isnan(high) or (key == "bounds" and not np.isfinite([low, high]).all()):
         raise InputError(f"{where}: {key} is [{low:g}, {high:g}]; expected finite numbers")
     if low >= high:

@@ -259,10 +259,10 @@ def _frame_skip(
     """``frame_skip`` as given, or as the log's time step says."""
     if config.frame_skip is not None:
         return config.frame_skip
-    if sim is not None:
-        return sim.frame_skip
     if config.backend == "gymnasium":
         return 1  # an environment's step is what its designer calls one
+    if sim is not None:
+        return sim.frame_skip
     assert model is not None
     step = float(model.opt.timestep)
     if trajectories.dt is None:

@@ -64,6 +64,8 @@ class ReadOptions:
                 raise InputError(f"data: {name} is {value!r}; expected text")
         if isinstance(self.preprocess, Mapping):
             object.__setattr__(self, "preprocess", Preprocess.from_mapping(self.preprocess))
+        elif self.preprocess is not None and not isinstance(self.preprocess, Preprocess):
+            raise InputError(f"data: preprocess is {self.preprocess!r}; expected options such as dt and cutoff")
 
     def updated(self, mapping: Mapping[str, Any]) -> ReadOptions:
         """Return these options with those of a config's mapping in their place."""

@@ -23,7 +23,7 @@ from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
-from dropo_torch.fit import Fit, fit, write_atomically
+from dropo_torch.fit import Fit, fit, refuse_dead_parameters, write_atomically
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem, make_problem
@@ -32,8 +32,8 @@ from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
-    "fit.json", "sweep.json", "compare.json", "certificate.json", "checkpoint.pkl", "sweep-progress.json", "compare-progress.json",
-    "distribution.yaml", "config.yaml",
+    "fit.json", "sweep.json", "compare.json", "certificate.json", "checkpoint.pkl", "sweep-progress.json",
+    "compare-progress.json", "distribution.yaml", "fitted_config.yaml",
     "model.xml", "report.html", "tensorboard",
 )  # fmt: skip
 #: The first of them: a folder with none of these holds no run.
@@ -53,7 +53,10 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     """
     _check_log_option(log)
     problem = make_problem(config)
-    _prepare(out, problem, resume=resume and (out / "checkpoint.pkl").exists())
+    continued = resume and (out / "checkpoint.pkl").exists()
+    if not continued:
+        refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
+    _prepare(out, problem, resume=continued)
     result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
     _refuse_lost(problem, result)
     _write_fit(problem, result, out)
@@ -228,6 +231,9 @@ def _prepare(out: Path, problem: Problem, *, resume: bool) -> None:
         tempfile.TemporaryFile(dir=out).close()
     except OSError as error:
         raise InputError(f"--out: cannot write to folder {out}: {error.strerror}") from None
+    for name in _RESULTS:
+        for stale in out.glob(f".{name}.*.tmp"):  # a write that kill -9 cut short
+            stale.unlink()
     present = [name for name in _RESULTS if (out / name).exists()]
     source = problem.model_path
     if source is not None and source.name in present and source.resolve() == (out / source.name).resolve():
@@ -262,7 +268,7 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
     result.distribution.save(out / "distribution.yaml")
     document = problem.config.document()
     portable = yaml.safe_dump(problem.config.portable(), sort_keys=False, allow_unicode=True)
-    write_atomically(out / "config.yaml", portable.encode())
+    write_atomically(out / "fitted_config.yaml", portable.encode())
     notes = []
     if problem.model_path is not None:
         try:

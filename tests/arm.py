@@ -33,7 +33,7 @@ PARAMETERS = {
 }
 CONFIG = {
     "model": "arm.xml", "data": "log.npz", "frame_skip": FRAME_SKIP, "samples": 20, "threads": 1,
-    "parameters": {"upper_mass": PARAMETERS["upper_mass"]},
+    "parameters": PARAMETERS,
 }  # fmt: skip
 
 #: An adapter as a user would write it: MuJoCo behind three methods.

@@ -27,6 +27,8 @@ VAGUE = 0.25
 #: Lists in sentences name at most this many.
 MOST_NAMED = 6
 
+#: Share of its mean from which a deviation is suspect.
+WIDE = 0.5
 Level = Literal["attention", "note"]
 
 
@@ -67,9 +69,10 @@ def headline(fit: Fit, diagnostics: Diagnostics) -> str:
     start = f"{many} fitted to the log, judged here on {whole(count, 'transition')}."
     if len(names) > MOST_NAMED:
         return f"{start} The fitted values are in the table below."
+    pairs = _pairs(distribution, diagnostics.standard_error)
     values = [
         f"{name} = {value} ± {std}{f' {unit}' if unit else ''}".replace(" ", "\u00a0")
-        for name, (value, std), unit in zip(names, _pairs(distribution), distribution.units, strict=True)
+        for name, (value, std), unit in zip(names, pairs, distribution.units, strict=True)
     ]
     return f"{start} Mean ± standard deviation: {joined(values, len(values))}."
 
@@ -221,17 +224,29 @@ def place(spec: Any) -> str:
     return f"{spec['field']}{component}{f' of {joined(names)}' if names else ''}{tail}"
 
 
-def _pairs(distribution: Distribution) -> list[tuple[str, str]]:
-    """Mean and deviation of each parameter, to digits that suit each other."""
-    return [(number(m, s), number(s, s)) for m, s in zip(distribution.center, distribution.spread, strict=True)]
+def _pairs(distribution: Distribution, error: np.ndarray) -> list[tuple[str, str]]:
+    """Mean, to digits that its deviation and standard error ``(d,)`` support, and deviation of each parameter."""
+    center, spread = distribution.center, distribution.spread
+    unsure = np.fmax(spread, np.where(np.isfinite(error), error, 0.0))
+    return [(number(m, u), number(s, s)) for m, s, u in zip(center, spread, unsure, strict=True)]
 
 
 def _at_bounds(distribution: Distribution) -> list[Finding]:
     box = search_box(distribution)
     share = (distribution.mean - box.low) / box.width
     found = []
+    physical = distribution.low <= distribution.limits[:, 0]
+    none = _with_values(distribution, (share < AT_BOUND) & physical, distribution.low)
+    if none:
+        found.append(
+            Finding(
+                "note",
+                "Mean at its physical limit",
+                f"{joined(none)}. The log shows no sign of this effect; leave it out, or log a motion that needs it.",
+            )
+        )
     for side, at, bound in (
-        ("lower", share < AT_BOUND, distribution.low),
+        ("lower", (share < AT_BOUND) & ~physical, distribution.low),
         ("upper", share > 1 - AT_BOUND, distribution.high),
     ):
         names = _with_values(distribution, at, bound)
@@ -260,6 +275,18 @@ def _deviations(distribution: Distribution) -> list[Finding]:
                 f"{joined(_chosen(distribution, top))}. The log asks for more variation than a quarter of the search "
                 "box. Usually the model lacks something (a delay, friction, an offset) and this parameter stands in "
                 "for it; do not read the spread as that of the real quantity.",
+            )
+        )
+    wide = ~top & (distribution.spread >= WIDE * np.abs(distribution.center)) & (distribution.mean > box.low)
+    if wide.any():
+        found.append(
+            Finding(
+                "attention",
+                "Standard deviation as large as the mean",
+                f"{joined(_chosen(distribution, wide))}. Such a spread rarely is the quantity's own: it usually stands "
+                "in for something that is wrong in the model, such as a mass whose inertia did not follow "
+                "(scale_inertia), one value tied over joints that differ, a missing friction or delay, or noise on "
+                "the log that was not declared.",
             )
         )
     if floor.any():

@@ -1,0 +1,107 @@
+"""Choosing ε: where the elbow lies, and a sweep that is interrupted."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from arm import Folder
+
+from dropo_torch.cli import main
+from dropo_torch.errors import InputError
+from dropo_torch.sweep import default_epsilons, elbow, sweep_epsilon
+
+EPSILONS = [1e-8, 1e-7, 1e-6, 1e-5, 1e-4]
+
+
+@pytest.mark.parametrize(
+    ("errors", "chosen", "words"),
+    [
+        ([9, 5, 2, 2, 2], 1e-6, "no larger value lowers it"),
+        ([9, 5, 2.09, 2, 2], 1e-6, "no larger value lowers it"),  # within five percent
+        ([9, 5, 2.2, 2, 2], 1e-5, "no larger value lowers it"),
+        ([2, 2, 2, 3, 9], 1e-8, "or less"),
+        ([9, 7, 5, 3, 1], 1e-4, "sweep further"),
+        ([9, 5, 2, 3, 4], 1e-6, "no larger value lowers it"),  # too much ε worsens the fit again
+        ([float("nan"), 5, 2, 2, float("inf")], 1e-6, "no larger value lowers it"),
+        ([0, 0, 0, 0, 0], 1e-8, "or less"),
+    ],
+)
+def test_the_elbow_is_where_the_error_stops_falling(errors: list[float], chosen: float, words: str) -> None:
+    found, reason = elbow(EPSILONS, errors)
+    assert found == chosen
+    assert words in reason
+
+
+def test_there_is_no_elbow_without_a_finite_error() -> None:
+    with pytest.raises(InputError, match="no fit"):
+        elbow(EPSILONS, [float("nan")] * 5)
+
+
+def test_default_values_span_ten_decades_below_the_logs_variance() -> None:
+    measured = np.random.default_rng(0).normal(0, 3, (500, 4))
+    values = default_epsilons(measured)
+    assert len(values) == 9
+    assert 0.05 < values[-1] / 9 < 1
+    np.testing.assert_allclose(np.diff(np.log10(values)), 1)
+    assert all(v > 0 for v in default_epsilons(np.zeros((5, 2))))
+
+
+def fit_result(epsilon: float) -> SimpleNamespace:
+    distribution = SimpleNamespace(summary=lambda: {"m": {"mean": 1 / 3, "std": epsilon}})
+    return SimpleNamespace(distribution=distribution, mse=max(1e-6, 1e-12 / epsilon), log_likelihood=-epsilon)
+
+
+def test_an_interrupted_sweep_repeats_no_finished_fit(tmp_path: Path) -> None:
+    whole = sweep_epsilon(fit_result, EPSILONS)
+    done: list[float] = []
+
+    def interrupted(epsilon: float) -> SimpleNamespace:
+        if len(done) == 2:
+            raise KeyboardInterrupt
+        done.append(epsilon)
+        return fit_result(epsilon)
+
+    with pytest.raises(KeyboardInterrupt):
+        sweep_epsilon(interrupted, EPSILONS, fingerprint="f", store=tmp_path / "store")
+    later: list[float] = []
+    resumed = sweep_epsilon(
+        lambda e: later.append(e) or fit_result(e), EPSILONS, fingerprint="f", store=tmp_path / "store"
+    )
+    assert sorted(done + later) == EPSILONS
+    assert resumed == whole
+
+
+@pytest.mark.parametrize("content", ["", "{", "[]", '{"points": 3}', '{"fingerprint": "f", "points": [{"x": 1}]}'])
+def test_a_damaged_record_is_refused(content: str, tmp_path: Path) -> None:
+    (tmp_path / "store").write_text(content)
+    with pytest.raises(InputError, match="no record of a sweep"):
+        sweep_epsilon(fit_result, EPSILONS, fingerprint="f", store=tmp_path / "store")
+
+
+def test_the_record_of_another_log_is_refused(tmp_path: Path) -> None:
+    sweep_epsilon(fit_result, EPSILONS, fingerprint="f", store=tmp_path / "store")
+    with pytest.raises(InputError, match="another config or log"):
+        sweep_epsilon(fit_result, EPSILONS, fingerprint="g", store=tmp_path / "store")
+
+
+@pytest.mark.parametrize("values", [[1, 2], [1, 1, 1], [-1, 1, 2], [0, 1, 2], [1, 2, float("nan")], []])
+def test_three_positive_values_are_needed(values: list[float]) -> None:
+    with pytest.raises(InputError, match="three or more positive"):
+        sweep_epsilon(fit_result, values)
+
+
+def test_the_command_writes_what_it_chose_and_why(tmp_path: Path) -> None:
+    config = Folder(tmp_path / "robot").config()
+    out = tmp_path / "out"
+    assert main(["sweep-epsilon", str(config), "--out", str(out), "--epsilons", "1e-4,1e-6,1e-5"]) == 0
+    found = json.loads((out / "sweep.json").read_text())
+    assert found["schema"] == "dropo-torch/sweep/1"
+    assert [p["epsilon"] for p in found["points"]] == [1e-6, 1e-5, 1e-4]
+    assert found["chosen"] == 1e-6  # the simulation explains this log
+    assert {p.name for p in out.iterdir()} == {"sweep.json", "report.html", "sweep-progress.json"}
+    assert main(["sweep-epsilon", str(config), "--out", str(out), "--epsilons", "[1e-6, 1e-5, 1e-4]", "--resume"]) == 0
+    assert json.loads((out / "sweep.json").read_text()) == found
