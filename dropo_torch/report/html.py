@@ -160,6 +160,7 @@ def nats(value: float) -> str:
 
 
 def render(template: str, content: Mapping[str, Any]) -> bytes:
+    """Return a page of a template, as it goes into the file."""
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(Path(__file__).parent),
         autoescape=True,
