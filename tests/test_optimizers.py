@@ -340,7 +340,7 @@ def test_sampled_scores_are_the_gradient_of_the_sampled_likelihood():
     for samples in (8, 40):  # without and with bends in the regression
         uniforms = draw_uniforms(samples, 2, 0)
         sums, expected = stage_gradient(
-            lambda m, s, u=uniforms: SampledStage(objective.box, limits_of(objective), u, m, s, np.zeros(len(m), bool)),
+            lambda m, s, u=uniforms: SampledStage(objective.box, limits_of(objective), u, m, s),
             objective,
             *AWAY,
         )

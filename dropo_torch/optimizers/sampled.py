@@ -7,7 +7,7 @@ its gradient follows from how the samples' next states regress on z: no further 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -32,7 +32,7 @@ class SampledStage:
         limits: physical limits in coordinates, low and high, ``(d,)`` each.
         uniforms: base uniforms, ``(K, d)``.
         mean, std: the best φ so far, ``(d,)`` each.
-        is_log: which parameters are searched by their logarithm, ``(d,)`` bool.
+        is_log: which parameters are searched by their logarithm, ``(d,)`` bool; none by default.
     """
 
     box: SearchBox
@@ -40,7 +40,7 @@ class SampledStage:
     uniforms: torch.Tensor
     mean: np.ndarray
     std: np.ndarray
-    is_log: np.ndarray
+    is_log: np.ndarray = field(default_factory=lambda: np.zeros(1, dtype=bool))
     damping: float = 1e-2
     log_likelihood: float = -np.inf
     iterations: int = 0
