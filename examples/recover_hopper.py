@@ -22,15 +22,19 @@ import dropo_torch as dropo
 from sims.hopper import SIM
 from sims.hopper.record import NOISE_VARIANCE, SPREAD, record
 
+#: Standard deviation of a normal of deviation 1 that is truncated at plus and minus 2.
+TRUNCATED = 0.8796
 EPSILON = {"point": 1e-5, "noisy": 1e-8, "distribution": 1e-7}
 
 
-def recover(experiment: str, seed: int, optimizer: str, budget: int, samples: int, steps: int) -> dict[str, Any]:
+def recover(
+    experiment: str, seed: int, *, optimizer: str, backend: str, budget: int, samples: int, steps: int
+) -> dict[str, Any]:
     """Record a log of the experiment, fit it, and compare with what it was recorded with."""
     log = record(variant=experiment, seed=seed, steps=steps)
     space = dropo.ParameterSpace(SIM.model, SIM.parameters)
-    simulator = dropo.make_simulator("mujoco", SIM.model, parameters=space, frame_skip=SIM.frame_skip)
-    observation = dropo.parse_observation(simulator.model, SIM.observation)
+    simulator = dropo.make_simulator(backend, SIM.model, parameters=space, frame_skip=SIM.frame_skip)
+    observation = dropo.parse_observation(space.model, SIM.observation)
     trajectories = dropo.Trajectories(log.observations, log.next_observations, log.actions, log.terminals)
     objective = dropo.Objective(
         simulator,
@@ -46,6 +50,7 @@ def recover(experiment: str, seed: int, optimizer: str, budget: int, samples: in
     return {
         "experiment": experiment,
         "optimizer": optimizer,
+        "backend": backend,
         "seed": seed,
         "transitions": len(objective),
         "names": list(space.names),
@@ -63,12 +68,15 @@ def recover(experiment: str, seed: int, optimizer: str, budget: int, samples: in
 def show(result: dict[str, Any]) -> None:
     error = 100 * (np.array(result["mean"]) / np.array(result["true_mean"]) - 1)
     print(
-        f"{result['experiment']:<13}{result['optimizer']:<7} seed {result['seed']}: "
+        f"{result['experiment']:<13}{result['optimizer']} on {result['backend']}, seed {result['seed']}: "
         f"{result['simulated_per_logged']:.0f} simulated per logged transition, {result['seconds']:.1f} s, "
         f"log-likelihood {result['log_likelihood']:.1f}, {result['stop_reason']}"
     )
     for i, name in enumerate(result["names"]):
-        spread = f", realised {result['true_std'][i]:.3f}" if name in SPREAD and result["true_std"][i] > 1e-9 else ""
+        spread = ""
+        if name in SPREAD and result["true_std"][i] > 1e-9:
+            deviation = TRUNCATED * result["std"][i]
+            spread = f", deviation {deviation:.3f}, realised {result['true_std'][i]:.3f}"
         print(f"    {name:<12} mean {result['mean'][i]:.4f} ({error[i]:+.3f} %)  std {result['std'][i]:.2g}{spread}")
 
 
@@ -77,13 +85,22 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("experiment", choices=sorted(EPSILON))
     parser.add_argument("--seeds", type=int, default=3, help="logs to record and fit")
     parser.add_argument("--steps", type=int, default=500, help="transitions of each of the two episodes")
-    parser.add_argument("--optimizer", choices=["fisher", "cma"], default="fisher")
+    parser.add_argument("--optimizer", choices=["fisher", "cma", "adam"], default="fisher")
+    parser.add_argument("--backend", choices=["mujoco", "warp"], default="mujoco")
     parser.add_argument("--budget", type=int, default=1000, help="evaluations of CMA-ES")
     parser.add_argument("--samples", type=int, default=100, help="K")
     parser.add_argument("--json", type=Path, help="file to which the results are appended, a line each")
     given = parser.parse_args(arguments)
     for seed in range(given.seeds):
-        result = recover(given.experiment, seed, given.optimizer, given.budget, given.samples, given.steps)
+        result = recover(
+            given.experiment,
+            seed,
+            optimizer=given.optimizer,
+            backend=given.backend,
+            budget=given.budget,
+            samples=given.samples,
+            steps=given.steps,
+        )
         show(result)
         if given.json is not None:
             with given.json.open("a") as stream:
