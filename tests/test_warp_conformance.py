@@ -213,7 +213,7 @@ HOPPER = {
 
 
 def test_hopper_through_four_substeps():
-    check(Case("hopper", "hopper.xml", HOPPER, skip=4, states=1e-10, spread=0.05, length=100), count=24)
+    check(Case("hopper", "hopper.xml", HOPPER, skip=4, states=1e-10, spread=0.05, length=100), count=14)
 
 
 ARM = """<mujoco><option integrator="{integrator}" timestep="0.004" {option}/>

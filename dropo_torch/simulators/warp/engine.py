@@ -196,6 +196,8 @@ class Engine:
         widths |= {"qpos": (number, m.nq), "hess": (number, m.nh), "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}
         for name, (count, width) in widths.items():
             setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
+        if not m.has_ball:  # then a rate is a velocity
+            rows.rate = rows.qvel
         rows.held = wp.empty(number, dtype=wp.int32, device=self.device)
         return rows
 

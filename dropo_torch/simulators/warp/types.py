@@ -83,6 +83,7 @@ class Tables:
     clampctrl: wp.int32
     implicit: wp.int32
     implicit_actuators: wp.int32
+    has_ball: wp.int32
     has_spring: wp.int32
     has_damper: wp.int32
     always_dense: wp.int32
