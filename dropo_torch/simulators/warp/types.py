@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no notice of each module
+
 f64 = wp.float64
 vec2 = wp.vec2d
 vec3 = wp.vec3d
