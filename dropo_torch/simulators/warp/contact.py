@@ -1,7 +1,7 @@
 """Contacts: finding them, their Jacobians, the friction cone's force, and the adjoint of all three."""
 
 # mypy: ignore-errors
-# ruff: noqa: UP018
+# ruff: noqa: UP018, RUF046
 # kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
 
 from __future__ import annotations

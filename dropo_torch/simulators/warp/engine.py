@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
@@ -66,6 +68,8 @@ class Engine:
         self.wanted = torch.from_numpy(wanted.astype(np.int64))
         self._scratch: dict[tuple[int, bool], Scratch] = {}
         self._free: list[tuple[int, Rows]] = []
+        self._lock = threading.RLock()  # one call at a time in the scratch memory
+        self._loaded: set[str] = set()
 
     def row_bytes(self, lag: int) -> int:
         """Bytes that one world keeps for its backward."""
@@ -84,11 +88,12 @@ class Engine:
         out = torch.empty(problem.worlds * problem.lag, states.shape[1], dtype=torch.float64, device=states.device)
         inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
         traces = []
-        for first, count in self.chunks(problem.worlds):
-            part = wp.from_torch(out[first * problem.lag : (first + count) * problem.lag])
-            trace = self._forward(problem, inputs, part, first, count, keep)
-            if keep:
-                traces.append(trace)
+        with self._lock, self._stream(states):
+            for first, count in self.chunks(problem.worlds):
+                part = wp.from_torch(out[first * problem.lag : (first + count) * problem.lag])
+                trace = self._forward(problem, inputs, part, first, count, keep)
+                if keep:
+                    traces.append(trace)
         return out, traces
 
     def adjoint(
@@ -101,14 +106,17 @@ class Engine:
         columns = torch.zeros(problem.parameters, len(self.wanted), dtype=torch.float64, device=states.device)
         state_bar, control_bar = torch.zeros_like(states), torch.zeros_like(flat)
         totals = [wp.from_torch(x) for x in (columns, state_bar, control_bar)]
-        for number, (first, count) in enumerate(self.chunks(problem.worlds)):
-            rows = slice(first * problem.lag, (first + count) * problem.lag)
-            if traces:
-                trace = traces[number]
-            else:
-                part = wp.empty((count * problem.lag, states.shape[1]), dtype=wp.float64, device=self.device)
-                trace = self._forward(problem, inputs, part, first, count, keep=True)
-            self._backward(problem, inputs, trace, wp.from_torch(out_bar[rows]), totals, first, count)
+        with self._lock, self._stream(states):
+            for number, (first, count) in enumerate(self.chunks(problem.worlds)):
+                rows = slice(first * problem.lag, (first + count) * problem.lag)
+                if traces:
+                    trace = traces[number]
+                else:
+                    part = wp.empty((count * problem.lag, states.shape[1]), dtype=wp.float64, device=self.device)
+                    trace = self._forward(problem, inputs, part, first, count, keep=True)
+                self._backward(problem, inputs, trace, wp.from_torch(out_bar[rows]), totals, first, count)
+                if not traces:
+                    self.release([trace])
         theta_bar = torch.zeros_like(theta)
         theta_bar[:, self.wanted.to(theta.device)] = columns
         return theta_bar, state_bar, control_bar.reshape(controls.shape)
@@ -131,22 +139,24 @@ class Engine:
         inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
         width, lag = states.shape[1], problem.lag
         after, by_theta, by_state = [], [], []
-        for first, count in self.chunks(problem.worlds):
-            out = torch.empty(count * lag, width, dtype=torch.float64, device=states.device)
-            trace = self._forward(problem, inputs, wp.from_torch(out), first, count, keep=True)
-            after.append(out[lag - 1 :: lag])
-            columns = []
-            for direction in directions:
-                bar = torch.zeros_like(out)
-                bar[lag - 1 :: lag] = direction
-                theta_bar, state_bar, _ = self._worlds(problem, inputs, trace, wp.from_torch(bar), first, count)
-                columns.append((wp.to_torch(theta_bar).clone(), wp.to_torch(state_bar).clone()))
-            self.release([trace])
-            by_theta.append(torch.stack([c[0] for c in columns], 1))
-            by_state.append(torch.stack([c[1] for c in columns], 1))
+        with self._lock, self._stream(states):
+            for first, count in self.chunks(problem.worlds):
+                out = torch.empty(count * lag, width, dtype=torch.float64, device=states.device)
+                trace = self._forward(problem, inputs, wp.from_torch(out), first, count, keep=True)
+                after.append(out[lag - 1 :: lag])
+                columns = []
+                for direction in directions:
+                    bar = torch.zeros_like(out)
+                    bar[lag - 1 :: lag] = direction
+                    theta_bar, state_bar, _ = self._worlds(problem, inputs, trace, wp.from_torch(bar), first, count)
+                    columns.append((wp.to_torch(theta_bar).clone(), wp.to_torch(state_bar).clone()))
+                self.release([trace])
+                by_theta.append(torch.stack([c[0] for c in columns], 1))
+                by_state.append(torch.stack([c[1] for c in columns], 1))
         return torch.cat(after), torch.cat(by_theta), torch.cat(by_state)
 
     def _forward(self, problem: Problem, inputs: list[Any], out: Any, first: int, count: int, keep: bool) -> Trace:
+        self._load(kernel_forward)
         period = problem.lag * self.skip + 1 if keep else 2
         slots = self._slots(count)
         rows = self._rows((count if keep else slots) * period * self.tables.nstage)
@@ -184,6 +194,7 @@ class Engine:
         self, problem: Problem, inputs: list[Any], trace: Trace, out_bar: Any, first: int, count: int
     ) -> tuple[Any, Any, Any]:
         """Adjoints of θ, states and controls, a row for every world (and logged step) of a chunk."""
+        self._load(kernel_backward)
         theta, states, controls = inputs
         lag, period = problem.lag, problem.lag * self.skip + 1
         scratch = self._working(self._slots(count), adjoint=True)
@@ -227,7 +238,20 @@ class Engine:
 
     def release(self, traces: list[Trace]) -> None:
         """Take the memory of traces back for the next call."""
-        self._free = [(t.rows.qpos.shape[0], t.rows) for t in traces]
+        with self._lock:
+            self._free = [(t.rows.qpos.shape[0], t.rows) for t in traces]
+
+    def _stream(self, like: torch.Tensor) -> Any:
+        """PyTorch's stream of a GPU as Warp's, so that kernels wait for tensors and tensors for kernels."""
+        if self.is_cpu:
+            return contextlib.nullcontext()
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
+
+    def _load(self, module: Any) -> None:
+        """Compile or load kernels before threads launch them."""
+        if module.__name__ not in self._loaded:
+            wp.load_module(module, device=self.device)
+            self._loaded.add(module.__name__)
 
     def _new_rows(self, number: int) -> Rows:
         m, rows = self.tables, Rows()
@@ -236,6 +260,8 @@ class Engine:
         widths |= {"qpos": (number, m.nq), "hess": (number, m.nh), "soft": (soft, m.nv), "soft_hess": (soft, m.nh)}
         for name, (count, width) in widths.items():
             setattr(rows, name, wp.empty((count, max(width, 1)), dtype=wp.float64, device=self.device))
+        if not m.has_ball:  # then a rate is a velocity
+            rows.rate = rows.qvel
         rows.held = wp.empty(number, dtype=wp.int32, device=self.device)
         return rows
 

@@ -1,7 +1,7 @@
 """The kernel that simulates: one thread a world, all its physics steps."""
 
 # mypy: ignore-errors
-# ruff: noqa: UP018
+# ruff: noqa: UP018, RUF046
 # kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
 
 from __future__ import annotations

@@ -5,7 +5,7 @@ A row has at most three dofs. Its force f minimises MuJoCo's cost at J a − are
 """
 
 # mypy: ignore-errors
-# ruff: noqa: UP018
+# ruff: noqa: UP018, RUF046
 # kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
 
 from __future__ import annotations

@@ -69,7 +69,6 @@ class WarpSimulator(Simulator):
         self.timestep = model.opt.timestep * frame_skip
         self._fields = Fields(model, parameters, pairs)
         with _LOADING:
-            wp.config.quiet = True
             wp.init()
             try:
                 wp.get_device(device)

@@ -122,7 +122,8 @@ def _links(model: mujoco.MjModel) -> dict[str, Any]:
                 break
     kinds, joints, dofs, qs = (np.array([r[i] for r in rows], dtype=int) for i in range(4))
     return {
-        "nlink": len(rows), "body_link": first, "body_nlink": count, "link_kind": kinds, "link_dof": dofs,
+        "nlink": len(rows), "has_ball": int(bool(np.any(kinds == 3))),
+        "body_link": first, "body_nlink": count, "link_kind": kinds, "link_dof": dofs,
         "link_qpos": qs, "link_jnt": joints, "link_body": model.jnt_bodyid[joints] if len(rows) else joints,
         "link_frclimited": model.jnt_actfrclimited[joints].astype(int) if len(rows) else joints,
         "link_axis": np.array([r[4] for r in rows]).reshape(-1, 3),

@@ -13,6 +13,8 @@ from typing import Any
 
 import warp as wp
 
+wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no notice of each module
+
 f64 = wp.float64
 vec2 = wp.vec2d
 vec3 = wp.vec3d
@@ -83,6 +85,7 @@ class Tables:
     clampctrl: wp.int32
     implicit: wp.int32
     implicit_actuators: wp.int32
+    has_ball: wp.int32
     has_spring: wp.int32
     has_damper: wp.int32
     always_dense: wp.int32
