@@ -13,7 +13,7 @@ import warp as wp
 
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.base import DIVERGED, Simulator
 from dropo_torch.simulators.warp.engine import Engine, Problem, Simulate
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
@@ -91,7 +91,7 @@ class WarpSimulator(Simulator):
         return self.rollout(states, controls, values)[:, :, -1]
 
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return the states after each transition ``(T, K, lag, nq + nv)``; NaN from a divergence on."""
+        """Return the states after each transition ``(T, K, lag, nq + nv)``; see :meth:`Simulator.rollout`."""
         self.check_arguments(states, controls, values)
         origin = states.device
         shape = (len(states), len(values), controls.shape[1], self.num_states)
@@ -100,6 +100,9 @@ class WarpSimulator(Simulator):
         theta = self._fields(values.to("cpu", torch.float64)).to(self._device)
         start, inputs = (x.to(self._device, torch.float64).contiguous() for x in (states, controls))
         out: torch.Tensor = Simulate.apply(theta.contiguous(), start, inputs, self._engine)
+        lost = ~(out.detach().abs() < DIVERGED).flatten(2).all(-1)
+        if bool(lost.any()):
+            out = out.masked_fill(lost[..., None, None], torch.nan)
         return out.to(origin)
 
     def jacobian(
