@@ -247,13 +247,14 @@ def test_options_that_do_not_act_are_accepted(model, space):
 
 @pytest.mark.parametrize(
     "flag", ["gravity", "contact", "limit", "actuation", "frictionloss", "spring", "damper", "clampctrl", "eulerdamp",
-             "refsafe", "filterparent", "constraint"]
+             "refsafe", 'spring="disable" damper', "filterparent", "constraint"]
 )  # fmt: skip
 def test_disabled_flags_act_as_in_mujoco(flag):
-    xml = f"""<mujoco><option timestep="0.01"><flag {flag}="disable"/></option><worldbody>
+    xml = f"""<mujoco><option timestep="0.01" density="50"><flag {flag}="disable"/></option><worldbody>
     <geom type="plane" size="5 5 1"/><body pos="0 0 .2"><joint name="z" type="slide" axis="0 0 1" damping="1"/>
-    <geom type="sphere" size=".25"/><body pos="0 0 .2"><joint name="h" axis="0 1 0" stiffness="5" springref="30"
-    damping=".5" frictionloss=".1" limited="true" range="-5 5" solreflimit=".004 1"/>
+    <geom type="sphere" size=".25"/><body pos="0 0 .2" gravcomp=".5"><joint name="h" axis="0 1 0" stiffness="5"
+    springref="30" damping=".5" frictionloss=".1" limited="true" range="-5 5"
+    solreflimit=".004 1"/>
     <geom type="capsule" size=".05 .2" pos=".2 0 0"/></body></body></worldbody>
     <actuator><motor joint="h" ctrllimited="true" ctrlrange="-1 1"/></actuator></mujoco>"""
     model = mujoco.MjModel.from_xml_string(xml)

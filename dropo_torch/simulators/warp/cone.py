@@ -175,12 +175,6 @@ def cone_hessian(dim: int, elliptic: int, d: f64, th: Reals, o_mu: int, impratio
 
 
 @wp.func
-def _edges(w0: f64, wk: f64, l0: f64, lk: f64, mu: f64) -> f64:
-    """Two opposite edges of a pyramid with D = 1: Σ max(0, −jar) · Jλ."""
-    return wp.max(ZERO, -(w0 + mu * wk)) * (l0 + mu * lk) + wp.max(ZERO, -(w0 - mu * wk)) * (l0 - mu * lk)
-
-
-@wp.func
 def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f64:
     """f · Jλ of an elliptic cone."""
     reg = mu[0] / wp.sqrt(impratio)
@@ -214,43 +208,33 @@ def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f
 
 
 @wp.func
-def contact_power(
-    dim: int,
-    elliptic: int,
-    u: vec6,
-    v: vec6,
-    jl: vec6,
-    dist: f64,
-    margin: f64,
-    mu: vec5,
-    solref: vec2,
-    friction_ref: vec2,
-    solimp: vec5,
-    invweight: f64,
-    impratio: f64,
-    h: f64,
-    refsafe: int,
-) -> f64:
-    """−f (Jλ) of a contact with J a = u, J q̇ = v, J λ = jl: the leaf whose gradient the adjoint takes."""
+def elliptic_power(
+    dim: int, u: vec6, v: vec6, jl: vec6, dist: f64, margin: f64, mu: vec5, solref: vec2, friction_ref: vec2,
+    solimp: vec5, invweight: f64, impratio: f64, h: f64, refsafe: int,
+) -> f64:  # fmt: skip
+    """−f (Jλ) of an elliptic contact with J a = u, J q̇ = v, J λ = jl: the leaf whose gradient the adjoint takes."""
     x = dist - margin
     imp = impedance(x, solimp)
     b = damping(solref, solimp, h, refsafe)
     bf = b
-    if elliptic != 0 and (friction_ref[0] != ZERO or friction_ref[1] != ZERO):
+    if friction_ref[0] != ZERO or friction_ref[1] != ZERO:
         bf = damping(friction_ref, solimp, h, refsafe)
     w0 = u[0] + b * v[0] + stiffness(solref, solimp, h, refsafe) * imp * x
-    d = normal_d(dim, elliptic, regularisation(imp, ONE), invweight, mu[0], impratio)
-    out = ZERO
-    if dim == 1:
-        out = d * wp.max(ZERO, -w0) * jl[0]
-    elif elliptic == 0:
-        y = _edges(w0, u[1] + bf * v[1], jl[0], jl[1], mu[0]) + _edges(w0, u[2] + bf * v[2], jl[0], jl[2], mu[1])
-        if dim > 3:
-            y += _edges(w0, u[3] + bf * v[3], jl[0], jl[3], mu[2])
-        if dim > 4:
-            y += _edges(w0, u[4] + bf * v[4], jl[0], jl[4], mu[3]) + _edges(w0, u[5] + bf * v[5], jl[0], jl[5], mu[4])
-        out = d * y
-    else:
-        w = vec6(w0, u[1] + bf * v[1], u[2] + bf * v[2], u[3] + bf * v[3], u[4] + bf * v[4], u[5] + bf * v[5])
-        out = _elliptic(dim, w, jl, mu, d, impratio)
-    return -out
+    d = normal_d(dim, 1, regularisation(imp, ONE), invweight, mu[0], impratio)
+    w = vec6(w0, u[1] + bf * v[1], u[2] + bf * v[2], u[3] + bf * v[3], u[4] + bf * v[4], u[5] + bf * v[5])
+    return -_elliptic(dim, w, jl, mu, d, impratio)
+
+
+@wp.func
+def contact_scalars(
+    dim: int, dist: f64, margin: f64, mu: f64, solref: vec2, solimp: vec5, invweight: f64, impratio: f64, h: f64,
+    refsafe: int, dbar: f64, bbar: f64, sbar: f64,
+) -> f64:  # fmt: skip
+    """Leaf: ⟨D, D̄⟩ + ⟨B, B̄⟩ + ⟨K d(x) x, s̄⟩ of a pyramidal or frictionless contact."""
+    x = dist - margin
+    imp = impedance(x, solimp)
+    return (
+        dbar * normal_d(dim, 0, regularisation(imp, ONE), invweight, mu, impratio)
+        + bbar * damping(solref, solimp, h, refsafe)
+        + sbar * stiffness(solref, solimp, h, refsafe) * imp * x
+    )

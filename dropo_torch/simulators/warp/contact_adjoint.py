@@ -28,10 +28,11 @@ from dropo_torch.simulators.warp.collide import (
     ellipsoid_point,
     round_dual,
 )
-from dropo_torch.simulators.warp.cone import contact_power
+from dropo_torch.simulators.warp.cone import cone_force, cone_piece, contact_scalars, elliptic_power, normal_d
 from dropo_torch.simulators.warp.contact import geom_centre, geom_rotation, half_axis, in_frame
+from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
 from dropo_torch.simulators.warp.rows import theta_vec2, theta_vec5
-from dropo_torch.simulators.warp.spatial import ang, cross_force, join, wrench
+from dropo_torch.simulators.warp.spatial import ang, cross_force, join, nothing, wrench
 from dropo_torch.simulators.warp.types import (
     HALF,
     MINVAL,
@@ -55,67 +56,155 @@ def _row(frame: mat33, i: int) -> vec3:
 @wp.func(inline=True)
 def contacts_adjoint(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
     """Add the gradient of Σ −f Jλ over the contacts to the bodies' F and Y and to θ."""
+    _late = wp.grad(nothing)(ONE)
     for c in range(ncon):
         k = s.con_pair[t, c]
-        b1 = m.pair_body1[k]
-        b2 = m.pair_body2[k]
         frame = s.con_frame[t, c]
         p = s.con_point[t, c]
+        b1 = m.pair_body1[k]
+        b2 = m.pair_body2[k]
         u = s.total[t, b2] - s.total[t, b1]
         v = s.velocity[t, b2] - s.velocity[t, b1]
         dual = s.dual[t, b2] - s.dual[t, b1]
-        o_mu = m.o_pair_friction + 5 * k
-        o_ref = m.o_pair_solref + 2 * k
-        o_fref = m.o_pair_solreffriction + 2 * k
-        o_imp = m.o_pair_solimp + 5 * k
-        _d, _e, ub, vb, lb, distbar, marginbar, mubar, refbar, frefbar, impbar, wbar, _r, _h, _s = wp.grad(
-            contact_power
-        )(
-            m.pair_dim[k], m.elliptic, in_frame(frame, u, p), in_frame(frame, v, p), in_frame(frame, dual, p),
-            s.con_dist[t, c], th[m.o_pair_margin + k], theta_vec5(th, o_mu), theta_vec2(th, o_ref),
-            theta_vec2(th, o_fref), theta_vec5(th, o_imp), th[m.o_pair_invweight + k], m.impratio, m.h, m.refsafe,
+        ju = in_frame(frame, u, p)
+        jv = in_frame(frame, v, p)
+        jl = in_frame(frame, dual, p)
+        ub = vec6()
+        vb = vec6()
+        lb = vec6()
+        distbar = f64(0.0)
+        if m.elliptic != 0 and m.pair_dim[k] > 1:
+            ub, vb, lb, distbar = _elliptic_adjoint(m, s, t, th, c, ju, jv, jl)
+        else:
+            ub, vb, lb, distbar = _pyramid_adjoint(m, s, t, th, c, ju, jv, jl)
+        if wp.length_sq(ub) > ZERO or wp.length_sq(lb) > ZERO:
+            _hang(m, s, t, c, u, v, dual, ub, vb, lb, distbar)
+
+
+@wp.func(inline=True)
+def _elliptic_adjoint(m: Tables, s: Scratch, t: int, th: Reals, c: int, ju: vec6, jv: vec6, jl: vec6):
+    """Adjoints of J a, J q̇, Jλ and the distance of a contact with an elliptic cone; adds that of θ."""
+    _late = wp.grad(nothing)(ONE)
+    k = s.con_pair[t, c]
+    o_mu = m.o_pair_friction + 5 * k
+    o_ref = m.o_pair_solref + 2 * k
+    o_fref = m.o_pair_solreffriction + 2 * k
+    o_imp = m.o_pair_solimp + 5 * k
+    _d, ub, vb, lb, distbar, marginbar, mubar, refbar, frefbar, impbar, wbar, _r, _h, _s = wp.grad(elliptic_power)(
+        m.pair_dim[k], ju, jv, jl, s.con_dist[t, c], th[m.o_pair_margin + k], theta_vec5(th, o_mu),
+        theta_vec2(th, o_ref), theta_vec2(th, o_fref), theta_vec5(th, o_imp), th[m.o_pair_invweight + k], m.impratio,
+        m.h, m.refsafe,
+    )  # fmt: skip
+    s.grad[t, m.o_pair_margin + k] += marginbar
+    s.grad[t, m.o_pair_invweight + k] += wbar
+    for i in range(2):
+        s.grad[t, o_ref + i] += refbar[i]
+        s.grad[t, o_fref + i] += frefbar[i]
+    for i in range(5):
+        s.grad[t, o_mu + i] += mubar[i]
+        s.grad[t, o_imp + i] += impbar[i]
+    return ub, vb, lb, distbar
+
+
+@wp.func(inline=True)
+def _pyramid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, c: int, ju: vec6, jv: vec6, jl: vec6):
+    """Adjoints of J a, J q̇, Jλ and the distance of a contact with a pyramid, or without friction; adds that of θ.
+
+    With the force f and the Hessian C of the cost at w = J a − aref, −f Jλ has the gradient C Jλ in w.
+    """
+    _late = wp.grad(nothing)(ONE)
+    k = s.con_pair[t, c]
+    dim = m.pair_dim[k]
+    o_mu = m.o_pair_friction + 5 * k
+    o_ref = m.o_pair_solref + 2 * k
+    o_imp = m.o_pair_solimp + 5 * k
+    mu1 = th[o_mu]
+    solref = theta_vec2(th, o_ref)
+    solimp = theta_vec5(th, o_imp)
+    margin = th[m.o_pair_margin + k]
+    weight = th[m.o_pair_invweight + k]
+    x = s.con_dist[t, c] - margin
+    imp = impedance(x, solimp)
+    b = damping(solref, solimp, m.h, m.refsafe)
+    w = ju + jv * b
+    w[0] += stiffness(solref, solimp, m.h, m.refsafe) * imp * x
+    d = normal_d(dim, 0, regularisation(imp, ONE), weight, mu1, m.impratio)
+    wbar = vec6()
+    lbar = vec6()
+    distbar = f64(0.0)
+    if cone_piece(dim, 0, th, o_mu, m.impratio, w) != 0:
+        f = cone_force(dim, 0, d, th, o_mu, m.impratio, w)
+        lbar = -f
+        if dim == 1:
+            wbar[0] = d * jl[0]
+        for i in range(1, dim):
+            mu = th[o_mu + i - 1]
+            for sign in range(2):
+                e = mu * f64(1.0 - 2.0 * float(sign))
+                jar = w[0] + e * w[i]
+                if jar < ZERO:
+                    slope = d * (jl[0] + e * jl[i])
+                    wbar[0] += slope
+                    wbar[i] += e * slope
+                    s.grad[t, o_mu + i - 1] += (e / mu) * (w[i] * slope + jl[i] * d * jar)
+        _dim, distbar, marginbar, mubar, refbar, impbar, weightbar, _r, _h, _s, _1, _2, _3 = wp.grad(contact_scalars)(
+            dim, s.con_dist[t, c], margin, mu1, solref, solimp, weight, m.impratio, m.h, m.refsafe,
+            -wp.dot(f, jl) / d, wp.dot(jv, wbar), wbar[0],
         )  # fmt: skip
         s.grad[t, m.o_pair_margin + k] += marginbar
-        s.grad[t, m.o_pair_invweight + k] += wbar
+        s.grad[t, m.o_pair_invweight + k] += weightbar
+        s.grad[t, o_mu] += mubar
         for i in range(2):
             s.grad[t, o_ref + i] += refbar[i]
-            s.grad[t, o_fref + i] += frefbar[i]
         for i in range(5):
-            s.grad[t, o_mu + i] += mubar[i]
             s.grad[t, o_imp + i] += impbar[i]
-        back = wp.transpose(frame)
-        fu = _spread(back, ub, p)
-        fv = _spread(back, vb, p)
-        fl = _spread(back, lb, p)
-        # p enters J x through x_lin + x_ang × p
-        pbar = (
-            wp.cross(back * vec3(ub[0], ub[1], ub[2]), ang(u))
-            + wp.cross(back * vec3(vb[0], vb[1], vb[2]), ang(v))
-            + wp.cross(back * vec3(lb[0], lb[1], lb[2]), ang(dual))
-        )
-        xu = vec3(u[3], u[4], u[5]) + wp.cross(ang(u), p)
-        xv = vec3(v[3], v[4], v[5]) + wp.cross(ang(v), p)
-        xl = vec3(dual[3], dual[4], dual[5]) + wp.cross(ang(dual), p)
-        nbar = xu * ub[0] + xv * vb[0] + xl * lb[0] + ang(u) * ub[3] + ang(v) * vb[3] + ang(dual) * lb[3]
-        t1bar = xu * ub[1] + xv * vb[1] + xl * lb[1] + ang(u) * ub[4] + ang(v) * vb[4] + ang(dual) * lb[4]
-        t2bar = xu * ub[2] + xv * vb[2] + xl * lb[2] + ang(u) * ub[5] + ang(v) * vb[5] + ang(dual) * lb[5]
-        y = _geometry_adjoint(m, s, t, c, distbar, pbar, nbar, t1bar, t2bar)
-        y1 = y[0]
-        y2 = y[1]
-        if b1 > 0:
-            y1 -= cross_force(s.total[t, b1], fu) + cross_force(s.velocity[t, b1], fv)
-            y1 -= cross_force(s.dual[t, b1], fl)
-            s.f_total[t, b1] = s.f_total[t, b1] - fu
-            s.f_velocity[t, b1] = s.f_velocity[t, b1] - fv
-            s.f_dual[t, b1] = s.f_dual[t, b1] - fl
-            s.f_pose[t, b1] = s.f_pose[t, b1] + y1
-        if b2 > 0:
-            y2 += cross_force(s.total[t, b2], fu) + cross_force(s.velocity[t, b2], fv)
-            y2 += cross_force(s.dual[t, b2], fl)
-            s.f_total[t, b2] = s.f_total[t, b2] + fu
-            s.f_velocity[t, b2] = s.f_velocity[t, b2] + fv
-            s.f_dual[t, b2] = s.f_dual[t, b2] + fl
-            s.f_pose[t, b2] = s.f_pose[t, b2] + y2
+    return wbar, wbar * b, lbar, distbar
+
+
+@wp.func(inline=True)
+def _hang(
+    m: Tables, s: Scratch, t: int, c: int, u: vec6, v: vec6, dual: vec6, ub: vec6, vb: vec6, lb: vec6, distbar: f64
+):
+    """Hang the adjoints of J a, J q̇, Jλ and the distance on the two bodies: F_U, F_V, F_Λ and Y."""
+    _late = wp.grad(nothing)(ONE)
+    k = s.con_pair[t, c]
+    frame = s.con_frame[t, c]
+    p = s.con_point[t, c]
+    b1 = m.pair_body1[k]
+    b2 = m.pair_body2[k]
+    back = wp.transpose(frame)
+    fu = _spread(back, ub, p)
+    fv = _spread(back, vb, p)
+    fl = _spread(back, lb, p)
+    # p enters J x through x_lin + x_ang × p
+    pbar = (
+        wp.cross(back * vec3(ub[0], ub[1], ub[2]), ang(u))
+        + wp.cross(back * vec3(vb[0], vb[1], vb[2]), ang(v))
+        + wp.cross(back * vec3(lb[0], lb[1], lb[2]), ang(dual))
+    )
+    xu = vec3(u[3], u[4], u[5]) + wp.cross(ang(u), p)
+    xv = vec3(v[3], v[4], v[5]) + wp.cross(ang(v), p)
+    xl = vec3(dual[3], dual[4], dual[5]) + wp.cross(ang(dual), p)
+    nbar = xu * ub[0] + xv * vb[0] + xl * lb[0] + ang(u) * ub[3] + ang(v) * vb[3] + ang(dual) * lb[3]
+    t1bar = xu * ub[1] + xv * vb[1] + xl * lb[1] + ang(u) * ub[4] + ang(v) * vb[4] + ang(dual) * lb[4]
+    t2bar = xu * ub[2] + xv * vb[2] + xl * lb[2] + ang(u) * ub[5] + ang(v) * vb[5] + ang(dual) * lb[5]
+    y = _geometry_adjoint(m, s, t, c, distbar, pbar, nbar, t1bar, t2bar)
+    y1 = y[0]
+    y2 = y[1]
+    if b1 > 0:
+        y1 -= cross_force(s.total[t, b1], fu) + cross_force(s.velocity[t, b1], fv)
+        y1 -= cross_force(s.dual[t, b1], fl)
+        s.f_total[t, b1] = s.f_total[t, b1] - fu
+        s.f_velocity[t, b1] = s.f_velocity[t, b1] - fv
+        s.f_dual[t, b1] = s.f_dual[t, b1] - fl
+        s.f_pose[t, b1] = s.f_pose[t, b1] + y1
+    if b2 > 0:
+        y2 += cross_force(s.total[t, b2], fu) + cross_force(s.velocity[t, b2], fv)
+        y2 += cross_force(s.dual[t, b2], fl)
+        s.f_total[t, b2] = s.f_total[t, b2] + fu
+        s.f_velocity[t, b2] = s.f_velocity[t, b2] + fv
+        s.f_dual[t, b2] = s.f_dual[t, b2] + fl
+        s.f_pose[t, b2] = s.f_pose[t, b2] + y2
 
 
 @wp.func

@@ -8,7 +8,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.collide import box_dual, cylinder_dual, ellipsoid_dual, round_dual
-from dropo_torch.simulators.warp.cone import contact_power
+from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
 from dropo_torch.simulators.warp.rows import row_power
@@ -118,7 +118,8 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array
     v5 = vec5(a[0], a[1], a[2], a[3], a[4])
     s = a[0]
     y[0] = row_power(0, s, s, s, s, v2, v5, s, s, s, 1)
-    y[1] = contact_power(3, 0, a, a, a, s, s, v5, v2, v2, v5, s, s, s, 1)
+    y[1] = elliptic_power(3, a, a, a, s, s, v5, v2, v2, v5, s, s, s, 1)
+    y[8] = contact_scalars(3, s, s, s, v2, v5, s, s, s, 1, s, s, s)
     y[2] = box_power(v, v, v, v, v, s, s, s)
     y[3] = round_dual(v, v, s, v, v, s, 0, s, v, v)
     y[4] = cylinder_dual(v, v, r[0], v, 0, v)

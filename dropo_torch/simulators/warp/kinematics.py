@@ -23,6 +23,7 @@ from dropo_torch.simulators.warp.spatial import (
 )
 from dropo_torch.simulators.warp.types import (
     HINGE,
+    MINVAL,
     SLIDE,
     TRANSLATION,
     ZERO,
@@ -132,7 +133,7 @@ def inertial_forces(m: Tables, s: Scratch, t: int, th: Reals):
             if m.has_gravcomp != 0:
                 a += join(vec3(), theta_vec3(th, m.o_gravity) * th[m.o_gravcomp + b])
             f = inertia_mul(i, a) + cross_force(v, inertia_mul(i, v))
-            if m.has_fluid != 0:
+            if m.has_fluid != 0 and th[m.o_mass + b] >= MINVAL:
                 f -= fluid_wrench(m, s, t, th, b)
             s.force[t, b] = f
         else:

@@ -39,6 +39,7 @@ from dropo_torch.simulators.warp.spatial import (
 )
 from dropo_torch.simulators.warp.types import (
     BALL,
+    MINVAL,
     ONE,
     TRANSLATION,
     Ints,
@@ -211,7 +212,7 @@ def bodies_adjoint(m: Tables, s: Scratch, t: int, th: Reals, moving: int, posed:
             s.f_accel[t, b] = fa
             if m.want_inertial != 0:
                 _inertia_adjoint(m, s, t, th, b, dual, a, lv, v)
-            if moving != 0 and m.has_fluid != 0:
+            if moving != 0 and m.has_fluid != 0 and th[m.o_mass + b] >= MINVAL:
                 _fluid_adjoint(m, s, t, th, b, dual, v)
 
 

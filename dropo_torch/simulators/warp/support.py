@@ -111,6 +111,8 @@ def _structure(model: mujoco.MjModel) -> Iterator[str]:
         yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[g]!r}"
     for i in range(1, model.nbody):
         moving = model.body_weldid[i] != 0
+        if model.body_gravcomp[i] < 0:
+            yield f"negative gravcomp of body {model.body(i).name!r} (MuJoCo ignores it unless another is positive)"
         if moving and model.body_gravcomp[i] and _actgravcomp(model, i):
             yield f"actuatorgravcomp on body {model.body(i).name!r}"
 

@@ -210,6 +210,8 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
     damper = damper and not _disabled(model, _DISABLE.mjDSBL_DAMPER)
     spring = acts("jnt_stiffness", model.jnt_stiffness) or acts("jnt_stiffnesspoly", model.jnt_stiffnesspoly)
     fluid = acts("opt.density", np.array(model.opt.density)) or acts("opt.viscosity", np.array(model.opt.viscosity))
+    # without springs and dampers MuJoCo leaves out all passive forces
+    passive = not (_disabled(model, _DISABLE.mjDSBL_SPRING) and _disabled(model, _DISABLE.mjDSBL_DAMPER))
     implicit = integrator == 2 or (integrator == 0 and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP))
     return {
         "want_inertial": int(any(_targets(space, f) for f in ("body_mass", "body_inertia", "body_ipos"))),
@@ -220,5 +222,6 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
         "refsafe": int(not _disabled(model, _DISABLE.mjDSBL_REFSAFE)), "implicit": int(implicit),
         "implicit_actuators": int(integrator == 2), "has_damper": int(damper),
         "has_spring": int(spring and not _disabled(model, _DISABLE.mjDSBL_SPRING)),
-        "has_gravcomp": int(acts("body_gravcomp", model.body_gravcomp)), "has_fluid": int(fluid),
+        "has_gravcomp": int(passive and acts("body_gravcomp", model.body_gravcomp)),
+        "has_fluid": int(passive and fluid),
     }  # fmt: skip
