@@ -3,8 +3,8 @@
     python examples/gradient_vs_gradient_free.py --out out/gradients                  # all four
     python examples/gradient_vs_gradient_free.py --out out/gradients --systems chain20
 
-Hopper masses (4), Walker2d masses and dampings (13), chains of 10 and 20 links with a mass, a damping and an armature each
-(30, 60). Every log has 200 transitions with known truth; the measured next states carry noise of the variance ε that the
+Hopper masses (4), Walker2d masses and dampings (13), chains of 10 and 20 links with mass, damping and armature each
+(30, 60). Every log has 200 transitions with known truth; measured next states carry noise of the variance ε that the
 likelihood assumes. Each optimizer fits the same objective on the same log; CMA-ES gets at least ten times the simulated
 transitions of Adam.
 """
@@ -67,8 +67,9 @@ def chain(links: int) -> System:
     for i in range(links):
         axis = "0 1 0" if i % 2 == 0 else "1 0 0"
         bodies += (
-            f'<body name="link{i}" pos="0 0 {0 if i == 0 else -0.2}"><joint name="joint{i}" axis="{axis}" damping="0.1" '
-            f'armature="0.02"/><geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.03" mass="0.5" contype="0"/>'
+            f'<body name="link{i}" pos="0 0 {0 if i == 0 else -0.2}">'
+            f'<joint name="joint{i}" axis="{axis}" damping="0.1" armature="0.02"/>'
+            '<geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.03" mass="0.5" contype="0"/>'
         )
         motors += f'<motor joint="joint{i}" gear="4"/>'
     xml = (
@@ -76,8 +77,9 @@ def chain(links: int) -> System:
         f"<worldbody>{bodies}{'</body>' * links}</worldbody><actuator>{motors}</actuator></mujoco>"
     )
     parameters: dict[str, dict[str, Any]] = {}
+    inertia = {"scale_inertia": True}
     for i in range(links):
-        parameters[f"mass{i}"] = {"field": "body_mass", "name": f"link{i}", "bounds": [0.1, 1.5], "scale_inertia": True}
+        parameters[f"mass{i}"] = {"field": "body_mass", "name": f"link{i}", "bounds": [0.1, 1.5]} | inertia
         parameters[f"damping{i}"] = {"field": "dof_damping", "name": f"joint{i}", "bounds": [0.01, 0.5]}
         parameters[f"armature{i}"] = {"field": "dof_armature", "name": f"joint{i}", "bounds": [0.005, 0.1]}
     return System(mujoco.MjModel.from_xml_string(xml), parameters, 4)

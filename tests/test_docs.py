@@ -7,6 +7,7 @@ import os
 import re
 import shlex
 import shutil
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
@@ -88,6 +89,7 @@ def load_example(path: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
     spec.loader.exec_module(module)
     return module
 
@@ -254,6 +256,16 @@ def test_links_and_files_exist(page: Path) -> None:
 def test_recover_hopper(capsys: pytest.CaptureFixture) -> None:
     load_example(ROOT / "examples" / "recover_hopper.py").main(["point", "--steps", "30", "--seeds", "1"])
     assert "torso_mass" in capsys.readouterr().out
+
+
+def test_gradient_vs_gradient_free(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    example = load_example(ROOT / "examples" / "gradient_vs_gradient_free.py")
+    small = ["--steps", "10", "--samples", "8", "--adam-steps", "5", "--budget", "12"]
+    example.main(["--out", str(tmp_path), "--systems", "hopper", "walker", *small])
+    for name in ("hopper", "walker"):
+        assert (tmp_path / f"{name}.html").exists()
+        assert "cma-warp" in (tmp_path / f"{name}.json").read_text()
+    assert "13 parameters" in capsys.readouterr().out
 
 
 def test_demo_figure(tmp_path: Path) -> None:
