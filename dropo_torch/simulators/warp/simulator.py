@@ -17,6 +17,7 @@ from dropo_torch.simulators.base import DIVERGED, Simulator
 from dropo_torch.simulators.warp.engine import Engine, Problem, Simulate
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
+from dropo_torch.simulators.warp.start import start_warp
 from dropo_torch.simulators.warp.support import check_support
 from dropo_torch.simulators.warp.tables import build_tables
 
@@ -68,8 +69,8 @@ class WarpSimulator(Simulator):
         self.num_states, self.num_controls = model.nq + model.nv, model.nu
         self.timestep = model.opt.timestep * frame_skip
         self._fields = Fields(model, parameters, pairs)
+        start_warp()
         with _LOADING:
-            wp.init()
             try:
                 wp.get_device(device)
             except Exception:
