@@ -12,7 +12,8 @@ from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit
-from dropo_torch.objective import Objective, log_likelihood
+from dropo_torch.likelihood import log_likelihood
+from dropo_torch.objective import Objective
 from dropo_torch.observation import Observation, parse_observation
 from dropo_torch.parameters import Parameter, ParameterSpace
 from dropo_torch.preprocess import Preprocess, preprocess

@@ -1,7 +1,6 @@
-"""The likelihood of the measured next states, equations 2 and 3 of Tiboni et al. 2023.
+"""The objective: the likelihood of one log under one simulator, as a function of φ.
 
-Pure functions of simulated and measured states come first; :class:`Objective` binds them to a log, an
-observation and a simulator, and evaluates them in chunks whose size does not depend on T·K.
+It simulates in chunks whose size does not depend on T·K, and sums what a reduction makes of each.
 """
 
 from __future__ import annotations
@@ -17,126 +16,17 @@ import torch
 
 from dropo_torch.distribution import SearchBox, base_uniforms, to_values, values_from_uniforms
 from dropo_torch.errors import InputError, choices
+from dropo_torch.likelihood import likelihood_with_losses, propagate, rotation_vector, widen
 from dropo_torch.observation import Observation
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.trajectory import Transitions
 
-#: Log-likelihood taken from a transition for the share of its samples that diverged, in nats.
-DIVERGENCE_PENALTY = 1e3
-#: Log-likelihood of a transition of which fewer than two samples are left.
-LOST_TRANSITION = -1e4
-
-#: Antithetic pairs of start noise per noisy column, their seed, and degrees of freedom of Student's law.
+#: Antithetic pairs of start noise per noisy column, and their seed.
 NOISE_DRAWS = 2
 NOISE_SEED = 4
-STUDENT_DOF = 5.0
 
 #: ``reduce(features (t, P, m), measured (t, m), covariance (t, m, m)) -> (r,)``, summed over chunks.
 Reduce = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
-
-
-def sample_moments(samples: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return mean ``(..., n)`` and unbiased covariance ``(..., n, n)`` of samples ``(..., K, n)`` (eq. 2)."""
-    mean = samples.mean(-2)
-    centred = samples - mean.unsqueeze(-2)
-    return mean, centred.mT @ centred / (samples.shape[-2] - 1)
-
-
-def gaussian_log_density(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-    """Return log N(residual; 0, covariance), constant term included (eq. 3).
-
-    Args:
-        residual: ``(..., n)``.
-        covariance: positive definite, ``(..., n, n)``.
-
-    Returns:
-        ``(...)``.
-    """
-    factor = robust_cholesky(covariance)
-    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
-    log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
-    return -0.5 * white.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
-
-
-def robust_cholesky(covariance: torch.Tensor) -> torch.Tensor:
-    """Return the lower Cholesky factor, ``(..., n, n)``.
-
-    A matrix that rounding has left indefinite (deviations of very different size) gets the smallest
-    multiple of its trace on the diagonal that cures it; all others are left as they are.
-    """
-    factor, info = torch.linalg.cholesky_ex(covariance)
-    jitter = 1e-15
-    while bool((info > 0).any()) and jitter < 1e-3:
-        scale = torch.diagonal(covariance, dim1=-2, dim2=-1).mean(-1)[..., None, None]
-        eye = torch.eye(covariance.shape[-1], dtype=covariance.dtype)
-        covariance = torch.where((info > 0)[..., None, None], covariance + jitter * scale * eye, covariance)
-        factor, info = torch.linalg.cholesky_ex(covariance)
-        jitter *= 10
-    return factor
-
-
-def log_likelihood(
-    samples: torch.Tensor, measured: torch.Tensor, epsilon: torch.Tensor | float, extra: torch.Tensor | None = None
-) -> torch.Tensor:
-    """Return the log-likelihood of each measured next state under its simulated samples (eq. 2 and 3).
-
-    Args:
-        samples: simulated next states, ``(..., K, n)``, K at least 2.
-        measured: measured next states, broadcast to ``(..., n)``.
-        epsilon: added to the covariance's diagonal, scalar or ``(n,)``.
-        extra: a further covariance, broadcast to ``(..., n, n)``.
-
-    Returns:
-        ``(...)``, one value a transition, in nats.
-    """
-    mean, covariance = sample_moments(samples)
-    diagonal = torch.as_tensor(epsilon, dtype=samples.dtype).expand(samples.shape[-1])
-    covariance = covariance + torch.diag(diagonal)
-    return gaussian_log_density(measured - mean, covariance if extra is None else covariance + extra)
-
-
-def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return shift ``(t, m)`` and covariance ``(t, m, m)`` of outcomes of noisy starts.
-
-    Args:
-        outcomes: the undisturbed one, then those of antithetic draws, ``(t, 1 + M, m)``.
-        draws: standard normal, ``(1 + M, c)``, the first zero.
-    """
-    outcomes = torch.where(torch.isfinite(outcomes), outcomes, outcomes[:, :1])
-    outcomes = torch.nan_to_num(outcomes)
-    spread = outcomes[:, 1:] - outcomes[:, 1:].mean(1, keepdim=True)
-    gain = (torch.linalg.pinv(draws[1:]) @ spread).mT  # G √ν, (t, m, c)
-    left = spread - draws[1:] @ gain.mT
-    variance = left.square().sum(1) / (len(draws) - 1 - draws.shape[1])
-    shift = outcomes[:, 1:].mean(1) - outcomes[:, 0]
-    return shift, gain @ gain.mT + torch.diag_embed(variance)
-
-
-def widen(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-    """Return covariances ``(t, m, m)`` widened where the residual ``(t, m)`` lies far outside them.
-
-    The factor is that of the scale-mixture form of Student's t law: (ν + χ²) / (ν + m), at least 1.
-    """
-    factor = robust_cholesky(covariance)
-    white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)
-    chi2 = white.square().sum((-2, -1))
-    scale = (STUDENT_DOF + chi2) / (STUDENT_DOF + residual.shape[-1])
-    return covariance * scale.clamp(min=1.0)[:, None, None]
-
-
-def rotation_vector(measured: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:
-    """Return the rotation from measured to simulated unit quaternions (w, x, y, z), ``(..., 3)`` in rad.
-
-    Its length is the angle between the two orientations, in [0, π].
-    """
-    w0, v0 = measured[..., :1], measured[..., 1:]
-    w1, v1 = simulated[..., :1], simulated[..., 1:]
-    scalar = w0 * w1 + (v0 * v1).sum(-1, keepdim=True)
-    vector = w0 * v1 - w1 * v0 - torch.linalg.cross(v0.expand_as(v1), v1)
-    sign = torch.where(scalar < 0, -1.0, 1.0)
-    norm = vector.norm(dim=-1, keepdim=True)
-    angle = 2 * torch.atan2(norm, scalar * sign)
-    return sign * vector * torch.where(norm > 1e-12, angle / norm.clamp(min=1e-300), torch.full_like(norm, 2.0))
 
 
 @dataclass(frozen=True)
@@ -359,7 +249,7 @@ class Objective:
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
             samples = features.unflatten(1, (num_phi, -1))
-            values, squared, lost = _likelihood_with_losses(
+            values, squared, lost = likelihood_with_losses(
                 samples, measured[:, None], covariance[:, None], self._angles
             )
             return torch.cat([values.sum(0), squared.nansum(0), squared.isfinite().sum(0).double(), lost.sum(0)])
@@ -501,56 +391,6 @@ def draw_uniforms(num_samples: int, num_parameters: int, *seeds: int) -> torch.T
 def draw_normals(num_draws: int, width: int, seed: int) -> torch.Tensor:
     """Draw standard normals ``(num_draws, width)``, a pure function of the seed."""
     return torch.special.ndtri(draw_uniforms(num_draws, width, seed))
-
-
-def _likelihood_with_losses(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Log-likelihood, squared error and number of diverged samples, ``(t, P)`` each, of ``(t, P, K, m)``.
-
-    The squared error of a transition of which nothing is left is NaN.
-    """
-    finite = torch.isfinite(samples).all(-1)
-    lost = (~finite).sum(-1)
-    if not bool(lost.any()):
-        values, squared = _gaussian(samples, measured, covariance, num_rotations)
-        return values, squared, lost.double()
-    values = torch.full(lost.shape, LOST_TRANSITION, dtype=samples.dtype)
-    squared = torch.full_like(values, torch.nan)
-    num_samples = samples.shape[2]
-    for t, p in (finite.sum(-1) >= 2).nonzero().tolist():
-        kept = samples[t, p, finite[t, p]]
-        one, error = _gaussian(kept, measured[t, 0], covariance[t, 0], num_rotations)
-        values[t, p] = one - DIVERGENCE_PENALTY * lost[t, p] / num_samples
-        squared[t, p] = error
-    return values, squared, lost.double()
-
-
-def _gaussian(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-likelihood, with rotations by their angles and both signs, and squared error of the mean features."""
-    squared = (measured - samples.mean(-2)).square().sum(-1)
-    if num_rotations:
-        samples, measured, covariance = _rotation_angles(samples, measured, covariance, num_rotations)
-    mean, sampled = sample_moments(samples)
-    return gaussian_log_density(measured - mean, sampled + covariance), squared
-
-
-def _rotation_angles(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Replace each rotation vector by its angle α, the sample by its union with all angles negated."""
-    plain = samples.shape[-1] - 3 * num_rotations
-    angles = samples[..., plain:].unflatten(-1, (num_rotations, 3)).norm(dim=-1)
-    rest = samples[..., :plain]
-    both = torch.cat([torch.cat([rest, angles], -1), torch.cat([rest, -angles], -1)], -2)
-    average = torch.zeros(samples.shape[-1], plain + num_rotations, dtype=samples.dtype)
-    average[torch.arange(plain), torch.arange(plain)] = 1
-    for i in range(num_rotations):  # an angle's variance is its rotation vector's, averaged over the axes
-        average[plain + 3 * i : plain + 3 * i + 3, plain + i] = 3**-0.5
-    flat = torch.cat([measured[..., :plain], torch.zeros_like(angles[..., 0, :])], -1)
-    return both, flat, average.T @ covariance @ average
 
 
 def _blocks(total: int, rows: int) -> Iterator[slice]:

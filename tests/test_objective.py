@@ -24,17 +24,15 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from dropo_torch.errors import InputError
-from dropo_torch.objective import (
+from dropo_torch.likelihood import (
     DIVERGENCE_PENALTY,
     LOST_TRANSITION,
-    Objective,
-    draw_uniforms,
     gaussian_log_density,
     log_likelihood,
-    no_effect,
     robust_cholesky,
     rotation_vector,
 )
+from dropo_torch.objective import Objective, draw_uniforms, no_effect
 from dropo_torch.observation import generic_observation, parse_observation
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator

@@ -21,7 +21,8 @@ from conftest import (
 
 from dropo_torch.distribution import coordinate_limits, to_values, truncated_interval, truncated_moments
 from dropo_torch.fit import fit
-from dropo_torch.objective import LOST_TRANSITION, Objective, draw_uniforms
+from dropo_torch.likelihood import LOST_TRANSITION
+from dropo_torch.objective import Objective, draw_uniforms
 from dropo_torch.observation import parse_observation
 from dropo_torch.optimizers import CMAOptimizer, FisherOptimizer, Optimizer
 from dropo_torch.optimizers.fisher import ScoringStage

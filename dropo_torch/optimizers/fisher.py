@@ -20,10 +20,11 @@ from dropo_torch.distribution import (
     truncated_interval,
     truncated_moments,
 )
-from dropo_torch.objective import LOST_TRANSITION, Reduce, draw_uniforms, gaussian_log_density
+from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density
+from dropo_torch.objective import Reduce, draw_uniforms
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.optimizers.gauss_newton import MeansStage
-from dropo_torch.optimizers.sampled import MAX_DAMPING, SampledStage, scoring_step
+from dropo_torch.optimizers.sampled import MAX_DAMPING, SampledStage, judge, scoring_step
 from dropo_torch.parameters import ParameterSpace
 
 MAX_ITERATIONS = 60
@@ -82,24 +83,7 @@ class ScoringStage:
 
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one."""
-        value = float(sums[0])
-        if np.isfinite(value) and value > self.log_likelihood:
-            gain = value - self.log_likelihood
-            self.mean, self.std = self.candidate or (self.mean, self.std)
-            self.log_likelihood, self.sums = value, sums.numpy().copy()
-            self.damping = max(self.damping / 4, 1e-6)
-            self.small_gains = self.small_gains + 1 if gain < SMALL_GAIN else 0
-            if self.small_gains >= 2:
-                self.reason = f"two steps in a row gained less than {SMALL_GAIN:g} nat"
-        elif self.candidate is None:
-            self.reason = "no simulation succeeded at the starting point"
-        else:
-            self.damping *= 8
-            if self.damping > MAX_DAMPING:
-                self.reason = "no step improves the likelihood"
-        self.iterations += 1
-        if self.iterations >= MAX_ITERATIONS and self.reason is None:
-            self.reason = f"{MAX_ITERATIONS} iterations of Fisher scoring"
+        judge(self, sums, small_gain=SMALL_GAIN, max_damping=MAX_DAMPING, max_iterations=MAX_ITERATIONS)
         if self.reason is None:
             self._propose()
 

@@ -9,7 +9,8 @@ import scipy.optimize
 import torch
 
 from dropo_torch.distribution import SearchBox
-from dropo_torch.objective import DIVERGENCE_PENALTY, Reduce, robust_cholesky
+from dropo_torch.likelihood import DIVERGENCE_PENALTY, robust_cholesky
+from dropo_torch.objective import Reduce
 
 #: Step of the forward differences, as a share of the search width.
 DIFFERENCE_STEP = 1e-5

@@ -8,13 +8,14 @@ its gradient follows from how the samples' next states regress on z: no further 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 import torch
 
 from dropo_torch.distribution import SearchBox, truncated_normal_icdf
-from dropo_torch.objective import LOST_TRANSITION, Reduce, gaussian_log_density, sample_moments
+from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density, sample_moments
+from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.gauss_newton import damped_step
 
 MAX_ITERATIONS = 25
@@ -73,26 +74,9 @@ class SampledStage:
             sums: of :meth:`reduction`.
             gradient: of the log-likelihood in the samples' values, ``(K, d)``; replaces the regressed scores.
         """
-        value = float(sums[0])
         if gradient is not None:
             sums = self._with_exact_scores(sums, gradient)
-        if np.isfinite(value) and value > self.log_likelihood:
-            gain = value - self.log_likelihood
-            self.mean, self.std = self.candidate or (self.mean, self.std)
-            self.log_likelihood, self.sums = value, sums.numpy().copy()
-            self.damping = max(self.damping / 4, 1e-6)
-            self.small_gains = self.small_gains + 1 if gain < SMALL_GAIN else 0
-            if self.small_gains >= 2:
-                self.reason = f"two steps in a row gained less than {SMALL_GAIN:g} nat"
-        elif self.candidate is None:
-            self.reason = "no simulation succeeded at the starting point"
-        else:
-            self.damping *= 8
-            if self.damping > MAX_DAMPING:
-                self.reason = "no step improves the sampled likelihood"
-        self.iterations += 1
-        if self.iterations >= MAX_ITERATIONS and self.reason is None:
-            self.reason = f"{MAX_ITERATIONS} iterations on the sampled likelihood"
+        judge(self, sums, small_gain=SMALL_GAIN, max_damping=MAX_DAMPING, max_iterations=MAX_ITERATIONS)
         if self.reason is None and self.sums is not None:
             self.candidate = scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
 
@@ -109,6 +93,50 @@ class SampledStage:
         by_mean, by_std = torch.autograd.grad(values, (mean, std), gradient)
         d = len(mean)
         return torch.cat([sums[:1], by_mean, by_std * std.detach(), sums[1 + 2 * d :]])
+
+
+class Ascent(Protocol):
+    """What a stage that climbs the likelihood by steps in (μ, log σ) remembers."""
+
+    mean: np.ndarray
+    std: np.ndarray
+    damping: float
+    log_likelihood: float
+    iterations: int
+    small_gains: int
+    reason: str | None
+    candidate: tuple[np.ndarray, np.ndarray] | None
+    sums: np.ndarray | None
+
+
+def judge(stage: Ascent, sums: torch.Tensor, *, small_gain: float, max_damping: float, max_iterations: int) -> None:
+    """Accept or reject a stage's candidate by its log-likelihood, the first of its sums; stop where it is time.
+
+    Args:
+        stage: changed in place.
+        sums: of the candidate.
+        small_gain: two accepted steps in a row that each gain less end the stage, in nats.
+        max_damping: damping beyond which no step is tried.
+        max_iterations: candidates after which the stage ends.
+    """
+    value = float(sums[0])
+    if np.isfinite(value) and value > stage.log_likelihood:
+        gain = value - stage.log_likelihood
+        stage.mean, stage.std = stage.candidate or (stage.mean, stage.std)
+        stage.log_likelihood, stage.sums = value, sums.numpy().copy()
+        stage.damping = max(stage.damping / 4, 1e-6)
+        stage.small_gains = stage.small_gains + 1 if gain < small_gain else 0
+        if stage.small_gains >= 2:
+            stage.reason = f"two steps in a row gained less than {small_gain:g} nat"
+    elif stage.candidate is None:
+        stage.reason = "no simulation succeeded at the starting point"
+    else:
+        stage.damping *= 8
+        if stage.damping > max_damping:
+            stage.reason = "no step improves the likelihood"
+    stage.iterations += 1
+    if stage.iterations >= max_iterations and stage.reason is None:
+        stage.reason = f"{max_iterations} iterations of Fisher scoring"
 
 
 def scoring_step(
