@@ -18,6 +18,8 @@ from dropo_torch.parameters import ParameterSpace
 
 _BETAS = (0.9, 0.99)
 _TINY = 1e-12
+#: Steps before the gradient's running size is trusted.
+_WARM_UP = 10
 
 
 @dataclass(frozen=True)
@@ -29,16 +31,17 @@ class AdamSettings:
         batch: transitions of a minibatch; the whole log where that is shorter.
         samples: parameter vectors of each step.
         learning_rate: of the first half of the steps, falling to a hundredth of it by a cosine.
-        clip: largest norm of the gradient, per transition and in the scaled φ.
+        clip: largest entry of a minibatch's gradient, in multiples of that entry's running root mean square:
+            a single transition at a stiff contact must not slow the steps that follow.
         plateau: steps without a better smoothed likelihood after which it stops.
         common_random_numbers: the same samples at every step instead of fresh ones.
     """
 
-    steps: int = 800
+    steps: int = 1600
     batch: int = 25
     samples: int = 16
     learning_rate: float = 0.05
-    clip: float = 1e6
+    clip: float = 3.0
     plateau: int = 300
     common_random_numbers: bool = False
 
@@ -120,7 +123,9 @@ class AdamOptimizer(Optimizer):
         phi = torch.from_numpy(self._phi.copy()).requires_grad_(True)
         (pulled,) = torch.autograd.grad(self._values(phi), phi, gradient.reshape(-1, len(self._space)))
         force = np.nan_to_num(pulled.numpy() / self._batch)
-        force = force * min(1.0, self._settings.clip / (float(np.linalg.norm(force)) + _TINY))
+        if self._step >= _WARM_UP:
+            usual = np.sqrt(self._second / (1 - _BETAS[1] ** self._step))
+            force = np.clip(force, -self._settings.clip * usual, self._settings.clip * usual)
         self._step += 1
         self._first = _BETAS[0] * self._first + (1 - _BETAS[0]) * force
         self._second = _BETAS[1] * self._second + (1 - _BETAS[1]) * force**2
