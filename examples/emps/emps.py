@@ -54,8 +54,9 @@ def open_loop_error(problem: dropo.Problem, values: np.ndarray) -> np.ndarray:
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("data", type=Path, help="DATA_EMPS.mat")
+    parser.add_argument("--backend", choices=["mujoco", "warp"], default="mujoco")
     given = parser.parse_args(arguments)
-    fit, problem = fit_emps(given.data)
+    fit, problem = fit_emps(given.data, {"backend": given.backend})
     print(f"{'':<18}{'found':>10}{'published':>11}{'difference':>12}")
     for name, entry in fit.distribution.summary().items():
         published = REFERENCE[name]
