@@ -42,7 +42,7 @@ class AdamSettings:
     samples: int = 16
     learning_rate: float = 0.05
     clip: float = 3.0
-    plateau: int = 300
+    plateau: int = 1600
     common_random_numbers: bool = False
 
     def __post_init__(self) -> None:
