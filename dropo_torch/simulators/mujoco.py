@@ -58,8 +58,8 @@ class MujocoSimulator(Simulator):
         self.timestep = float(model.opt.timestep) * self.frame_skip
         self._num_threads = num_threads
         self._chunk_size = int(chunk_size)
-        self._filters = _filter_activations(model)
-        self._row = _default_row(self.model)
+        self._filters = filter_activations(model)
+        self._row = default_row(self.model)
         self._batch: mujoco.batch.Batch | None = None
         self._tiled: tuple[np.ndarray, int] | None = None  # the values that the batch's fields hold, and their repeats
         self._constants: mujoco.batch.Batch | None = None
@@ -133,7 +133,7 @@ class MujocoSimulator(Simulator):
         qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
         if self._filters:
             activation, source = (list(x) for x in zip(*self._filters, strict=True))
-            settled = np.clip(control[:, 0], *_control_range(model))[:, source]
+            settled = np.clip(control[:, 0], *control_range(model))[:, source]
             batch.bind("act")[:num_rows, activation] = np.repeat(settled, num_k, axis=0)
         ctrl = batch.bind("ctrl")[:num_rows]
         out = np.empty((num_rows, lag if every_step else 1, self.num_states))
@@ -163,7 +163,7 @@ def _derived_fields(batch: mujoco.batch.Batch) -> list[str]:
     ]
 
 
-def _default_row(model: mujoco.MjModel) -> np.ndarray:
+def default_row(model: mujoco.MjModel) -> np.ndarray:
     """The integration state of a simulation that has just been reset, ``(nstate,)``."""
     data = mujoco.MjData(model)
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
@@ -172,7 +172,7 @@ def _default_row(model: mujoco.MjModel) -> np.ndarray:
     return row
 
 
-def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+def control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest control that acts, ``(nu,)`` each."""
     limited = model.actuator_ctrllimited.astype(bool) & ~bool(
         model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
@@ -181,7 +181,7 @@ def _control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 
 
-def _filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
+def filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
     """Activations of first-order filters and the controls they follow: each starts settled at its control.
 
     Any other hidden state (integrators, muscles, delays) is not in a log of positions and velocities.

@@ -1,0 +1,216 @@
+"""Effects of bodies: mass that the model lacks, forces from outside, air."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Quantity, Setting
+
+
+def body_number(model: mujoco.MjModel, target: str | None) -> int:
+    """Return the number of a body by its name, or ``body3`` for an unnamed one."""
+    names = [model.body(b).name or f"body{b}" for b in range(model.nbody)]
+    return names.index(str(target))
+
+
+class BodyEffect(Effect):
+    """An effect of one moving body."""
+
+    kind = "body"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return every body with mass that moves in the log."""
+        m = setting.model
+        names = setting.names("body")
+        moving = [b for b in range(1, m.nbody) if m.body_mass[b] > 0 and setting.signals.linear_speed[b] > 0]
+        return [names[b] for b in moving]
+
+    @staticmethod
+    def extent(setting: Setting, body: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the corners of the box around a body's geoms, in its frame, ``(3,)`` each."""
+        m = setting.model
+        low, high = m.body_ipos[body] - 0.02, m.body_ipos[body] + 0.02
+        for g in range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body]):
+            turn = np.empty(9)
+            mujoco.mju_quat2Mat(turn, m.geom_quat[g])
+            reach = np.abs(turn.reshape(3, 3)) @ m.geom_aabb[g, 3:]
+            center = m.geom_pos[g] + turn.reshape(3, 3) @ m.geom_aabb[g, :3]
+            low, high = np.minimum(low, center - reach), np.maximum(high, center + reach)
+        return low, high
+
+
+def add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: np.ndarray) -> None:
+    """Weld a point mass at ``position`` in a body's frame: its mass, centre and inertia follow."""
+    own, center = float(model.body_mass[body]), model.body_ipos[body].copy()
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, model.body_iquat[body])
+    axes = turn.reshape(3, 3)
+    total = own + mass
+    shared = (own * center + mass * position) / total
+    inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
+    for m, at in ((own, center), (mass, position)):
+        arm = at - shared
+        inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+    model.body_mass[body], model.body_ipos[body] = total, shared
+    _write_inertia(model, body, inertia)
+
+
+def _write_inertia(model: mujoco.MjModel, body: int, inertia: np.ndarray) -> None:
+    """Write an inertia tensor as principal moments and axes."""
+    moments, axes = np.linalg.eigh(inertia)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(axes).reshape(9))
+    model.body_inertia[body], model.body_iquat[body] = moments, quaternion
+    unmark_simple(model, body)
+
+
+def unmark_simple(model: mujoco.MjModel, body: int) -> None:
+    """Tell MuJoCo that a body's centre and axes are no longer those of its frame."""
+    model.body_sameframe[body] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+
+
+class Payload(BodyEffect):
+    """A mass fixed to a body: a tool, a gripped object, a battery."""
+
+    name = "payload"
+    sentence = "a mass on {target} that the model lacks, such as a tool or a gripped object"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        body = body_number(setting.model, target)
+        own = float(setting.model.body_mass[body])
+        low, high = self.extent(setting, body)
+        size = float(np.linalg.norm(high - low))
+        center = setting.model.body_ipos[body]
+        places = tuple(
+            Quantity(n, "m", float(c), float(a - 0.5 * size), float(b + 0.5 * size), 0.5 * size)
+            for n, c, a, b in zip("xyz", center, low, high, strict=True)
+        )
+        return (Quantity("mass", "kg", 0.0, 0.0, 5 * own, own), *places)
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        """Begin with a small mass at the body's centre and at the ends of its longest side."""
+        body = body_number(setting.model, target)
+        low, high = self.extent(setting, body)
+        center, longest = setting.model.body_ipos[body], int(np.argmax(high - low))
+        places = [center.copy() for _ in range(3)]
+        places[1][longest], places[2][longest] = low[longest], high[longest]
+        mass = 0.05 * float(setting.model.body_mass[body])
+        return [np.concatenate([[mass], p]) for p in places]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        if values[0] != 0:
+            add_point_mass(model, body_number(model, target), float(values[0]), np.asarray(values[1:]))
+
+
+class CenterOfMass(BodyEffect):
+    """A centre of mass that sits elsewhere than in the model."""
+
+    name = "center_of_mass"
+    sentence = "the centre of mass of {target} sits elsewhere than in the model"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        low, high = self.extent(setting, body_number(setting.model, target))
+        size = float(np.linalg.norm(high - low))
+        return tuple(Quantity(n, "m", 0.0, -size, size, 0.2 * size) for n in "xyz")
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        body = body_number(model, target)
+        model.body_ipos[body] += values
+        unmark_simple(model, body)
+
+
+class Inertia(BodyEffect):
+    """Moments of inertia that differ from the model's in proportion."""
+
+    name = "inertia"
+    sentence = "the moments of inertia of {target} are not the model's"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        return [t for t in super().targets(setting) if m.body_inertia[body_number(m, t)].max() > 1e-12]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("factor", "-", 1.0, 0.02, 30.0, 0.5),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.body_inertia[body_number(model, target)] *= values[0]
+
+
+class ExternalForce(BodyEffect):
+    """A constant force on a body, in the world's directions: a hanging cable, a counterweight."""
+
+    name = "external_force"
+    sentence = "a constant force on {target} from outside, such as a hanging cable"
+    native = False
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        m = setting.model
+        weight = float(m.body_subtreemass[body_number(m, target)])
+        scale = max(weight * float(np.linalg.norm(m.opt.gravity)), weight)
+        return tuple(Quantity(n, "N", 0.0, -5 * scale, 5 * scale, 0.1 * scale) for n in "xyz")
+
+    def wrench(self, setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray:
+        out = np.zeros((setting.model.nbody, 6))
+        out[body_number(setting.model, target), :3] = values
+        return out
+
+
+class FluidDrag(BodyEffect):
+    """Drag of air or water on a body, with the square of its speed.
+
+    It is MuJoCo's ellipsoid drag of the body's largest geom with equal blunt and slender coefficients, which makes it
+    the same from all sides.
+    """
+
+    name = "fluid_drag"
+    sentence = "drag of air or water on {target}, with the square of its speed"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        if m.opt.density > 0 or m.opt.viscosity > 0:
+            return []
+        return [t for t in super().targets(setting) if self.geom(m, t) is not None]
+
+    @staticmethod
+    def geom(model: mujoco.MjModel, target: str | None) -> int | None:
+        """Return the body's largest geom."""
+        body = body_number(model, target)
+        own = range(model.body_geomadr[body], model.body_geomadr[body] + model.body_geomnum[body])
+        return max(own, key=lambda g: float(np.prod(model.geom_aabb[g, 3:])), default=None)
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        m, body = setting.model, body_number(setting.model, target)
+        speed = float(setting.signals.linear_speed[body])
+        weight = float(m.body_mass[body]) * 10.0
+        scale = 0.1 * weight / speed**2
+        return (Quantity("coefficient", "N·s²/m²", 0.0, 0.0, 300 * scale, scale),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        geom = self.geom(model, target)
+        if geom is None or values[0] == 0:
+            return
+        area = _largest_section(model, geom)
+        model.opt.density = 1.0
+        for g in range(model.ngeom):  # a body whose geoms all have coefficient zero feels nothing
+            if model.geom_fluid[g, 0] == 0:
+                model.geom_fluid[g] = 0.0
+                model.geom_fluid[g, 0] = 1.0
+        model.geom_fluid[geom, 1:3] = values[0] / area
+
+
+def _largest_section(model: mujoco.MjModel, geom: int) -> float:
+    """Return the largest section of the ellipsoid by which MuJoCo computes a geom's drag, in m²."""
+    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        axes = np.repeat(size[0], 3)
+    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        axes = np.array([size[0], size[0], size[1] + size[0]])
+    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
+        axes = np.array([size[0], size[0], size[1]])
+    else:
+        axes = np.array(size[:3])
+    largest = np.sort(axes)[1:]
+    return float(np.pi * largest[0] * largest[1])

@@ -1,0 +1,144 @@
+"""Effects of contacts: friction, softness and reach of a geom."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.parameters import object_names
+
+
+def geom_number(model: mujoco.MjModel, target: str | None) -> int:
+    """Return the number of a geom by its name, or ``geom2`` for an unnamed one."""
+    return object_names(model, "geom").index(str(target))
+
+
+class ContactEffect(Effect):
+    """An effect of every contact of one geom that touches something in the log."""
+
+    kind = "geom"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return [n for n, touches in zip(setting.names("geom"), setting.signals.contacts, strict=True) if touches]
+
+    @staticmethod
+    def partners(model: mujoco.MjModel, geom: int) -> list[int]:
+        """Return the geoms that may touch this one."""
+        kind, affinity = model.geom_contype, model.geom_conaffinity
+        body = model.geom_bodyid
+        return [
+            g for g in range(model.ngeom)
+            if body[g] != body[geom] and ((kind[g] & affinity[geom]) or (kind[geom] & affinity[g]))
+        ]  # fmt: skip
+
+
+def take_over(model: mujoco.MjModel, geom: int, partners: list[int]) -> None:
+    """Let one geom alone decide its contacts' properties, which stay as they were mixed."""
+    same = [g for g in [geom, *partners] if model.geom_priority[g] == model.geom_priority[geom]]
+    higher = [g for g in partners if model.geom_priority[g] > model.geom_priority[geom]]
+    if higher:
+        other = higher[0]
+        for field in ("geom_friction", "geom_solref", "geom_solimp", "geom_condim"):
+            getattr(model, field)[geom] = getattr(model, field)[other]
+    elif len(same) > 1:
+        other = same[1]
+        model.geom_friction[geom] = model.geom_friction[same].max(0)
+        weights = model.geom_solmix[[geom, other]]
+        share = float(weights[0] / weights.sum()) if weights.sum() > 1e-15 else 0.5
+        for field in ("geom_solref", "geom_solimp"):
+            values = getattr(model, field)
+            if field == "geom_solref" and (values[[geom, other], 0] <= 0).any():
+                values[geom] = np.minimum(values[geom], values[other])
+            else:
+                values[geom] = share * values[geom] + (1 - share) * values[other]
+        model.geom_condim[geom] = model.geom_condim[same].max()
+    model.geom_priority[geom] = model.geom_priority[[geom, *partners]].max() + 1
+
+
+class ContactFriction(ContactEffect):
+    """Sliding friction of a geom's contacts."""
+
+    name = "contact_friction"
+    sentence = "the sliding friction of {target} is not the model's"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        own = self.own(setting.model, target)
+        return (Quantity("friction", "-", own, 0.01 * own, max(5.0, 5 * own), 0.3 * own),)
+
+    def own(self, model: mujoco.MjModel, target: str | None) -> float:
+        """Return the friction that the model's contacts of this geom have."""
+        geom = geom_number(model, target)
+        same = [geom, *self.partners(model, geom)]
+        top = model.geom_priority[same].max()
+        return float(max(model.geom_friction[g, 0] for g in same if model.geom_priority[g] == top))
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        own = self.own(setting.model, target)
+        return [np.array([0.9 * own]), np.array([0.6 * own]), np.array([1.4 * own])]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        geom = geom_number(model, target)
+        take_over(model, geom, self.partners(model, geom))
+        model.geom_friction[geom, 0] = values[0]
+
+
+class ContactStiffness(ContactEffect):
+    """Softness and damping of a geom's contacts."""
+
+    name = "contact_stiffness"
+    sentence = "contacts of {target} are softer or stiffer than the model's"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        return [t for t in super().targets(setting) if self.own(m, t)[0] > 0]
+
+    def own(self, model: mujoco.MjModel, target: str | None) -> np.ndarray:
+        """Return the time constant and damping ratio that the model's contacts of this geom have."""
+        geom = geom_number(model, target)
+        copy = _shallow(model)
+        take_over(copy, geom, self.partners(model, geom))
+        return copy.geom_solref[geom].copy()
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        time, ratio = (float(x) for x in self.own(setting.model, target))
+        least = 2 * float(setting.model.opt.timestep)
+        return (
+            Quantity("time_constant", "s", time, min(least, time), 30 * max(time, least), 0.5 * time),
+            Quantity("damping_ratio", "-", ratio, 0.05 * ratio, 20 * ratio, 0.5 * ratio),
+        )
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        time, ratio = (float(x) for x in self.own(setting.model, target))
+        return [np.array([1.15 * time, ratio]), np.array([2 * time, ratio])]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        geom = geom_number(model, target)
+        take_over(model, geom, self.partners(model, geom))
+        model.geom_solref[geom] = values
+
+
+class ContactMargin(ContactEffect):
+    """A geom whose contacts act from a distance on, as if it were larger: a sole or a coating that the model lacks."""
+
+    name = "contact_margin"
+    sentence = "contacts of {target} act from a distance on, as if it were larger than in the model"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        m = setting.model
+        size = float(m.geom_rbound[geom_number(m, target)]) or 0.1
+        own = float(m.geom_margin[geom_number(m, target)])
+        return (Quantity("margin", "m", 0.0, -own, 0.5 * size, 0.02 * size),)
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        scale = self.quantities(setting, target)[0].scale
+        return [np.array([0.3 * scale]), np.array([1.5 * scale])]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.geom_margin[geom_number(model, target)] += values[0]
+
+
+def _shallow(model: mujoco.MjModel) -> mujoco.MjModel:
+    import copy
+
+    return copy.copy(model)

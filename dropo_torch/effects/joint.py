@@ -1,0 +1,283 @@
+"""Effects of joints: friction, damping, springs, inertia, stops."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.observation import joint_name
+
+_HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
+
+
+def unit(setting: Setting, target: str | None, hinge: str, slide: str) -> str:
+    """Return the unit of a joint's quantity."""
+    return slide if setting.is_slide(str(target)) else hinge
+
+
+class JointEffect(Effect):
+    """An effect of one hinge or slide joint."""
+
+    kind = "joint"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return every hinge and slide joint that moves in the log."""
+        m = setting.model
+        return [
+            joint_name(m, j)
+            for j in range(m.njnt)
+            if int(m.jnt_type[j]) in (_HINGE, _SLIDE) and setting.signals.speed[m.jnt_dofadr[j]] > 0
+        ]
+
+    @staticmethod
+    def dof(model: mujoco.MjModel, target: str | None) -> int:
+        """Return the joint's degree of freedom."""
+        return int(model.jnt_dofadr[joint_number(model, target)])
+
+
+def joint_number(model: mujoco.MjModel, target: str | None) -> int:
+    """Return the number of a joint by its name."""
+    return [joint_name(model, j) for j in range(model.njnt)].index(str(target))
+
+
+class JointDamping(JointEffect):
+    """Viscous friction: a torque against the velocity, in proportion to it."""
+
+    name = "joint_damping"
+    sentence = "viscous friction in {target}: a force against the velocity, in proportion to it"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        scale = setting.signals.force[dof] / setting.signals.speed[dof]
+        own = float(setting.model.dof_damping[dof])
+        return (Quantity("damping", unit(setting, target, "N·m·s/rad", "N·s/m"), 0.0, -own, 30 * scale, scale),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.dof_damping[self.dof(model, target)] += values[0]
+
+
+class JointQuadraticDamping(JointEffect):
+    """Friction that grows with the square of the velocity."""
+
+    name = "joint_quadratic_damping"
+    sentence = "friction in {target} that grows with the square of the velocity"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        scale = setting.signals.force[dof] / setting.signals.speed[dof] ** 2
+        own = float(setting.model.dof_dampingpoly[dof, 0])
+        return (Quantity("coefficient", unit(setting, target, "N·m·s²/rad²", "N·s²/m²"), 0.0, -own, 30 * scale, scale),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.dof_dampingpoly[self.dof(model, target), 0] += values[0]
+
+
+class JointFriction(JointEffect):
+    """Coulomb friction: a constant force against the motion, which also holds at rest."""
+
+    name = "joint_friction"
+    sentence = "dry (Coulomb) friction in {target}: a constant force against any motion"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        scale = float(setting.signals.force[dof])
+        own = float(setting.model.dof_frictionloss[dof])
+        return (Quantity("friction", unit(setting, target, "N·m", "N"), 0.0, -own, 10 * scale, scale),)
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        scale = self.quantities(setting, target)[0].scale
+        return [np.array([0.02 * scale]), np.array([0.2 * scale])]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.dof_frictionloss[self.dof(model, target)] += values[0]
+
+
+class JointStribeck(JointEffect):
+    """Dry friction that is larger at rest than in motion.
+
+    At speed v the friction is ``coulomb + (static - coulomb)·exp(-(v/velocity)²)``: MuJoCo's dry friction holds up to
+    ``static``, and a smooth force gives back the difference in motion.
+    """
+
+    name = "joint_stribeck"
+    sentence = "dry friction in {target} that is larger at rest than in motion (Stribeck)"
+    native = False
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        scale, speed = float(setting.signals.force[dof]), float(setting.signals.speed[dof])
+        force = unit(setting, target, "N·m", "N")
+        return (
+            Quantity("coulomb", force, 0.0, 0.0, 10 * scale, scale),
+            Quantity("static", force, 0.0, 0.0, 10 * scale, scale),
+            Quantity("velocity", unit(setting, target, "rad/s", "m/s"), 0.2 * speed, 0.01 * speed, 3 * speed, speed),
+        )
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        force, _, speed = (q.scale for q in self.quantities(setting, target))
+        return [np.array([0.1 * force, 0.2 * force, 0.1 * speed]), np.array([0.1 * force, 0.2 * force, 0.4 * speed])]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.dof_frictionloss[self.dof(model, target)] += max(values[0], values[1], 0.0)
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        dof = setting.dof(str(target))
+        v = velocity[:, dof]
+        out = np.zeros_like(velocity)
+        out[:, dof] = max(values[1] - values[0], 0.0) * -np.expm1(-((v / values[2]) ** 2)) * np.sign(v)
+        return out
+
+
+class JointStiffness(JointEffect):
+    """A spring, such as a cable harness, that pulls the joint towards a rest position."""
+
+    name = "joint_stiffness"
+    sentence = "a spring at {target}, such as a cable harness, that pulls it towards a rest position"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof, coordinate = setting.dof(str(target)), setting.coordinate(str(target))
+        low, high = setting.signals.position[coordinate]
+        span = max(high - low, 1e-9)
+        scale = setting.signals.force[dof] / span
+        own = float(setting.model.jnt_stiffness[setting.joint(str(target))])
+        rest = float(setting.model.qpos_spring[coordinate])
+        angle = unit(setting, target, "rad", "m")
+        return (
+            Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), 0.0, -own, 30 * scale, scale),
+            Quantity("reference", angle, rest, low - 10 * span, high + 10 * span, span),
+        )
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        stiffness, reference = self.quantities(setting, target)
+        middle = float(np.mean(setting.signals.position[setting.coordinate(str(target))]))
+        begin = [reference.neutral] if abs(reference.neutral - middle) < 0.2 * reference.scale else [
+            reference.neutral, middle,
+        ]  # fmt: skip
+        return [np.array([0.05 * stiffness.scale, at]) for at in begin]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        joint = joint_number(model, target)
+        own, coordinate = float(model.jnt_stiffness[joint]), int(model.jnt_qposadr[joint])
+        rest = float(model.qpos_spring[coordinate])
+        total = own + values[0]
+        if total > 0:
+            model.qpos_spring[coordinate] = (own * rest + values[0] * values[1]) / total
+        model.jnt_stiffness[joint] = total
+
+
+class JointCogging(JointEffect):
+    """A force that ripples with the position, as of a motor's magnets or a gear's teeth."""
+
+    name = "joint_cogging"
+    sentence = "a force at {target} that ripples with its position, as of a motor's magnets or a gear's teeth"
+    native = False
+    #: Ripples per radian (per metre: times 50) that are tried.
+    POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        scale = float(setting.signals.force[dof])
+        return (
+            Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, 0.0, 10 * scale, scale),
+            Quantity("poles", unit(setting, target, "1/rad", "1/m"), 1.0, 0.1, 1e4, 1.0),
+            Quantity("phase", "rad", 0.0, -20.0, 20.0, 1.0),
+        )
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        low, high = setting.signals.position[setting.coordinate(str(target))]
+        factor = 1.0 if not setting.is_slide(str(target)) else 50.0
+        amplitude = 0.1 * self.quantities(setting, target)[0].scale
+        poles = [factor * n for n in self.POLES if factor * n * (high - low) > 2 * np.pi]
+        return [np.array([amplitude, n, phase]) for n in poles for phase in (0.0, np.pi / 2)]
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        out = np.zeros_like(velocity)
+        angle = values[1] * position[:, setting.coordinate(str(target))] + values[2]
+        out[:, setting.dof(str(target))] = values[0] * np.sin(angle)
+        return out
+
+
+class Armature(JointEffect):
+    """Inertia of a rotor or gear, seen at the joint."""
+
+    name = "armature"
+    sentence = "a rotor's or gear's inertia at {target}, on top of the links'"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        scale = float(setting.signals.inertia[dof])
+        own = float(setting.model.dof_armature[dof])
+        return (Quantity("armature", unit(setting, target, "kg·m²", "kg"), 0.0, -own, 5 * scale, scale),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.dof_armature[self.dof(model, target)] += values[0]
+
+
+class JointLimit(JointEffect):
+    """A stop that sits elsewhere than in the model."""
+
+    name = "joint_limit"
+    sentence = "the stops of {target} sit elsewhere than in the model"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        return [t for t in super().targets(setting) if m.jnt_limited[setting.joint(str(t))]]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        low, high = setting.model.jnt_range[setting.joint(str(target))]
+        width, angle = float(high - low), unit(setting, target, "rad", "m")
+        return tuple(Quantity(n, angle, 0.0, -0.45 * width, 0.45 * width, 0.1 * width) for n in ("lower", "upper"))
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        """Begin at the model's stops and at the ends of the measured motion."""
+        low, high = setting.model.jnt_range[setting.joint(str(target))]
+        seen = setting.signals.position[setting.coordinate(str(target))]
+        shifts = [np.clip(seen[0] - low, -0.2 * (high - low), 0.4 * (high - low)), np.clip(seen[1] - high, -0.4 * (high - low), 0.2 * (high - low))]  # fmt: skip
+        return [np.array(s, dtype=float) for s in ((0.0, 0.0), (shifts[0], 0.0), (0.0, shifts[1]))]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.jnt_range[joint_number(model, target)] += values
+
+
+class JointCoupling(JointEffect):
+    """A spring between a joint and the one before it in the chain, as of a tendon or a belt."""
+
+    name = "joint_coupling"
+    sentence = "a spring between {target} and the joint before it in the chain, as of a tendon or belt"
+    native = False
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return [t for t in super().targets(setting) if self.partner(setting, t) is not None]
+
+    @staticmethod
+    def partner(setting: Setting, target: str | None) -> int | None:
+        """Return the nearest hinge or slide joint above, of the same kind."""
+        m, joint = setting.model, setting.joint(str(target))
+        before = [j for j in range(joint) if m.jnt_bodyid[j] == m.jnt_bodyid[joint]]
+        body = int(m.body_parentid[m.jnt_bodyid[joint]])
+        while not before and body > 0:
+            before = [int(m.body_jntadr[body]) + i for i in range(int(m.body_jntnum[body]))]
+            body = int(m.body_parentid[body])
+        return before[-1] if before and m.jnt_type[before[-1]] == m.jnt_type[joint] else None
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        dof = setting.dof(str(target))
+        low, high = setting.signals.position[setting.coordinate(str(target))]
+        scale = float(setting.signals.force[dof] / max(high - low, 1e-9))
+        return (Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), 0.0, -30 * scale, 30 * scale, scale),)
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        m, other = setting.model, self.partner(setting, target)
+        assert other is not None
+        stretch = position[:, setting.coordinate(str(target))] - position[:, m.jnt_qposadr[other]]
+        out = np.zeros_like(velocity)
+        out[:, setting.dof(str(target))] = -values[0] * stretch
+        out[:, m.jnt_dofadr[other]] += values[0] * stretch
+        return out

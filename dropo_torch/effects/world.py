@@ -1,0 +1,101 @@
+"""Effects of the whole world: gravity's direction, the ground's, and the simulator's own step."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Quantity, Setting
+
+
+def _turn(roll: float, pitch: float) -> np.ndarray:
+    """Return the rotation about the world's x by ``roll`` and then about its y by ``pitch``."""
+    cr, sr, cp, sp = np.cos(roll), np.sin(roll), np.cos(pitch), np.sin(pitch)
+    about_x = np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+    about_y = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    return about_y @ about_x
+
+
+class WorldEffect(Effect):
+    """An effect of the world as a whole."""
+
+    kind = "world"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return [None]
+
+
+def _angles(*names: str) -> tuple[Quantity, ...]:
+    return tuple(Quantity(n, "rad", 0.0, -0.7, 0.7, 0.1) for n in names)
+
+
+class GravityTilt(WorldEffect):
+    """A base that does not stand level: gravity is turned about the world's x and y axes."""
+
+    name = "gravity_tilt"
+    sentence = "the base does not stand level: gravity is tilted"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return [None] if np.linalg.norm(setting.model.opt.gravity) > 0 else []
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return _angles("roll", "pitch")
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.opt.gravity = _turn(*values) @ model.opt.gravity
+
+
+class GroundSlope(WorldEffect):
+    """A ground that is not level: every plane of the world is turned about the world's x and y axes."""
+
+    name = "ground_slope"
+    sentence = "the ground is not level"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return [None] if any(setting.signals.contacts[g] for g in _planes(setting.model)) else []
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return _angles("roll", "pitch")
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        turned = np.empty(4)
+        mujoco.mju_mat2Quat(turned, np.ascontiguousarray(_turn(*values)).reshape(9))
+        for g in _planes(model):
+            mujoco.mju_mulQuat(model.geom_quat[g], turned, model.geom_quat[g].copy())
+            model.geom_sameframe[g] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+
+
+def _planes(model: mujoco.MjModel) -> list[int]:
+    return [
+        g for g in range(model.ngeom)
+        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE and model.geom_bodyid[g] == 0
+    ]  # fmt: skip
+
+
+class Integration(WorldEffect):
+    """The simulator's own step is too coarse: a finer one, with a better integrator, gives other motion."""
+
+    name = "integration"
+    sentence = "the simulator's own integration step is too coarse for this motion"
+
+    #: How many times finer the step becomes, and its integrator.
+    FINER = 8
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        step = float(setting.model.opt.timestep)
+        return (Quantity("timestep", "s", step, step / self.FINER, step, step),)
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        return [np.array([float(setting.model.opt.timestep) / self.FINER])]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.opt.timestep = values[0]
+        if not _has_stiff_damping(model):
+            model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+
+
+def _has_stiff_damping(model: mujoco.MjModel) -> bool:
+    """Whether contacts or servo damping make an explicit integrator a worse choice."""
+    return model.opt.integrator in (
+        mujoco.mjtIntegrator.mjINT_IMPLICIT, mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    ) and bool((model.actuator_biasprm[:, 2] < 0).any())  # fmt: skip

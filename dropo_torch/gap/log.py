@@ -1,0 +1,204 @@
+"""The log as the gap sees it: features, windows with a start of their own, and the sizes of what it holds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dropo_torch.effects.base import Setting, Signals
+from dropo_torch.effects.twin import Windows
+from dropo_torch.observation import Observation
+from dropo_torch.problem import Problem
+from dropo_torch.trajectory import Trajectories
+
+#: Configurations of the log at which the typical forces are computed.
+SAMPLES = 400
+
+
+@dataclass(frozen=True)
+class Chart:
+    """Coordinates in which observed columns are compared: a quaternion becomes a rotation vector.
+
+    Attributes:
+        plain: observed columns that are compared as they are.
+        quaternions: columns of each observed quaternion.
+        labels: names of the features, ``(m,)``.
+        units: their units.
+    """
+
+    plain: tuple[int, ...]
+    quaternions: tuple[tuple[int, int, int, int], ...]
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+
+    @classmethod
+    def of(cls, observation: Observation) -> Chart:
+        """Return the chart of an observation."""
+        taken = {c for q in observation.quaternions for c in q}
+        plain = tuple(c for c in range(observation.size) if c not in taken)
+        turned = [f"{observation.labels[q[0]].split('[')[0]}.rotation[{a}]" for q in observation.quaternions for a in "xyz"]  # fmt: skip
+        return cls(
+            plain, observation.quaternions, tuple(observation.labels[c] for c in plain) + tuple(turned),
+            tuple(observation.units[c] for c in plain) + ("rad",) * len(turned),
+        )  # fmt: skip
+
+    @property
+    def size(self) -> int:
+        """Number of features m."""
+        return len(self.plain) + 3 * len(self.quaternions)
+
+    def difference(self, measured: np.ndarray, simulated: np.ndarray) -> np.ndarray:
+        """Return measured minus simulated, ``(..., m)``, of columns ``(..., n)``."""
+        parts = [(measured - simulated)[..., list(self.plain)]]
+        parts += [_rotation(simulated[..., list(q)], measured[..., list(q)]) for q in self.quaternions]
+        return np.concatenate(parts, -1)
+
+    def move(self, columns: np.ndarray, delta: np.ndarray) -> np.ndarray:
+        """Return columns ``(..., n)`` moved by features ``(..., m)``."""
+        out = np.broadcast_to(columns, (*delta.shape[:-1], columns.shape[-1])).copy()
+        out[..., list(self.plain)] += delta[..., : len(self.plain)]
+        for i, q in enumerate(self.quaternions):
+            turn = delta[..., len(self.plain) + 3 * i : len(self.plain) + 3 * i + 3]
+            out[..., list(q)] = _turned(out[..., list(q)], turn)
+        return out
+
+    def known(self, valid: np.ndarray) -> np.ndarray:
+        """Return which features ``(..., m)`` are known, of columns ``(..., n)``."""
+        parts = [valid[..., list(self.plain)]]
+        parts += [np.repeat(valid[..., list(q)].all(-1, keepdims=True), 3, -1) for q in self.quaternions]
+        return np.concatenate(parts, -1)
+
+
+def _rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Rotation vector, in the body's frame, from one quaternion to another."""
+    w0, x0, y0, z0 = np.moveaxis(start, -1, 0)
+    w1, x1, y1, z1 = np.moveaxis(end, -1, 0)
+    w = w0 * w1 + x0 * x1 + y0 * y1 + z0 * z1
+    v = np.stack(
+        [
+            w0 * x1 - x0 * w1 - y0 * z1 + z0 * y1,
+            w0 * y1 - y0 * w1 - z0 * x1 + x0 * z1,
+            w0 * z1 - z0 * w1 - x0 * y1 + y0 * x1,
+        ],
+        -1,
+    )
+    v, w = np.where(w[..., None] < 0, -v, v), np.abs(w)
+    sine = np.linalg.norm(v, axis=-1)
+    angle = 2 * np.arctan2(sine, w)
+    return v * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 2.0)[..., None]
+
+
+def _turned(quaternion: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Quaternion turned by a rotation vector in the body's frame."""
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    share = np.where(angle > 1e-12, np.sin(angle / 2) / np.maximum(angle, 1e-300), 0.5)
+    w1, (x1, y1, z1) = np.cos(angle / 2)[..., 0], np.moveaxis(turn * share, -1, 0)
+    w0, x0, y0, z0 = np.moveaxis(quaternion, -1, 0)
+    return np.stack(
+        [
+            w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+            w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+            w0 * y1 + y0 * w1 + z0 * x1 - x0 * z1,
+            w0 * z1 + z0 * w1 + x0 * y1 - y0 * x1,
+        ],
+        -1,
+    )
+
+
+def episode_bounds(log: Trajectories) -> list[tuple[int, int]]:
+    """Return first and last-plus-one row of every episode."""
+    ends = np.flatnonzero(log.terminals) + 1
+    return list(zip(np.append(0, ends[:-1]).tolist(), ends.tolist(), strict=True))
+
+
+def cut_windows(log: Trajectories, observation: Observation, length: int, *, stride: int | None = None) -> Windows:
+    """Cut a log into windows of ``length`` logged steps, one every ``stride``.
+
+    By default no two windows share a measurement. They never cross an episode's end; an episode shorter than a window
+    gives none.
+    """
+    bounds = episode_bounds(log)
+    longest = max(b - a for a, b in bounds)
+    commands = np.zeros((len(bounds), longest + 1, log.actions.shape[1]))
+    observed, following = observation.observed(log.observations), observation.observed(log.next_observations)
+    measured, rates, episodes, steps = [], [], [], []
+    for e, (a, b) in enumerate(bounds):
+        commands[e, : b - a] = log.actions[a:b]
+        commands[e, b - a :] = log.actions[b - 1]
+        path = np.concatenate([observed[a : a + 1], following[a:b]])
+        slope = np.gradient(path, axis=0) if len(path) > 1 else np.zeros_like(path)
+        for start in range(0, b - a - length + 1, stride or length + 1):
+            measured.append(path[start : start + length + 1])
+            rates.append(slope[start])
+            episodes.append(e)
+            steps.append(start)
+    shape = (0, length + 1, observed.shape[1])
+    return Windows(
+        np.stack(measured) if measured else np.zeros(shape),
+        (np.stack(rates) if rates else np.zeros((0, observed.shape[1]))) / (log.dt or 1.0),
+        np.array(episodes, dtype=int),
+        np.array(steps, dtype=int),
+        commands,
+    )
+
+
+def make_setting(problem: Problem, log: Trajectories) -> Setting:
+    """Return where effects are looked for: the model, its columns, and the sizes of the log."""
+    model = problem.space.apply(_start_values(problem))
+    frame_skip = problem.simulator.frame_skip
+    states = problem.observation.states(log.observations)
+    rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
+    data = mujoco.MjData(model)
+    nv = model.nv
+    inertia, force, speed, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.nbody), np.zeros(model.ngeom, bool)
+    dense = np.zeros((nv, nv))
+    after = problem.observation.states(log.next_observations)
+    step = frame_skip * float(model.opt.timestep)
+    for row in rows:
+        data.qpos[:], data.qvel[:] = states[row, : model.nq], states[row, model.nq :]
+        data.ctrl[:] = log.actions[row]
+        mujoco.mj_forward(model, data)
+        mujoco.mj_fullM(model, data, dense)
+        inertia += np.diag(dense)
+        acceleration = (after[row, model.nq :] - states[row, model.nq :]) / step
+        total = np.abs(dense @ acceleration) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator)
+        force += total
+        for b in range(model.nbody):
+            speed[b] += float(np.sum(_velocity(model, data, b) ** 2))
+        for contact in data.contact[: data.ncon]:
+            touches[contact.geom[contact.geom >= 0]] = True
+    observed = problem.observation.observed(log.observations)
+    seen = np.isin(np.arange(model.nq), problem.observation.columns)
+    position = np.where(
+        seen[:, None], np.percentile(states[:, : model.nq], [1, 99], axis=0).T, np.nan
+    )  # fmt: skip
+    velocity = np.sqrt(np.mean(states[:, model.nq :] ** 2, axis=0))
+    signals = Signals(
+        timestep=step,
+        position=position,
+        speed=velocity,
+        force=np.maximum(force / len(rows), 1e-12),
+        inertia=inertia / len(rows),
+        command=np.abs(log.actions).max(0) if log.actions.shape[1] else np.zeros(0),
+        column=observed.std(0),
+        linear_speed=np.sqrt(speed / len(rows)),
+        contacts=touches,
+    )
+    return Setting(model, problem.observation, signals, frame_skip)
+
+
+def _velocity(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
+    out = np.empty(6)
+    mujoco.mj_objectVelocity(model, data, int(mujoco.mjtObj.mjOBJ_BODY), body, out, 0)
+    return out[3:]
+
+
+def _start_values(problem: Problem) -> np.ndarray:
+    """Declared parameters to begin with: the model's own where they lie in their box, else its middle."""
+    space = problem.space
+    middle = 0.5 * (space.low + space.high)
+    nominal = space.nominal
+    inside = np.isfinite(nominal) & (nominal >= space.low) & (nominal <= space.high)
+    return np.where(inside, nominal, middle)

@@ -1,0 +1,296 @@
+"""Naming what is missing: screen, refit, accept by the excess that is removed, swap, prune, and tell what ties."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Placed
+from dropo_torch.gap.evidence import Cost, Evidence, caps_of, cost_of
+from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.screen import Candidate, all_candidates, promising_pairs, screen
+
+
+@dataclass(frozen=True)
+class Rules:
+    """Thresholds of the naming; the same for every log, since all they compare is in units of the noise.
+
+    Attributes:
+        gate: excess in standard deviations of χ² from which on something is missing.
+        least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
+        most: share of the excess that the named effects must remove together.
+        enough: share of the excess at which a single effect ends the search for more at once.
+        least: share of the first excess below which an effect is not named.
+        significance: paired standard errors, over blocks of the log, by which one hypothesis beats another.
+        tie: paired standard errors within which two hypotheses tie.
+        refits: candidates that are refitted in a round.
+        effects: the most effects that are named.
+    """
+
+    gate: float = 5.0
+    least_reduced: float = 1.1
+    most: float = 0.8
+    enough: float = 0.99
+    least: float = 1e-3
+    significance: float = 3.0
+    tie: float = 2.0
+    refits: int = 7
+    effects: int = 4
+
+
+@dataclass(frozen=True)
+class Trial:
+    """A candidate that was refitted, for the report: what it left of the excess."""
+
+    placed: Placed
+    excess: float
+    before: float
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What was found.
+
+    Attributes:
+        base: the declared parameters alone.
+        final: with the named effects, or the base again.
+        gap: whether anything is missing at all.
+        named: whether the named effects account for it.
+        ties: for each named effect, the candidates that do as well in its place.
+        trials: what was refitted, in order.
+        judged: candidates that change nothing on this log, which it therefore cannot judge.
+        best: the wrong candidates that removed the most, where nothing could be named.
+    """
+
+    base: Refit
+    final: Refit
+    gap: bool
+    named: bool
+    ties: tuple[tuple[Placed, ...], ...] = ()
+    trials: tuple[Trial, ...] = ()
+    silent: tuple[tuple[str, str | None], ...] = ()
+    best: tuple[Trial, ...] = field(default=())
+
+
+#: ``report(stage, share)`` as the work goes on.
+Report = Callable[[str, float], None]
+
+
+def significant(cost: Cost, rules: Rules) -> bool:
+    """Return whether a misfit is more than noise."""
+    return cost.excess > rules.gate * np.sqrt(2 * cost.degrees) and cost.reduced > rules.least_reduced
+
+
+def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
+    """Return by how many standard errors the first misfit is above the second, over blocks of the log ``(W,)``."""
+    change = (first.windows + first.penalty) - (second.windows + second.penalty)
+    names = np.unique(blocks)
+    sums = np.array([change[blocks == b].sum() for b in names])
+    if len(sums) < 2:
+        return float(np.sign(sums.sum()) * np.inf)
+    error = sums.std(ddof=1) * np.sqrt(len(sums))
+    return float(sums.sum() / max(error, 1e-12))
+
+
+class Search:
+    """The search for missing effects on one log.
+
+    Args:
+        evidence: all windows of the training part.
+        effects: the vocabulary.
+        rules: thresholds.
+        few: windows that refits use; all if there are fewer.
+        fewer: windows that the screening uses.
+    """
+
+    def __init__(
+        self, evidence: Evidence, effects: Sequence[Effect], *, rules: Rules, few: int = 48, fewer: int = 14,
+        report: Report = lambda stage, share: None,
+    ) -> None:  # fmt: skip
+        self.evidence, self.effects, self.rules, self._report = evidence, effects, rules, report
+        self._few, self._fewer = few, fewer
+        self.trials: list[Trial] = []
+        self.silent: list[tuple[str, str | None]] = []
+        setting = evidence.twin.setting
+        self.candidates = list(all_candidates(setting, effects))
+
+    def run(self, begin: Hypothesis) -> Naming:
+        """Return what is missing, beginning from the declared parameters' values."""
+        rules = self.rules
+        self._report("fitting the declared parameters", 0.0)
+        base = refit(self._part(self._few), begin)
+        caps = caps_of(base.cost.windows, base.cost.degrees)
+        self._caps = caps
+        base = refit(self._part(self._few), base.hypothesis, caps=caps, iterations=4)
+        if not significant(base.cost, rules):
+            return Naming(base, base, gap=False, named=False)
+        current = base
+        for number in range(rules.effects):
+            found = self._next(current, base, number)
+            if found is None:
+                break
+            current = found
+            if self._is_done(current, base):
+                break
+            if len(current.hypothesis.placed) > 1:
+                current = self._swap(current, base)
+                if self._is_done(current, base):
+                    break
+        current = self._prune(current, base)
+        removed = 1 - max(current.cost.excess, 0.0) / base.cost.excess
+        if not current.hypothesis.placed or removed < rules.most:
+            best = tuple(sorted(self.trials, key=lambda t: t.excess)[:3])
+            return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent), best=best)
+        ties = tuple(self._ties(current, index) for index in range(len(current.hypothesis.placed)))
+        return Naming(base, current, True, True, ties, tuple(self.trials), tuple(self.silent))
+
+    def _part(self, count: int) -> Evidence:
+        """The evidence on a spread of windows."""
+        windows = self.evidence.windows
+        if len(windows) <= count:
+            return self.evidence
+        rows = np.unique(np.linspace(0, len(windows) - 1, count).astype(int))
+        return self.evidence.on(windows.select(rows))
+
+    def _fewer_of(self, current: Refit, count: int) -> tuple[Evidence, Refit, np.ndarray]:
+        """The windows that fit worst and a spread of the others, with the fitted hypothesis there."""
+        part = self._part(self._few)
+        order = np.argsort(-current.cost.windows)
+        half = count // 2
+        spread = np.linspace(0, len(order) - 1, count - half).astype(int)
+        rows = np.unique(np.concatenate([order[:half], order[spread]]))
+        starts = replace(
+            current.starts, basis=current.starts.basis[rows], weights=current.starts.weights[rows],
+            shift=current.starts.shift[rows],
+        )  # fmt: skip
+        here = replace(current, residual=current.residual[rows], slope=current.slope[:, rows], starts=starts)
+        return part.on(part.windows.select(rows)), here, self._caps[rows]
+
+    def _is_done(self, current: Refit, base: Refit) -> bool:
+        """Whether what is left is noise, or too small a part of the gap to tell anything."""
+        return not significant(current.cost, self.rules) or (
+            current.cost.excess < self.rules.least * base.cost.excess
+        )
+
+    @property
+    def blocks(self) -> np.ndarray:
+        """The block of each refitted window, for paired tests: its episode, or a tenth of a single one."""
+        windows = self._part(self._few).windows
+        if len(np.unique(windows.episodes)) >= 5:
+            return windows.episodes
+        return (np.arange(len(windows)) * 10) // len(windows)
+
+    def _screened(self, current: Refit) -> list[Candidate]:
+        """Screen on the windows that fit worst and on a spread of the others."""
+        fewer, here, caps = self._fewer_of(current, self._fewer)
+        total = len(self.candidates)
+        return screen(
+            fewer, here, self.candidates, caps=caps,
+            on_progress=lambda done: self._report(f"screening {total} candidates", done / total),
+        )  # fmt: skip
+
+    def _next(self, current: Refit, base: Refit, number: int) -> Refit | None:
+        """The hypothesis with one or two more effects that removes the most, or ``None``."""
+        rules = self.rules
+        ranked = self._screened(current)
+        if number == 0:
+            self.silent = [c.key for c in ranked if c.dead]
+        alive = [c for c in ranked if not c.dead]
+        singles = self._refits(current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
+        if not singles:
+            return None
+        best = singles[0]
+        left = best.cost.excess / current.cost.excess
+        if left > 1 - rules.most:
+            pairs = promising_pairs(*self._aligned(current, alive[:16]), 5)
+            tried = self._refits(current, pairs, "refitting pairs")
+            if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
+                best = tried[0]
+        gained = current.cost.excess - best.cost.excess
+        if gained < rules.least * base.cost.excess or paired(current.cost, best.cost, self.blocks) < rules.significance:
+            return None
+        return best
+
+    def _aligned(self, current: Refit, candidates: Sequence[Candidate]) -> tuple[Refit, list[Candidate], np.ndarray]:
+        """Promising candidates screened again from where they promise the most, on more windows."""
+        fewer, here, caps = self._fewer_of(current, 2 * self._fewer)
+        return here, screen(fewer, here, [c.placed for c in candidates], caps=caps), caps
+
+    def _refits(self, current: Refit, groups: Sequence[Sequence[Placed]], stage: str) -> list[Refit]:
+        """Refit the current hypothesis with each group of effects more; the best first.
+
+        All are fitted a little, on few windows; those that come near the best of them are then fitted in full.
+        """
+        fewer, here, caps = self._fewer_of(current, 2 * self._fewer)
+        before = cost_of(here.residual, here.starts, fewer.degrees(here.starts), caps).excess
+        rough: list[Refit] = []
+        for number, group in enumerate(groups):
+            self._report(stage, number / (len(groups) + 2))
+            hypothesis = current.hypothesis
+            for placed in group:
+                hypothesis = hypothesis.with_effect(placed)
+            fitted = refit(fewer, hypothesis, starts=here.starts, caps=caps, iterations=5)
+            rough.append(fitted)
+            for placed in fitted.hypothesis.placed[len(current.hypothesis.placed) :]:
+                self.trials.append(Trial(placed, fitted.cost.excess, before))
+        rough.sort(key=lambda r: r.cost.excess)
+        if not rough:
+            return []
+        near = 3 * max(rough[0].cost.excess, 0.0) + self.rules.least * before + 10 * np.sqrt(2 * rough[0].cost.degrees)
+        full = []
+        for number, fitted in enumerate(r for r in rough[:4] if r.cost.excess <= near):
+            self._report(stage, (len(groups) + number / 4) / (len(groups) + 2))
+            full.append(refit(self._part(self._few), fitted.hypothesis, caps=self._caps))
+        return sorted(full, key=lambda r: r.cost.excess)
+
+    def _swap(self, current: Refit, base: Refit) -> Refit:
+        """Try to put another effect in the place of each accepted one."""
+        for _ in range(2):
+            before = current
+            for index in range(len(current.hypothesis.placed)):
+                without = refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
+                alive = [c for c in self._screened(without) if not c.dead][:3]
+                for found in self._refits(without, [(c.placed,) for c in alive], "swapping")[:1]:
+                    if (
+                        found.cost.excess < current.cost.excess
+                        and paired(current.cost, found.cost, self.blocks) > self.rules.significance
+                    ):
+                        current = found
+                        break
+            if current is before:
+                break
+        return current
+
+    def _prune(self, current: Refit, base: Refit) -> Refit:
+        """Drop effects that are not needed, the least needed first."""
+        while len(current.hypothesis.placed) > 1:
+            without = [
+                refit(self._part(self._few), current.hypothesis.without(i), caps=self._caps)
+                for i in range(len(current.hypothesis.placed))
+            ]
+            least = min(without, key=lambda r: r.cost.excess)
+            needed = least.cost.excess - current.cost.excess
+            if (
+                needed >= self.rules.least * base.cost.excess
+                and paired(least.cost, current.cost, self.blocks) >= self.rules.significance
+            ):
+                break
+            current = least
+        return current
+
+    def _ties(self, current: Refit, index: int) -> tuple[Placed, ...]:
+        """Candidates that explain the log as well in the place of one named effect."""
+        own = current.hypothesis.placed[index]
+        without = refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
+        ranked = [c for c in self._screened(without) if not c.dead and c.key != own.key][:5]
+        found = []
+        for fitted in self._refits(without, [(c.placed,) for c in ranked], "looking for ties"):
+            other = fitted.hypothesis.placed[-1]
+            close = fitted.cost.excess - current.cost.excess < max(
+                self.rules.least * without.cost.excess, 4 * np.sqrt(2 * current.cost.degrees)
+            )
+            if close and paired(fitted.cost, current.cost, self.blocks) < self.rules.tie:
+                found.append(other)
+        return tuple(found)

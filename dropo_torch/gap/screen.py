@@ -1,0 +1,171 @@
+"""Which candidates could explain the gap: one linear prediction each, all on the same few windows.
+
+A candidate is tried from each of its starts. There, the projected residuals and their derivatives by the candidate's
+numbers, by the declared parameters and by the effects that were accepted already predict the χ² that a full fit would
+reach. The prediction only ranks; a refit decides.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Placed, Setting
+from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, slopes
+
+#: Difference step of a candidate's numbers, relative to their scale.
+STEP = 2e-3
+#: A candidate whose derivatives are smaller than this, in whitened units for a change by its scale, does nothing here.
+DEAD = 1e-3
+#: Candidates that one batch of simulations holds.
+BATCH = 24
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """What one start of a candidate promises.
+
+    Attributes:
+        placed: the effect with the predicted numbers.
+        chi2: predicted χ² on the screened windows.
+        windows: predicted χ² of each screened window, ``(W,)``.
+        residual: projected residuals at the candidate's start, ``(W·N,)``.
+        slope: projected derivatives by its numbers, ``(p, W·N)``.
+        dead: whether it changes nothing in these windows.
+    """
+
+    placed: Placed
+    chi2: float
+    windows: np.ndarray
+    residual: np.ndarray
+    slope: np.ndarray
+    dead: bool
+
+    @property
+    def key(self) -> tuple[str, str | None]:
+        """Effect and target."""
+        return self.placed.key
+
+
+def all_candidates(setting: Setting, effects: Sequence[Effect]) -> Iterator[Placed]:
+    """Yield every effect at every target, at each of its starts."""
+    for effect in effects:
+        for target in effect.targets(setting):
+            for start in effect.starts(setting, target):
+                yield Placed(effect, target, tuple(float(v) for v in start))
+
+
+def screen(
+    evidence: Evidence,
+    base: Refit,
+    candidates: Sequence[Placed],
+    *,
+    caps: np.ndarray,
+    on_progress: Callable[[int], None] | None = None,
+) -> list[Candidate]:
+    """Return each candidate from its best start, the most promising first.
+
+    Args:
+        evidence: the windows to screen on.
+        base: the fitted hypothesis so far, on these windows.
+        candidates: effects at their starts.
+        caps: factors of the windows' residuals.
+        on_progress: called with the number of candidates done.
+    """
+    setting, space = evidence.twin.setting, evidence.twin.space
+    factor = np.repeat(caps, evidence.num_rows)
+    shared = base.slope.reshape(len(base.slope), -1) * factor
+    origin = base.residual.ravel() * factor
+    best: dict[tuple[str, str | None], Candidate] = {}
+    taken = {p.key for p in base.hypothesis.placed}
+    waiting = [c for c in candidates if c.key not in taken]
+    for first in range(0, len(waiting), BATCH):
+        part = waiting[first : first + BATCH]
+        for found in _predict(evidence, base, part, setting, space, shared, origin, factor):
+            known = best.get(found.key)
+            if known is None or (known.dead, known.chi2) > (found.dead, found.chi2):
+                best[found.key] = found
+        if on_progress is not None:
+            on_progress(first + len(part))
+    return sorted(best.values(), key=lambda c: (c.dead, c.chi2))
+
+
+def _predict(
+    evidence: Evidence, base: Refit, part: Sequence[Placed], setting: Setting, space, shared: np.ndarray,
+    origin: np.ndarray, factor: np.ndarray,
+) -> Iterator[Candidate]:  # fmt: skip
+    """Simulate candidates at their starts and beside them, in one batch, and predict."""
+    hypotheses, spans = [], []
+    for placed in part:
+        hypothesis = base.hypothesis.with_effect(placed)
+        limits = limits_of(hypothesis, space, setting)
+        size = len(placed.values)
+        vector, begin = hypothesis.vector, len(hypotheses)
+        hypotheses.append(hypothesis)
+        signs = []
+        for c in range(len(vector) - size, len(vector)):
+            sign = 1.0 if vector[c] + STEP * limits.scale[c] <= limits.high[c] else -1.0
+            moved = vector.copy()
+            moved[c] += sign * STEP * limits.scale[c]
+            hypotheses.append(hypothesis.at(moved))
+            signs.append(sign)
+        spans.append((begin, np.array(signs), limits))
+    found, _ = evidence.residuals([h.variant for h in hypotheses])
+    for placed, (begin, signs, limits) in zip(part, spans, strict=True):
+        size = len(placed.values)
+        residual = evidence.project(found[begin], base.starts).ravel() * factor
+        change = (found[begin + 1 : begin + 1 + size] - found[begin]) / (signs[:, None, None] * STEP)
+        slope = evidence.project_slope(change, base.starts).reshape(size, -1) * factor
+        dead = bool(np.abs(residual - origin).max() < DEAD and np.abs(slope).max(initial=0.0) < DEAD)
+        columns = np.concatenate([shared, slope])
+        move = _bounded(columns, residual, len(shared), np.array(placed.values), limits)
+        left = residual + move @ columns
+        values = np.array(placed.values) + move[len(shared) :] * limits.scale[-size:] if size else np.zeros(0)
+        windows = (left**2).reshape(len(evidence.windows), -1).sum(-1)
+        yield Candidate(placed.at(values), float(windows.sum()), windows, residual, slope, dead)
+
+
+def _bounded(columns: np.ndarray, residual: np.ndarray, num_shared: int, values: np.ndarray, limits) -> np.ndarray:
+    """Least-squares move whose candidate part stays inside its bounds."""
+    size = len(values)
+    normal, gradient = columns @ columns.T, -(columns @ residual)
+    ridge = 1e-10 * np.diag(normal).max(initial=1e-300) * np.eye(len(normal)) + 1e-6 * np.diag(np.diag(normal))
+    move = np.linalg.solve(normal + ridge, gradient)
+    scale = limits.scale[-size:] if size else np.zeros(0)
+    low = (limits.low[-size:] - values) / scale if size else np.zeros(0)
+    high = (limits.high[-size:] - values) / scale if size else np.zeros(0)
+    own = np.clip(move[num_shared:], low, high)
+    if size and not np.array_equal(own, move[num_shared:]) and num_shared:
+        rest = residual + own @ columns[num_shared:]
+        part = normal[:num_shared, :num_shared] + ridge[:num_shared, :num_shared]
+        move[:num_shared] = np.linalg.solve(part, -(columns[:num_shared] @ rest))
+    move[num_shared:] = own
+    return move
+
+
+def promising_pairs(base: Refit, candidates: Sequence[Candidate], caps: np.ndarray, count: int) -> list[tuple[Placed, Placed]]:  # fmt: skip
+    """Return the pairs of candidates that together predict the least χ², the best first."""
+    factor = np.repeat(caps, base.residual.shape[1])
+    shared = base.slope.reshape(len(base.slope), -1) * factor
+    origin = base.residual.ravel() * factor
+    alive = [c for c in candidates if not c.dead]
+    found = []
+    for a, b in combinations(range(len(alive)), 2):
+        first, second = alive[a], alive[b]
+        columns = np.concatenate(
+            [shared, first.slope, second.slope, [first.residual - origin], [second.residual - origin]]
+        )
+        norm = np.sqrt((columns**2).sum(1))
+        columns = columns[norm > 0] / norm[norm > 0, None]
+        normal = columns @ columns.T + 1e-9 * np.eye(len(columns))
+        gradient = columns @ origin
+        found.append((float(origin @ origin - gradient @ np.linalg.solve(normal, gradient)), a, b))
+    found.sort()
+    return [(alive[a].placed, alive[b].placed) for _, a, b in found[:count]]
+
+
+__all__ = ["Candidate", "all_candidates", "promising_pairs", "screen", "slopes"]
