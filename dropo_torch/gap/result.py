@@ -1,0 +1,198 @@
+"""What a search for a gap gives: where, what, how strong, what is left, and what would tell more."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+SCHEMA = "dropo-torch/gap/1"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where simulation and measurement disagree.
+
+    Attributes:
+        kind: joint, body, actuator, sensor, contact or world.
+        name: which one; ``None`` for the world.
+        share: share of the gap that a change there could explain, in [0, 1].
+        when: the regime in which it shows, in words.
+    """
+
+    kind: str
+    name: str | None
+    share: float
+    when: str
+
+
+@dataclass(frozen=True)
+class Strength:
+    """One number of a named effect, with its 90 % interval."""
+
+    value: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class NamedEffect:
+    """A missing effect.
+
+    Attributes:
+        effect: its name in the vocabulary, or ``unnamed``.
+        target: where it sits; ``*`` for a family over all joints or actuators, ``None`` for the world.
+        parameters: its numbers.
+        share_of_gap: share of the excess misfit that goes when it is added, in [0, 1].
+        indistinguishable_from: effect and target of those that explain this log as well.
+        sentence: what it is, to a person.
+    """
+
+    effect: str
+    target: str | None
+    parameters: Mapping[str, Strength]
+    share_of_gap: float
+    indistinguishable_from: tuple[tuple[str, str | None], ...] = ()
+    sentence: str = ""
+
+
+@dataclass(frozen=True)
+class Score:
+    """How far a model is from held-out data.
+
+    Attributes:
+        mse: mean squared error of one-step predictions, over features.
+        log_likelihood: of the one-step predictions, with the noise of start and end, in nats.
+        rollout_rmse: root mean square error of open-loop positions over :attr:`Gap.rollout_seconds`.
+        rollout: root mean square error of each feature in open loop, ``(m,)``.
+    """
+
+    mse: float
+    log_likelihood: float
+    rollout_rmse: float
+    rollout: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Ranked:
+    """A candidate that was tried, for the report: the share of the excess that it left, and its numbers."""
+
+    effect: str
+    target: str | None
+    values: Mapping[str, float]
+    left: float
+    round: int = 0
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """Residuals before and after against the variable that tells most, for one named effect or place.
+
+    Attributes:
+        title: what is shown.
+        label: the variable and its unit.
+        unit: unit of the force.
+        variable: its values, ``(N,)``.
+        before, after: missing generalised force without and with the effects, ``(N,)``.
+    """
+
+    title: str
+    label: str
+    unit: str
+    variable: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+
+@dataclass(frozen=True)
+class Gap:
+    """The result of ``dropo gap``.
+
+    Attributes:
+        where: places, the largest share first.
+        effects: named effects, the strongest first; empty if the log shows no gap.
+        before, after, noise_floor: scores on held-out data.
+        next_experiment: what motion would tell more, or ``None``.
+        found: whether anything is missing at all.
+        declared: values of the declared parameters: as given, fitted alone, fitted with the effects.
+        noise: estimated (or given) standard deviation of each feature.
+        labels, units: the features.
+        reduced: χ² per degree of freedom before and after.
+        ranking: candidates that were tried, best first.
+        residuals: pictures of what is missing.
+        cannot_judge: candidates that change nothing on this log.
+        rollout_seconds: length of an open-loop prediction.
+        window: logged steps of the windows on which hypotheses were compared.
+        simulated_transitions, seconds, backend, seed: what it took.
+        notes: remarks for a person.
+        symbolic: a sparse formula for a force that has no name, or empty.
+    """
+
+    where: tuple[Place, ...]
+    effects: tuple[NamedEffect, ...]
+    before: Score
+    after: Score
+    noise_floor: Score
+    next_experiment: str | None
+    found: bool
+    declared: Mapping[str, tuple[float, float, float]]
+    noise: tuple[float, ...]
+    labels: tuple[str, ...]
+    units: tuple[str, ...]
+    reduced: tuple[float, float]
+    ranking: tuple[Ranked, ...] = ()
+    residuals: tuple[Residuals, ...] = ()
+    cannot_judge: tuple[tuple[str, str | None], ...] = ()
+    rollout_seconds: float = 0.0
+    window: int = 0
+    simulated_transitions: int = 0
+    seconds: float = 0.0
+    backend: str = "mujoco"
+    seed: int = 0
+    notes: tuple[str, ...] = ()
+    symbolic: str = ""
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    def document(self) -> dict[str, Any]:
+        """Return the content of ``gap.json``."""
+        return {
+            "schema": SCHEMA,
+            "where": [{"kind": p.kind, "name": p.name, "share": p.share, "when": p.when} for p in self.where],
+            "effects": [_effect(e) for e in self.effects],
+            "gap": {
+                name: {"mse": s.mse, "log_likelihood": s.log_likelihood, "rollout_rmse": s.rollout_rmse}
+                for name, s in (("before", self.before), ("after", self.after), ("noise_floor", self.noise_floor))
+            },
+            "next_experiment": self.next_experiment,
+            "declared": {
+                n: {"given": a, "alone": b, "with_effects": c} for n, (a, b, c) in self.declared.items()
+            },
+            "noise": dict(zip(self.labels, self.noise, strict=True)),
+            "chi2_per_degree": {"before": self.reduced[0], "after": self.reduced[1]},
+            "ranking": [
+                {"effect": r.effect, "target": r.target, "values": dict(r.values), "left": r.left, "round": r.round}
+                for r in self.ranking
+            ],
+            "cannot_judge": [{"effect": e, "target": t} for e, t in self.cannot_judge],
+            "symbolic": self.symbolic or None,
+            "notes": list(self.notes),
+            "backend": self.backend,
+            "simulated_transitions": self.simulated_transitions,
+            "seconds": self.seconds,
+            "seed": self.seed,
+        }  # fmt: skip
+
+
+def _effect(e: NamedEffect) -> dict[str, Any]:
+    return {
+        "effect": e.effect,
+        "target": e.target,
+        "parameters": {
+            n: {"value": s.value, "low": s.low, "high": s.high, "unit": s.unit} for n, s in e.parameters.items()
+        },
+        "share_of_gap": e.share_of_gap,
+        "indistinguishable_from": [{"effect": n, "target": t} for n, t in e.indistinguishable_from],
+    }
