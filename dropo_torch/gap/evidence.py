@@ -8,7 +8,7 @@ P = I − QQᵀ from the QR factors of ∂r/∂x₀. What is left, P r, is compa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -186,6 +186,3 @@ def caps_of(chi2: np.ndarray, degrees: float) -> np.ndarray:
     """Return factors ``(W,)`` by which no window has more than its share of χ², however bad it is."""
     most = max(CAP * float(chi2.sum()), 10 * degrees / len(chi2))
     return np.sqrt(np.minimum(1.0, most / np.maximum(chi2, 1e-300)))
-
-
-__all__ = ["Cost", "Evidence", "Starts", "caps_of", "cost_of", "replace"]

@@ -146,7 +146,7 @@ def cut_windows(log: Trajectories, observation: Observation, length: int, *, str
 
 def make_setting(problem: Problem, log: Trajectories) -> Setting:
     """Return where effects are looked for: the model, its columns, and the sizes of the log."""
-    model = problem.space.apply(_start_values(problem))
+    model = problem.space.apply(start_values(problem))
     frame_skip = problem.simulator.frame_skip
     states = problem.observation.states(log.observations)
     rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
@@ -195,7 +195,7 @@ def _velocity(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarr
     return out[3:]
 
 
-def _start_values(problem: Problem) -> np.ndarray:
+def start_values(problem: Problem) -> np.ndarray:
     """Declared parameters to begin with: the model's own where they lie in their box, else its middle."""
     space = problem.space
     middle = 0.5 * (space.low + space.high)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -47,6 +47,7 @@ class Trial:
     placed: Placed
     excess: float
     before: float
+    round: int = 0
 
 
 @dataclass(frozen=True)
@@ -60,8 +61,9 @@ class Naming:
         named: whether the named effects account for it.
         ties: for each named effect, the candidates that do as well in its place.
         trials: what was refitted, in order.
-        judged: candidates that change nothing on this log, which it therefore cannot judge.
+        silent: candidates that change nothing on this log, which it therefore cannot judge.
         best: the wrong candidates that removed the most, where nothing could be named.
+        shares: excess that comes back when each named effect alone is left out.
     """
 
     base: Refit
@@ -71,7 +73,8 @@ class Naming:
     ties: tuple[tuple[Placed, ...], ...] = ()
     trials: tuple[Trial, ...] = ()
     silent: tuple[tuple[str, str | None], ...] = ()
-    best: tuple[Trial, ...] = field(default=())
+    best: tuple[Trial, ...] = ()
+    shares: tuple[float, ...] = ()
 
 
 #: ``report(stage, share)`` as the work goes on.
@@ -113,6 +116,9 @@ class Search:
         self._few, self._fewer = few, fewer
         self.trials: list[Trial] = []
         self.silent: list[tuple[str, str | None]] = []
+        self.first: list[Candidate] = []
+        self.first_chi2, self.first_degrees = 0.0, 0.0
+        self._round = 0
         setting = evidence.twin.setting
         self.candidates = list(all_candidates(setting, effects))
 
@@ -121,6 +127,7 @@ class Search:
         rules = self.rules
         self._report("fitting the declared parameters", 0.0)
         base = refit(self._part(self._few), begin)
+        base = self._renoise(base)
         caps = caps_of(base.cost.windows, base.cost.degrees)
         self._caps = caps
         base = refit(self._part(self._few), base.hypothesis, caps=caps, iterations=4)
@@ -143,8 +150,27 @@ class Search:
         if not current.hypothesis.placed or removed < rules.most:
             best = tuple(sorted(self.trials, key=lambda t: t.excess)[:3])
             return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent), best=best)
-        ties = tuple(self._ties(current, index) for index in range(len(current.hypothesis.placed)))
-        return Naming(base, current, True, True, ties, tuple(self.trials), tuple(self.silent))
+        ties, shares = [], []
+        for index in range(len(current.hypothesis.placed)):
+            tied, share = self._ties(current, index, base)
+            ties.append(tied)
+            shares.append(share)
+        current, ties = self._canonical(current, ties)
+        return Naming(
+            base, current, True, True, tuple(ties), tuple(self.trials), tuple(self.silent), shares=tuple(shares)
+        )
+
+    def _renoise(self, fitted: Refit) -> Refit:
+        """Lower the noise where even this hypothesis leaves less of it in a feature, and fit again."""
+        m = self.evidence.chart.size
+        squares = (fitted.residual**2).reshape(len(fitted.residual), -1, m)
+        rows = (fitted.starts.weights > 0).reshape(squares.shape).sum((0, 1))
+        free = rows * fitted.cost.degrees / max(float((fitted.starts.weights > 0).sum()), 1.0)
+        ratio = np.sqrt(squares.sum((0, 1)) / np.maximum(free, 1.0))
+        if fitted.cost.reduced > self.rules.least_reduced or (ratio > 0.97).all():
+            return fitted
+        self.evidence = self.evidence.with_noise(self.evidence.noise * np.minimum(ratio, 1.0))
+        return refit(self._part(self._few), fitted.hypothesis, iterations=4)
 
     def _part(self, count: int) -> Evidence:
         """The evidence on a spread of windows."""
@@ -195,8 +221,12 @@ class Search:
         """The hypothesis with one or two more effects that removes the most, or ``None``."""
         rules = self.rules
         ranked = self._screened(current)
+        self._round = number
         if number == 0:
             self.silent = [c.key for c in ranked if c.dead]
+            fewer, here, caps = self._fewer_of(current, self._fewer)
+            self.first, self.first_degrees = ranked, fewer.degrees(here.starts)
+            self.first_chi2 = float(((here.residual * caps[:, None]) ** 2).sum())
         alive = [c for c in ranked if not c.dead]
         singles = self._refits(current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
         if not singles:
@@ -234,7 +264,7 @@ class Search:
             fitted = refit(fewer, hypothesis, starts=here.starts, caps=caps, iterations=5)
             rough.append(fitted)
             for placed in fitted.hypothesis.placed[len(current.hypothesis.placed) :]:
-                self.trials.append(Trial(placed, fitted.cost.excess, before))
+                self.trials.append(Trial(placed, fitted.cost.excess, before, self._round))
         rough.sort(key=lambda r: r.cost.excess)
         if not rough:
             return []
@@ -280,17 +310,35 @@ class Search:
             current = least
         return current
 
-    def _ties(self, current: Refit, index: int) -> tuple[Placed, ...]:
-        """Candidates that explain the log as well in the place of one named effect."""
-        own = current.hypothesis.placed[index]
-        without = refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
-        ranked = [c for c in self._screened(without) if not c.dead and c.key != own.key][:5]
+    def _ties(self, current: Refit, index: int, base: Refit) -> tuple[tuple[Placed, ...], float]:
+        """Candidates that explain the log as well in the place of one named effect, and the excess it accounts for."""
+        placed = current.hypothesis.placed
+        own = placed[index]
+        alone = len(placed) == 1
+        without = base if alone else refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
+        ranked = self.first if alone else self._screened(without)
+        order = [c for c in ranked if not c.dead and c.key != own.key and len(c.placed.values) <= len(own.values)]
+        self._round = -1
         found = []
-        for fitted in self._refits(without, [(c.placed,) for c in ranked], "looking for ties"):
+        for fitted in self._refits(without, [(c.placed,) for c in order[:5]], "looking for ties"):
             other = fitted.hypothesis.placed[-1]
             close = fitted.cost.excess - current.cost.excess < max(
                 self.rules.least * without.cost.excess, 4 * np.sqrt(2 * current.cost.degrees)
             )
             if close and paired(fitted.cost, current.cost, self.blocks) < self.rules.tie:
                 found.append(other)
-        return tuple(found)
+        return tuple(found), without.cost.excess - current.cost.excess
+
+    def _canonical(self, current: Refit, ties: list[tuple[Placed, ...]]) -> tuple[Refit, list[tuple[Placed, ...]]]:
+        """Among exact ties name the one with the fewest numbers that the vocabulary lists first."""
+        order = {effect.name: i for i, effect in enumerate(self.effects)}
+        for index, tied in enumerate(ties):
+            own = current.hypothesis.placed[index]
+            first = min((own, *tied), key=lambda p: (len(p.values), order.get(p.effect.name, 99)))
+            if first is own:
+                continue
+            placed = list(current.hypothesis.placed)
+            placed[index] = first
+            current = refit(self._part(self._few), Hypothesis(current.hypothesis.declared, tuple(placed)), caps=self._caps)
+            ties[index] = tuple(own if p is first else p for p in tied)
+        return current, ties

@@ -15,7 +15,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, slopes
+from dropo_torch.gap.refit import Hypothesis, Refit, limits_of
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
@@ -166,6 +166,3 @@ def promising_pairs(base: Refit, candidates: Sequence[Candidate], caps: np.ndarr
         found.append((float(origin @ origin - gradient @ np.linalg.solve(normal, gradient)), a, b))
     found.sort()
     return [(alive[a].placed, alive[b].placed) for _, a, b in found[:count]]
-
-
-__all__ = ["Candidate", "all_candidates", "promising_pairs", "screen", "slopes"]
