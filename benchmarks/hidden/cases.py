@@ -81,7 +81,7 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
         "torque_arm": ("upper", "fore"), "servo_arm": ("upper", "fore"), "cart_pole": ("cart", "pole"),
         "furuta": ("pendulum",), "puck": ("puck",),
     },
-    "gravity_tilt": {s: (None,) for s in ("torque_arm", "servo_arm", "cart_pole", "furuta", "puck", "hopper")},
+    "gravity_tilt": dict.fromkeys(("torque_arm", "servo_arm", "cart_pole", "furuta", "puck", "hopper"), (None,)),
     "ground_slope": {"puck": (None,), "hopper": (None,)},
     "integration": {s: (None,) for s in SYSTEMS if s.startswith("coarse_")},
     "actuator_gain": _MOTORS,
