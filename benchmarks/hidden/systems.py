@@ -294,7 +294,7 @@ PUCK = System(
         (("contact_margin", "puck"), ("contact_margin", "floor"), ("sensor_bias", "root.position[z]")),
     ),
     free="root",
-    substeps=20,
+    substeps=30,
 )
 
 
@@ -339,6 +339,7 @@ HOPPER = System(
     observation=("qpos[1:]", "qvel"),
     episodes=20,
     transitions=(80, 110),
+    substeps=60,
 )  # fmt: skip
 
 SYSTEMS = {

@@ -201,29 +201,23 @@ def _position_force(law: Callable[[float], float]) -> Callable[[Plant, str], For
 
 
 def _dry_friction(plant: Plant, joint: str, level: Callable[[float, float], float]) -> Force:
-    """Friction that sticks: it stops the joint within one fine step where the level (of q, |v|) suffices."""
+    """Friction that sticks: it stops the joint within one fine step where the level (of q, |v|) suffices.
+
+    It has to come after all other forces: what it must balance is their acceleration.
+    """
     i, j = plant.dof(joint), plant.address(joint)
     unit = np.zeros((1, plant.model.nv))
     unit[0, i] = 1.0
     column = np.zeros_like(unit)
-    memory = {"force": 0.0, "inertia": 0.0, "age": 0}
-
-    def forget() -> None:
-        memory.update(force=0.0, inertia=0.0, age=0)
 
     def force(p: Plant) -> None:
         v = float(p.v[i])
         limit = level(float(p.middle_q[j]), abs(v))
-        if memory["age"] % 4 == 0:
-            mujoco.mj_fwdPosition(p.model, p.data) if memory["inertia"] == 0 else None
-            mujoco.mj_solveM(p.model, p.data, column, unit)
-            memory["inertia"] = 1.0 / column[0, i]
-        memory["age"] += 1
-        stopping = memory["force"] - memory["inertia"] * (v / p.h + float(p.a[i]))
-        memory["force"] = min(max(stopping, -limit), limit)
-        p.force[i] += memory["force"]
+        mujoco.mj_forwardSkip(p.model, p.data, mujoco.mjtStage.mjSTAGE_VEL, 1)
+        mujoco.mj_solveM(p.model, p.data, column, unit)
+        stopping = -(v / p.h + float(p.data.qacc[i])) / column[0, i]
+        p.force[i] += min(max(stopping, -limit), limit)
 
-    plant.memories.append(forget)
     return force
 
 
@@ -276,6 +270,8 @@ JOINT_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     "joint_stribeck": lambda p, j, x: _dry_friction(p, j, _stribeck_level(x["coulomb"], x["static"], x["velocity"])),
     "joint_coupling": lambda p, j, x: _coupling(p, j, x["stiffness"]),
 }
+#: Those with sticking, which are evaluated last; and the one of them that no vocabulary knows.
+DRY, UNEVEN = ("joint_friction", "joint_stribeck"), "uneven_friction"
 
 
 # --- forces on bodies -----------------------------------------------------------------------------------------
@@ -462,14 +458,12 @@ def _far_spring(plant: Plant, body: str, x: Mapping[str, float]) -> Force:
     return force
 
 
-OUTSIDE_FORCES = {
+#: Forces outside the vocabulary: (plant, target, parameters) → force.
+OUTSIDE_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     "torque_ripple": _ripple,
-    "uneven_friction": _uneven_friction,
     "hysteresis": _hysteresis,
     "far_spring": _far_spring,
 }
-#: Effects outside the vocabulary.
-OUTSIDE = (*OUTSIDE_FORCES, "slosh", "dropout", "gain_drift")
 
 
 # --- what has to change the model -----------------------------------------------------------------------------
@@ -487,7 +481,7 @@ def _added_bodies(spec: mujoco.MjSpec, base: mujoco.MjModel, effects: Sequence[E
             _weld(spec, e.target, f"inertia{n}", own.ipos, 1e-9, inertia, quat=own.iquat)
         elif e.name == "slosh":
             place = [x["x"], x["y"], x["z"]]
-            body = _weld(spec, e.target, f"slosh{n}", place, x["mass"], [1e-6] * 3)
+            body = _weld(spec, e.target, f"slosh{n}", place, x["mass"], [1e-9] * 3)
             body.add_joint(
                 name=f"slosh{n}",
                 type=mujoco.mjtJoint.mjJNT_SLIDE,
@@ -563,13 +557,15 @@ def make_plant(system: System, declared: Mapping[str, float], effects: Sequence[
     for e in effects:
         if e.name.startswith("actuator_") or e.name in ("dropout", "gain_drift"):
             driven.setdefault(str(e.target), []).append(e)
-        elif e.name in JOINT_FORCES:
+        elif e.name in JOINT_FORCES and e.name not in DRY:
             plant.forces.append(JOINT_FORCES[e.name](plant, str(e.target), e.parameters))
         elif e.name in OUTSIDE_FORCES:
             plant.forces.append(OUTSIDE_FORCES[e.name](plant, str(e.target), e.parameters))
         elif e.name == "fluid_drag":
             plant.forces.append(_drag(plant, str(e.target), e.parameters))
     plant.forces += [_drive(plant, actuator, of) for actuator, of in driven.items()]
+    dry = [JOINT_FORCES[e.name](plant, str(e.target), e.parameters) for e in effects if e.name in DRY]
+    plant.forces += dry + [_uneven_friction(plant, str(e.target), e.parameters) for e in effects if e.name == UNEVEN]
     return plant
 
 
