@@ -1,0 +1,509 @@
+"""The list of cases, and how strong what is hidden in each is.
+
+A seed decides systems, targets and strengths. A strength is drawn by the gap that it makes: the misfit of
+the user's model to the log, one transition at a time and with the declared parameters at their best, is
+some 8 to 80 times the noise.
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from benchmarks.hidden.systems import SYSTEMS, System, load
+from benchmarks.hidden.truths import Case, Effect, Recording, make_case, make_recording, observed
+from dropo_torch.parameters import ParameterSpace
+
+#: The gap that a single effect is given, in units of the noise; and the least with which a case is kept.
+GAP, LEAST_GAP = (8.0, 80.0), 3.0
+#: Size of a draw, from hardly there to as much as makes sense.
+SIZES = (1e-4, 1.0)
+#: The least size of effects which sensitive systems would show when too small to matter.
+LEAST_SIZE = {
+    "actuator_delay": 0.06, "actuator_lag": 0.06, "actuator_backlash": 0.02, "actuator_deadband": 0.02,
+    "sensor_delay": 0.1, "sensor_scale": 0.05, "sensor_bias": 0.05, "ground_slope": 0.02, "contact_margin": 0.02,
+    "contact_friction": 0.05, "payload": 0.03, "joint_friction": 0.02,
+}  # fmt: skip
+
+_ARM, _SERVO, _CART, _FURUTA = (
+    ("yaw", "shoulder", "elbow"), ("shoulder", "elbow", "wrist"), ("rail", "hinge"), ("turn", "swing"),
+)  # fmt: skip
+_LEG = ("thigh_joint", "leg_joint", "foot_joint")
+_JOINTS = {"torque_arm": _ARM, "servo_arm": _SERVO, "cart_pole": _CART, "furuta": _FURUTA}
+_ACTUATORS: dict[str, tuple[str | None, ...]] = {
+    "torque_arm": ("yaw_motor", "shoulder_motor", "elbow_motor"),
+    "servo_arm": ("shoulder_servo", "elbow_servo", "wrist_servo"),
+    "cart_pole": ("push",),
+    "furuta": ("drive",),
+}
+_MOTORS = {**_ACTUATORS, "hopper": ("thigh_motor", "leg_motor", "foot_motor")}
+_COLUMNS: dict[str, tuple[str | None, ...]] = {
+    "torque_arm": ("shoulder.position", "elbow.position", "shoulder.velocity", "elbow.velocity"),
+    "servo_arm": ("shoulder.position", "elbow.position", "wrist.position", "elbow.velocity"),
+    "cart_pole": ("hinge.position", "hinge.velocity", "rail.velocity"),
+    "furuta": ("swing.position", "swing.velocity", "turn.velocity"),
+}
+_CONTACTS: dict[str, tuple[str | None, ...]] = {"puck": ("puck",), "hopper": ("foot_geom",)}
+#: Effect → system → what can carry it there, such that it shows.
+OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
+    "joint_damping": {**_JOINTS, "hopper": _LEG},
+    "joint_quadratic_damping": _JOINTS,
+    "joint_friction": _JOINTS,
+    "joint_stribeck": _JOINTS,
+    "joint_stiffness": {**_JOINTS, "hopper": _LEG},
+    "joint_cogging": _JOINTS,
+    "armature": {**_JOINTS, "hopper": _LEG},
+    "joint_limit": {"torque_arm": ("elbow",)},
+    "joint_coupling": {"torque_arm": ("shoulder", "elbow"), "servo_arm": ("elbow", "wrist"), "furuta": ("swing",)},
+    "payload": {
+        "torque_arm": ("upper", "fore"), "servo_arm": ("fore", "hand"), "cart_pole": ("pole",),
+        "furuta": ("pendulum",), "hopper": ("torso", "foot"),
+    },
+    "center_of_mass": {
+        "torque_arm": ("upper", "fore"), "servo_arm": ("fore", "hand"), "cart_pole": ("pole",),
+        "furuta": ("pendulum",), "hopper": ("torso",),
+    },
+    "inertia": {
+        "torque_arm": ("upper", "fore"), "servo_arm": ("fore",), "cart_pole": ("pole",), "furuta": ("pendulum",),
+        "puck": ("puck",), "hopper": ("torso",),
+    },
+    "external_force": {
+        "torque_arm": ("upper", "fore"), "servo_arm": ("fore", "hand"), "cart_pole": ("cart", "pole"),
+        "furuta": ("pendulum",), "puck": ("puck",), "hopper": ("torso",),
+    },
+    "fluid_drag": {
+        "torque_arm": ("upper", "fore"), "servo_arm": ("upper", "fore"), "cart_pole": ("cart", "pole"),
+        "furuta": ("pendulum",), "puck": ("puck",),
+    },
+    "gravity_tilt": dict.fromkeys(("torque_arm", "servo_arm", "cart_pole", "furuta", "puck", "hopper"), (None,)),
+    "ground_slope": {"puck": (None,), "hopper": (None,)},
+    "integration": {s: (None,) for s in SYSTEMS if s.startswith("coarse_")},
+    "actuator_gain": _MOTORS,
+    "actuator_bias": _ACTUATORS,
+    "actuator_damping": _ACTUATORS,
+    "actuator_delay": _MOTORS,
+    "actuator_lag": _MOTORS,
+    "actuator_deadband": _ACTUATORS,
+    "actuator_backlash": _ACTUATORS,
+    "actuator_saturation": _ACTUATORS,
+    "sensor_bias": _COLUMNS,
+    "sensor_scale": {k: (*v, "rail.position") if k == "cart_pole" else v for k, v in _COLUMNS.items()},
+    "sensor_delay": _COLUMNS,
+    "contact_friction": _CONTACTS,
+    "contact_stiffness": _CONTACTS,
+    "contact_margin": _CONTACTS,
+    "torque_ripple": {"torque_arm": _ARM, "furuta": _FURUTA, "puck": ("root",)},
+    "uneven_friction": {"servo_arm": ("elbow",), "furuta": ("turn",), "cart_pole": ("rail",)},
+    "hysteresis": {"torque_arm": ("elbow", "shoulder"), "cart_pole": ("hinge",)},
+    "far_spring": {"torque_arm": ("fore",), "servo_arm": ("fore",)},
+    "slosh": {"torque_arm": ("fore",), "cart_pole": ("pole",), "servo_arm": ("hand",)},
+    "dropout": {"torque_arm": _ACTUATORS["torque_arm"], "cart_pole": ("push",)},
+    "gain_drift": {"torque_arm": _ACTUATORS["torque_arm"], "furuta": ("drive",)},
+}  # fmt: skip
+OUTSIDE = ("torque_ripple", "uneven_friction", "hysteresis", "far_spring", "slosh", "dropout", "gain_drift")
+VOCABULARY = tuple(e for e in OPTIONS if e not in OUTSIDE)
+#: Pairs of effects: system, and what hides in it.
+DOUBLES = (
+    ("torque_arm", "joint_friction", "payload"),
+    ("torque_arm", "joint_damping", "actuator_delay"),
+    ("torque_arm", "joint_cogging", "actuator_gain"),
+    ("servo_arm", "joint_friction", "actuator_delay"),
+    ("servo_arm", "payload", "actuator_backlash"),
+    ("servo_arm", "joint_stiffness", "actuator_lag"),
+    ("cart_pole", "joint_friction", "fluid_drag"),
+    ("cart_pole", "actuator_deadband", "gravity_tilt"),
+    ("furuta", "joint_damping", "actuator_gain"),
+    ("furuta", "joint_friction", "sensor_delay"),
+    ("puck", "contact_friction", "gravity_tilt"),
+    ("puck", "fluid_drag", "ground_slope"),
+    ("hopper", "joint_damping", "contact_friction"),
+    ("hopper", "payload", "actuator_gain"),
+)
+#: Effects of the small list, each once.
+SMALL = (
+    "joint_damping", "joint_friction", "payload", "gravity_tilt", "actuator_delay", "sensor_bias",
+    "contact_friction", "torque_ripple",
+)  # fmt: skip
+#: Systems and bodies that move in the world's x-z plane only: nothing along y, no roll, shows there.
+_PLANAR = frozenset({"cart_pole", "hopper", "servo_arm"})
+
+
+@dataclass(frozen=True)
+class CaseSpec:
+    """A case before it is simulated.
+
+    Attributes:
+        name: unique in a list.
+        kind: ``null``, ``single``, ``double`` or ``outside``.
+        system: the system's name.
+        effects: names of what is hidden.
+        seed: decides targets, strengths and log.
+    """
+
+    name: str
+    kind: str
+    system: str
+    effects: tuple[str, ...]
+    seed: tuple[int, ...]
+
+    def make(self) -> Case:
+        """Draw the strengths and simulate the log."""
+        system, rng = SYSTEMS[self.system], np.random.default_rng([*self.seed, 1])
+        effects = tuple(_drawn(system, e, rng, self.seed) for e in self.effects)
+        recording = make_recording(system, effects, self.seed)
+        ratio = gap_ratio(system, recording)
+        return make_case(system, effects, recording, name=self.name, kind=self.kind, gap_ratio=ratio)
+
+
+def cases(seed: int, which: str = "all") -> list[CaseSpec]:
+    """Return the list of cases of a seed: ``all`` of them, or a ``small`` list of some ten."""
+    if which == "small":
+        chosen = [_spec("null", s, (), seed) for s in ("torque_arm", "puck")]
+        chosen += [s for e in SMALL for s in _spread(e, seed, 1)]
+        return [*chosen, _spec("double", *_pair(DOUBLES[0]), seed)]
+    if which != "all":
+        raise ValueError(f"which is {which!r}; expected all or small")
+    systems = [s for s in SYSTEMS if not s.startswith("coarse_")]
+    found = [_spec("null", s, (), seed, n) for s in systems for n in range(2)]
+    found += [s for e in VOCABULARY for s in _spread(e, seed, 2)]
+    found += [_spec("double", *_pair(d), seed) for d in DOUBLES]
+    return found + [s for e in OUTSIDE for s in _spread(e, seed, 1)]
+
+
+def select(specs: Sequence[CaseSpec], pattern: str = "*", kind: str | None = None) -> list[CaseSpec]:
+    """Return the cases whose name matches a pattern, of one kind where given."""
+    return [s for s in specs if fnmatch.fnmatch(s.name, pattern) and kind in (None, s.kind)]
+
+
+def _pair(double: tuple[str, str, str]) -> tuple[str, tuple[str, ...]]:
+    return double[0], double[1:]
+
+
+def _spec(kind: str, system: str, effects: tuple[str, ...], seed: int, number: int = 0) -> CaseSpec:
+    name = f"{kind}-{system}" + "".join(f"-{e}" for e in effects) + (f"-{number}" if number else "")
+    return CaseSpec(name, kind, system, effects, (seed, zlib.crc32(name.encode())))
+
+
+def _spread(effect: str, seed: int, count: int) -> list[CaseSpec]:
+    """One effect on as many different systems as asked for, or on its only one as often."""
+    rng = np.random.default_rng([seed, zlib.crc32(effect.encode())])
+    systems = list(rng.permutation(sorted(OPTIONS[effect])))
+    kind = "outside" if effect in OUTSIDE else "single"
+    return [
+        _spec(kind, str(systems[n % len(systems)]), (effect,), seed, n // len(systems)) for n in range(count)
+    ]  # fmt: skip
+
+
+# --- strengths ------------------------------------------------------------------------------------------------
+
+Draw = Callable[[float], dict[str, float]]
+
+
+def _drawn(system: System, effect: str, rng: np.random.Generator, seed: Sequence[int]) -> Effect:
+    """An effect on a target that shows it, of a strength that makes the wanted gap."""
+    best: tuple[float, Effect] | None = None
+    for _ in range(4):
+        options = OPTIONS[effect][system.name]
+        target = options[int(rng.integers(len(options)))]
+        if effect == "integration":
+            return Effect(effect, target, {"timestep": load(system.xml).opt.timestep})
+        found = _sized(system, effect, target, rng, seed)
+        if best is None or found[0] > best[0]:
+            best = found
+        if best[0] >= LEAST_GAP:
+            break
+    assert best is not None
+    return best[1]
+
+
+def _sized(
+    system: System, effect: str, target: str | None, rng: np.random.Generator, seed: Sequence[int]
+) -> tuple[float, Effect]:
+    """The effect whose gap is closest to a random one, and its gap."""
+    draw, wanted = DRAWS[effect](system, target, rng), math.exp(rng.uniform(*np.log(GAP)))
+    least, tried = LEAST_SIZE.get(effect, SIZES[0]), []
+    size = max(0.1, least)
+    for _ in range(5):
+        hidden = Effect(effect, target, draw(size))
+        ratio = gap_ratio(system, make_recording(system, [hidden], seed, episodes=2, transitions=150, substeps=20))
+        tried.append((abs(math.log(max(ratio, 1e-9) / wanted)), ratio, hidden))
+        step = min(max(wanted / max(ratio, 1e-9), 0.02), 5.0)
+        following = min(max(size * step, least), SIZES[1])
+        if tried[-1][0] < 0.5 or following == size:
+            break
+        size = following
+    _, ratio, hidden = min(tried, key=lambda t: t[0])
+    return ratio, hidden
+
+
+def gap_ratio(system: System, recording: Recording) -> float:
+    """The gap that effects make beside the noise: of the column where it is largest, the ratio of their rms.
+
+    The gap is what is left of the user's model's misfit, one transition from each sensed state without noise,
+    after the declared parameters have taken what they can to first order.
+    """
+    declared, levels, log = recording.declared, recording.noise, recording.log
+    states = np.concatenate([s[:-1] for s in log.states])
+    after = np.concatenate([s[1:] for s in log.states])[:, observed(system).index]
+    commands = np.concatenate(log.commands)
+    space = ParameterSpace(load(system.xml), system.declared)  # type: ignore[arg-type]
+    truth = space.vector(declared)
+    weight = math.sqrt(2.0) * levels
+    expected = _predicted(system, space, truth, states, commands)
+    misfit = ((after - expected) / weight).reshape(-1)
+    columns = []
+    for p, step in enumerate(1e-3 * np.abs(truth)):
+        moved = truth.copy()
+        moved[p] += step
+        columns.append(((_predicted(system, space, moved, states, commands) - expected) / weight / step).reshape(-1))
+    jacobian = np.stack(columns, 1)
+    left = misfit - jacobian @ np.linalg.lstsq(jacobian, misfit, rcond=None)[0]
+    return float(np.sqrt((left.reshape(-1, len(levels)) ** 2).mean(0)).max())
+
+
+def _predicted(
+    system: System, space: ParameterSpace, values: np.ndarray, states: np.ndarray, commands: np.ndarray
+) -> np.ndarray:
+    """What the user's model makes of each state and command, observed columns."""
+    model, index = space.apply(values), observed(system).index
+    data = mujoco.MjData(model)
+    out = np.empty((len(states), model.nq + model.nv))
+    for n, (state, command) in enumerate(zip(states, commands, strict=True)):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], command
+        data.qacc_warmstart[:] = 0
+        mujoco.mj_step(model, data, system.frame_skip)
+        out[n, : model.nq], out[n, model.nq :] = data.qpos, data.qvel
+    return out[:, index]
+
+
+def _joint_draw(
+    make: Callable[[float, float, float, np.random.Generator], Draw],
+) -> Callable[[System, str | None, np.random.Generator], Draw]:
+    """A draw from a joint's typical torque, velocity and inertia."""
+
+    def draw(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+        scale = system.scales[str(target)]
+        return make(scale.torque, scale.velocity, scale.inertia, rng)
+
+    return draw
+
+
+def _actuator_draw(
+    make: Callable[[float, float, float, np.random.Generator], Draw],
+) -> Callable[[System, str | None, np.random.Generator], Draw]:
+    """A draw from an actuator's typical force, velocity and command."""
+
+    def draw(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+        model = load(system.xml)
+        number = model.actuator(target).id
+        gear = float(model.actuator_gear[number, 0])
+        scale = system.scales[model.joint(int(model.actuator_trnid[number, 0])).name]
+        return make(scale.torque / gear, scale.velocity * gear, system.commands[number].amplitude, rng)
+
+    return draw
+
+
+def _sign(rng: np.random.Generator) -> float:
+    return float(rng.choice([-1.0, 1.0]))
+
+
+def _stiffness(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
+    reference = rng.uniform(-0.6, 0.6)
+    return lambda s: {"stiffness": s * 1.5 * t, "reference": reference}
+
+
+def _stribeck(t: float, v: float, _i: float, rng: np.random.Generator) -> Draw:
+    ratio, knee = rng.uniform(1.5, 2.2), rng.uniform(0.05, 0.15) * v
+    return lambda s: {"coulomb": 0.3 * s * t, "static": 0.3 * s * t * ratio, "velocity": knee}
+
+
+def _cogging(t: float, v: float, _i: float, rng: np.random.Generator) -> Draw:
+    poles, phase = int(rng.integers(4, 15)), rng.uniform(-np.pi, np.pi)
+    return lambda s: {"amplitude": 0.5 * s * t, "poles": poles, "phase": phase}
+
+
+def _limit(_t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
+    lower, upper = _sign(rng) * rng.uniform(0.15, 0.3), _sign(rng) * rng.uniform(0.15, 0.3)
+    return lambda s: {"lower": s * lower, "upper": s * upper}
+
+
+def _gain(_t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
+    sign = _sign(rng)
+    return lambda s: {"gain": 1.0 + 0.5 * sign * s}
+
+
+def _bias(t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
+    sign = _sign(rng)
+    return lambda s: {"force": 0.4 * sign * s * t}
+
+
+def _place(system: System, target: str | None, rng: np.random.Generator) -> np.ndarray:
+    """A point on a body, off its centre of mass: further out, and a little aside."""
+    body = load(system.xml).body(target)
+    out = body.ipos * rng.uniform(1.5, 2.0)
+    aside = rng.uniform(0.2, 0.5) * max(float(np.linalg.norm(body.ipos)), 0.05) * rng.standard_normal(3)
+    if system.name in _PLANAR and target != "hand":
+        aside[1] = 0.0
+    return out + aside
+
+
+def _direction(system: System, target: str | None, rng: np.random.Generator) -> np.ndarray:
+    """A random direction in which something shows."""
+    way = rng.standard_normal(3)
+    if system.name in _PLANAR and target != "hand":
+        way[1] = 0.0
+    if target == "cart":
+        way[1:] = 0.0
+    if target == "puck":
+        way[2] *= 0.3
+    return way / np.linalg.norm(way)
+
+
+def _body_mass(system: System, target: str | None) -> float:
+    return float(load(system.xml).body(target).mass[0])
+
+
+def _payload(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    place, mass = _place(system, target, rng), _body_mass(system, target)
+    return lambda s: {"mass": 0.8 * s * mass, **dict(zip("xyz", map(float, place), strict=True))}
+
+
+def _shift(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    way = _direction(system, target, rng) * max(float(np.linalg.norm(load(system.xml).body(target).ipos)), 0.1)
+    return lambda s: dict(zip("xyz", (0.5 * s * way).tolist(), strict=True))
+
+
+def _inertia(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    heavier = rng.uniform() < 0.7
+    return lambda s: {"factor": 1.0 + 3.0 * s if heavier else 1.0 / (1.0 + 3.0 * s)}
+
+
+def _external_force(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    way, mass = _direction(system, target, rng), _body_mass(system, target)
+    return lambda s: dict(zip("xyz", (3.0 * s * mass * way).tolist(), strict=True))
+
+
+def _fluid_drag(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    mass = _body_mass(system, target)
+    most = 15.0 if target == "puck" else 4.0  # the puck is slow
+    return lambda s: {"coefficient": most * s * mass}
+
+
+def _tilt(system: System, _target: str | None, rng: np.random.Generator) -> Draw:
+    angle = rng.uniform(-np.pi, np.pi)
+    roll, pitch = math.cos(angle), math.sin(angle)
+    if system.name in _PLANAR:
+        roll, pitch = 0.0, _sign(rng)
+    return lambda s: {"roll": 0.12 * s * roll, "pitch": 0.12 * s * pitch}
+
+
+def _sensor(key: str, neutral: float, span: float, signed: bool = True) -> Callable[..., Draw]:
+    def draw(_system: System, target: str | None, rng: np.random.Generator) -> Draw:
+        sign = _sign(rng) if signed else 1.0
+        return lambda s: {key: neutral + sign * s * span}
+
+    return draw
+
+
+def _contact_friction(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    own, sign = float(load(system.xml).geom(target).friction[0]), _sign(rng)
+    if system.name == "hopper":  # what does not slip does not slip more with more friction
+        return lambda s: {"friction": own / (1 + 9 * s)}
+    return lambda s: {"friction": own * (1 + 0.6 * sign * s)}
+
+
+def _contact_stiffness(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    own, ratio = float(load(system.xml).geom(target).solref[0]), rng.uniform(0.8, 1.1)
+    return lambda s: {"time_constant": own * (1 + s), "damping_ratio": 1 + (ratio - 1) * min(1.0, 5 * s)}
+
+
+def _contact_margin(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    return lambda s: {"margin": 0.02 * s}
+
+
+def _ripple(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
+    frequency, phase = rng.uniform(2.0, 9.0), rng.uniform(-np.pi, np.pi)
+    return lambda s: {"amplitude": 0.5 * s * t, "frequency": frequency, "phase": phase}
+
+
+def _uneven(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
+    waves, phase = rng.uniform(3.0, 8.0), rng.uniform(-np.pi, np.pi)
+    return lambda s: {"friction": 0.3 * s * t, "waves": waves, "phase": phase}
+
+
+def _hysteresis(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
+    width = rng.uniform(0.05, 0.2)
+    return lambda s: {"stiffness": 0.5 * s * t / width, "yield": width}
+
+
+def _far_spring(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    x, y, z = (rng.uniform(-0.5, 0.5, 3) + np.array([0.3, 0.0, 1.0])).tolist()
+    weight, rest = 9.81 * _body_mass(system, target), rng.uniform(0.1, 0.3)
+    return lambda s: {"stiffness": 8.0 * s * weight, "x": x, "y": y, "z": z, "rest": rest}
+
+
+def _slosh(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    place, mass = load(system.xml).body(target).ipos * rng.uniform(1.4, 1.8), _body_mass(system, target)
+    way = _direction(system, target, rng)
+    frequency, ratio = rng.uniform(2.0, 5.0), rng.uniform(0.05, 0.2)
+    axis = dict(zip(("axis_x", "axis_y", "axis_z"), way.tolist(), strict=True))
+    where = dict(zip("xyz", place.tolist(), strict=True))
+    return lambda s: {"mass": 0.5 * s * mass, "frequency": frequency, "damping_ratio": ratio, **axis, **where}
+
+
+def _dropout(_t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
+    period, phase = rng.uniform(0.6, 1.2), rng.uniform(-np.pi, np.pi)
+    return lambda s: {"period": period, "duration": 0.02 + 0.2 * s, "phase": phase}
+
+
+def _gain_drift(_t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
+    seconds = rng.uniform(0.7, 2.0)
+    return lambda s: {"loss": 0.6 * s, "seconds": seconds}
+
+
+#: Effect → (system, target, rng) → (size → parameters).
+DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
+    "joint_damping": _joint_draw(lambda t, v, i, r: lambda s: {"damping": s * t / v}),
+    "joint_quadratic_damping": _joint_draw(lambda t, v, i, r: lambda s: {"coefficient": s * t / v**2}),
+    "joint_friction": _joint_draw(lambda t, v, i, r: lambda s: {"friction": 0.4 * s * t}),
+    "joint_stribeck": _joint_draw(_stribeck),
+    "joint_stiffness": _joint_draw(_stiffness),
+    "joint_cogging": _joint_draw(_cogging),
+    "armature": _joint_draw(lambda t, v, i, r: lambda s: {"armature": s * i}),
+    "joint_limit": _joint_draw(_limit),
+    "joint_coupling": _joint_draw(lambda t, v, i, r: lambda s: {"stiffness": s * t}),
+    "payload": _payload,
+    "center_of_mass": _shift,
+    "inertia": _inertia,
+    "external_force": _external_force,
+    "fluid_drag": _fluid_drag,
+    "gravity_tilt": _tilt,
+    "ground_slope": _tilt,
+    "actuator_gain": _actuator_draw(_gain),
+    "actuator_bias": _actuator_draw(_bias),
+    "actuator_damping": _actuator_draw(lambda f, v, c, r: lambda s: {"damping": s * f / v}),
+    "actuator_delay": _actuator_draw(lambda f, v, c, r: lambda s: {"delay": 0.05 * s}),
+    "actuator_lag": _actuator_draw(lambda f, v, c, r: lambda s: {"time_constant": 0.08 * s}),
+    "actuator_deadband": _actuator_draw(lambda f, v, c, r: lambda s: {"width": 0.4 * s * c}),
+    "actuator_backlash": _actuator_draw(lambda f, v, c, r: lambda s: {"width": 0.5 * s * c}),
+    "actuator_saturation": _actuator_draw(lambda f, v, c, r: lambda s: {"limit": f / (0.3 + 7 * s)}),
+    "sensor_bias": _sensor("bias", 0.0, 0.2),
+    "sensor_scale": _sensor("factor", 1.0, 0.2),
+    "sensor_delay": _sensor("delay", 0.0, 0.03, signed=False),
+    "contact_friction": _contact_friction,
+    "contact_stiffness": _contact_stiffness,
+    "contact_margin": _contact_margin,
+    "torque_ripple": _joint_draw(_ripple),
+    "uneven_friction": _joint_draw(_uneven),
+    "hysteresis": _joint_draw(_hysteresis),
+    "far_spring": _far_spring,
+    "slosh": _slosh,
+    "dropout": _actuator_draw(_dropout),
+    "gain_drift": _actuator_draw(_gain_drift),
+}

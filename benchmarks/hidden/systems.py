@@ -1,0 +1,351 @@
+"""The systems in whose logs effects are hidden: models, commands, starts and what a user would declare."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+#: Seconds of a logged transition.
+DT = 0.01
+HOPPER_XML = Path(__file__).parents[2] / "sims" / "hopper" / "hopper.xml"
+
+
+@dataclass(frozen=True)
+class Command:
+    """What drives one actuator: a smooth random multi-sine or chirp, and a weak hold of a posture.
+
+    Attributes:
+        amplitude: of the excitation, in command units.
+        offset: what it is centred on.
+        band: lowest and highest frequency, Hz.
+        hold: gains on position and velocity of ``joint`` around ``offset``: a feedback that a torque needs to stay put.
+        joint: the joint that is held.
+        limit: the command is clipped to ± this.
+    """
+
+    amplitude: float
+    offset: float = 0.0
+    band: tuple[float, float] = (0.2, 2.5)
+    hold: tuple[float, float] = (0.0, 0.0)
+    joint: str = ""
+    limit: float = np.inf
+
+
+@dataclass(frozen=True)
+class Scale:
+    """Typical sizes at one joint, from which strengths are drawn: torque, velocity, and effective inertia."""
+
+    torque: float
+    velocity: float
+    inertia: float
+
+
+@dataclass(frozen=True)
+class System:
+    """A model and how its logs are made.
+
+    Attributes:
+        name: what it is called.
+        xml: the model that a user has.
+        declared: name → mapping of the project's ``parameters``: what the user lets vary.
+        commands: one for each actuator.
+        start: joint → half width of the positions, half width of the velocities at the start.
+        start_mean: joint → what the start's positions are centred on, where that is not ``qpos0``.
+        scales: joint → typical sizes.
+        twins: groups of (effect, target) that are the same thing here, by construction of the mechanism.
+        observation: what the log's columns are.
+        episodes, transitions: size of the log; the length of an episode is drawn from a range.
+        free: the name of a free joint which starts with random velocities on a table.
+        substeps: steps of the truth in one logged transition.
+    """
+
+    name: str
+    xml: str
+    declared: Mapping[str, Mapping[str, object]]
+    commands: tuple[Command, ...]
+    start: Mapping[str, tuple[float, float]]
+    scales: Mapping[str, Scale]
+    start_mean: Mapping[str, float] = field(default_factory=dict)
+    twins: tuple[frozenset[tuple[str, str | None]], ...] = ()
+    observation: tuple[str, ...] = ("qpos", "qvel")
+    episodes: int = 8
+    transitions: tuple[int, int] = (300, 450)
+    free: str = ""
+    substeps: int = 40
+
+    @property
+    def frame_skip(self) -> int:
+        """Steps of the model in one logged transition."""
+        return round(DT / load(self.xml).opt.timestep)
+
+
+@cache
+def load(xml: str) -> mujoco.MjModel:
+    """Return the compiled model; shared, so never written to."""
+    return mujoco.MjModel.from_xml_string(xml)
+
+
+def mass(body: str, own: float) -> dict[str, object]:
+    """Declare a link's mass, its inertia in proportion, with bounds around the model's own value."""
+    return {
+        "field": "body_mass", "name": body, "bounds": [round(0.6 * own, 4), round(1.6 * own, 4)], "unit": "kg",
+        "scale_inertia": True,
+    }  # fmt: skip
+
+
+def twins(*groups: tuple[tuple[str, str | None], ...]) -> tuple[frozenset[tuple[str, str | None]], ...]:
+    """Return groups of (effect, target) as sets."""
+    return tuple(frozenset(g) for g in groups)
+
+
+def coarse(system: System, timestep: float) -> System:
+    """Return the system with a model that a careless user has: Euler's method, a large step."""
+    xml = re.sub(r"<option[^>]*?/>|<option[^>]*?>", lambda m: _euler(m[0], timestep), system.xml, count=1)
+    return replace(system, name=f"coarse_{system.name}", xml=xml)
+
+
+def _euler(option: str, timestep: float) -> str:
+    option = re.sub(r'integrator="\w+"', 'integrator="Euler"', option)
+    return re.sub(r'timestep="[\d.]+"', f'timestep="{timestep}"', option)
+
+
+TORQUE_ARM = System(
+    name="torque_arm",
+    xml="""
+<mujoco model="torque_arm">
+  <compiler angle="radian"/>
+  <option integrator="RK4" timestep="0.002"/>
+  <worldbody>
+    <body name="turret" pos="0 0 1">
+      <joint name="yaw" type="hinge" axis="0 0 1" damping="0.6" armature="0.06"/>
+      <geom name="turret" type="cylinder" size=".08 .06" mass="2"/>
+      <body name="upper" pos="0.05 0 0">
+        <joint name="shoulder" type="hinge" axis="0 1 0" damping="0.3" armature="0.01"/>
+        <geom name="upper" type="capsule" size=".035" fromto="0 0 0 0 .02 -.35" mass="1.8"/>
+        <body name="fore" pos="0 .02 -.35">
+          <joint name="elbow" type="hinge" axis="0 1 0" damping="0.2" armature="0.005" limited="true" range="-1.1 1.3"
+                 solreflimit="0.08 1" solimplimit="0 0.9 0.3 0.5 2"/>
+          <geom name="fore" type="capsule" size=".03" fromto="0 0 0 .02 0 -.3" mass="1.1"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="yaw_motor" joint="yaw" gear="4"/>
+    <motor name="shoulder_motor" joint="shoulder" gear="8"/>
+    <motor name="elbow_motor" joint="elbow" gear="3"/>
+  </actuator>
+</mujoco>""",
+    declared={"upper_mass": mass("upper", 1.8), "fore_mass": mass("fore", 1.1)},
+    commands=(
+        Command(0.9, hold=(0.2, 0.0), joint="yaw", band=(0.3, 2.0)),
+        Command(1.0, band=(0.3, 2.0)),
+        Command(0.9, band=(0.3, 2.0)),
+    ),
+    start={"yaw": (1.0, 1.0), "shoulder": (1.2, 1.5), "elbow": (0.9, 1.5)},
+    scales={
+        "yaw": Scale(3.0, 3.0, 0.08),
+        "shoulder": Scale(6.0, 4.0, 0.3),
+        "elbow": Scale(2.0, 5.0, 0.04),
+    },
+    twins=twins(
+        (("armature", "yaw"), ("inertia", "turret"), ("payload", "turret"), ("center_of_mass", "turret")),
+    ),
+)
+
+SERVO_ARM = System(
+    name="servo_arm",
+    xml="""
+<mujoco model="servo_arm">
+  <option integrator="RK4" timestep="0.0025"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" type="hinge" axis="0 1 0" damping="0.5" armature="0.05"/>
+      <geom name="upper" type="capsule" size=".04" fromto="0 0 0 .4 0 0" mass="2.5"/>
+      <body name="fore" pos=".4 0 0">
+        <joint name="elbow" type="hinge" axis="0 1 0" damping="0.3" armature="0.02"/>
+        <geom name="fore" type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="1.2"/>
+        <body name="hand" pos=".3 0 0">
+          <joint name="wrist" type="hinge" axis="1 0 0" damping="0.02" armature="0.002"/>
+          <geom name="hand" type="box" size=".05 .04 .015" pos=".05 0 .02" mass=".5"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="shoulder_servo" joint="shoulder" kp="90" kv="6"/>
+    <position name="elbow_servo" joint="elbow" kp="40" kv="2"/>
+    <position name="wrist_servo" joint="wrist" kp="2" kv="0.06"/>
+  </actuator>
+</mujoco>""",
+    declared={"upper_mass": mass("upper", 2.5), "fore_mass": mass("fore", 1.2)},
+    commands=(
+        Command(0.7, offset=-0.2, band=(0.2, 1.5)),
+        Command(0.8, offset=0.3, band=(0.2, 2.0)),
+        Command(0.9, band=(0.2, 2.5)),
+    ),
+    start={"shoulder": (0.5, 1.0), "elbow": (0.6, 1.0), "wrist": (0.8, 2.0)},
+    start_mean={"shoulder": -0.2, "elbow": 0.3},
+    scales={
+        "shoulder": Scale(25.0, 3.0, 0.6),
+        "elbow": Scale(6.0, 4.0, 0.12),
+        "wrist": Scale(0.4, 5.0, 0.003),
+    },
+    twins=twins(
+        (("armature", "shoulder"), ("inertia", "upper")),
+        (("fluid_drag", "upper"), ("joint_quadratic_damping", "shoulder")),
+        (("armature", "wrist"), ("inertia", "hand")),
+    ),
+)
+
+CART_POLE = System(
+    name="cart_pole",
+    xml="""
+<mujoco model="cart_pole">
+  <option integrator="RK4" timestep="0.005"/>
+  <worldbody>
+    <body name="cart" pos="0 0 1">
+      <joint name="rail" type="slide" axis="1 0 0" damping="1.0"/>
+      <geom name="cart" type="box" size=".12 .08 .05" mass="1.5"/>
+      <body name="pole">
+        <joint name="hinge" type="hinge" axis="0 1 0" damping="0.01"/>
+        <geom name="pole" type="capsule" size=".02" fromto="0 0 0 0 0 -.6" mass=".4"/>
+        <geom name="bob" type="sphere" size=".03" pos="0 0 -.6" mass=".1"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="rail" gear="10"/></actuator>
+</mujoco>""",
+    declared={"pole_mass": mass("pole", 0.5)},
+    commands=(Command(0.9, hold=(0.15, 0.0), joint="rail", band=(0.3, 2.5)),),
+    start={"rail": (0.3, 0.5), "hinge": (2.0, 3.0)},
+    scales={"rail": Scale(7.0, 1.5, 1.8), "hinge": Scale(0.6, 5.0, 0.06)},
+    twins=twins(
+        (("actuator_bias", "push"), ("external_force", "cart")),
+        (("fluid_drag", "cart"), ("joint_quadratic_damping", "rail")),
+        (("armature", "rail"), ("payload", "cart")),
+        (("armature", "hinge"), ("inertia", "pole")),
+    ),
+    substeps=20,
+)
+
+FURUTA = System(
+    name="furuta",
+    xml="""
+<mujoco model="furuta">
+  <option integrator="RK4" timestep="0.0025"/>
+  <worldbody>
+    <body name="arm" pos="0 0 .5">
+      <joint name="turn" type="hinge" axis="0 0 1" damping="0.004" armature="0.0005"/>
+      <geom name="arm" type="capsule" size=".012" fromto="0 0 0 .2 0 0" mass=".2"/>
+      <body name="pendulum" pos=".2 0 0">
+        <joint name="swing" type="hinge" axis="1 0 0" damping="0.0005"/>
+        <geom name="pendulum" type="capsule" size=".008" fromto=".01 0 0 .01 0 -.24" mass=".12"/>
+        <geom name="tip" type="sphere" size=".015" pos=".01 0 -.24" mass=".03"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="drive" joint="turn" gear="0.15"/></actuator>
+</mujoco>""",
+    declared={"pendulum_mass": mass("pendulum", 0.15)},
+    commands=(Command(0.9, hold=(0.15, 0.02), joint="turn", band=(0.4, 3.0)),),
+    start={"turn": (1.5, 2.0), "swing": (2.0, 3.0)},
+    scales={"turn": Scale(0.1, 5.0, 0.006), "swing": Scale(0.15, 7.0, 0.004)},
+    twins=twins(
+        (("armature", "turn"), ("inertia", "arm"), ("payload", "arm"), ("center_of_mass", "arm")),
+        (("fluid_drag", "arm"), ("joint_quadratic_damping", "turn")),
+    ),
+    substeps=20,
+)
+
+PUCK = System(
+    name="puck",
+    xml="""
+<mujoco model="puck">
+  <option integrator="RK4" timestep="0.002" cone="elliptic"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="20 20 .1" friction="0.02 0.005 0.0001" solref="0.04 1"
+          solimp="0 0.9 0.01 0.5 2"/>
+    <body name="puck" pos="0 0 0.03">
+      <freejoint name="root"/>
+      <geom name="puck" type="box" size=".12 .1 .03" mass="1.4" friction="0.25 0.005 0.0001" solref="0.04 1"
+            solimp="0 0.9 0.01 0.5 2"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="push_x" joint="root" gear="6 0 0 0 0 0"/>
+    <motor name="push_y" joint="root" gear="0 6 0 0 0 0"/>
+  </actuator>
+</mujoco>""",
+    declared={"puck_mass": mass("puck", 1.4)},
+    commands=(Command(1.0, band=(0.3, 1.5)), Command(1.0, band=(0.3, 1.5))),
+    start={"root": (0.0, 1.5)},
+    scales={"root": Scale(4.0, 1.0, 1.4)},
+    twins=twins(
+        (("gravity_tilt", None), ("external_force", "puck")),
+        (("contact_friction", "puck"), ("contact_friction", "floor")),
+        (("contact_stiffness", "puck"), ("contact_stiffness", "floor")),
+        (("contact_margin", "puck"), ("contact_margin", "floor"), ("sensor_bias", "root.position[z]")),
+    ),
+    free="root",
+    substeps=30,
+)
+
+
+def _hopper_xml() -> str:
+    """The bundled Hopper with a soft ground, whose force sets in smoothly, and a slippery floor geom."""
+    xml = HOPPER_XML.read_text()
+    xml = re.sub(r"<!--.*?-->|<visual>.*?</visual>|<asset>.*?</asset>|<light.*?/>|<camera.*?/>", "", xml, flags=re.S)
+    xml = xml.replace(' material="floor"', "").replace(' rgba="0.25 0.45 0.65 1"', "")
+    xml = xml.replace('timestep="0.002"', 'timestep="0.001"')
+    xml = xml.replace('solimp="0.8 0.8 0.01" solref="0.02 1"', 'solimp="0 0.9 0.03 0.5 2" solref="0.05 1"')
+    xml = xml.replace('limited="true"/>', 'limited="true" solreflimit="0.08 1" solimplimit="0 0.9 0.1 0.5 2"/>', 1)
+    xml = xml.replace('margin="0.001"', "").replace('friction="1 0.005 0.0001"', 'friction="0.1 0.005 0.0001"')
+    return re.sub(r"\n\s*\n", "\n", xml)
+
+
+HOPPER = System(
+    name="hopper",
+    xml=_hopper_xml(),
+    declared={
+        "thigh_mass": {"field": "body_mass", "name": "thigh", "bounds": [2.0, 7.0], "unit": "kg"},
+        "leg_mass": {"field": "body_mass", "name": "leg", "bounds": [1.4, 5.0], "unit": "kg"},
+    },
+    commands=(
+        Command(0.35, -0.3, (0.5, 3.0), (0.7, 0.05), "thigh_joint", 1.0),
+        Command(0.35, -0.6, (0.5, 3.0), (0.7, 0.05), "leg_joint", 1.0),
+        Command(0.25, 0.3, (0.5, 3.0), (0.7, 0.05), "foot_joint", 1.0),
+    ),
+    start={
+        "rootz": (0.05, 0.3), "rooty": (0.05, 0.2), "thigh_joint": (0.1, 0.5), "leg_joint": (0.1, 0.5),
+        "foot_joint": (0.1, 0.5),
+    },
+    start_mean={"rootz": 1.3, "thigh_joint": -0.3, "leg_joint": -0.6, "foot_joint": 0.3},
+    scales={
+        "rootx": Scale(60.0, 1.0, 15.0), "rootz": Scale(100.0, 1.0, 15.0), "rooty": Scale(40.0, 2.0, 1.0),
+        "thigh_joint": Scale(60.0, 3.0, 2.0), "leg_joint": Scale(60.0, 4.0, 1.5), "foot_joint": Scale(40.0, 4.0, 1.2),
+    },
+    twins=twins(
+        (("contact_friction", "foot_geom"), ("contact_friction", "floor")),
+        (("contact_stiffness", "foot_geom"), ("contact_stiffness", "floor")),
+        (("contact_margin", "foot_geom"), ("contact_margin", "floor"), ("sensor_bias", "rootz.position")),
+    ),
+    observation=("qpos[1:]", "qvel"),
+    episodes=20,
+    transitions=(80, 110),
+    substeps=60,
+)  # fmt: skip
+
+SYSTEMS = {
+    s.name: s
+    for s in (
+        TORQUE_ARM, SERVO_ARM, CART_POLE, FURUTA, PUCK, HOPPER,
+        coarse(TORQUE_ARM, 0.005), coarse(FURUTA, 0.01), coarse(CART_POLE, 0.01),
+    )
+}  # fmt: skip

@@ -1,0 +1,287 @@
+"""Score `dropo gap` on logs in which effects are hidden: what it names, how strong it says it is, what it leaves.
+
+python benchmarks/hidden_effects.py --out out/hidden --jobs 2        # all cases of a fresh seed
+python benchmarks/hidden_effects.py --seed 7 --cases '*friction*'    # some of them
+python benchmarks/hidden_effects.py --out out/hidden --resume        # go on where it stopped
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import multiprocessing
+import sys
+import tempfile
+import time
+import traceback
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.hidden.cases import CaseSpec, cases, select
+from benchmarks.hidden.truths import Case
+
+KINDS = ("null", "single", "double", "outside")
+#: The parameters that say how strong an effect is, with their neutral value; all of an effect's where not listed.
+STRENGTH = {
+    "joint_stiffness": ("stiffness",), "joint_cogging": ("amplitude",), "payload": ("mass",),
+    "joint_stribeck": ("coulomb", "static"), "contact_stiffness": ("time_constant",),
+}  # fmt: skip
+NEUTRAL = {"gain": 1.0, "factor": 1.0}
+#: Parameters that need not be told: structure, or angles that are equal modulo a turn.
+UNSCORED = {"poles", "phase", "reference", "velocity", "damping_ratio"}
+
+
+def run_case(case: Case, backend: str) -> dict[str, Any]:
+    """Return the answer of the workflow to a case, the document of its gap.json."""
+    from dropo_torch.gap import find_gap
+
+    from dropo_torch.config import load_config
+    from dropo_torch.problem import make_problem
+
+    with tempfile.TemporaryDirectory() as folder:
+        config = load_config(case.write(folder), {"backend": backend})
+        return find_gap(make_problem(config)).document()
+
+
+# --- judging one answer ---------------------------------------------------------------------------------------
+
+Pair = tuple[str, str | None]
+
+
+def judge(case: Case, document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return what is right and wrong in an answer."""
+    entries = [e for e in document.get("effects") or [] if e["effect"] != "unnamed"]
+    unnamed = any(e["effect"] == "unnamed" for e in document.get("effects") or [])
+    matches = _matches(case, entries)
+    scored = [_strength(case, h, entries[m]) for h, m in matches.items()]
+    scored = [s for s in scored if s is not None]
+    complete = len(matches) == len(case.effects) and len(entries) == len(case.effects)
+    return {
+        "named": [[e["effect"], e.get("target")] for e in entries],
+        "unnamed": unnamed,
+        "right": complete and not unnamed if case.kind != "outside" else unnamed and not entries,
+        "found": len(matches),
+        "errors": [s["error"] for s in scored],
+        "covered": [c for s in scored for c in s["covered"]],
+        "reduction": reductions(document.get("gap") or {}),
+    }
+
+
+def _names(entry: Mapping[str, Any]) -> set[Pair]:
+    """An answer's (effect, target), and what it says cannot be told from it."""
+    others = entry.get("indistinguishable_from") or []
+    return {(e["effect"], e.get("target")) for e in (entry, *others)}
+
+
+def _matches(case: Case, entries: Sequence[Mapping[str, Any]]) -> dict[int, int]:
+    """Which entry names each hidden effect: an effect's own name first, then its equivalents."""
+    found: dict[int, int] = {}
+    for hidden, (effect, twins) in enumerate(zip(case.effects, case.equivalents, strict=True)):
+        own = (effect.name, effect.target)
+        for accepted in (lambda e, own=own: own == (e["effect"], e.get("target")),
+                         lambda e, own=own, twins=twins: bool(_names(e) & {own, *twins})):  # fmt: skip
+            free = [n for n, e in enumerate(entries) if n not in found.values() and accepted(e)]
+            if free and hidden not in found:
+                found[hidden] = free[0]
+    return found
+
+
+def _strength(case: Case, hidden: int, entry: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Relative error and coverage of an effect's parameters, where it is called by its own name."""
+    effect = case.effects[hidden]
+    if entry["effect"] != effect.name or entry.get("target") != effect.target:
+        return None
+    told, true = _positive(entry.get("parameters") or {}), effect.parameters
+    hidden_by_plane = {k for k in ("y", "roll") if true.get(k) == 0.0}
+    keys = [k for k in STRENGTH.get(effect.name, tuple(true)) if k in told and k not in UNSCORED | hidden_by_plane]
+    if not keys or effect.name == "integration":
+        return None
+    off = np.array([told[k]["value"] - true[k] for k in keys])
+    size = np.array([true[k] - NEUTRAL.get(k, 0.0) for k in keys])
+    inside = [bool(told[k]["low"] <= true[k] <= told[k]["high"]) for k in keys]
+    return {"error": float(np.linalg.norm(off) / np.linalg.norm(size)), "covered": inside}
+
+
+def _positive(told: Mapping[str, Any]) -> Mapping[str, Any]:
+    """Parameters with an amplitude above 0: below, it is the same wave half a turn on."""
+    amplitude = told.get("amplitude")
+    if amplitude is None or amplitude["value"] >= 0:
+        return told
+    flipped = {"value": -amplitude["value"], "low": -amplitude["high"], "high": -amplitude["low"]}
+    return {**told, "amplitude": flipped}
+
+
+def reductions(gap: Mapping[str, Any]) -> dict[str, float]:
+    """The share of the gap above the noise floor that is gone: of the mean square, and of the rollout's rms."""
+    found = {}
+    for key in ("mse", "rollout_rmse"):
+        try:
+            before, after, floor = (float(gap[k][key]) for k in ("before", "after", "noise_floor"))
+        except (KeyError, TypeError, ValueError):
+            continue
+        if before > floor:
+            found[key] = (before - max(after, floor)) / (before - floor)
+    return found
+
+
+# --- running them ---------------------------------------------------------------------------------------------
+
+
+def attempt(spec: CaseSpec, backend: str) -> dict[str, Any]:
+    """Make a case, run it and judge the answer; what fails is recorded with its traceback."""
+    result: dict[str, Any] = {"name": spec.name, "kind": spec.kind, "system": spec.system, "seed": spec.seed[0]}
+    try:
+        case = spec.make()
+        result["hidden"] = [[e.name, e.target, dict(e.parameters)] for e in case.effects]
+        result["equivalents"], result["gap_ratio"] = case.equivalents, case.gap_ratio
+        started = time.perf_counter()
+        document = run_case(case, backend)
+        result["seconds"] = time.perf_counter() - started
+        result.update(judge(case, document), document=document)
+    except Exception:  # a case that fails must not stop the others
+        result["failure"] = traceback.format_exc()
+    return json.loads(json.dumps(result, default=_plain))
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
+
+
+def attempts(specs: Sequence[CaseSpec], backend: str, jobs: int) -> Iterator[dict[str, Any]]:
+    """Yield the cases' results as they come."""
+    if jobs == 1:
+        yield from (attempt(s, backend) for s in specs)
+        return
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        waiting = {pool.submit(attempt, s, backend): s for s in specs}
+        for done in as_completed(waiting):
+            try:
+                yield done.result()
+            except Exception:  # the process itself died
+                s = waiting[done]
+                failure = traceback.format_exc()
+                yield {"name": s.name, "kind": s.kind, "system": s.system, "seed": s.seed[0], "failure": failure}
+
+
+# --- the summary ----------------------------------------------------------------------------------------------
+
+
+def share(flags: Sequence[bool]) -> str:
+    """A share as text, with its counts."""
+    return f"{100 * sum(flags) / len(flags):5.1f} %  ({sum(flags)} of {len(flags)})" if flags else "-"
+
+
+def confusion(results: Sequence[Mapping[str, Any]]) -> str:
+    """What is named where one effect, or nothing, is hidden: a line for each hidden effect."""
+    rows: dict[str, Counter[str]] = {}
+    for r in results:
+        if "failure" in r:
+            said = "FAILED"
+        else:
+            names = [e for e, _ in r["named"]] + ["unnamed"] * r["unnamed"]
+            said = "as hidden" if r["right"] else " + ".join(sorted(names)) or "nothing"
+        hidden = " + ".join(e for e, _, _ in r.get("hidden", [])) or ("nothing" if r["kind"] == "null" else r["name"])
+        rows.setdefault(f"{r['kind']:8s}{hidden}", Counter())[said] += 1
+    width = max(map(len, rows), default=0)
+    return "\n".join(
+        f"{hidden:{width}s}  " + ", ".join(f"{n} × {said}" for said, n in told.most_common())
+        for hidden, told in sorted(rows.items())
+    )
+
+
+def scores(results: Sequence[Mapping[str, Any]]) -> dict[str, str]:
+    """The scores by name."""
+    done = [r for r in results if "failure" not in r]
+    of = {k: [r for r in done if r["kind"] == k] for k in KINDS}
+    hidden = of["single"] + of["double"]
+    errors = [e for r in hidden for e in r["errors"]]
+    seconds = [r["seconds"] for r in of["single"]]
+    table = {f"named right, {k}": share([r["right"] for r in of[k]]) for k in ("single", "double")}
+    table |= {
+        "false alarms where nothing is missing": share([bool(r["named"] or r["unnamed"]) for r in of["null"]]),
+        "names claimed for outsiders": share([bool(r["named"]) for r in of["outside"]]),
+        "outsiders reported as unnamed": share([r["unnamed"] for r in of["outside"]]),
+        "strength within 5 %": share([e <= 0.05 for e in errors]),
+        "true value in the 90 % interval": share([c for r in hidden for c in r["covered"]]),
+    }
+    for key, what in (("mse", "mean square"), ("rollout_rmse", "rollout")):
+        gone = [r["reduction"][key] >= 0.95 for r in hidden if key in r["reduction"]]
+        table[f"held-out gap reduced by 95 %, {what}"] = share(gone)
+    table["median seconds of a single-effect case"] = f"{np.median(seconds):.1f}" if seconds else "-"
+    table["failed cases"] = str(len(results) - len(done))
+    return table
+
+
+def one_line(r: Mapping[str, Any]) -> str:
+    """A result as a line of progress."""
+    if "failure" in r:
+        return f"{r['name']}: FAILED: {r['failure'].strip().splitlines()[-1]}"
+    named = ", ".join(f"{e} {t or ''}".strip() for e, t in r["named"]) + (" unnamed" if r["unnamed"] else "")
+    hidden = ", ".join(f"{e} {t or ''}".strip() for e, t, _ in r["hidden"])
+    error = f", strength {100 * max(r['errors']):.1f} % off" if r["errors"] else ""
+    gap = f", gap {r['gap_ratio']:.0f} × noise" if math.isfinite(r["gap_ratio"]) and r["hidden"] else ""
+    verdict = "right" if r["right"] else "WRONG"
+    asked, told = f"[{hidden or 'nothing'}{gap}]", named.strip() or "nothing"
+    return f"{verdict} {r['name']} {asked} → {told}{error}, {r['seconds']:.0f} s"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, help="of targets, strengths and logs; fresh from the clock where absent")
+    parser.add_argument("--cases", default="*", metavar="PATTERN", help="only the cases whose name matches")
+    parser.add_argument("--only", choices=KINDS, help="only the cases of one kind")
+    parser.add_argument("--small", action="store_true", help="a short list")
+    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--backend", choices=("mujoco", "warp"), default="mujoco")
+    parser.add_argument("--out", type=Path, help="folder of results.jsonl, written as results come")
+    parser.add_argument("--resume", action="store_true", help="skip the cases that are in results.jsonl; its seed")
+    parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
+    given = parser.parse_args(arguments)
+    if given.resume and given.out is None:
+        parser.error("--resume needs --out")
+    path = None if given.out is None else given.out / "results.jsonl"
+    before = read_results(path) if given.resume and path is not None else []
+    seed = given.seed if given.seed is not None else (before[0]["seed"] if before else int(time.time()) % 1_000_000)
+    specs = select(cases(seed, "small" if given.small else "all"), given.cases, given.only)
+    kept = [r for r in before if r["seed"] == seed and "failure" not in r]
+    results = [r for r in kept if r["name"] in {s.name for s in specs}]
+    if given.list:
+        print("\n".join(s.name for s in specs))
+        return
+    print(f"seed {seed}: {len(specs)} cases, {len(results)} of them done before", flush=True)
+    if path is not None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("".join(json.dumps(r) + "\n" for r in kept), encoding="utf-8")
+    waiting = [s for s in specs if s.name not in {r["name"] for r in results}]
+    for number, result in enumerate(attempts(waiting, given.backend, given.jobs), len(results) + 1):
+        results.append(result)
+        print(f"{number}/{len(specs)} {one_line(result)}", flush=True)
+        if path is not None:
+            with path.open("a", encoding="utf-8") as stream:
+                stream.write(json.dumps(result) + "\n")
+    print("\n" + confusion(results) + "\n")
+    for name, value in scores(results).items():
+        print(f"{name:45s} {value}")
+
+
+def read_results(path: Path) -> list[dict[str, Any]]:
+    """Return the results of an earlier run; a line that was cut off is left out."""
+    found = []
+    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else []:
+        try:
+            found.append(json.loads(line))
+        except json.JSONDecodeError:
+            continue
+    return found
+
+
+if __name__ == "__main__":
+    main()
