@@ -199,10 +199,10 @@ def _run(
             objective.linearise(at)
         if request.gradient:
             search.tell(*objective.gradient(request.values, request.reduce, request.rows))
-        elif request.is_stencil and objective.has_cheaper_jacobian:
+        elif request.is_stencil and request.rows is None and objective.has_cheaper_jacobian:
             search.tell(objective.map_linear(request.values, request.reduce))
         else:
-            search.tell(objective.map(request.values, request.reduce))
+            search.tell(objective.map(request.values, request.reduce, request.rows))
         evaluations += request.evaluations
         progress = search.progress
         mean, std = search.candidates()[0]
