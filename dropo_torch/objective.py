@@ -160,8 +160,8 @@ class Objective:
         total: torch.Tensor | None = None
         for block in _blocks(len(self) if rows is None else len(rows), max(1, self._chunk_size // max(1, len(values)))):
             picked = block if chosen is None else chosen[block]
-            features = self._simulate(self._states[picked], picked, values)
-            with single_thread():
+            with single_thread():  # the simulator has threads of its own; torch's would only get in their way
+                features = self._simulate(self._states[picked], picked, values)
                 part = reduce(features, self.target(picked), self.base_covariance(picked))
                 total = part if total is None else total + part
         assert total is not None
@@ -188,7 +188,7 @@ class Objective:
                 features = self.features(observed, self._raw[block][:, None].expand_as(observed))
                 part = reduce(features, self.target(block), self.base_covariance(block))
                 total = part if total is None else total + part
-        self.simulated_transitions += len(self) * self.transitions.lag
+        self.simulated_transitions += len(self) * len(directions) * self.transitions.lag  # a pass counts as one
         assert total is not None
         return total
 

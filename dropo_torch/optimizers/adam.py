@@ -1,8 +1,9 @@
 """Adam on φ with reparameterised samples, for simulators that differentiate.
 
-Adam (Kingma and Ba 2015) gives every coordinate a rate of its own, which is slow where parameters trade off against each
-other: the valley of the likelihood then lies across the coordinates. As in SOAP (Vyas et al. 2024), Adam therefore runs in
-the eigenbasis of a preconditioner, here the Gauss-Newton matrix Σ JᵀC⁻¹J of the means.
+Adam (Kingma and Ba 2015) gives every coordinate a rate of its own, which is slow where parameters trade off against
+each other: the valley of the likelihood then lies across the coordinates. As in SOAP (Vyas et al. 2024), Adam
+therefore runs in the eigenbasis of a preconditioner, here the Gauss-Newton matrix Σ JᵀC⁻¹J of the means, and no
+step along an eigenvector is longer than Newton's, gradient / eigenvalue.
 """
 
 from __future__ import annotations
@@ -30,6 +31,8 @@ _TINY = 1e-300
 _WARM_UP = 10
 #: The first learning rate of the second stage, as a share of the first stage's.
 _JOINT_RATE = 0.2
+#: Standard errors by which residuals must exceed their covariance for deviations to leave their floor at once.
+_SIGNIFICANCE = 3.0
 #: Steps between two refreshes of the start noise at the current μ.
 _RELINEARISE = 100
 
@@ -50,7 +53,7 @@ class AdamSettings:
         common_random_numbers: the same samples at every step instead of fresh ones.
     """
 
-    steps: int = 300
+    steps: int = 200
     batch: int = 25
     samples: int = 16
     learning_rate: float = 0.5
@@ -65,13 +68,10 @@ class AdamSettings:
         if self.samples < 2:
             raise InputError("adam.samples: 1 given; a covariance needs 2 or more")
 
-    def first_rate(self, step: int) -> float:
-        """Return the first learning rate of a step's stage; steps count from 0 over both."""
-        return self.learning_rate * (1.0 if step < self.steps else _JOINT_RATE)
-
     def rate(self, step: int) -> float:
-        """Return the learning rate of a step."""
-        return self.first_rate(step) * (1 - step % self.steps / self.steps)
+        """Return the learning rate of a step, counted from 0 over both stages."""
+        first = self.learning_rate * (1.0 if step < self.steps else _JOINT_RATE)
+        return first * (1 - step % self.steps / self.steps)
 
 
 def adam_settings(given: Mapping[str, Any]) -> AdamSettings:
@@ -92,10 +92,15 @@ def adam_settings(given: Mapping[str, Any]) -> AdamSettings:
 class AdamOptimizer(Optimizer):
     """Stochastic gradient ascent of the sampled likelihood over minibatches of transitions, in two stages.
 
-    First the means alone, with deviations at their floor: weighted least squares, one simulation a transition.
-    Then means and deviations on samples. The means move in the eigenbasis of their Gauss-Newton matrix. The deviations
-    move by their logarithms, but Adam sees the gradients of their variances: those do not vanish towards the floor,
-    so that a deviation can leave it and reach it again.
+    First the means alone, with deviations at their floor: weighted least squares, one simulation a transition. The
+    residuals that are left give a first guess of the deviations. Then both on samples. With m and v the running
+    mean and mean square of the gradient (as in Adam, bias corrected), λ an eigenvalue of the minibatch's
+    Gauss-Newton matrix per transition, α the learning rate and α₀ its setting, the means move along an
+    eigenvector by α m / max(√v, α₀ λ): Adam's bounded step far away, a damped Newton step near by. The matrix is
+    computed anew every few steps from a stencil of d + 1 points on a minibatch, and the moments turn along.
+
+    The deviations move by their logarithms, but Adam sees the gradients of their variances: those do not vanish
+    towards the floor, so that a deviation can leave it and reach it again.
 
     Args:
         objective: its reduction and its simulator's gradients are used; it is not evaluated here.
@@ -153,9 +158,9 @@ class AdamOptimizer(Optimizer):
             return
         phi = torch.from_numpy(self._phi.copy()).requires_grad_(True)
         (pulled,) = torch.autograd.grad(self._values(phi), phi, gradient.reshape(-1, len(self._space)))
-        self._advance(self._to_basis(np.nan_to_num(pulled.numpy() / self._batch)))
         value = float(sums[0]) / self._batch
         self._smoothed = value if math.isnan(self._smoothed) else 0.9 * self._smoothed + 0.1 * value
+        self._advance(self._to_basis(np.nan_to_num(pulled.numpy() / self._batch)))
 
     @property
     def stop_reason(self) -> str | None:
@@ -211,7 +216,7 @@ class AdamOptimizer(Optimizer):
         first, second = (m / (1 - b ** (taken + 1)) for m, b in zip((self._first, self._second), _BETAS, strict=True))
         d, rate = len(self._space), self._settings.rate(self._step)
         size = np.sqrt(second + _TINY)
-        size[:d] = np.maximum(size[:d], self._settings.first_rate(self._step) * self._curvature)
+        size[:d] = np.maximum(size[:d], self._settings.learning_rate * self._curvature)
         move = rate * first / size
         move[:d] = self._basis @ move[:d]
         self._phi = np.clip(self._phi + move, 0.0, SearchBox.WIDTH)
@@ -236,10 +241,12 @@ class AdamOptimizer(Optimizer):
         count = len(self._objective) if self._is_new_stage else self._batch
         self._curvature, basis = np.linalg.eigh(stage.hessian * np.outer(scale, scale) / count)
         turn = basis.T @ self._basis
-        self._first[:d], self._second[:d] = turn @ self._first[:d], turn**2 @ self._second[:d]
+        self._first = np.concatenate([turn @ self._first[:d], self._first[d:]])
+        self._second = np.concatenate([turn**2 @ self._second[:d], self._second[d:]])
         if self._is_new_stage:
             self._first, self._second, self._smoothed = np.zeros(2 * d), np.zeros(2 * d), float("nan")
-            self._phi = self._box.normalise(stage.point, stage.deviations(self._box))
+            guess = stage.deviations(self._box, significance=_SIGNIFICANCE)
+            self._phi = np.concatenate([self._phi[:d], self._box.normalise(stage.point, guess)[d:]])
         self._basis, self._refreshed = basis, self._step
 
     def _values(self, phi: torch.Tensor) -> torch.Tensor:
