@@ -166,21 +166,24 @@ def draw(comparisons: Mapping[str, Comparison], path: Path) -> None:
     """Draw the log-likelihood that is missing to the best against simulated transitions, a panel a system."""
     figure = Figure(figsize=(2.9 * max(2, len(comparisons)), 3.4), dpi=160, layout="constrained")
     FigureCanvasAgg(figure)
-    panels = figure.subplots(1, len(comparisons), sharey=True, squeeze=False)[0]
+    panels = figure.subplots(1, len(comparisons), sharex=True, sharey=True, squeeze=False)[0]
     for axes, (name, comparison) in zip(panels, comparisons.items(), strict=True):
         best = max(run.log_likelihood for run in comparison.runs)
         for run in comparison.runs:
             draw_run(axes, run, best)
         axes.axhline(2, color="#9aa0a6", lw=0.8, ls=":", zorder=0)
-        axes.set(xscale="log", yscale="log", xlabel="simulated transitions", ylim=(SMALLEST / 1.6, 1e6))
+        axes.set(xscale="log", yscale="log", xlabel="simulated transitions", ylim=(SMALLEST / 1.6, 1e9))
+        axes.minorticks_off()
         axes.set_title(f"{name}: {len(comparison.reference)} parameters", fontsize=10)
         axes.spines[["top", "right"]].set_visible(False)
     panels[0].set_ylabel("log-likelihood below the best (nats)")
     panels[0].text(0.02, 2.3, "2 nats", color="#6b7075", fontsize=8, transform=panels[0].get_yaxis_transform())
-    ticks = [10.0**k for k in range(0, 7, 2)]
-    panels[0].set_yticks([SMALLEST, *ticks], [f"≤ {SMALLEST:g}", *(f"$10^{k}$" for k in range(0, 7, 2))])
+    powers = range(0, 9, 2)
+    panels[0].set_yticks([SMALLEST, *(10.0**k for k in powers)], [f"≤ {SMALLEST:g}", *(f"$10^{k}$" for k in powers)])
     handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label()[0] != "_"}
-    figure.legend(handles.values(), handles.keys(), frameon=False, ncols=len(handles), loc="outside upper center")
+    figure.legend(
+        handles.values(), handles.keys(), frameon=False, ncols=4 if len(panels) > 2 else 2, loc="outside upper center"
+    )
     figure.savefig(path)
 
 
@@ -192,7 +195,7 @@ def draw_run(axes: Axes, run: Run, best: float) -> None:
     optimizer, backend = run.method.split("-")
     label = f"{NAMES[optimizer]} ({NAMES[backend]})"
     color, style = COLOURS[run.method], "--" if run.method == "fisher-mujoco" else "-"
-    axes.plot(cost, short, style, color=color, lw=1.4, label=label)
+    axes.plot(cost, short, style, color=color, lw=1.4, label=label, zorder=3 if style == "--" else 2)
     axes.plot(cost[-1], short[-1], "o", color=color, ms=5, clip_on=False)
 
 
