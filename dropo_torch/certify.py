@@ -122,6 +122,12 @@ def certify(objective: Objective, *, max_transitions: int = 100, points: int = 2
     return Certificate(tuple(entries), len(states) * points, state_error)
 
 
+def has_reference(objective: Objective) -> bool:
+    """Whether the objective's simulator has derivatives, and a MuJoCo model to compare them with."""
+    simulator = objective.simulator
+    return hasattr(simulator, "jacobian") and isinstance(simulator.parameters.model, mujoco.MjModel)
+
+
 def _converged_reference(objective: Objective) -> MujocoSimulator:
     """MuJoCo with its solver run to convergence, so that differences see the physics and not its tolerance."""
     space = objective.simulator.parameters

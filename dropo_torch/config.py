@@ -52,7 +52,7 @@ class Config(pydantic.BaseModel):
     population: int | None = pydantic.Field(None, ge=2, description="with cma: φ per generation")
     common_random_numbers: bool = pydantic.Field(False, description="with cma: the same samples in every generation")
     adam: dict[str, Any] = pydantic.Field(
-        {}, description="with adam: steps, batch, samples, learning_rate, clip, plateau, common_random_numbers"
+        {}, description="with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers"
     )
     device: str = pydantic.Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
     threads: int = pydantic.Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")

@@ -145,18 +145,24 @@ class Objective:
             parts.append(rotation_vector(measured[..., q].expand_as(observed[..., q]), observed[..., q]))
         return torch.cat(parts, -1) / self.scale
 
-    def map(self, values: np.ndarray | torch.Tensor, reduce: Reduce) -> torch.Tensor:
-        """Simulate every transition under parameter values ``(P, d)`` and sum ``reduce`` over chunks.
+    def map(self, values: np.ndarray | torch.Tensor, reduce: Reduce, rows: np.ndarray | None = None) -> torch.Tensor:
+        """Simulate transitions under parameter values ``(P, d)`` and sum ``reduce`` over chunks.
 
         The chunks do not depend on the number of threads, and neither does the sum.
+
+        Args:
+            values: parameter values in their units, ``(P, d)``.
+            reduce: what to sum.
+            rows: the transitions to simulate; ``None`` for all of them.
         """
         values = torch.as_tensor(np.asarray(values), dtype=torch.float64)
-        rows = max(1, self._chunk_size // max(1, len(values)))
+        chosen = None if rows is None else torch.as_tensor(rows)
         total: torch.Tensor | None = None
-        for block in _blocks(len(self), rows):
-            features = self._simulate(self._states[block], block, values)
-            with single_thread():
-                part = reduce(features, self.target(block), self.base_covariance(block))
+        for block in _blocks(len(self) if rows is None else len(rows), max(1, self._chunk_size // max(1, len(values)))):
+            picked = block if chosen is None else chosen[block]
+            with single_thread():  # the simulator has threads of its own; torch's would only get in their way
+                features = self._simulate(self._states[picked], picked, values)
+                part = reduce(features, self.target(picked), self.base_covariance(picked))
                 total = part if total is None else total + part
         assert total is not None
         return total
@@ -182,7 +188,7 @@ class Objective:
                 features = self.features(observed, self._raw[block][:, None].expand_as(observed))
                 part = reduce(features, self.target(block), self.base_covariance(block))
                 total = part if total is None else total + part
-        self.simulated_transitions += len(self) * self.transitions.lag
+        self.simulated_transitions += len(self) * len(directions) * self.transitions.lag  # a pass counts as one
         assert total is not None
         return total
 
@@ -207,10 +213,10 @@ class Objective:
         slope = torch.zeros_like(leaf)
         for block in _blocks(len(chosen), max(1, self._chunk_size // len(leaf))):
             part = chosen[block]
-            features = self._simulate(self._states[part], part, leaf)
-            with single_thread():
+            with single_thread():  # minibatches are small: more threads cost more than they give
+                features = self._simulate(self._states[part], part, leaf)
                 sums = reduce(features, self.target(part), self.base_covariance(part))
-            slope += torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0])
+                slope += torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0])
             total = sums.detach() if total is None else total + sums.detach()
         assert total is not None
         return total, slope

@@ -203,8 +203,6 @@ def versions() -> dict[str, str]:
 
 def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Console, label: str = "fit") -> Fit:
     config = problem.config
-    if config.optimizer == "adam" and not resume:
-        certify(problem.objective, max_transitions=20, points=1, seed=config.seed).check()
     with FitProgress(console, label) as progress:
         return fit(
             problem.objective,

@@ -6,14 +6,14 @@
 Hopper masses (4), Walker2d masses and dampings (13), chains of 10 and 20 links with mass, damping and armature each
 (30, 60). Every log has 200 transitions with known truth; measured next states carry noise of the variance ε that the
 likelihood assumes. Each optimizer fits the same objective on the same log; CMA-ES gets at least ten times the simulated
-transitions of Adam.
+transitions of Adam. ``gradients.png`` shows how far each is from the best, against what it has simulated.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,9 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
@@ -33,8 +36,18 @@ from dropo_torch.runs import versions
 from sims.hopper import SIM
 
 EPSILON = 1e-6
+#: Smallest difference of the figure, in nats; curves that reach the best end there.
+SMALLEST = 0.1
+COLOURS = {
+    "fisher-mujoco": "#56b4e9",
+    "fisher-warp": "#0072b2",
+    "adam-warp": "#d55e00",
+    "cma-mujoco": "#9aa0a6",
+    "cma-warp": "#5f6368",
+}
+NAMES = {"fisher": "Fisher scoring", "adam": "Adam", "cma": "CMA-ES", "mujoco": "MuJoCo", "warp": "Warp"}
 #: Evaluations of CMA-ES of K samples each, by the number of parameters.
-BUDGET = {4: 400, 13: 500, 30: 600, 60: 700}
+BUDGET = {4: 150, 13: 150, 30: 160, 60: 200}
 
 
 @dataclass(frozen=True)
@@ -149,6 +162,43 @@ def table(comparison: Comparison, title: str) -> Table:
     return found
 
 
+def draw(comparisons: Mapping[str, Comparison], path: Path) -> None:
+    """Draw the log-likelihood that is missing to the best against simulated transitions, a panel a system."""
+    figure = Figure(figsize=(2.9 * max(2, len(comparisons)), 3.4), dpi=160, layout="constrained")
+    FigureCanvasAgg(figure)
+    panels = figure.subplots(1, len(comparisons), sharex=True, sharey=True, squeeze=False)[0]
+    for axes, (name, comparison) in zip(panels, comparisons.items(), strict=True):
+        best = max(run.log_likelihood for run in comparison.runs)
+        for run in comparison.runs:
+            draw_run(axes, run, best)
+        axes.axhline(2, color="#9aa0a6", lw=0.8, ls=":", zorder=0)
+        axes.set(xscale="log", yscale="log", xlabel="simulated transitions", ylim=(SMALLEST / 1.6, 1e9))
+        axes.minorticks_off()
+        axes.set_title(f"{name}: {len(comparison.reference)} parameters", fontsize=10)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set_ylabel("log-likelihood below the best (nats)")
+    panels[0].text(0.02, 2.3, "2 nats", color="#6b7075", fontsize=8, transform=panels[0].get_yaxis_transform())
+    powers = range(0, 9, 2)
+    panels[0].set_yticks([SMALLEST, *(10.0**k for k in powers)], [f"≤ {SMALLEST:g}", *(f"$10^{k}$" for k in powers)])
+    handles = {line.get_label(): line for axes in panels for line in axes.get_lines() if line.get_label()[0] != "_"}
+    figure.legend(
+        handles.values(), handles.keys(), frameon=False, ncols=4 if len(panels) > 2 else 2, loc="outside upper center"
+    )
+    figure.savefig(path)
+
+
+def draw_run(axes: Axes, run: Run, best: float) -> None:
+    """Draw one run's way, and where it ended."""
+    points = [(p.simulated_transitions, p.log_likelihood) for p in run.curve]
+    cost, found = np.array([*points, (run.simulated_transitions, run.log_likelihood)]).T
+    short = np.maximum(best - found, SMALLEST)
+    optimizer, backend = run.method.split("-")
+    label = f"{NAMES[optimizer]} ({NAMES[backend]})"
+    color, style = COLOURS[run.method], "--" if run.method == "fisher-mujoco" else "-"
+    axes.plot(cost, short, style, color=color, lw=1.4, label=label, zorder=3 if style == "--" else 2)
+    axes.plot(cost[-1], short[-1], "o", color=color, ms=5, clip_on=False)
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, required=True, help="folder of the results")
@@ -157,24 +207,26 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, default=1, help="seeds of each method")
     parser.add_argument("--steps", type=int, default=100, help="transitions of each of the two episodes")
     parser.add_argument("--samples", type=int, default=50, help="K")
-    parser.add_argument("--adam-steps", type=int, default=600)
+    parser.add_argument("--adam-steps", type=int, default=200, help="of each of its two stages")
     parser.add_argument("--budget", type=int, help="evaluations of CMA-ES")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
+    comparisons = {}
     for name in given.systems:
-        comparison = compare_on(
+        comparisons[name] = comparison = compare_on(
             name,
             methods=given.methods,
             seeds=given.seeds,
             steps=given.steps,
             samples=given.samples,
-            adam=AdamSettings(steps=given.adam_steps, plateau=given.adam_steps),
+            adam=AdamSettings(steps=given.adam_steps),
             budget=given.budget,
         )
         (given.out / f"{name}.json").write_text(json.dumps(comparison.document(), indent=2) + "\n")
         title = f"{name}, {len(comparison.reference)} parameters"
         write_compare_report(given.out / f"{name}.html", comparison, config=None, versions=versions(), title=title)
         Console().print(table(comparison, title))
+    draw(comparisons, given.out / "gradients.png")
 
 
 if __name__ == "__main__":

@@ -60,9 +60,19 @@ def recover(
         "true_std": realised.std(0).tolist(),
         "log_likelihood": fit.log_likelihood,
         "simulated_per_logged": fit.simulated_transitions / len(objective),
+        "to_percent": reached(fit, realised.mean(0), 1e-2),
+        "to_permille": reached(fit, realised.mean(0), 1e-3),
         "seconds": seconds,
         "stop_reason": fit.stop_reason,
     }
+
+
+def reached(fit: dropo.Fit, truth: np.ndarray, limit: float) -> int | None:
+    """Simulated transitions from which every mean stays within a relative error ``limit``."""
+    error = [np.max(np.abs(entry.mean / truth - 1)) for entry in fit.history]
+    outside = np.flatnonzero(np.array(error) > limit)
+    first = outside[-1] + 1 if outside.size else 0
+    return fit.history[first].simulated_transitions if first < len(error) else None
 
 
 def show(result: dict[str, Any]) -> None:
@@ -72,6 +82,10 @@ def show(result: dict[str, Any]) -> None:
         f"{result['simulated_per_logged']:.0f} simulated per logged transition, {result['seconds']:.1f} s, "
         f"log-likelihood {result['log_likelihood']:.1f}, {result['stop_reason']}"
     )
+    for limit, key in (("1 %", "to_percent"), ("0.1 %", "to_permille")):
+        if result[key] is not None:
+            cost = result[key] / result["transitions"]
+            print(f"    every mean within {limit} from {cost:.1f} simulated per logged transition on")
     for i, name in enumerate(result["names"]):
         spread = ""
         if name in SPREAD and result["true_std"][i] > 1e-9:

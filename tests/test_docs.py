@@ -265,6 +265,7 @@ def test_gradient_vs_gradient_free(tmp_path: Path, capsys: pytest.CaptureFixture
     for name in ("hopper", "walker"):
         assert (tmp_path / f"{name}.html").exists()
         assert "cma-warp" in (tmp_path / f"{name}.json").read_text()
+    assert (tmp_path / "gradients.png").stat().st_size > 10_000
     assert "13 parameters" in capsys.readouterr().out
 
 

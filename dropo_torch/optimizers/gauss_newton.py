@@ -83,16 +83,16 @@ class MeansStage:
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
 
-    def deviations(self, box: SearchBox) -> np.ndarray:
+    def deviations(self, box: SearchBox, significance: float = 0.0) -> np.ndarray:
         """Return a first guess of σ, ``(d,)``: the variances that explain the residuals' excess over C.
 
         One scoring step from σ = 0 in the linear model, with variances kept non-negative. Where the
-        residuals do not exceed C there is nothing to explain, and σ starts at its floor; else no lower
-        than a hundredth of the width, from which it can still go either way.
+        residuals do not exceed C, by ``significance`` standard errors, there is nothing to explain, and σ
+        starts at its floor; else no lower than a hundredth of the width, from which it can still go either way.
         """
         if not len(self.excess):
             return np.clip(box.width / 40, box.min_std, box.max_std)
-        if (self.excess <= 0).all():
+        if (self.excess <= significance * np.sqrt(2 * np.diag(self.squares))).all():
             return box.min_std.copy()
         scale = np.sqrt(np.maximum(np.diag(self.squares), 1e-300))
         variances = scipy.optimize.nnls(self.squares / np.outer(scale, scale), self.excess / scale)[0] / scale
