@@ -348,6 +348,10 @@ def test_too_much_of_an_effect() -> None:
     number = {"damping": Strength(-0.02, -0.03, -0.01, "N·m·s/rad")}
     sentence, _ = gap_words.answer(replace(single(), effects=(NamedEffect("joint_damping", "elbow", number, 0.9),)))
     assert sentence.startswith("Your model has too much viscous friction in elbow: −0.02")
+    both = (FRICTION, NamedEffect("joint_damping", "elbow", number, 0.9))
+    sentence, items = gap_words.answer(replace(single(), effects=both))
+    assert sentence == "Your model and the robot differ in two things:"
+    assert items[1].startswith("viscous friction in elbow: too much in the model, −0.02")
 
 
 @pytest.mark.parametrize(
@@ -363,6 +367,12 @@ def test_too_much_of_an_effect() -> None:
 def test_when(when: str, text: str) -> None:
     gap = replace(single(), where=(Place("joint", "elbow", 0.5, when),))
     assert gap_words.shows(gap) == f"it shows at joint elbow{text}"
+
+
+def test_the_command_to_go_on_names_the_folder_as_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("runs/arm").mkdir(parents=True)
+    assert "dropo fit runs/arm/config.yaml" in page(Path("runs/arm"), single())
 
 
 def test_running_median_follows_a_step() -> None:

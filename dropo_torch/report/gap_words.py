@@ -175,6 +175,8 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     if len(named) < len(gap.effects):
         items.append(f"something that none of the {len(VOCABULARY)} known effects explains")
     count = _COUNTS[len(items)] if len(items) < len(_COUNTS) else str(len(items))
+    if any(_too_much(e) or e.effect in _CLAUSES for e in named):
+        return f"Your model and the robot differ in {count} things:", items
     return f"Your model lacks {count} things:", items
 
 
