@@ -121,6 +121,7 @@ TORQUE_ARM = System(
 <mujoco model="torque_arm">
   <compiler angle="radian"/>
   <option integrator="RK4" timestep="0.002"/>
+  <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <body name="turret" pos="0 0 1">
       <joint name="yaw" type="hinge" axis="0 0 1" damping="0.6" armature="0.06"/>
@@ -164,6 +165,7 @@ SERVO_ARM = System(
     xml="""
 <mujoco model="servo_arm">
   <option integrator="RK4" timestep="0.0025"/>
+  <default><geom contype="0" conaffinity="0"/></default>
   <worldbody>
     <body name="upper" pos="0 0 1">
       <joint name="shoulder" type="hinge" axis="0 1 0" damping="0.5" armature="0.05"/>

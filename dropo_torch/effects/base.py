@@ -124,6 +124,14 @@ class Effect(abc.ABC):
         """Return the values from which a search begins, each ``(p,)``; by default the neutral ones."""
         return [np.array([q.neutral for q in self.quantities(setting, target)])]
 
+    def screened(self) -> list[int] | None:
+        """Return which quantities the screening moves beside each start; ``None`` for all."""
+        return None
+
+    def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """Return the values that a linear prediction ``values`` from ``start`` stands for."""
+        return values
+
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         """Write the effect into a copy of the model; constants are derived afterwards."""
 

@@ -181,7 +181,7 @@ class JointCogging(JointEffect):
         dof = setting.dof(str(target))
         scale = float(setting.signals.force[dof])
         return (
-            Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, 0.0, 10 * scale, scale),
+            Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),
             Quantity("poles", unit(setting, target, "1/rad", "1/m"), 1.0, 0.1, 1e4, 1.0),
             Quantity("phase", "rad", 0.0, -20.0, 20.0, 1.0),
         )
@@ -191,7 +191,15 @@ class JointCogging(JointEffect):
         factor = 1.0 if not setting.is_slide(str(target)) else 50.0
         amplitude = 0.1 * self.quantities(setting, target)[0].scale
         poles = [factor * n for n in self.POLES if factor * n * (high - low) > 2 * np.pi]
-        return [np.array([amplitude, n, phase]) for n in poles for phase in (0.0, np.pi / 2)]
+        return [np.array([amplitude, n, 0.0]) for n in poles]
+
+    def screened(self) -> list[int]:
+        """Return amplitude and phase: the force is linear in their sine and cosine parts."""
+        return [0, 2]
+
+    def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        sine, cosine = values[0], start[0] * values[2]
+        return np.array([np.hypot(sine, cosine), values[1], np.arctan2(cosine, sine)])
 
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

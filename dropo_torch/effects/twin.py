@@ -5,13 +5,14 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import mujoco
 import mujoco.batch
 import numpy as np
 
 from dropo_torch.effects.actuator import actuator_number
-from dropo_torch.effects.base import Path, Placed, Setting
+from dropo_torch.effects.base import Effect, Path, Placed, Setting
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.model import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, write_field
@@ -70,12 +71,15 @@ class Twin:
         space: the declared parameters.
         num_threads: threads, 0 for all processors; results do not depend on it.
         chunk_size: simulations at a time.
+        warp: simulate with the Warp backend wherever it can; MuJoCo does the rest, with the same physics.
     """
 
     def __init__(
-        self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, chunk_size: int = 6000
-    ) -> None:
+        self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, chunk_size: int = 6000,
+        warp: bool = False,
+    ) -> None:  # fmt: skip
         self.setting, self.space = setting, space
+        self._warp = _warp_variants(space, num_threads) if warp else None
         self._base = copy.copy(setting.model)
         self._base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._filters = filter_activations(self._base)
@@ -135,7 +139,7 @@ class Twin:
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
         valid = np.ones(out.shape, dtype=bool)
-        groups: dict[tuple[int, bool, bool], list[int]] = {}
+        groups: dict[tuple, list[int]] = {}
         models: list[mujoco.MjModel | None] = []
         for k, variant in enumerate(variants):
             try:
@@ -146,8 +150,10 @@ class Twin:
             finer = round(self._base.opt.timestep / models[-1].opt.timestep)
             forced = any(p.effect.has_force for p in variant.placed)
             fine = any(p.effect.acts_on_sensor for p in variant.placed)
-            groups.setdefault((max(finer, 1), forced, fine), []).append(k)
-        for (finer, forced, fine), members in groups.items():
+            pushed = any(type(p.effect).wrench is not Effect.wrench for p in variant.placed)
+            natives = tuple(p.key for p in variant.placed if p.effect.native) if self._warp is not None else ()
+            groups.setdefault((max(finer, 1), forced, fine, pushed, natives), []).append(k)
+        for (finer, forced, fine, _pushed, _natives), members in groups.items():
             per_call = max(1, self._chunk // max(1, num_w))
             for a in range(0, len(members), per_call):
                 part = members[a : a + per_call]
@@ -225,6 +231,10 @@ class Twin:
     ) -> np.ndarray:  # fmt: skip
         """Return states after each logged (or physics) step ``(K, W, L or L·skip, nq + nv)``."""
         num_k, num_w = starts.shape[:2]
+        if self._warp is not None and not forced and pushes is None and not self._filters:
+            found = self._by_warp(models, variants, starts, signals, finer, fine)
+            if found is not None:
+                return found
         rows, nq = num_k * num_w, self._base.nq
         batch = self._batch(rows)
         batch.set_models([m for m in models for _ in range(num_w)])
@@ -263,6 +273,24 @@ class Twin:
         batch.set_models(None)
         return out.reshape(num_k, num_w, *out.shape[1:])
 
+    def _by_warp(
+        self, models: list[mujoco.MjModel], variants: list[Variant], starts: np.ndarray, signals: np.ndarray,
+        finer: int, fine: bool,
+    ) -> np.ndarray | None:  # fmt: skip
+        """Do what :meth:`_simulate` does with Warp, or return ``None`` where it cannot."""
+        assert self._warp is not None
+        every = finer * (1 if fine else self.setting.frame_skip)
+        out = []
+        for k, model in enumerate(models):
+            placed = variants[k].placed
+            if any(p.effect.wrench(self.setting, p.target, np.asarray(p.values)) is not None for p in placed):
+                return None
+            path = self._warp.rollout(model, starts[k], np.repeat(signals[k], finer, axis=1))
+            if path is None:
+                return None
+            out.append(path[:, every - 1 :: every])
+        return np.stack(out)
+
     def _push(self, batch: mujoco.batch.Batch, variants: list[Variant], num_w: int) -> None:
         """Set the constant wrenches."""
         for k, variant in enumerate(variants):
@@ -293,6 +321,13 @@ class Twin:
                 self._batches.clear()
             self._batches[rows] = mujoco.batch.Batch(self._base, rows, self._num_threads)
         return self._batches[rows]
+
+
+def _warp_variants(space: ParameterSpace, num_threads: int) -> Any:
+    """The Warp backend, imported only where it is asked for."""
+    from dropo_torch.simulators.warp.variants import Variants
+
+    return Variants(space, num_threads=num_threads)
 
 
 def _varies(control: np.ndarray, every: int) -> bool:

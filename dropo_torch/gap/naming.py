@@ -109,7 +109,7 @@ class Search:
     """
 
     def __init__(
-        self, evidence: Evidence, effects: Sequence[Effect], *, rules: Rules, few: int = 48, fewer: int = 14,
+        self, evidence: Evidence, effects: Sequence[Effect], *, rules: Rules, few: int = 40, fewer: int = 10,
         report: Report = lambda stage, share: None,
     ) -> None:  # fmt: skip
         self.evidence, self.effects, self.rules, self._report = evidence, effects, rules, report

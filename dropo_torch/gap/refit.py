@@ -13,6 +13,8 @@ from dropo_torch.parameters import ParameterSpace
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.
 STEP, LEAST_MOVE = 1e-3, 2e-5
+#: Move, relative to a parameter's scale, after which the starts are linearised again.
+FAR = 0.03
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,10 @@ class Limits:
     low: np.ndarray
     high: np.ndarray
     scale: np.ndarray
+
+    def of(self, columns: np.ndarray) -> Limits:
+        """Return those of some of the numbers."""
+        return Limits(self.low[columns], self.high[columns], self.scale[columns])
 
 
 def limits_of(hypothesis: Hypothesis, space: ParameterSpace, setting: Setting) -> Limits:
@@ -129,7 +135,7 @@ def refit(
     Args:
         evidence: the windows.
         hypothesis: where to begin.
-        starts: the linearisation to use; at the hypothesis by default, and then again at the result.
+        starts: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
         caps: factors of the windows' residuals.
         iterations: the most of them.
     """
@@ -141,6 +147,7 @@ def refit(
     factor = np.ones(len(evidence.windows)) if caps is None else caps
     damping, converged = 1e-3, False
     current = hypothesis.at(np.clip(hypothesis.vector, limits.low, limits.high))
+    begin = current.vector
     raw, change = slopes(evidence, current, limits, columns)
     residual, slope = evidence.project(raw, starts), evidence.project_slope(change, starts)
     value = float(((residual * factor[:, None]) ** 2).sum())
@@ -165,7 +172,8 @@ def refit(
             damping *= 6
             if damping > 1e4:
                 break
-    if relinearise:
+    far = np.abs((current.vector - begin) / limits.scale).max(initial=0.0) > FAR
+    if relinearise and far:
         return refit(evidence, current, starts=evidence.linearise(current.variant), caps=caps, iterations=4)
     degrees = evidence.degrees(starts) - len(columns)
     cost = cost_of(residual, starts, degrees, caps)

@@ -67,7 +67,9 @@ def prepare(problem: Problem) -> Scene:
         raise InputError("gap: this simulator is no MuJoCo model; effects can only be looked for in one")
     train, held = hold_out(problem.trajectories)
     setting = make_setting(problem, train)
-    twin = Twin(setting, problem.space, num_threads=problem.config.threads)
+    twin = Twin(
+        setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp"
+    )
     begin = Hypothesis(tuple(float(v) for v in start_values(problem)))
     noise = _noise(problem, twin, train, begin)
     length, rough = _choose_window(twin, train, begin, noise)

@@ -107,26 +107,35 @@ def _predict(
         vector, begin = hypothesis.vector, len(hypotheses)
         hypotheses.append(hypothesis)
         signs = []
-        for c in range(len(vector) - size, len(vector)):
+        for c in _moved(placed, len(vector) - size):
             sign = 1.0 if vector[c] + STEP * limits.scale[c] <= limits.high[c] else -1.0
             moved = vector.copy()
             moved[c] += sign * STEP * limits.scale[c]
             hypotheses.append(hypothesis.at(moved))
             signs.append(sign)
-        spans.append((begin, np.array(signs), limits))
+        moving = np.array(_moved(placed, 0), dtype=int)
+        spans.append((begin, np.array(signs), limits.of(moving - size), moving))
     found, _ = evidence.residuals([h.variant for h in hypotheses])
-    for placed, (begin, signs, limits) in zip(part, spans, strict=True):
-        size = len(placed.values)
+    for placed, (begin, signs, limits, moving) in zip(part, spans, strict=True):
         residual = evidence.project(found[begin], base.starts).ravel() * factor
-        change = (found[begin + 1 : begin + 1 + size] - found[begin]) / (signs[:, None, None] * STEP)
-        slope = evidence.project_slope(change, base.starts).reshape(size, -1) * factor
+        change = (found[begin + 1 : begin + 1 + len(moving)] - found[begin]) / (signs[:, None, None] * STEP)
+        slope = evidence.project_slope(change, base.starts).reshape(len(moving), -1) * factor
         dead = bool(np.abs(residual - origin).max() < DEAD and np.abs(slope).max(initial=0.0) < DEAD)
         columns = np.concatenate([shared, slope])
-        move = _bounded(columns, residual, len(shared), np.array(placed.values), limits)
+        start = np.array(placed.values)
+        move = _bounded(columns, residual, len(shared), start[moving], limits)
         left = residual + move @ columns
-        values = np.array(placed.values) + move[len(shared) :] * limits.scale[-size:] if size else np.zeros(0)
+        values = start.copy()
+        values[moving] += move[len(shared) :] * limits.scale
+        values = placed.effect.settle(start, values)
         windows = (left**2).reshape(len(evidence.windows), -1).sum(-1)
         yield Candidate(placed.at(values), float(windows.sum()), windows, residual, slope, dead)
+
+
+def _moved(placed: Placed, first: int) -> list[int]:
+    """Which of a candidate's numbers are moved, counted from ``first``."""
+    chosen = placed.effect.screened()
+    return [first + i for i in (range(len(placed.values)) if chosen is None else chosen)]
 
 
 def _bounded(columns: np.ndarray, residual: np.ndarray, num_shared: int, values: np.ndarray, limits) -> np.ndarray:

@@ -117,6 +117,10 @@ class Fields:
             slopes = [torch.autograd.grad(theta[:, c].sum(), leaf, retain_graph=True)[0] for c in self.wanted.tolist()]
         return theta.detach(), torch.stack(slopes, 1)
 
+    def constant(self) -> np.ndarray:
+        """Return θ of the model itself, ``(1, P)``."""
+        return torch.cat([self._raw[None, : self._direct], *self._constant], dim=1).numpy()
+
     def _derive(self, raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Contact parameters and inverse weights of raw fields ``(K, ...)``."""
         return self._mix(raw), self._weigh(raw)

@@ -21,7 +21,8 @@ from dropo_torch.simulators.warp.start import start_warp
 from dropo_torch.simulators.warp.support import check_support
 from dropo_torch.simulators.warp.tables import build_tables
 
-_LOADING = threading.Lock()
+#: Held while a device is looked up or tables are made.
+LOADING = threading.Lock()
 
 
 class WarpSimulator(Simulator):
@@ -70,7 +71,7 @@ class WarpSimulator(Simulator):
         self.timestep = model.opt.timestep * frame_skip
         self._fields = Fields(model, parameters, pairs)
         start_warp()
-        with _LOADING:
+        with LOADING:
             try:
                 wp.get_device(device)
             except Exception:

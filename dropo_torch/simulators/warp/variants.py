@@ -1,0 +1,109 @@
+"""Open-loop simulation of models that differ from each other in anything, one model at a time."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+import torch
+
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.simulators.base import DIVERGED
+from dropo_torch.simulators.warp.engine import Engine, Problem
+from dropo_torch.simulators.warp.fields import DIRECT, MIXED, Fields
+from dropo_torch.simulators.warp.pairs import candidate_pairs
+from dropo_torch.simulators.warp.simulator import LOADING
+from dropo_torch.simulators.warp.start import start_warp
+from dropo_torch.simulators.warp.support import check_support
+from dropo_torch.simulators.warp.tables import build_tables
+
+#: Engines that are kept.
+KEPT = 64
+
+
+@dataclass(frozen=True)
+class Structure:
+    """What of a model stands in an engine's tables, as bytes; models that share it share an engine."""
+
+    content: bytes
+
+
+class Variants:
+    """Simulates variants of a model with Warp; an engine is made for every structure that comes along.
+
+    Args:
+        space: parameters, whose fields may vary within one engine.
+        num_threads: threads of a CPU, 0 for all processors.
+        device: Warp's name of the device.
+    """
+
+    def __init__(self, space: ParameterSpace, *, num_threads: int = 0, device: str = "cpu") -> None:
+        self._space, self._device = space, device
+        self._threads = num_threads or os.cpu_count() or 1
+        self._engines: dict[Structure, Engine | None] = {}
+
+    def rollout(self, model: mujoco.MjModel, starts: np.ndarray, controls: np.ndarray) -> np.ndarray | None:
+        """Return the states after every physics step ``(W, S, nq + nv)``, NaN throughout where one diverged.
+
+        Args:
+            model: the variant, with its derived constants.
+            starts: start states ``(W, nq + nv)``.
+            controls: controls of every physics step ``(W, S, nu)``.
+
+        Returns:
+            ``None`` for a model outside the subset that Warp simulates.
+        """
+        structure = _structure(model)
+        if structure not in self._engines:
+            if len(self._engines) >= KEPT:
+                self._engines.pop(next(iter(self._engines)))
+            self._engines[structure] = self._engine(model)
+        engine = self._engines[structure]
+        if engine is None:
+            return None
+        pairs = candidate_pairs(model)
+        theta = Fields(model, self._space, pairs).constant()
+        problem = Problem(len(starts), 1, controls.shape[1], 1)
+        inputs = [torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, starts, controls)]
+        flat, _ = engine.simulate(problem, inputs[0], inputs[1], inputs[2], keep=False)
+        out = flat.numpy().reshape(len(starts), controls.shape[1], starts.shape[1])
+        with np.errstate(invalid="ignore"):
+            out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
+        return out
+
+    def _engine(self, model: mujoco.MjModel) -> Engine | None:
+        pairs = candidate_pairs(model)
+        try:
+            check_support(model, self._space, pairs)
+        except InputError:
+            return None
+        fields = Fields(model, self._space, pairs)
+        start_warp()
+        with LOADING:
+            return Engine(
+                build_tables(model, self._space, pairs, fields.layout, self._device), fields.layout.size, fields.wanted,
+                skip=1, chunk_size=4096, num_threads=self._threads, device=self._device,
+            )  # fmt: skip
+
+
+def _structure(model: mujoco.MjModel) -> Structure:
+    """Everything but the numbers in θ, of which only stands whether each is zero."""
+    numbers = {field for _, field, _ in DIRECT} | set(MIXED)
+    parts = []
+    for field in sorted({*numbers, *_TABLED}):
+        array = np.asarray(read_field(model, field))
+        parts.append((array != 0).tobytes() if field in numbers else array.tobytes())
+    return Structure(b"|".join(parts))
+
+
+#: Fields that an effect may change and that stand in an engine's tables.
+_TABLED = (
+    "opt.timestep", "opt.integrator", "opt.disableflags", "opt.cone", "opt.impratio", "opt.o_margin", "body_iquat",
+    "body_pos", "body_quat", "body_sameframe", "geom_pos", "geom_quat", "geom_size", "geom_sameframe", "geom_priority",
+    "geom_condim", "geom_fluid", "geom_gap", "geom_solmix", "geom_contype", "geom_conaffinity", "jnt_axis", "jnt_pos",
+    "jnt_limited", "jnt_actfrclimited", "actuator_biastype", "actuator_gaintype", "actuator_forcelimited",
+    "actuator_ctrllimited", "actuator_gear", "actuator_dyntype", "qpos0", "actuator_damping",
+)  # fmt: skip
