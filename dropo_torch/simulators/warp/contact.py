@@ -26,7 +26,7 @@ from dropo_torch.simulators.warp.collide import (
     vec7,
 )
 from dropo_torch.simulators.warp.cone import normal_d
-from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
+from dropo_torch.simulators.warp.impedance import damping, impedance_slope, regularisation, stiffness
 from dropo_torch.simulators.warp.rows import theta_vec2, theta_vec5
 from dropo_torch.simulators.warp.spatial import ang, at
 from dropo_torch.simulators.warp.types import (
@@ -226,7 +226,7 @@ def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
         friction_ref = theta_vec2(th, m.o_pair_solreffriction + 2 * k)
         solimp = theta_vec5(th, m.o_pair_solimp + 5 * k)
         x = s.con_dist[t, c] - th[m.o_pair_margin + k]
-        imp = impedance(x, solimp)
+        imp = impedance_slope(x, solimp)[0]
         b = damping(solref, solimp, m.h, m.refsafe)
         bf = b
         if m.elliptic != 0 and (friction_ref[0] != ZERO or friction_ref[1] != ZERO):
