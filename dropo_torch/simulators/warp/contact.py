@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.collide import (
+    CAPSULE_BOX,
     PLANE_BOX,
     PLANE_CAPSULE,
     PLANE_CYLINDER,
@@ -17,6 +18,8 @@ from dropo_torch.simulators.warp.collide import (
     ROUND,
     SPHERE_BOX,
     box_closest,
+    capsule_box_codes,
+    capsule_box_contact,
     column,
     corner,
     cylinder_point,
@@ -91,7 +94,7 @@ def pair_count(m: Tables, k: int, parallel: bool) -> int:
     """How many points of a pair may touch."""
     kind = m.pair_kind[k]
     n = int(1)
-    if kind == PLANE_CAPSULE:
+    if kind == PLANE_CAPSULE or kind == CAPSULE_BOX:
         n = 2
     elif kind == PLANE_BOX:
         n = 8
@@ -132,9 +135,17 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                 parallel = are_parallel(a1, a2)
             elif kind > PLANE_CAPSULE:
                 rot = geom_rotation(m, s, t, g2)
+            first = int(-1)
+            second = int(-1)
+            if kind == CAPSULE_BOX:
+                a1 = geom_axis(m, s, t, g1) * size1[1]
+                back = wp.transpose(rot)
+                limit = margin + f64(2.0) * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
+                first, second = capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
             start = n
             for i in range(pair_count(m, k, parallel)):
                 possible = bool(True)
+                which = i
                 hint = vec3()
                 x = vec7()
                 if kind == PLANE_SPHERE:
@@ -155,6 +166,11 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                     x = plane_point(normal, c1, ellipsoid_point(normal, c2, rot, size2), ZERO)
                 elif kind == SPHERE_BOX:
                     x = box_closest(c2, rot, size2, c1, size1[0])
+                elif kind == CAPSULE_BOX:
+                    which = wp.where(i == 0, first, second)
+                    possible = which >= 0
+                    if possible:
+                        x = capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
                 else:
                     which = int(0)
                     if parallel:
@@ -162,7 +178,7 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                         possible = n - start < 2
                     x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
                 if possible and x[0] < margin:
-                    _add(s, t, n, k, wp.where(parallel, i + 1, i), x, hint)
+                    _add(s, t, n, k, which, x, hint)
                     n += 1
     return n
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.collide import (
+    CAPSULE_BOX,
     PLANE_BOX,
     PLANE_CAPSULE,
     PLANE_CYLINDER,
@@ -20,6 +21,7 @@ from dropo_torch.simulators.warp.collide import (
     PLANE_SPHERE,
     SPHERE_BOX,
     box_dual,
+    capsule_box_dual,
     column,
     corner,
     cylinder_dual,
@@ -292,6 +294,14 @@ def _geometry_adjoint(
         rot = geom_rotation(m, s, t, g2)
         cb, rb, _sb, xb, _rb, _d, _p, _n = wp.grad(box_dual)(c2, rot, size, c1, m.geom_size[g1][0], distbar, pbar, nbar)
         y1 = wrench(xb, c1)
+        y2 = wrench(cb, c2) + join(_turned(rot, rb), vec3())
+    elif kind == CAPSULE_BOX:
+        rot = geom_rotation(m, s, t, g2)
+        a1 = half_axis(m, s, t, g1)
+        c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(capsule_box_dual)(
+            c1, a1, m.geom_size[g1][0], c2, rot, size, which, distbar, pbar, nbar
+        )
+        y1 = wrench(c1b, c1) + join(wp.cross(a1, a1b), vec3())
         y2 = wrench(cb, c2) + join(_turned(rot, rb), vec3())
     else:
         a1 = half_axis(m, s, t, g1)

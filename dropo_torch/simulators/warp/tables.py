@@ -33,6 +33,7 @@ _KINDS = {
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 1),
     (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 2),
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_BOX): (collide.SPHERE_BOX, 1),
+    (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 2),
 }  # fmt: skip
 
 
