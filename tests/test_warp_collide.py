@@ -12,7 +12,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.collide import capsule_box_codes, capsule_box_contact, vec7
 from dropo_torch.simulators.warp.start import start_warp
-from dropo_torch.simulators.warp.types import Mats, Reals, Vec3s, f64, vec3
+from dropo_torch.simulators.warp.types import Mats, Vec3s, f64, vec3
 
 MARGIN = 0.02
 RADIUS, HALF = 0.05, 0.2

@@ -451,7 +451,11 @@ CONTACTS += [
     Case(
         "capsule over an edge",
         OVER_EDGE,
-        {"mass": p("body_mass", "rod"), "friction": p("geom_friction", "floor"), "solref": p("geom_solref", "floor", 0)},
+        {
+            "mass": p("body_mass", "rod"),
+            "friction": p("geom_friction", "floor"),
+            "solref": p("geom_solref", "floor", 0),
+        },
         length=16,
         spread=0.1,
     ),

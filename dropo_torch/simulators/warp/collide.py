@@ -1,8 +1,9 @@
 """Where two geoms touch: distance, point and normal as smooth functions of their poses.
 
 A contact is found by ``find_contacts`` (contact.py) and named by its pair and a number ``which`` within the pair;
-its geometry is then one of two shapes. Against a plane it is decided by a point x fixed in the other geom, or by
-the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments.
+its geometry is then one of three shapes. Against a plane it is decided by a point x fixed in the other geom, or by
+the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments; against a
+box by a ball, at a capsule's centre line wherever ``which`` says (:func:`capsule_place`).
 """
 
 # mypy: ignore-errors
@@ -439,7 +440,6 @@ def _second_by_corner(half: vec3, size: vec3, near: int, t: f64, first: int) -> 
 def _second_by_edge(half: vec3, size: vec3, near: int, edge: int, t: f64, x: f64, first: int) -> int:
     """Code of the second point where the inside of an edge is closest: over the face that the axis is flatter on."""
     code = int(-1)
-    rel = near
     axisdir = int(0)
     for j in range(3):
         if half[j] > ZERO:

@@ -93,8 +93,8 @@ def _add(s: Scratch, t: int, n: int, k: int, which: int, x: vec7, hint: vec3):
 def pair_count(m: Tables, k: int, parallel: bool) -> int:
     """How many points of a pair may touch."""
     kind = m.pair_kind[k]
-    n = int(1)
-    if kind == PLANE_CAPSULE or kind == CAPSULE_BOX:
+    n = int(wp.where(kind == CAPSULE_BOX, 2, 1))
+    if kind == PLANE_CAPSULE:
         n = 2
     elif kind == PLANE_BOX:
         n = 8
