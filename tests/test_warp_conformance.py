@@ -443,7 +443,31 @@ LOOP = """<mujoco><worldbody><body name="a"><joint name="a" axis="0 1 0"/><geom 
 pos=".3 0 0"><joint name="b" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></body><body name="c" pos="0 2 0">
 <joint name="c" axis="0 1 0"/><geom size=".1" pos=".2 0 0"/></body></worldbody><equality><joint joint1="b"
 polycoef=".3 0 0 0 0"/><joint joint1="a" joint2="c" polycoef="0 1.5 .2 0 0"/></equality></mujoco>"""
+OVER_EDGE = """<mujoco><worldbody><geom name="floor" type="box" size=".5 .4 .5"/><body name="rod" pos=".45 .05 .56"
+euler="3 85 10"><freejoint/><geom name="grod" type="capsule" size=".05 .2" friction=".7 .01 .01"/></body></worldbody>
+</mujoco>"""
+ON_BOX = BOX + free("rod", ".02 .03 .27", 'type="capsule" size=".06 .15"', "0.7 0.1 0.7 0.1")
 CONTACTS += [
+    Case(
+        "capsule over an edge",
+        OVER_EDGE,
+        {
+            "mass": p("body_mass", "rod"),
+            "friction": p("geom_friction", "floor"),
+            "solref": p("geom_solref", "floor", 0),
+        },
+        length=16,
+        spread=0.1,
+    ),
+    Case("capsule on a box", scene(ON_BOX, slope="0"), contact_parameters("rod"), length=8, spread=0.1),
+    Case(
+        "capsule on a box, elliptic",
+        scene(ON_BOX, slope="0", cone="elliptic", condim="6"),
+        contact_parameters("rod"),
+        length=8,
+        spread=0.1,
+        states=1e-8,
+    ),
     Case("welded bodies", WELDED, {"b": p("body_mass", "b"), "c": p("body_mass", "c")}, most=1e-2),
     Case("sphere in a box", IN_BOX, {"mass": p("body_mass", "ball"), "solref": p("geom_solref", "floor", 0)}, length=8),
     Case("equalities across trees", LOOP, {"b": p("body_mass", "b"), "c": p("body_mass", "c")}),

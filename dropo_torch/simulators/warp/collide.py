@@ -1,8 +1,9 @@
 """Where two geoms touch: distance, point and normal as smooth functions of their poses.
 
 A contact is found by ``find_contacts`` (contact.py) and named by its pair and a number ``which`` within the pair;
-its geometry is then one of two shapes. Against a plane it is decided by a point x fixed in the other geom, or by
-the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments.
+its geometry is then one of three shapes. Against a plane it is decided by a point x fixed in the other geom, or by
+the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments; against a
+box by a ball, at a capsule's centre line wherever ``which`` says (:func:`capsule_place`).
 """
 
 # mypy: ignore-errors
@@ -27,7 +28,16 @@ PLANE_CYLINDER = wp.constant(3)
 PLANE_ELLIPSOID = wp.constant(4)
 ROUND = wp.constant(5)  # spheres and capsules among themselves
 SPHERE_BOX = wp.constant(6)
-SPHERE_CYLINDER = wp.constant(7)
+CAPSULE_BOX = wp.constant(7)
+
+#: Where on its axis a capsule touches a box: one of its ends, where it passes a corner, where it passes an edge.
+END = wp.constant(0)  # the end at −1; 1 is that at +1
+AT_CORNER = wp.constant(2)
+AT_EDGE = wp.constant(3)
+#: How a second point follows from the first: across the box, along its edge, or where the axis meets a side's plane.
+ACROSS = wp.constant(1)
+ALONG = wp.constant(2)
+PLANE = wp.constant(3)
 
 
 @wp.func
@@ -248,3 +258,245 @@ def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
 def box_dual(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64, dbar: f64, pbar: vec3, nbar: vec3) -> f64:
     """Leaf: the adjoint of :func:`box_closest` is its gradient."""
     return pair7(box_closest(c, rot, size, x, radius), dbar, pbar, nbar)
+
+
+@wp.func
+def _place_code(base: int, near: int, edge: int, step: int, axis: int, back: int, less: int) -> int:
+    """One number for a place on a capsule's axis; ``near`` is a corner, ``back`` and ``less`` are signs."""
+    return base + 4 * near + 32 * edge + 128 * step + 512 * axis + 2048 * back + 4096 * less
+
+
+@wp.func
+def capsule_place(pos: vec3, half: vec3, size: vec3, code: int) -> f64:
+    """Place in [−1, 1] on a capsule's half-axis that a code names, all in the box's frame; differentiable."""
+    base = code % 4
+    edge = (code // 32) % 4
+    step = (code // 128) % 4
+    axis = (code // 512) % 4
+    sign = ONE
+    if (code // 2048) % 2 != 0:
+        sign = -ONE
+    t = -ONE
+    if base == 1:
+        t = ONE
+    elif base >= AT_CORNER:
+        e = corner((code // 4) % 8, size) - pos
+        mc = wp.dot(half, half)
+        if base == AT_CORNER:
+            t = wp.dot(half, e) / mc
+        else:
+            # closest to a line along the edge: neither half nor e counts along it
+            hj = half[edge]
+            ej = e[edge]
+            t = (wp.dot(half, e) - hj * ej) / (mc - hj * hj)
+    if step == ACROSS:
+        t = t + sign * (size[axis] + size[axis]) / wp.abs(half[axis])
+    elif step == ALONG:
+        # the edge's own place, where the axis is at t
+        x = (pos[edge] + t * half[edge]) / size[edge]
+        if (code // 4096) % 2 != 0:
+            x = -x
+        t = t + sign * size[axis] * (ONE + x) / wp.abs(half[axis])
+    elif step == PLANE:
+        t = (sign * size[axis] - pos[axis]) / half[axis]
+    return t
+
+
+@wp.func
+def _end(sign: f64) -> int:
+    return wp.where(sign > ZERO, 1, 0)
+
+
+@wp.func
+def capsule_box_first(pos: vec3, half: vec3, size: vec3, limit: f64):
+    """Where a capsule is closest to a box: face or −1, edge or −1, corner, whether it is a corner, places on both.
+
+    The last number is the code of the place, −1 without one. As in MuJoCo ``limit`` bounds the squared distance.
+    """
+    best = f64(limit)
+    code = int(-1)
+    face = int(-1)
+    edge = int(-1)
+    near = int(0)
+    at_corner = int(0)
+    t = f64(0.0)
+    x = f64(0.0)
+    ends = int(2)
+    for i in range(ends):
+        sign = f64(float(2 * i - 1))
+        p = pos + half * sign
+        outside = int(0)
+        side = int(-1)
+        q = ZERO
+        for j in range(3):
+            beyond = wp.abs(p[j]) - size[j]
+            if beyond > ZERO:
+                outside += 1
+                side = j
+                q += beyond * beyond
+        if outside <= 1 and q < best:
+            best = q
+            code = i
+            face = side
+            t = sign
+    mc = wp.dot(half, half)
+    edges = int(24)
+    for k in range(edges):
+        j = k // 8
+        i = k % 8
+        if ((i >> j) & 1) == 0:
+            sj = size[j]
+            e = corner(i, size) - pos
+            e[j] = -pos[j]
+            ma = sj * sj
+            mb = -sj * half[j]
+            u = -sj * e[j]
+            v = wp.dot(half, e)
+            det = ma * mc - mb * mb
+            if wp.abs(det) >= MINVAL:
+                x1 = (mc * u - mb * v) / det
+                x2 = (ma * v - mb * u) / det
+                s1 = int(1)
+                s2 = int(1)
+                if wp.abs(x1) > ONE:
+                    x1 = wp.sign(x1)
+                    s1 = wp.where(x1 > ZERO, 2, 0)
+                    x2 = (v - x1 * mb) / mc
+                if wp.abs(x2) > ONE:
+                    x2 = wp.sign(x2)
+                    s2 = wp.where(x2 > ZERO, 2, 0)
+                    x1 = (u - x2 * mb) / ma
+                    if wp.abs(x1) > ONE:
+                        x1 = wp.sign(x1)
+                        s1 = wp.where(x1 > ZERO, 2, 0)
+                e = e - half * x2
+                e[j] = e[j] + sj * x1
+                q = wp.dot(e, e)
+                if q < best - MINVAL:
+                    best = q
+                    edge = j
+                    near = i
+                    at_corner = 1
+                    if s1 == 2:
+                        near = i + (1 << j)
+                    elif s1 == 1:
+                        at_corner = 0
+                    t = x2
+                    x = x1
+                    code = s2 // 2
+                    if s2 == 1:
+                        code = _place_code(wp.where(s1 == 1, AT_EDGE, AT_CORNER), near, j, 0, 0, 0, 0)
+    return face, edge, near, at_corner, t, x, code
+
+
+@wp.func
+def _second_by_face(pos: vec3, half: vec3, size: vec3, face: int, t: f64) -> int:
+    """Code of the second point where one end is closest to a face: how far the axis stays above it."""
+    code = _end(-t)
+    best = f64(2.0)
+    start = pos + half * t
+    for i in range(3):
+        if i != face:
+            for back in range(2):
+                side = size[i] * (ONE - f64(2.0 * float(back)))
+                reach = -t * (side - start[i]) / half[i]
+                if reach > ZERO and reach < best:
+                    best = reach
+                    code = _place_code(END, 0, 0, PLANE, i, back, 0)
+    return code
+
+
+@wp.func
+def _second_by_corner(half: vec3, size: vec3, near: int, t: f64, first: int) -> int:
+    """Code of the second point where a corner is closest: along an edge or over a face, if the axis goes there."""
+    code = int(-1)
+    rel = near
+    for j in range(3):
+        if half[j] > ZERO:
+            rel = rel ^ (1 << j)
+    if rel != 0 and rel != 7:
+        way = f64(1.0)
+        if rel == 3 or rel == 5 or rel == 6:
+            way = f64(-1.0)
+            rel = 7 - rel
+        ax = rel // 2
+        if half[ax] * half[ax] > HALF * wp.dot(half, half):
+            code = _end(way)
+            if (size[ax] + size[ax]) / wp.abs(half[ax]) < ONE - way * t:
+                code = first + _place_code(END, 0, 0, ACROSS, ax, 1 - _end(way), 0)
+        else:
+            code = _end(-way)
+            best = ONE + way * t
+            for turn in range(1, 3):
+                i = (ax + turn) % 3
+                reach = (size[i] + size[i]) / wp.abs(half[i])
+                if reach < best:
+                    best = reach
+                    code = first + _place_code(END, 0, 0, ACROSS, i, _end(way), 0)
+    return code
+
+
+@wp.func
+def _second_by_edge(half: vec3, size: vec3, near: int, edge: int, t: f64, x: f64, first: int) -> int:
+    """Code of the second point where the inside of an edge is closest: over the face that the axis is flatter on."""
+    code = int(-1)
+    axisdir = int(0)
+    for j in range(3):
+        if half[j] > ZERO:
+            axisdir += 1 << j
+    rel = (near ^ axisdir) & (7 - (1 << edge))
+    if rel == 1 or rel == 2 or rel == 4:
+        ax1 = (edge + 1) % 3
+        ax2 = (edge + 2) % 3
+        if wp.abs(half[ax1]) > wp.abs(half[ax2]):
+            ax2 = ax1
+        ahead = (rel >> ax2) & 1
+        way = f64(2.0 * float(ahead) - 1.0)
+        code = _end(way)
+        best = ONE - way * t
+        reach = (size[ax2] + size[ax2]) / wp.abs(half[ax2])
+        if reach < best:
+            best = reach
+            code = first + _place_code(END, 0, 0, ACROSS, ax2, 1 - ahead, 0)
+        less = int(0)
+        if ((axisdir >> edge) & 1) == ahead:
+            less = 1
+        rest = ONE + x
+        if less != 0:
+            rest = ONE - x
+        if size[edge] * rest / wp.abs(half[edge]) < best:
+            # the first code has the edge unless it is one of the ends
+            code = first % 32 + _place_code(END, 0, edge, ALONG, edge, 1 - ahead, less)
+    return code
+
+
+@wp.func
+def capsule_box_codes(pos: vec3, half: vec3, size: vec3, limit: f64):
+    """Codes of the one or two places of a capsule that touch a box, −1 for none: MuJoCo's capsule-box."""
+    face, edge, near, at_corner, t, x, first = capsule_box_first(pos, half, size, limit)
+    second = int(-1)
+    if first >= 0:
+        if edge >= 0:
+            if at_corner != 0:
+                second = _second_by_corner(half, size, near, t, first)
+            else:
+                second = _second_by_edge(half, size, near, edge, t, x, first)
+        elif face >= 0:
+            second = _second_by_face(pos, half, size, face, t)
+    return first, second
+
+
+@wp.func
+def capsule_box_contact(c1: vec3, a1: vec3, radius: f64, c2: vec3, rot: mat33, size: vec3, code: int) -> vec7:
+    """Contact of a capsule with half-axis a1 (first geom) and a box (second) at the place that a code names."""
+    back = wp.transpose(rot)
+    t = capsule_place(back * (c1 - c2), back * a1, size, code)
+    return box_closest(c2, rot, size, c1 + a1 * t, radius)
+
+
+@wp.func
+def capsule_box_dual(
+    c1: vec3, a1: vec3, radius: f64, c2: vec3, rot: mat33, size: vec3, code: int, dbar: f64, pbar: vec3, nbar: vec3
+) -> f64:
+    """Leaf: the adjoint of :func:`capsule_box_contact` is its gradient."""
+    return pair7(capsule_box_contact(c1, a1, radius, c2, rot, size, code), dbar, pbar, nbar)

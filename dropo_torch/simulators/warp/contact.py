@@ -9,6 +9,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.collide import (
+    CAPSULE_BOX,
     PLANE_BOX,
     PLANE_CAPSULE,
     PLANE_CYLINDER,
@@ -17,6 +18,8 @@ from dropo_torch.simulators.warp.collide import (
     ROUND,
     SPHERE_BOX,
     box_closest,
+    capsule_box_codes,
+    capsule_box_contact,
     column,
     corner,
     cylinder_point,
@@ -26,7 +29,7 @@ from dropo_torch.simulators.warp.collide import (
     vec7,
 )
 from dropo_torch.simulators.warp.cone import normal_d
-from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
+from dropo_torch.simulators.warp.impedance import damping, impedance_slope, regularisation, stiffness
 from dropo_torch.simulators.warp.rows import theta_vec2, theta_vec5
 from dropo_torch.simulators.warp.spatial import ang, at
 from dropo_torch.simulators.warp.types import (
@@ -90,7 +93,7 @@ def _add(s: Scratch, t: int, n: int, k: int, which: int, x: vec7, hint: vec3):
 def pair_count(m: Tables, k: int, parallel: bool) -> int:
     """How many points of a pair may touch."""
     kind = m.pair_kind[k]
-    n = int(1)
+    n = int(wp.where(kind == CAPSULE_BOX, 2, 1))
     if kind == PLANE_CAPSULE:
         n = 2
     elif kind == PLANE_BOX:
@@ -132,9 +135,17 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                 parallel = are_parallel(a1, a2)
             elif kind > PLANE_CAPSULE:
                 rot = geom_rotation(m, s, t, g2)
+            first = int(-1)
+            second = int(-1)
+            if kind == CAPSULE_BOX:
+                a1 = geom_axis(m, s, t, g1) * size1[1]
+                back = wp.transpose(rot)
+                limit = margin + f64(2.0) * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
+                first, second = capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
             start = n
             for i in range(pair_count(m, k, parallel)):
                 possible = bool(True)
+                which = i
                 hint = vec3()
                 x = vec7()
                 if kind == PLANE_SPHERE:
@@ -155,6 +166,11 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                     x = plane_point(normal, c1, ellipsoid_point(normal, c2, rot, size2), ZERO)
                 elif kind == SPHERE_BOX:
                     x = box_closest(c2, rot, size2, c1, size1[0])
+                elif kind == CAPSULE_BOX:
+                    which = wp.where(i == 0, first, second)
+                    possible = which >= 0
+                    if possible:
+                        x = capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
                 else:
                     which = int(0)
                     if parallel:
@@ -162,7 +178,7 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                         possible = n - start < 2
                     x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
                 if possible and x[0] < margin:
-                    _add(s, t, n, k, wp.where(parallel, i + 1, i), x, hint)
+                    _add(s, t, n, k, which, x, hint)
                     n += 1
     return n
 
@@ -226,7 +242,7 @@ def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
         friction_ref = theta_vec2(th, m.o_pair_solreffriction + 2 * k)
         solimp = theta_vec5(th, m.o_pair_solimp + 5 * k)
         x = s.con_dist[t, c] - th[m.o_pair_margin + k]
-        imp = impedance(x, solimp)
+        imp = impedance_slope(x, solimp)[0]
         b = damping(solref, solimp, m.h, m.refsafe)
         bf = b
         if m.elliptic != 0 and (friction_ref[0] != ZERO or friction_ref[1] != ZERO):

@@ -13,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.collide import (
+    CAPSULE_BOX,
     PLANE_BOX,
     PLANE_CAPSULE,
     PLANE_CYLINDER,
@@ -20,6 +21,7 @@ from dropo_torch.simulators.warp.collide import (
     PLANE_SPHERE,
     SPHERE_BOX,
     box_dual,
+    capsule_box_dual,
     column,
     corner,
     cylinder_dual,
@@ -28,10 +30,10 @@ from dropo_torch.simulators.warp.collide import (
     ellipsoid_point,
     round_dual,
 )
-from dropo_torch.simulators.warp.cone import cone_force, cone_piece, contact_scalars, elliptic_power, normal_d
+from dropo_torch.simulators.warp.cone import cone_force, cone_piece, elliptic_power, normal_d
 from dropo_torch.simulators.warp.contact import geom_centre, geom_rotation, half_axis, in_frame
-from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
-from dropo_torch.simulators.warp.rows import theta_vec2, theta_vec5
+from dropo_torch.simulators.warp.impedance import damping, impedance_slope, regularisation, stiffness
+from dropo_torch.simulators.warp.rows import soft_adjoint, theta_vec2, theta_vec5
 from dropo_torch.simulators.warp.spatial import ang, cross_force, join, nothing, wrench
 from dropo_torch.simulators.warp.types import (
     HALF,
@@ -124,11 +126,12 @@ def _pyramid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, c: int, ju: vec6,
     margin = th[m.o_pair_margin + k]
     weight = th[m.o_pair_invweight + k]
     x = s.con_dist[t, c] - margin
-    imp = impedance(x, solimp)
+    imp = impedance_slope(x, solimp)
     b = damping(solref, solimp, m.h, m.refsafe)
+    stiff = stiffness(solref, solimp, m.h, m.refsafe)
     w = ju + jv * b
-    w[0] += stiffness(solref, solimp, m.h, m.refsafe) * imp * x
-    d = normal_d(dim, 0, regularisation(imp, ONE), weight, mu1, m.impratio)
+    w[0] += stiff * imp[0] * x
+    d = normal_d(dim, 0, regularisation(imp[0], ONE), weight, mu1, m.impratio)
     wbar = vec6()
     lbar = vec6()
     distbar = f64(0.0)
@@ -147,17 +150,13 @@ def _pyramid_adjoint(m: Tables, s: Scratch, t: int, th: Reals, c: int, ju: vec6,
                     wbar[0] += slope
                     wbar[i] += e * slope
                     s.grad[t, o_mu + i - 1] += (e / mu) * (w[i] * slope + jl[i] * d * jar)
-        _dim, distbar, marginbar, mubar, refbar, impbar, weightbar, _r, _h, _s, _1, _2, _3 = wp.grad(contact_scalars)(
-            dim, s.con_dist[t, c], margin, mu1, solref, solimp, weight, m.impratio, m.h, m.refsafe,
+        distbar, weightbar, mubar = soft_adjoint(
+            m, s, t, o_ref, o_imp, dim, x, mu1, solref, solimp, weight, imp[0], imp[1], stiff, d,
             -wp.dot(f, jl) / d, wp.dot(jv, wbar), wbar[0],
         )  # fmt: skip
-        s.grad[t, m.o_pair_margin + k] += marginbar
+        s.grad[t, m.o_pair_margin + k] -= distbar
         s.grad[t, m.o_pair_invweight + k] += weightbar
         s.grad[t, o_mu] += mubar
-        for i in range(2):
-            s.grad[t, o_ref + i] += refbar[i]
-        for i in range(5):
-            s.grad[t, o_imp + i] += impbar[i]
     return wbar, wbar * b, lbar, distbar
 
 
@@ -295,6 +294,14 @@ def _geometry_adjoint(
         rot = geom_rotation(m, s, t, g2)
         cb, rb, _sb, xb, _rb, _d, _p, _n = wp.grad(box_dual)(c2, rot, size, c1, m.geom_size[g1][0], distbar, pbar, nbar)
         y1 = wrench(xb, c1)
+        y2 = wrench(cb, c2) + join(_turned(rot, rb), vec3())
+    elif kind == CAPSULE_BOX:
+        rot = geom_rotation(m, s, t, g2)
+        a1 = half_axis(m, s, t, g1)
+        c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(capsule_box_dual)(
+            c1, a1, m.geom_size[g1][0], c2, rot, size, which, distbar, pbar, nbar
+        )
+        y1 = wrench(c1b, c1) + join(wp.cross(a1, a1b), vec3())
         y2 = wrench(cb, c2) + join(_turned(rot, rb), vec3())
     else:
         a1 = half_axis(m, s, t, g1)

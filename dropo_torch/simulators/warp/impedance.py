@@ -58,6 +58,47 @@ def impedance(x: f64, solimp: vec5) -> f64:
 
 
 @wp.func
+def _plain_power(x: f64, p: f64) -> f64:
+    """x to the power p without the logarithm that a derivative in p would want."""
+    y = x
+    if p != ONE:
+        y = wp.pow(x, p)
+    return y
+
+
+@wp.func
+def impedance_slope(x: f64, solimp: vec5) -> vec2:
+    """d(x) of :func:`impedance` and d'(x)."""
+    d0 = _limit(solimp[0])
+    d1 = _limit(solimp[1])
+    width = wp.max(ZERO, solimp[2])
+    d = HALF * (d0 + d1)
+    slope = ZERO
+    if width > MINVAL:
+        a = wp.abs(x) / width
+        if a >= ONE:
+            d = d1
+        elif a <= ZERO:
+            d = d0
+        else:
+            mid = _limit(solimp[3])
+            p = wp.max(ONE, solimp[4])
+            z = a
+            ratio = ONE
+            if a > mid:
+                z = ONE - a
+                mid = ONE - mid
+            if p != ONE:
+                ratio = _plain_power(z, p - ONE) / _plain_power(mid, p - ONE)
+            y = z * ratio
+            if z != a:
+                y = ONE - y
+            d = d0 + y * (d1 - d0)
+            slope = (d1 - d0) * p * ratio * wp.sign(x) / width
+    return vec2(d, slope)
+
+
+@wp.func
 def _solref(solref: vec2, h: f64, refsafe: int) -> vec2:
     """solref made safe: no mixed signs, and a time constant of at least two steps."""
     a = solref[0]

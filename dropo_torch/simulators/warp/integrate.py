@@ -68,6 +68,20 @@ def move_adjoint(
     m: Tables, vel: Reals2, rv: int, h: f64, bar: Reals2, rb: int, pos_bar: Reals2, vel_bar: Reals2, o: int
 ):
     """Adjoint of :func:`move`: adds to ``pos_bar[rb]`` and ``vel_bar[rb, o:]`` from ``bar[rb]``."""
+    if m.has_ball == 0:
+        for i in range(m.nv):
+            g = bar[rb, i]
+            pos_bar[rb, i] += g
+            vel_bar[rb, o + i] += h * g
+    else:
+        _move_adjoint(m, vel, rv, h, bar, rb, pos_bar, vel_bar, o)
+
+
+@wp.func(inline=True)
+def _move_adjoint(
+    m: Tables, vel: Reals2, rv: int, h: f64, bar: Reals2, rb: int, pos_bar: Reals2, vel_bar: Reals2, o: int
+):
+    """:func:`move_adjoint` where there are quaternions."""
     for k in range(m.nlink):
         d = m.link_dof[k]
         kind = m.link_kind[k]
@@ -92,7 +106,7 @@ def move_adjoint(
 @wp.func(inline=True)
 def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
     """rate[r] of a stage that is ``c`` rate[r − 1] away from the start of its step."""
-    for k in range(m.nlink):
+    for k in range(m.nlink * m.has_ball):
         d = m.link_dof[k]
         kind = m.link_kind[k]
         if kind == BALL:
@@ -111,6 +125,17 @@ def chart_rates(m: Tables, rate: Reals2, r: int, c: f64, qvel: Reals2):
 @wp.func(inline=True)
 def chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: f64, qvel: Reals2, o: int):
     """Adjoint of :func:`chart_rates`: ``s.stage_rate_bar[o:]`` to ``s.vel_bar`` and the stage before."""
+    _late = wp.grad(nothing)(ONE)
+    if m.has_ball == 0:
+        for i in range(m.nv):
+            s.vel_bar[t, i] += s.stage_rate_bar[t, o + i]
+    else:
+        _chart_rates_adjoint(m, s, t, rate, r, c, qvel, o)
+
+
+@wp.func(inline=True)
+def _chart_rates_adjoint(m: Tables, s: Scratch, t: int, rate: Reals2, r: int, c: f64, qvel: Reals2, o: int):
+    """:func:`chart_rates_adjoint` where there are quaternions."""
     _late = wp.grad(nothing)(ONE)
     for k in range(m.nlink):
         d = m.link_dof[k]
@@ -419,10 +444,12 @@ def _end_adjoint(m: Tables, s: Scratch, t: int, qvel: Reals2, rate: Reals2, r: i
         s.tangent[t, i] = ZERO
         s.stage_vel_bar[t, i] = s.rate_bar[t, i]
         s.stage_rate_bar[t, i] = ZERO
-        if m.integrator == RK4:
-            s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
-        else:
-            s.work[t, i] = qvel[nxt, i]
+    if m.has_ball != 0:
+        for i in range(nv):
+            if m.integrator == RK4:
+                s.work[t, i] = (rate[r, i] + TWO * rate[r + 1, i] + TWO * rate[r + 2, i] + rate[r + 3, i]) / f64(6.0)
+            else:
+                s.work[t, i] = qvel[nxt, i]
     move_adjoint(m, s.work, t, h, s.pos_bar, t, s.pos_bar0, s.tangent, 0)
     for i in range(nv):
         g = s.tangent[t, i]

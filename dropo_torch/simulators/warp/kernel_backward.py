@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.collide import box_dual, cylinder_dual, ellipsoid_dual, round_dual
+from dropo_torch.simulators.warp.collide import box_dual, capsule_box_dual, cylinder_dual, ellipsoid_dual, round_dual
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
-from dropo_torch.simulators.warp.rows import row_power
 from dropo_torch.simulators.warp.spatial import chart_rate_dual
 from dropo_torch.simulators.warp.types import (
     ZERO,
@@ -62,8 +61,8 @@ def adjoint_kernel(
     th = theta[world % nparam]
     t = slot + tid * slot_stride
     base = i * period * m.nstage
-    for j in range(s.grad.shape[1]):
-        s.grad[t, j] = ZERO
+    for j in range(columns.shape[0]):  # whatever else is added up is never read
+        s.grad[t, columns[j]] = ZERO
     for j in range(m.nv):
         s.pos_bar[t, j] = ZERO
         s.rate_bar[t, j] = ZERO
@@ -117,7 +116,6 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array
     v2 = vec2(a[0], a[1])
     v5 = vec5(a[0], a[1], a[2], a[3], a[4])
     s = a[0]
-    y[0] = row_power(0, s, s, s, s, v2, v5, s, s, s, 1)
     y[1] = elliptic_power(3, a, a, a, s, s, v5, v2, v2, v5, s, s, s, 1)
     y[8] = contact_scalars(3, s, s, s, v2, v5, s, s, s, 1, s, s, s)
     y[2] = box_power(v, v, v, v, v, s, s, s)
@@ -125,6 +123,7 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array
     y[4] = cylinder_dual(v, v, r[0], v, 0, v)
     y[5] = ellipsoid_dual(v, v, r[0], v, v)
     y[6] = box_dual(v, r[0], v, v, s, s, v, v)
+    y[0] = capsule_box_dual(v, v, s, v, r[0], v, 0, s, v, v)
     y[7] = chart_rate_dual(v, v, v)
 
 

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
-from dropo_torch.simulators.warp.spatial import inverse_right_jacobian_t, quat_log
+from dropo_torch.simulators.warp.cone import contact_scalars
+from dropo_torch.simulators.warp.impedance import damping, impedance_slope, regularisation, stiffness
+from dropo_torch.simulators.warp.spatial import inverse_right_jacobian_t, nothing, quat_log
 from dropo_torch.simulators.warp.types import (
     BALL,
     MINVAL,
@@ -76,28 +77,6 @@ def row_state(kind: int, jar: f64, d: f64, loss: f64) -> int:
     return state
 
 
-@wp.func
-def row_power(
-    kind: int,
-    u: f64,
-    v: f64,
-    jl: f64,
-    x: f64,
-    solref: vec2,
-    solimp: vec5,
-    invweight: f64,
-    loss: f64,
-    h: f64,
-    refsafe: int,
-) -> f64:
-    """−f (Jλ) of a row with J a = u, J q̇ = v, J λ = jl: the leaf whose gradient the adjoint takes."""
-    imp = impedance(x, solimp)
-    aref = -damping(solref, solimp, h, refsafe) * v
-    if kind != ROW_FRICTION:
-        aref -= stiffness(solref, solimp, h, refsafe) * imp * x
-    return -row_force(kind, u - aref, ONE / regularisation(imp, invweight), loss) * jl
-
-
 @wp.func(inline=True)
 def equality_position(m: Tables, th: Reals, qpos: Reals2, r: int, e: int) -> vec3:
     """(q1 − p(q2), p'(q2), p''(q2)) of a joint equality, both measured from their references."""
@@ -111,93 +90,6 @@ def equality_position(m: Tables, th: Reals, qpos: Reals2, r: int, e: int) -> vec
         slope = th[c + 1] + y * (TWO * th[c + 2] + y * (THREE * th[c + 3] + y * FOUR * th[c + 4]))
         curve = TWO * th[c + 2] + y * (f64(6.0) * th[c + 3] + y * f64(12.0) * th[c + 4])
     return vec3(x, slope, curve)
-
-
-@wp.func(inline=True)
-def make_rows(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int) -> int:
-    """Instantiate the scalar rows of a state and return their number."""
-    n = int(0)
-    for candidate in range(m.neq + m.nfriction + 2 * m.nlimit):
-        kind = int(ROW_LIMIT)
-        index = int(candidate - m.neq)
-        x = f64(1.0)
-        loss = f64(0.0)
-        coef = vec3()
-        dof = int(0)
-        dof2 = int(-1)
-        o_ref = int(0)
-        o_imp = int(0)
-        if candidate < m.neq:
-            kind = ROW_EQUALITY
-            index = candidate
-            p = equality_position(m, th, qpos, r, index)
-            x = p[0]
-            dof = m.eq_dof[2 * index]
-            dof2 = m.eq_dof[2 * index + 1]
-            coef = vec3(ONE, -p[1], ZERO)
-            o_ref = m.o_eq_solref + 2 * m.eq_id[index]
-            o_imp = m.o_eq_solimp + 5 * m.eq_id[index]
-        elif candidate < m.neq + m.nfriction:
-            kind = ROW_FRICTION
-            dof = m.friction_dof[index]
-            x = f64(0.0)
-            loss = th[m.o_frictionloss + dof]
-            coef = vec3(ONE, ZERO, ZERO)
-            o_ref = m.o_dof_solref + 2 * dof
-            o_imp = m.o_dof_solimp + 5 * dof
-        else:
-            side = (index - m.nfriction) % 2
-            index = (index - m.nfriction) // 2
-            k = m.limit_link[index]
-            j = m.link_jnt[k]
-            iq = m.link_qpos[k]
-            dof = m.link_dof[k]
-            o = m.o_range + 2 * j
-            o_ref = m.o_jnt_solref + 2 * j
-            o_imp = m.o_jnt_solimp + 5 * j
-            if m.link_kind[k] == BALL:
-                if side == 0:
-                    q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
-                    rot = quat_log(q / wp.length(q))
-                    angle = wp.length(rot)
-                    x = wp.max(th[o], th[o + 1]) - angle - th[m.o_jnt_margin + j]
-                    coef = -rot / wp.max(angle, MINVAL)
-                    dof2 = dof + 1
-            elif side == 0:
-                x = qpos[r, iq] - th[o] - th[m.o_jnt_margin + j]
-                coef = vec3(ONE, ZERO, ZERO)
-            else:
-                x = th[o + 1] - qpos[r, iq] - th[m.o_jnt_margin + j]
-                coef = vec3(-ONE, ZERO, ZERO)
-        if kind == ROW_EQUALITY or (kind == ROW_FRICTION and loss > ZERO) or (kind == ROW_LIMIT and x < ZERO):
-            dof3 = int(-1)
-            v = coef[0] * qvel[r, dof]
-            w = th[m.o_dof_invweight + dof]
-            if dof2 >= 0:
-                v += coef[1] * qvel[r, dof2]
-                if kind == ROW_LIMIT:
-                    dof3 = dof + 2
-                    v += coef[2] * qvel[r, dof3]
-                else:
-                    w += th[m.o_dof_invweight + dof2]
-            s.row_kind[t, n] = kind
-            s.row_index[t, n] = index
-            s.row_dof[t, 3 * n] = dof
-            s.row_dof[t, 3 * n + 1] = dof2
-            s.row_dof[t, 3 * n + 2] = dof3
-            s.row_coef[t, n] = coef
-            s.row_x[t, n] = x
-            s.row_loss[t, n] = loss
-            solimp = theta_vec5(th, o_imp)
-            solref = theta_vec2(th, o_ref)
-            imp = impedance(x, solimp)
-            aref = -damping(solref, solimp, m.h, m.refsafe) * v
-            if kind != ROW_FRICTION:
-                aref -= stiffness(solref, solimp, m.h, m.refsafe) * imp * x
-            s.row_aref[t, n] = aref
-            s.row_d[t, n] = ONE / regularisation(imp, w)
-            n += 1
-    return n
 
 
 @wp.func(inline=True)
@@ -215,6 +107,109 @@ def row_dot(s: Scratch, t: int, n: int, x: Reals2, r: int) -> f64:
 
 
 @wp.func(inline=True)
+def _row_softness(m: Tables, s: Scratch, t: int, th: Reals, n: int):
+    """Places of solref and solimp of row ``n`` in θ, and its approximate inverse inertia."""
+    kind = s.row_kind[t, n]
+    index = s.row_index[t, n]
+    d = s.row_dof[t, 3 * n]
+    o_ref = m.o_dof_solref + 2 * d
+    o_imp = m.o_dof_solimp + 5 * d
+    w = th[m.o_dof_invweight + d]
+    if kind == ROW_LIMIT:
+        j = m.link_jnt[m.limit_link[index]]
+        o_ref = m.o_jnt_solref + 2 * j
+        o_imp = m.o_jnt_solimp + 5 * j
+    elif kind == ROW_EQUALITY:
+        o_ref = m.o_eq_solref + 2 * m.eq_id[index]
+        o_imp = m.o_eq_solimp + 5 * m.eq_id[index]
+        d2 = s.row_dof[t, 3 * n + 1]
+        if d2 >= 0:
+            w += th[m.o_dof_invweight + d2]
+    return o_ref, o_imp, w
+
+
+@wp.func(inline=True)
+def _weigh_row(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int, n: int):
+    """Reference acceleration and D of row ``n``."""
+    o_ref, o_imp, w = _row_softness(m, s, t, th, n)
+    solref = theta_vec2(th, o_ref)
+    solimp = theta_vec5(th, o_imp)
+    x = s.row_x[t, n]
+    imp = impedance_slope(x, solimp)[0]
+    aref = -damping(solref, solimp, m.h, m.refsafe) * row_dot(s, t, n, qvel, r)
+    if s.row_kind[t, n] != ROW_FRICTION:
+        aref -= stiffness(solref, solimp, m.h, m.refsafe) * imp * x
+    s.row_aref[t, n] = aref
+    s.row_d[t, n] = ONE / regularisation(imp, w)
+
+
+@wp.func(inline=True)
+def make_rows(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, weighed: int) -> int:
+    """List the scalar rows of a state and return their number; ``weighed`` 0 leaves out what resists in them."""
+    n = int(0)
+    for candidate in range(m.neq + m.nfriction + 2 * m.nlimit):
+        kind = int(ROW_LIMIT)
+        index = int(candidate - m.neq)
+        x = f64(1.0)
+        loss = f64(0.0)
+        coef = vec3()
+        dof = int(0)
+        dof2 = int(-1)
+        if candidate < m.neq:
+            kind = ROW_EQUALITY
+            index = candidate
+            p = equality_position(m, th, qpos, r, index)
+            x = p[0]
+            dof = m.eq_dof[2 * index]
+            dof2 = m.eq_dof[2 * index + 1]
+            coef = vec3(ONE, -p[1], ZERO)
+        elif candidate < m.neq + m.nfriction:
+            kind = ROW_FRICTION
+            dof = m.friction_dof[index]
+            x = f64(0.0)
+            loss = th[m.o_frictionloss + dof]
+            coef = vec3(ONE, ZERO, ZERO)
+        else:
+            side = (index - m.nfriction) % 2
+            index = (index - m.nfriction) // 2
+            k = m.limit_link[index]
+            j = m.link_jnt[k]
+            iq = m.link_qpos[k]
+            dof = m.link_dof[k]
+            o = m.o_range + 2 * j
+            if m.link_kind[k] == BALL:
+                if side == 0:
+                    q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
+                    rot = quat_log(q / wp.length(q))
+                    angle = wp.length(rot)
+                    x = wp.max(th[o], th[o + 1]) - angle - th[m.o_jnt_margin + j]
+                    coef = -rot / wp.max(angle, MINVAL)
+                    dof2 = dof + 1
+            elif side == 0:
+                x = qpos[r, iq] - th[o] - th[m.o_jnt_margin + j]
+                coef = vec3(ONE, ZERO, ZERO)
+            else:
+                x = th[o + 1] - qpos[r, iq] - th[m.o_jnt_margin + j]
+                coef = vec3(-ONE, ZERO, ZERO)
+        if kind == ROW_EQUALITY or (kind == ROW_FRICTION and loss > ZERO) or (kind == ROW_LIMIT and x < ZERO):
+            dof3 = int(-1)
+            if dof2 >= 0 and kind == ROW_LIMIT:
+                dof3 = dof + 2
+            s.row_kind[t, n] = kind
+            s.row_index[t, n] = index
+            s.row_dof[t, 3 * n] = dof
+            s.row_dof[t, 3 * n + 1] = dof2
+            s.row_dof[t, 3 * n + 2] = dof3
+            s.row_coef[t, n] = coef
+            s.row_x[t, n] = x
+            s.row_loss[t, n] = loss
+            if weighed != 0:
+                _weigh_row(m, s, t, th, qvel, r, n)
+            n += 1
+    return n
+
+
+@wp.func(inline=True)
 def row_add(s: Scratch, t: int, n: int, y: f64, x: Reals2, r: int):
     """x += Jᵀ y of row ``n``."""
     c = s.row_coef[t, n]
@@ -228,46 +223,79 @@ def row_add(s: Scratch, t: int, n: int, y: f64, x: Reals2, r: int):
 
 
 @wp.func(inline=True)
-def rows_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, nrow: int):
-    """Adjoint of the rows: the gradient of Σ −f Jλ, with J where it moves."""
-    for n in range(nrow):
-        kind = s.row_kind[t, n]
-        index = s.row_index[t, n]
-        d = s.row_dof[t, 3 * n]
-        d2 = s.row_dof[t, 3 * n + 1]
-        u = row_dot(s, t, n, acc, r)
-        v = row_dot(s, t, n, qvel, r)
-        jl = row_dot(s, t, n, s.lam, t)
-        o_ref = m.o_dof_solref + 2 * d
-        o_imp = m.o_dof_solimp + 5 * d
-        w = th[m.o_dof_invweight + d]
-        if kind == ROW_LIMIT:
-            j = m.link_jnt[m.limit_link[index]]
-            o_ref = m.o_jnt_solref + 2 * j
-            o_imp = m.o_jnt_solimp + 5 * j
-        elif kind == ROW_EQUALITY:
-            o_ref = m.o_eq_solref + 2 * m.eq_id[index]
-            o_imp = m.o_eq_solimp + 5 * m.eq_id[index]
-            if d2 >= 0:
-                w += th[m.o_dof_invweight + d2]
-        _kind, ubar, vbar, lbar, xbar, refbar, impbar, wbar, lossbar, _h, _safe = wp.grad(row_power)(
-            kind, u, v, jl, s.row_x[t, n], theta_vec2(th, o_ref), theta_vec5(th, o_imp), w, s.row_loss[t, n], m.h,
-            m.refsafe,
-        )  # fmt: skip
-        row_add(s, t, n, vbar, s.vel_bar, t)
-        s.grad[t, m.o_dof_invweight + d] += wbar
+def soft_adjoint(
+    m: Tables, s: Scratch, t: int, o_ref: int, o_imp: int, dim: int, x: f64, mu: f64, solref: vec2, solimp: vec5,
+    weight: f64, imp: f64, slope: f64, stiff: f64, d: f64, dbar: f64, bbar: f64, sbar: f64,
+):  # fmt: skip
+    """Adjoints of a constraint's position, inverse inertia and first friction; adds those of solref and solimp.
+
+    ⟨D, D̄⟩ + ⟨B, B̄⟩ + ⟨K d(x) x, s̄⟩ is the number; ``imp`` and ``slope`` are d(x) and d'(x), ``stiff`` is K.
+    """
+    _late = wp.grad(nothing)(ONE)
+    # D is inverse to R = (1 − d)/d · A, of a pyramid to 2 μ² (1 + μ²) R
+    xbar = sbar * stiff * (imp + slope * x)
+    weightbar = ZERO
+    mubar = ZERO
+    if dim > 1:
+        mubar = -TWO * dbar * d / mu
+    if (ONE - imp) * weight > MINVAL * imp:
+        xbar += dbar * d * slope / (imp * (ONE - imp))
+        weightbar = -dbar * d / weight
+        if dim > 1:
+            mubar -= TWO * dbar * d * mu / (ONE + mu * mu)
+    if m.want_soft != 0:
+        _d, _x, _margin, _mu, refbar, impbar, _w, _r, _h, _s, _1, _2, _3 = wp.grad(contact_scalars)(
+            dim, x, ZERO, mu, solref, solimp, weight, m.impratio, m.h, m.refsafe, dbar, bbar, sbar
+        )
         for i in range(2):
             s.grad[t, o_ref + i] += refbar[i]
         for i in range(5):
             s.grad[t, o_imp + i] += impbar[i]
-        if kind == ROW_FRICTION:
-            s.grad[t, m.o_frictionloss + d] += lossbar
-        elif kind == ROW_LIMIT:
-            _limit_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, vbar, lbar)
-        else:
-            if d2 >= 0:
-                s.grad[t, m.o_dof_invweight + d2] += wbar
-            _equality_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, vbar, lbar)
+    return xbar, weightbar, mubar
+
+
+@wp.func(inline=True)
+def rows_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, acc: Reals2, r: int, nrow: int):
+    """Adjoint of the rows: the gradient of Σ −f Jλ, with J where it moves."""
+    _late = wp.grad(nothing)(ONE)
+    for n in range(nrow):
+        kind = s.row_kind[t, n]
+        o_ref, o_imp, weight = _row_softness(m, s, t, th, n)
+        solref = theta_vec2(th, o_ref)
+        solimp = theta_vec5(th, o_imp)
+        x = s.row_x[t, n]
+        loss = s.row_loss[t, n]
+        imp = impedance_slope(x, solimp)
+        b = damping(solref, solimp, m.h, m.refsafe)
+        stiff = ZERO
+        if kind != ROW_FRICTION:
+            stiff = stiffness(solref, solimp, m.h, m.refsafe)
+        v = row_dot(s, t, n, qvel, r)
+        jar = row_dot(s, t, n, acc, r) + b * v + stiff * imp[0] * x
+        d = ONE / regularisation(imp[0], weight)
+        state = row_state(kind, jar, d, loss)
+        if state != 0:
+            jl = row_dot(s, t, n, s.lam, t)
+            dof = s.row_dof[t, 3 * n]
+            if state == 1:
+                ubar = d * jl
+                xbar, weightbar, _mubar = soft_adjoint(
+                    m, s, t, o_ref, o_imp, 1, x, ONE, solref, solimp, weight, imp[0], imp[1], stiff, d, jar * jl,
+                    v * ubar, wp.where(kind == ROW_FRICTION, ZERO, ubar),
+                )  # fmt: skip
+                row_add(s, t, n, b * ubar, s.vel_bar, t)
+                s.grad[t, m.o_dof_invweight + dof] += weightbar
+                lbar = d * jar
+                if kind == ROW_LIMIT:
+                    _limit_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, b * ubar, lbar)
+                elif kind == ROW_EQUALITY:
+                    if s.row_dof[t, 3 * n + 1] >= 0:
+                        s.grad[t, m.o_dof_invweight + s.row_dof[t, 3 * n + 1]] += weightbar
+                    _equality_adjoint(m, s, t, th, qpos, qvel, acc, r, n, xbar, ubar, b * ubar, lbar)
+            elif state == 2:
+                s.grad[t, m.o_frictionloss + dof] -= jl
+            else:
+                s.grad[t, m.o_frictionloss + dof] += jl
 
 
 @wp.func(inline=True)

@@ -76,9 +76,9 @@ def accelerate(
     if m.has_spring != 0:
         add_springs(m, s, t, th, qpos, r)
     add_actuators(m, s, t, th, qpos, qvel, r, ctrl, rc)
-    nrow = make_rows(m, s, t, th, qpos, qvel, r)
+    nrow = make_rows(m, s, t, th, qpos, qvel, r, 1)
     ncon = find_contacts(m, s, t, th)
-    held[r] = nrow + ncon
+    held[r] = wp.min(nrow, 1) + 2 * wp.min(ncon, 1)
     if nrow + ncon == 0:
         for i in range(m.nh):
             hess[r, i] = s.mass[t, i]
@@ -125,8 +125,10 @@ def accelerate_adjoint(
             s.bias[t, b] = vec6()
         solve(m, 0, soft_hess, r, s.lam, t)
     else:
-        if held[r] > 0:
-            nrow = make_rows(m, s, t, th, qpos, qvel, r)
+        kept = held[r]
+        if kept % 2 != 0:
+            nrow = make_rows(m, s, t, th, qpos, qvel, r, 0)
+        if kept > 1:
             ncon = find_contacts(m, s, t, th)
         solve(m, fills_in(m, s, t, ncon), hess, r, s.lam, t)
     carry_out(m, s, t)

@@ -33,7 +33,7 @@ COLLIDES = frozenset(
     {(int(_GEOM.mjGEOM_PLANE), int(g)) for g in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX,
                                                  _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_ELLIPSOID)}
     | {(a, b) for a in _ROUND for b in _ROUND if a <= b}
-    | {(int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_BOX))}
+    | {(a, int(_GEOM.mjGEOM_BOX)) for a in _ROUND}
 )  # fmt: skip
 
 

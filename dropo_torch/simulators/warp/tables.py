@@ -18,6 +18,11 @@ _JNT, _GEOM, _DISABLE = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit
 _INTEGRATOR = {
     mujoco.mjtIntegrator.mjINT_EULER: 0, mujoco.mjtIntegrator.mjINT_RK4: 1, mujoco.mjtIntegrator.mjINT_IMPLICITFAST: 2,
 }  # fmt: skip
+#: Fields of how soft a constraint is.
+SOFT = (
+    "jnt_solref", "jnt_solimp", "dof_solref", "dof_solimp", "eq_solref", "eq_solimp", "geom_solref", "geom_solimp",
+    "pair_solref", "pair_solreffriction", "pair_solimp",
+)  # fmt: skip
 _KINDS = {
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE): (collide.PLANE_SPHERE, 1),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CAPSULE): (collide.PLANE_CAPSULE, 2),
@@ -28,6 +33,7 @@ _KINDS = {
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 1),
     (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 2),
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_BOX): (collide.SPHERE_BOX, 1),
+    (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 2),
 }  # fmt: skip
 
 
@@ -217,6 +223,7 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
         "want_inertial": int(any(_targets(space, f) for f in ("body_mass", "body_inertia", "body_ipos"))),
         "want_inertia": int(bool(_targets(space, "body_inertia"))),
         "want_ipos": int(bool(_targets(space, "body_ipos"))),
+        "want_soft": int(any(_targets(space, f) for f in SOFT)),
         "integrator": integrator, "nstage": 4 if integrator == 1 else 1, "h": model.opt.timestep,
         "impratio": max(model.opt.impratio, 1e-15), "elliptic": int(model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC),
         "refsafe": int(not _disabled(model, _DISABLE.mjDSBL_REFSAFE)), "implicit": int(implicit),

@@ -95,6 +95,7 @@ class Tables:
     want_inertial: wp.int32  # gradients wanted of mass, body_inertia or body_ipos; of the second; of the third
     want_inertia: wp.int32
     want_ipos: wp.int32
+    want_soft: wp.int32  # gradients wanted of some solref or solimp
     maxcon: wp.int32
     maxrow: wp.int32
     # bodies
@@ -266,4 +267,4 @@ class Rows:
     soft: Reals2  # a' of the implicit integrators
     hess: Reals2  # factor of H
     soft_hess: Reals2  # factor of M + h B
-    held: Ints  # number of constraints of a stage
+    held: Ints  # of a stage: 1 if it has scalar rows, plus 2 if it has contacts
