@@ -73,6 +73,18 @@ class JointQuadraticDamping(JointEffect):
         model.dof_dampingpoly[self.dof(model, target), 0] += values[0]
 
 
+#: Impedance of dry friction that hardly creeps, and its time constant in physics steps.
+_STUCK, _STEPS = (0.999, 0.9999, 0.001, 0.5, 2.0), 2.0
+
+
+def add_friction(model: mujoco.MjModel, dof: int, friction: float) -> None:
+    """Add dry friction; where the model has none, with a constraint that hardly creeps while it sticks."""
+    if model.dof_frictionloss[dof] == 0 and friction != 0:
+        model.dof_solimp[dof] = _STUCK
+        model.dof_solref[dof] = (_STEPS * model.opt.timestep, 1.0)
+    model.dof_frictionloss[dof] += friction
+
+
 class JointFriction(JointEffect):
     """Coulomb friction: a constant force against the motion, which also holds at rest."""
 
@@ -90,7 +102,7 @@ class JointFriction(JointEffect):
         return [np.array([0.02 * scale]), np.array([0.2 * scale])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.dof_frictionloss[self.dof(model, target)] += values[0]
+        add_friction(model, self.dof(model, target), values[0])
 
 
 class JointStribeck(JointEffect):
@@ -119,7 +131,7 @@ class JointStribeck(JointEffect):
         return [np.array([0.1 * force, 0.2 * force, 0.1 * speed]), np.array([0.1 * force, 0.2 * force, 0.4 * speed])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.dof_frictionloss[self.dof(model, target)] += max(values[0], values[1], 0.0)
+        add_friction(model, self.dof(model, target), max(values[0], values[1], 0.0))
 
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

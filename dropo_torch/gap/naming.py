@@ -33,7 +33,7 @@ class Rules:
     least_reduced: float = 1.1
     most: float = 0.8
     enough: float = 0.99
-    least: float = 1e-3
+    least: float = 3e-3
     significance: float = 3.0
     tie: float = 2.0
     refits: int = 7
