@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed
+from dropo_torch.errors import InputError
+from dropo_torch.fit import write_atomically
 from dropo_torch.gap.evidence import Cost, Evidence, caps_of, cost_of
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.screen import Candidate, all_candidates, promising_pairs, screen
@@ -97,6 +101,20 @@ def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
     return float(sums.sum() / max(error, 1e-12))
 
 
+@dataclass(frozen=True)
+class Stage:
+    """Where a search stands: the declared parameters alone, the hypothesis so far, and rounds done."""
+
+    base: Refit
+    current: Refit
+    number: int
+    done: bool
+
+
+#: What else a checkpoint holds.
+_KEPT = ("trials", "silent", "first", "first_chi2", "first_degrees", "_round", "_caps")
+
+
 class Search:
     """The search for missing effects on one log.
 
@@ -104,16 +122,22 @@ class Search:
         evidence: all windows of the training part.
         effects: the vocabulary.
         rules: thresholds.
+        checkpoint: file of the state between rounds; none by default.
+        resume: go on from the checkpoint.
+        fingerprint: identifies config, model and log.
         few: windows that refits use; all if there are fewer.
         fewer: windows that the screening uses.
     """
 
     def __init__(
-        self, evidence: Evidence, effects: Sequence[Effect], *, rules: Rules, few: int = 40, fewer: int = 10,
+        self, evidence: Evidence, effects: Sequence[Effect], *, rules: Rules, checkpoint: Path | None = None,
+        resume: bool = False, fingerprint: str = "", few: int = 40, fewer: int = 10,
         report: Report = lambda stage, share: None,
     ) -> None:  # fmt: skip
         self.evidence, self.effects, self.rules, self._report = evidence, effects, rules, report
         self._few, self._fewer = few, fewer
+        self._checkpoint, self._resume, self._fingerprint = checkpoint, resume, fingerprint
+        self._caps = np.ones(0)
         self.trials: list[Trial] = []
         self.silent: list[tuple[str, str | None]] = []
         self.first: list[Candidate] = []
@@ -125,27 +149,13 @@ class Search:
     def run(self, begin: Hypothesis) -> Naming:
         """Return what is missing, beginning from the declared parameters' values."""
         rules = self.rules
-        self._report("fitting the declared parameters", 0.0)
-        base = refit(self._part(self._few), begin)
-        base = self._renoise(base)
-        caps = caps_of(base.cost.windows, base.cost.degrees)
-        self._caps = caps
-        base = refit(self._part(self._few), base.hypothesis, caps=caps, iterations=4)
-        if not significant(base.cost, rules):
-            return Naming(base, base, gap=False, named=False)
-        current = base
-        for number in range(rules.effects):
-            found = self._next(current, base, number)
-            if found is None:
-                break
-            current = found
-            if self._is_done(current, base):
-                break
-            if len(current.hypothesis.placed) > 1:
-                current = self._swap(current, base)
-                if self._is_done(current, base):
-                    break
-        current = self._prune(current, base)
+        stage = self._restored() or self._based(begin)
+        if not significant(stage.base.cost, rules):
+            return Naming(stage.base, stage.base, gap=False, named=False)
+        while not stage.done:
+            stage = self._round_of(stage)
+            self._save(stage)
+        base, current = stage.base, self._prune(stage.current, stage.base)
         removed = 1 - max(current.cost.excess, 0.0) / base.cost.excess
         if not current.hypothesis.placed or removed < rules.most:
             best = tuple(sorted(self.trials, key=lambda t: t.excess)[:3])
@@ -159,6 +169,56 @@ class Search:
         return Naming(
             base, current, True, True, tuple(ties), tuple(self.trials), tuple(self.silent), shares=tuple(shares)
         )
+
+    def _based(self, begin: Hypothesis) -> Stage:
+        """Fit the declared parameters alone."""
+        self._report("fitting the declared parameters", 0.0)
+        base = self._renoise(refit(self._part(self._few), begin))
+        self._caps = caps_of(base.cost.windows, base.cost.degrees)
+        base = refit(self._part(self._few), base.hypothesis, caps=self._caps, iterations=4)
+        stage = Stage(base, base, 0, False)
+        self._save(stage)
+        return stage
+
+    def _round_of(self, stage: Stage) -> Stage:
+        """Accept one or two more effects, and swap those accepted before for better ones."""
+        base = stage.base
+        found = self._next(stage.current, base, stage.number)
+        if found is None:
+            return replace(stage, done=True)
+        if not self._is_done(found, base) and len(found.hypothesis.placed) > 1:
+            found = self._swap(found, base)
+        number = stage.number + 1
+        return Stage(base, found, number, self._is_done(found, base) or number >= self.rules.effects)
+
+    def _save(self, stage: Stage) -> None:
+        """Write the state between two rounds, whole or not at all."""
+        if self._checkpoint is not None:
+            kept = {name: getattr(self, name) for name in _KEPT}
+            document = {"fingerprint": self._fingerprint, "stage": stage, "noise": self.evidence.noise, **kept}
+            write_atomically(self._checkpoint, pickle.dumps(document))
+
+    def _restored(self) -> Stage | None:
+        """Take up the state of an interrupted search, if there is one.
+
+        Raises:
+            InputError: it is of another config, model or log.
+        """
+        if self._checkpoint is None or not self._resume or not self._checkpoint.exists():
+            return None
+        try:
+            document = pickle.loads(self._checkpoint.read_bytes())
+        except (pickle.UnpicklingError, EOFError, AttributeError):
+            raise InputError(f"--resume: {self._checkpoint} is no checkpoint; run without --resume") from None
+        if document.get("fingerprint") != self._fingerprint:
+            raise InputError(
+                f"--resume: {self._checkpoint} is of another config, model or log; run without --resume, or name another "
+                "folder"
+            )
+        self.evidence = self.evidence.with_noise(document["noise"])
+        for name in _KEPT:
+            setattr(self, name, document[name])
+        return document["stage"]
 
     def _renoise(self, fitted: Refit) -> Refit:
         """Lower the noise where even this hypothesis leaves less of it in a feature, and fit again."""

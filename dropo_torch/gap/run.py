@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from dropo_torch.gap.naming import Naming, Report, Rules, Search
 from dropo_torch.gap.noise import LENGTH, FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Gap, NamedEffect, Ranked, Strength
+from dropo_torch.gap.suggest import suggest
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, score, spread
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import Trajectories
@@ -117,6 +119,8 @@ def find_gap(
     *,
     effects: Sequence[Effect] | None = None,
     rules: Rules | None = None,
+    checkpoint: Path | None = None,
+    resume: bool = False,
     report: Report = lambda stage, share: None,
 ) -> Gap:
     """Find where simulation and log disagree, name the missing effects, and verify them on held-out data.
@@ -125,6 +129,8 @@ def find_gap(
         problem: the model, its declared parameters, and the log.
         effects: the vocabulary; all of the package's by default.
         rules: thresholds.
+        checkpoint: file in which the state between rounds is kept.
+        resume: go on from it.
         report: called with a stage and its share done.
 
     Raises:
@@ -134,13 +140,16 @@ def find_gap(
     rules = rules or Rules()
     report("preparing", 0.0)
     scene = prepare(problem)
-    search = Search(scene.evidence, list(effects or VOCABULARY.values()), rules=rules, report=report)
+    search = Search(
+        scene.evidence, list(effects or VOCABULARY.values()), rules=rules, report=report, checkpoint=checkpoint,
+        resume=resume, fingerprint=problem.fingerprint,
+    )  # fmt: skip
     naming = search.run(scene.begin)
     report("verifying", 0.0)
-    return _result(scene, search, naming, rules, time.perf_counter() - started)
+    return _result(scene, search, naming, started)
 
 
-def _result(scene: Scene, search: Search, naming: Naming, rules: Rules, seconds: float) -> Gap:
+def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap:
     problem, twin = scene.problem, scene.twin
     noise = search.evidence.noise
     final = naming.final
@@ -159,7 +168,7 @@ def _result(scene: Scene, search: Search, naming: Naming, rules: Rules, seconds:
         before=score(evidence, held, naming.base.hypothesis),
         after=score(evidence, held, final.hypothesis if naming.named else naming.base.hypothesis),
         noise_floor=floor_score(evidence, held, final.hypothesis if naming.named else naming.base.hypothesis),
-        next_experiment=None,
+        next_experiment=_next_experiment(scene, search, naming, final),
         found=naming.gap,
         declared=_declared(scene, naming, final),
         noise=tuple(noise.tolist()),
@@ -172,7 +181,7 @@ def _result(scene: Scene, search: Search, naming: Naming, rules: Rules, seconds:
         rollout_seconds=held.seconds,
         window=evidence.windows.length,
         simulated_transitions=twin.simulated_transitions,
-        seconds=seconds,
+        seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
     )
@@ -220,6 +229,16 @@ def _telling(setting: Setting, shown: Sequence[NamedEffect], free: FreeForces) -
         ratio = np.nan_to_num(np.nanmedian(np.abs(free.forces) / free.errors, axis=0))
     order = list(np.argsort(-ratio))
     return [int(d) for d in order[: min(2, len(order))]]
+
+
+def _next_experiment(scene: Scene, search: Search, naming: Naming, final: Refit) -> str | None:
+    """What motion would tell tied effects apart, or would show what this log cannot."""
+    for index, tied in enumerate(naming.ties):
+        for other in tied:
+            placed = list(final.hypothesis.placed)
+            rival = Hypothesis(final.hypothesis.declared, (*placed[:index], other, *placed[index + 1 :]))
+            return suggest(search.evidence, final.hypothesis, rival, placed[index], other)
+    return None
 
 
 def _ranking(setting: Setting, naming: Naming) -> tuple[Ranked, ...]:
