@@ -77,13 +77,13 @@ def make_problem(config: Config) -> Problem:
         if config.environment is not None:
             raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
         model_path = _model_path(config, sim)
-        space = _space(load_model(model_path), config, sim)
+        space = _space(load_model(model_path, general=_has_effects(config)), config, sim)
         source = space.model
     trajectories = _log(config, sim, space.model)
     frame_skip = _frame_skip(config, sim, space.model, trajectories)
     width = trajectories.observations.shape[1]
     effects, history = None, 0
-    if config.effects or any(p.effect for p in space.parameters):
+    if _has_effects(config):
         observation = _observation(config, sim, space.model, _num_states(config, source), width)
         space, effects = _effects(config, space, observation, frame_skip)
         simulator, history = _with_effects(config, source, effects, space, trajectories)
@@ -166,6 +166,11 @@ def _model_path(config: Config, sim: BundledSim | None) -> Path:
         both = "both model and sim are" if sim else "neither model nor sim is"
         raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
     return sim.model if sim is not None else config.path(str(config.model))
+
+
+def _has_effects(config: Config) -> bool:
+    """Whether the config names effects."""
+    return bool(config.effects) or any("effect" in p for p in (config.parameters or {}).values())
 
 
 def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None) -> ParameterSpace:

@@ -178,7 +178,7 @@ def _located(
         if possible == [None]:
             raise InputError(f"{where}: {effect.name} belongs to the whole world; leave {key} out")
         if target is None and names:
-            raise InputError(f"{where}: no {key} given; expected a {effect.kind}" + choices("", names).lstrip(";"))
+            raise InputError(f"{where}: no {key} given; expected the {effect.kind}'s name" + choices("", names))
         has = f"cannot be at {target!r}" if target is not None else "fits nowhere in this model"
         raise InputError(f"{where}: {effect.name} {has}" + choices(target, names))
     return effect, target

@@ -308,10 +308,10 @@ def effect_simulator(
         InputError: effects that the backend cannot have.
     """
     setting = effects.setting
-    native = effects.matching(_is_native)
+    native = effects.matching(is_native)
     fixed = not any(e.varies for e in native.entries)
     shared = overlap(native, space) if fixed else None
-    outer = effects.matching(_is_outer)
+    outer = effects.matching(is_outer)
     inside = len(native) + len(outer) < len(effects)
     if inside or not fixed or shared is not None:
         if backend != "mujoco":
@@ -342,14 +342,14 @@ def effect_simulator(
     ), history  # fmt: skip
 
 
-def _is_outer(effect: Effect) -> bool:
+def is_outer(effect: Effect) -> bool:
     """Whether an effect stays outside of the simulator: it filters commands or measurements and does nothing else."""
     return (effect.acts_on_command or effect.acts_on_sensor) and not (
         _is_force(effect) or type(effect).apply is not Effect.apply
     )
 
 
-def _is_native(effect: Effect) -> bool:
+def is_native(effect: Effect) -> bool:
     """Whether an effect is numbers of the model and nothing else."""
     return effect.native and not (effect.acts_on_command or effect.acts_on_sensor or _is_force(effect))
 
@@ -361,7 +361,7 @@ def _is_force(effect: Effect) -> bool:
 def _refuse(backend: str, effects: EffectSet, native: EffectSet, shared: tuple[Entry, str] | None) -> None:
     """Say which effect a backend cannot have, and what would."""
     for entry in effects.entries:
-        if not _is_native(entry.effect) and not _is_outer(entry.effect):
+        if not is_native(entry.effect) and not is_outer(entry.effect):
             raise InputError(
                 f"effects: backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
             )
@@ -392,7 +392,7 @@ def _finer(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSet) ->
 
 def _check_timestep(setting: Setting, effects: EffectSet, space: ParameterSpace) -> None:
     """Raise unless the finer steps of the effects fill the model's."""
-    native = effects.matching(_is_native)
+    native = effects.matching(is_native)
     for vector in (space.low, 0.5 * (space.low + space.high)):
         changed = copy.copy(setting.model)
         for placed in native.at(vector):
