@@ -286,9 +286,17 @@ def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, lo
 
 
 def effect_simulator(
-    backend: str, effects: EffectSet, space: ParameterSpace, make: Callable[[mujoco.MjModel, int, ParameterSpace], Simulator],
-    *, timestep: float, longest: int, num_threads: int = 0, chunk_size: int = 10_000, owns_model: bool = True,
-) -> tuple[Simulator, int]:  # fmt: skip
+    backend: str,
+    effects: EffectSet,
+    space: ParameterSpace,
+    make: Callable[[mujoco.MjModel, int, ParameterSpace], Simulator],
+    *,
+    timestep: float,
+    longest: int,
+    num_threads: int = 0,
+    chunk_size: int = 10_000,
+    owns_model: bool = True,
+) -> tuple[Simulator, int]:
     """Return a simulator with effects in it, and how many logged steps of controls each window needs before it.
 
     Effects that are fixed and native become part of the model, and the backend's own simulator comes back where
