@@ -12,6 +12,7 @@ import torch
 import yaml
 from conftest import HOPPER
 
+from dropo_torch.cli import main
 from dropo_torch.config import load_config, make_config
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
 from dropo_torch.effects.base import Setting
@@ -20,10 +21,11 @@ from dropo_torch.effects.placing import lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
-from dropo_torch.observation import parse_observation
+from dropo_torch.observation import generic_observation, parse_observation
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
 from dropo_torch.simulators import MujocoSimulator, make_simulator
+from dropo_torch.trajectory import Trajectories, make_transitions
 from sims.hopper import SIM
 
 #: A chain of two links, a free ball on a floor, a slide without friction.
@@ -333,19 +335,27 @@ def test_a_dead_band_swallows_and_play_holds() -> None:
     np.testing.assert_allclose(forces(path), [0, 0.8, 0.8, 0.7, 0.7], atol=1e-9)
 
 
-def test_the_past_reaches_into_a_window() -> None:
+@pytest.mark.parametrize(
+    "effects",
+    [
+        [{"effect": "actuator_delay", "target": "push", "delay": 3.4 * STEP}],
+        [{"effect": "actuator_lag", "target": "push", "time_constant": 0.4 * STEP}],
+        [
+            {"effect": "actuator_delay", "target": "push", "delay": 3.4 * STEP},
+            {"effect": "actuator_backlash", "target": "push", "width": 0.3},
+        ],
+    ],
+)
+def test_the_past_reaches_into_a_window(effects: list) -> None:
     """Windows with their history continue what a whole episode does."""
-    effects = [
-        {"effect": "actuator_delay", "target": "push", "delay": 3.4 * STEP},
-        {"effect": "actuator_backlash", "target": "push", "width": 0.3},
-    ]
     whole = driven(effects, COMMAND)
     simulator, history = simulator_of(general(SLIDE), effects, skip=1)
-    at = 25
     padded = np.concatenate([np.repeat(COMMAND[:1], history), COMMAND])
-    controls = torch.from_numpy(padded[at : at + history + 10][None, :, None])
-    path = simulator.rollout(torch.from_numpy(whole[at - 1 : at]), controls, torch.zeros(1, 1, dtype=torch.float64))
-    np.testing.assert_allclose(path[0, 0].numpy(), whole[at : at + 10], atol=1e-12)
+    for at in range(20, 30):
+        controls = torch.from_numpy(padded[at : at + history + 5][None, :, None])
+        path = simulator.rollout(torch.from_numpy(whole[at - 1 : at]), controls, torch.zeros(1, 1, dtype=torch.float64))
+        tolerance = 1e-5 if len(effects) == 1 and "time_constant" in effects[0] else 1e-12
+        np.testing.assert_allclose(path[0, 0].numpy(), whole[at : at + 5], atol=tolerance)
 
 
 def test_saturation_and_gain_and_back_emf() -> None:
@@ -377,6 +387,8 @@ def test_a_late_sensor_shows_the_past() -> None:
     np.testing.assert_allclose(path[:, 1], 1.0 + 0.75 * times, atol=1e-9)  # 1.5 N on 2 kg, as it would be without delay
     path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], np.zeros(30), (0.2, 1.0))
     np.testing.assert_allclose(path[:, 0], 0.2 + times, atol=1e-9)
+    path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], command, (0.2, 0.0))
+    np.testing.assert_allclose(path[:3, 0], 0.2, atol=1e-12)
     path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], command, (0.2, 1.0))
     true = 0.2 + delay + times - delay + 0.375 * np.maximum(times - delay, 0) ** 2
     np.testing.assert_allclose(path[4:, 0], true[4:], atol=5e-4)
@@ -554,6 +566,71 @@ def test_ones_own_effect_joins_the_vocabulary(monkeypatch: pytest.MonkeyPatch) -
     assert register(Wind()) is find_effect("wind_test")
 
 
+def test_history_stays_inside_its_episode() -> None:
+    actions = np.arange(8.0)[:, None]
+    states = np.zeros((8, 2))
+    log = Trajectories(states, states, actions, np.array([0, 0, 0, 0, 1, 0, 0, 1]))
+    found = make_transitions(log, generic_observation(2), lag=1, history=3)
+    assert found.lag == 1
+    assert found.controls[2, :, 0].tolist() == [0, 0, 1, 2]
+    assert found.controls[4, :, 0].tolist() == [1, 2, 3, 4]
+    assert found.controls[6, :, 0].tolist() == [5, 5, 5, 6]
+    assert found.select(slice(2, 4)).lag == 1
+
+
+def test_backends_agree_where_all_parameters_are_of_effects(tmp_path: Path) -> None:
+    effects = [
+        {"effect": "sensor_delay", "target": "elbow.velocity", "delay": 0.013},
+        {"effect": "sensor_scale", "target": "elbow.position", "factor": 1.1},
+    ]
+    document = {**record_arm(tmp_path, steps=40), "lag": 3, "parameters": {"delay": DELAY}, "effects": effects}
+    values = np.array([[0.01], [0.033]])
+    found = [
+        make_problem(make_config({**document, "backend": b})).objective.simulated(values) for b in ("mujoco", "warp")
+    ]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-7)
+
+
+def test_a_sensor_shows_at_the_start_what_was_measured(tmp_path: Path) -> None:
+    effects = [
+        {"effect": "sensor_scale", "target": "rail.position", "factor": 1.3},
+        {"effect": "sensor_bias", "target": "rail.position", "bias": 0.2},
+    ]
+    shown = driven(effects, np.zeros(1), (0.7, 0.0))
+    np.testing.assert_allclose(shown[0], [0.7, 0.0], atol=1e-12)
+
+
+def test_a_free_body_may_carry_a_payload_in_a_config(tmp_path: Path) -> None:
+    (tmp_path / "rig.xml").write_text(RIG)
+    model = general()
+    states = some_states(model, 6).numpy()
+    np.savez(
+        tmp_path / "log.npz", observations=states[:-1], next_observations=states[1:], actions=np.zeros((5, model.nu)),
+        terminals=np.ones(5, dtype=bool),
+    )  # fmt: skip
+    payload = {"effect": "payload", "target": "ball", "x": 0.05, "y": 0, "z": 0}
+    parameters = {"mass": {"effect": "payload", "name": "ball", "index": "mass", "bounds": [0.1, 1.0]}}
+    document = {"model": "rig.xml", "data": "log.npz", "frame_skip": 1, "effects": [payload], "parameters": parameters}
+    problem = make_problem(make_config(document, base=tmp_path))
+    shown = problem.objective.simulated(np.array([[0.1], [0.9]]))
+    assert torch.isfinite(shown).all()
+    assert float((shown[:, 0] - shown[:, 1]).abs().max()) > 1e-4
+
+
+def test_a_run_says_what_its_model_file_lacks(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    effects = [{"effect": "joint_friction", "target": "elbow", "friction": 0.15}]
+    document = {**record_arm(tmp_path, delay=3, friction=0.15), "parameters": {"delay": DELAY}, "effects": effects}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
+    assert main(["fit", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]) == 0
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
+    assert written.joint("elbow").frictionloss[0] == pytest.approx(0.15)
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "actuator_delay at bend" in report
+    assert "delay of actuator_delay at bend" in report
+    again = make_problem(load_config(tmp_path / "out" / "fitted_config.yaml"))
+    assert isinstance(again.simulator, EffectSimulator)
+
+
 # In files
 
 
@@ -595,8 +672,9 @@ def test_a_found_config_fits(tmp_path: Path) -> None:
     problem = make_problem(config)
     setting = plain_setting(problem.space.model, problem.observation, 2)
     placed = [
-        Placed(find_effect("joint_friction"), "elbow", (0.14,)), Placed(find_effect("actuator_delay"), "bend", (0.028,)),
-    ]  # fmt: skip
+        Placed(find_effect("joint_friction"), "elbow", (0.14,)),
+        Placed(find_effect("actuator_delay"), "bend", (0.028,)),
+    ]
     intervals = {placed[0].key: {"friction": (0.13, 0.15)}, placed[1].key: {"delay": (0.026, 0.030)}}
     rest = write_model(tmp_path / "arm.xml", placed, tmp_path / "model.xml", problem.space, np.array([0.7]))
     assert [p.effect.name for p in rest] == ["actuator_delay"]
@@ -614,21 +692,28 @@ def test_a_found_config_fits(tmp_path: Path) -> None:
     assert result["mass"]["mean"] == pytest.approx(0.7, abs=1e-3)
 
 
-@pytest.mark.parametrize("relative", [False, True])
-def test_what_no_field_expresses_stays_an_effect_of_the_old_model(tmp_path: Path, relative: bool) -> None:
-    base = record_arm(tmp_path, friction=0.15)
-    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.3], "relative": relative}}
-    config = make_config({**base, "parameters": mass})
+_FRICTION = {"field": "dof_frictionloss", "name": "elbow", "bounds": [0.0, 0.5]}
+_MASS = {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.3]}
+
+
+@pytest.mark.parametrize(
+    ("declared", "name", "target", "numbers"),
+    [
+        pytest.param(_MASS, "payload", "lower", {"mass": 0.1, "x": 0, "y": 0, "z": 0}, id="several numbers"),
+        pytest.param({**_MASS, "relative": True}, "joint_friction", "elbow", {"friction": 0.15}, id="relative"),
+        pytest.param(_FRICTION, "joint_friction", "elbow", {"friction": 0.15}, id="the same number"),
+    ],
+)
+def test_what_no_field_expresses_stays_an_effect_of_the_old_model(
+    tmp_path: Path, declared: dict, name: str, target: str, numbers: dict
+) -> None:
+    config = make_config({**record_arm(tmp_path, friction=0.15), "parameters": {"declared": declared}})
     problem = make_problem(config)
     setting = plain_setting(problem.space.model, problem.observation, 2)
-    name, numbers = (
-        ("joint_friction", {"friction": 0.15}) if relative else ("payload", {"mass": 0.1, "x": 0, "y": 0, "z": 0})
-    )
-    target = "elbow" if relative else "lower"
-    placed = [Placed(find_effect(name), target, tuple(numbers.values()))]
+    placed = Placed(find_effect(name), target, tuple(numbers.values()))
     first = next(iter(numbers))
     write_config(
-        config, problem.space, setting, placed, {placed[0].key: {first: (0.05, 0.2)}}, tmp_path / "m.xml",
+        config, problem.space, setting, [placed], {placed.key: {first: (0.05, 0.2)}}, tmp_path / "m.xml",
         tmp_path / "config.yaml",
     )  # fmt: skip
     document = yaml.safe_load((tmp_path / "config.yaml").read_text())
