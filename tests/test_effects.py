@@ -248,6 +248,7 @@ def forces(path: np.ndarray, start: float = 0.0) -> np.ndarray:
     return 2 * np.diff(path[:, 1], prepend=start) / STEP
 
 
+_NOTHING = {"effect": "actuator_delay", "target": "push"}
 COMMAND = np.repeat(np.random.default_rng(3).uniform(-1, 1, 8), 5)
 
 
@@ -387,11 +388,23 @@ def test_a_late_sensor_shows_the_past() -> None:
     np.testing.assert_allclose(path[:, 1], 1.0 + 0.75 * times, atol=1e-9)  # 1.5 N on 2 kg, as it would be without delay
     path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], np.zeros(30), (0.2, 1.0))
     np.testing.assert_allclose(path[:, 0], 0.2 + times, atol=1e-9)
-    path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], command, (0.2, 0.0))
-    np.testing.assert_allclose(path[:3, 0], 0.2, atol=1e-12)
-    path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], command, (0.2, 1.0))
-    true = 0.2 + delay + times - delay + 0.375 * np.maximum(times - delay, 0) ** 2
-    np.testing.assert_allclose(path[4:, 0], true[4:], atol=5e-4)
+
+
+@pytest.mark.parametrize("late", [(3, 0), (0, 2), (3, 2)])
+def test_a_window_of_late_measurements_begins_where_they_were_taken(late: tuple[int, int]) -> None:
+    """Under one command up to a window's start and another from there on, every late measurement is foretold."""
+    command = np.concatenate([np.full(20, 1.5), np.full(10, -2.0)])
+    true = np.concatenate([[[0.2, 1.0]], driven([{**_NOTHING, "delay": 0.0}], command, (0.2, 1.0))])
+    shown = np.stack([true[20 - late[i] : 31 - late[i], i] for i in (0, 1)], 1)
+    effects = [
+        {"effect": "sensor_delay", "target": f"rail.{column}", "delay": n * STEP}
+        for column, n in zip(("position", "velocity"), late, strict=True)
+    ]
+    simulator, history = simulator_of(general(SLIDE), effects, skip=1)
+    assert history == 1
+    controls = torch.from_numpy(command[20 - history :][None, :, None])
+    path = simulator.rollout(torch.from_numpy(shown[:1]), controls, torch.zeros(1, 1, dtype=torch.float64))
+    np.testing.assert_allclose(path[0, 0], shown[1:], atol=1e-9)
 
 
 def test_each_parameter_vector_has_its_own_numbers() -> None:

@@ -158,23 +158,28 @@ class EffectSimulator(Simulator):
     ) -> np.ndarray:
         """Return states as the sensors show them, ``(K, T, lag, num_states)``."""
         signals = self._signals(control, placed)
-        if not self._sensed:
-            return self._engine.paths(values, placed, np.repeat(start[None], len(values), 0), signals, False)
-        rates = self._start_rates(start, signals, values, placed)
-        index = self.effects.setting.observation.index
+        begin = self.history * self.frame_skip
         starts = np.repeat(start[None], len(values), 0)
+        if not self._sensed:
+            return self._engine.paths(values, placed, starts, signals[:, :, begin:], False)
+        rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0)], values, placed)
+        index, known = self.effects.setting.observation.index, self._rates >= 0
         for k, effects in enumerate(placed):
-            starts[k][:, index] = unsensed(start[:, index], rates[k][:, index], effects, self.effects.setting)
-        fine = self._engine.paths(values, placed, starts, signals, True)
+            shown = start[:, index]
+            starts[k][:, index] = unsensed(shown, rates[k][:, index], effects, self.effects.setting)
+            if self._late:  # with the velocities now true, and changing, the past shows what is missing
+                rates[k][:, known] = starts[k][:, self._rates[known]]
+                starts[k][:, index] += shown - self._shown(starts[k][:, None], rates[k], effects)[:, 0]
+        fine = self._engine.paths(values, placed, starts, signals[:, :, begin:], True)
         fine = np.concatenate([starts[:, :, None], fine], 2)
         out = fine[:, :, self.frame_skip :: self.frame_skip].copy()
         for k, effects in enumerate(placed):
-            out[k][..., index] = self._shown(fine[k], rates[k], effects)
+            out[k][..., index] = self._shown(fine[k], rates[k], effects)[:, 1:]
         return out
 
     def _signals(self, control: np.ndarray, placed: list[tuple[Placed, ...]]) -> np.ndarray:
-        """Return commands as they act in every physics step of the windows, ``(K, T, lag·skip, nu)``."""
-        skip, begin = self.frame_skip, self.history * self.frame_skip
+        """Return commands as they act in every physics step, ``(K, T, (history + lag)·skip, nu)``."""
+        skip = self.frame_skip
         plain = np.repeat(control, skip, axis=1)
         step = (self.timestep or 0.0) / skip
         known: dict[tuple, np.ndarray] = {}
@@ -183,34 +188,35 @@ class EffectSimulator(Simulator):
             filters = [p for p in effects if p.effect.acts_on_command]
             key = tuple(p.values for p in filters)
             if key not in known:
-                known[key] = filtered(plain, filters, self.effects.setting.model, step)[:, begin:]
+                known[key] = filtered(plain, filters, self.effects.setting.model, step)
             out.append(known[key])
         return np.stack(out)
 
     def _start_rates(
-        self, start: np.ndarray, signals: np.ndarray, values: np.ndarray, placed: list[tuple[Placed, ...]]
+        self, starts: np.ndarray, command: np.ndarray, values: np.ndarray, placed: list[tuple[Placed, ...]]
     ) -> np.ndarray:
-        """Return time derivatives of the states at the starts, ``(K, T, num_states)``.
+        """Return time derivatives of the states at the starts, ``(K, T, num_states)``, just before them.
 
-        A position's is the velocity; a velocity's is found by one physics step, where a sensor is late.
+        A position's is the velocity; a velocity's is found by one physics step under the last command ``(K, T, nu)``
+        before the window, where a sensor is late.
         """
-        starts = np.repeat(start[None], len(values), 0)
         if not self._late:
             return np.zeros_like(starts)
-        after = self._engine.paths(values, placed, starts, signals[:, :, :1], True)[:, :, 0]
+        after = self._engine.paths(values, placed, starts, command[:, :, None], True)[:, :, 0]
         rates = np.nan_to_num((after - starts) * (self.frame_skip / (self.timestep or 1.0)))
         known = self._rates >= 0
         rates[..., known] = starts[..., self._rates[known]]
         return rates
 
     def _shown(self, fine: np.ndarray, rates: np.ndarray, effects: tuple[Placed, ...]) -> np.ndarray:
-        """Return observed columns as the sensors show them, ``(T, lag, n)``, of true states at every physics step."""
+        """Return observed columns as the sensors show them ``(T, L + 1, n)``, of states ``(T, L·skip + 1, ...)``."""
         setting, skip = self.effects.setting, self.frame_skip
         index = setting.observation.index
         step = (self.timestep or 0.0) / skip
         before = np.arange(-self._late * skip, 0)[None, :, None] * step
         columns = fine[..., index]
-        past = columns[:, :1] + before * rates[:, None, index]
+        curved = np.where(self._rates[index] >= 0, rates[:, self._rates[index]], 0.0)[:, None]
+        past = columns[:, :1] + before * rates[:, None, index] + 0.5 * before * (before + step) * curved
         columns = np.concatenate([past, columns], 1)
         places = {int(c): i for i, c in enumerate(index)}
         path = Path(
@@ -221,7 +227,7 @@ class EffectSimulator(Simulator):
             if placed.effect.acts_on_sensor:
                 column = SensorEffect.column(setting, placed.target)
                 path = placed.effect.sense(path, column, np.asarray(placed.values))
-        return path.columns[:, self._late + 1 :]
+        return path.columns[:, self._late :]
 
 
 def filtered(signal: np.ndarray, filters: list[Placed], model: mujoco.MjModel, step: float) -> np.ndarray:
@@ -279,8 +285,8 @@ def overlap(effects: EffectSet, space: ParameterSpace) -> tuple[Entry, str] | No
 def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, longest: int) -> int:
     """Return how many logged steps of controls the effects need before a window, of an episode of ``longest``."""
     seconds = effects.look_back(space, sensors=False)
-    if seconds == 0:
-        return 0
+    if seconds == 0:  # a late sensor asks for the command just before the window
+        return min(1, longest) if effects.look_back(space, sensors=True) > 0 else 0
     steps = LONGEST_HISTORY if seconds == math.inf else math.ceil(seconds / timestep - 1e-9) + 1
     return min(steps, longest)
 
