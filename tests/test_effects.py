@@ -12,6 +12,7 @@ import torch
 import yaml
 from conftest import HOPPER
 
+from dropo_torch.certify import certify
 from dropo_torch.cli import main
 from dropo_torch.config import load_config, make_config
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
@@ -484,9 +485,33 @@ def test_fixed_native_effects_become_part_of_the_model_and_keep_gradients(tmp_pa
         problem = make_problem(make_config({**base, "backend": backend, "parameters": mass, "effects": effects}))
         assert problem.simulator.differentiable == (backend == "warp")
         assert not isinstance(problem.simulator, EffectSimulator)
+        if backend == "warp":
+            certify(problem.objective, max_transitions=10, points=1).check()
         shown = problem.objective.simulated(np.array([[0.7]]))[:, 0]
         errors.append(float((shown - torch.from_numpy(problem.objective.transitions.measured)).abs().max()))
     assert max(errors) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "values"),
+    [
+        ("payload", "lower", (0.2, 0.05, 0.0, -0.3)), ("payload", "ball", (0.2, 0.05, 0.0, 0.0)),
+        ("gravity_tilt", None, (0.1, 0.2)), ("ground_slope", None, (0.1, -0.05)), ("integration", None, (STEP / 8,)),
+        ("contact_friction", "floor", (0.3,)), ("joint_limit", "shoulder", (0.8, -0.8)),
+        ("actuator_saturation", "bend", (0.5,)),
+    ],
+)  # fmt: skip
+def test_warp_has_native_effects_as_mujoco_has(name: str, target: str | None, values: tuple[float, ...]) -> None:
+    model = general(RIG.replace('name="cart" type="box" size=".1 .1 .1"', 'name="cart" type="sphere" size=".1"'))
+    document = entry(find_effect(name), target, np.array(values), setting_of(model))
+    states, controls = some_states(model), some_controls(model, 3)
+    found = [
+        simulator_of(model, [document], backend=backend)[0].rollout(
+            states, controls, torch.full((1, 1), 0.1, dtype=torch.float64)
+        )
+        for backend in ("mujoco", "warp")
+    ]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-9)
 
 
 def test_gymnasium_environments_have_effects_around_them() -> None:
@@ -733,6 +758,24 @@ def test_what_no_field_expresses_stays_an_effect_of_the_old_model(
     assert document["model"] == str(tmp_path / "arm.xml")
     assert document["parameters"][f"{target}_{first}"]["effect"] == name
     make_problem(load_config(tmp_path / "config.yaml"))
+
+
+def test_a_config_of_a_bundled_simulation_names_its_parts(tmp_path: Path) -> None:
+    config = make_config({"sim": "hopper", "backend": "warp", "optimizer": "adam"})
+    problem = make_problem(config)
+    setting = plain_setting(problem.space.model, problem.observation, SIM.frame_skip)
+    placed = [
+        Placed(find_effect("actuator_backlash"), setting.names("actuator")[0], (0.1,)),
+        Placed(find_effect("joint_friction"), "foot_joint", (0.2,)),
+    ]
+    intervals = {placed[0].key: {"width": (0.05, 0.15)}, placed[1].key: {"friction": (0.1, 0.3)}}
+    write_model(SIM.model, placed, tmp_path / "model.xml")
+    write_config(config, problem.space, setting, placed, intervals, tmp_path / "model.xml", tmp_path / "config.yaml")
+    again = load_config(tmp_path / "config.yaml")
+    assert (again.sim, again.model, again.backend, again.optimizer) == (None, "model.xml", "warp", "fisher")
+    found = make_problem(again)
+    assert found.space.names == (*problem.space.names, f"{placed[0].target}_width", "foot_joint_friction")
+    assert found.objective.transitions.history == 100  # an episode's length
 
 
 def test_a_search_box_is_wide_enough_and_physical() -> None:
