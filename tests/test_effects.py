@@ -260,6 +260,52 @@ def test_dry_friction_slides_and_sticks() -> None:
     assert forces(slid)[-1] == pytest.approx(1.5, rel=1e-3)
 
 
+@pytest.mark.parametrize("speed", [-1.5, 0.5])
+def test_passive_forces_of_a_joint(speed: float) -> None:
+    def passive(name: str, *values: float) -> float:
+        model, data = applied(
+            SLIDE.replace('type="slide"', 'type="slide" stiffness="2" springref="0.1"'), name, "rail", *values
+        )
+        data.qpos[0], data.qvel[0] = 0.3, speed
+        mujoco.mj_forward(model, data)
+        return float(data.qfrc_passive[0]) + 2 * (0.3 - 0.1)
+
+    assert passive("joint_damping", 0.7) == pytest.approx(-0.7 * speed)
+    assert passive("joint_quadratic_damping", 0.7) == pytest.approx(-0.7 * abs(speed) * speed)
+    assert passive("joint_stiffness", 5.0, -0.2) == pytest.approx(-5 * (0.3 + 0.2))
+    model, _ = applied(SLIDE, "armature", "rail", 0.4)
+    assert model.dof_M0[0] == pytest.approx(2.4)
+
+
+def test_inertia_and_centre_and_stops() -> None:
+    model, _ = applied(RIG, "inertia", "lower", 1.5)
+    np.testing.assert_allclose(model.body("lower").inertia, 1.5 * general().body("lower").inertia)
+    model, _ = applied(RIG, "center_of_mass", "lower", 0.01, 0.02, -0.03)
+    np.testing.assert_allclose(model.body("lower").ipos - general().body("lower").ipos, [0.01, 0.02, -0.03], atol=1e-12)
+    model, _ = applied(RIG, "joint_limit", "shoulder", 0.2, -0.1)
+    np.testing.assert_allclose(model.joint("shoulder").range, np.deg2rad([-60, 60]) + [0.2, -0.1])
+
+
+def test_a_geom_alone_decides_its_friction_and_softness() -> None:
+    """A box slides with the friction given, whatever the floor's; softness leaves the friction as it was."""
+    xml = """<mujoco><option timestep="0.001"/><worldbody>
+      <geom name="floor" type="plane" size="50 50 1" friction="1.3"/>
+      <body name="box" pos="0 0 .099">
+        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+        <geom name="box" type="box" size=".1 .1 .1" friction="0.7"/>
+      </body></worldbody></mujoco>"""
+    for name, values, friction in (("contact_friction", (0.4,), 0.4), ("contact_stiffness", (0.03, 1.0), 1.3)):
+        model, data = applied(xml, name, "box", *values)
+        mujoco.mj_step(model, data, 1000)
+        assert np.allclose(data.contact[0].solref, values) == (name == "contact_stiffness")
+        assert data.contact[0].friction[0] == pytest.approx(friction)
+        if name == "contact_stiffness":
+            continue  # what is soft also slips before it holds
+        data.qvel[0] = 0.5
+        mujoco.mj_step(model, data, 20)
+        assert (0.5 - float(data.qvel[0])) / 0.02 == pytest.approx(9.81 * friction, rel=0.1)
+
+
 @pytest.mark.parametrize("speed", [0.02, 0.1, 0.5])
 def test_stribeck_friction_at_a_steady_speed(speed: float) -> None:
     numbers = {"coulomb": 0.3, "static": 0.8, "velocity": 0.1}
