@@ -9,6 +9,7 @@
 from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.diagnostics import Diagnostics, diagnose
 from dropo_torch.distribution import Distribution
+from dropo_torch.effects import Effect, Placed, Quantity
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit
@@ -27,14 +28,17 @@ __all__ = [
     "Config",
     "Diagnostics",
     "Distribution",
+    "Effect",
     "Fit",
     "InputError",
     "Objective",
     "Observation",
     "Parameter",
     "ParameterSpace",
+    "Placed",
     "Preprocess",
     "Problem",
+    "Quantity",
     "Recording",
     "Simulator",
     "Trajectories",

@@ -97,7 +97,7 @@ def certify(objective: Objective, *, max_transitions: int = 100, points: int = 2
     """
     simulator = objective.simulator
     if not simulator.differentiable or not hasattr(simulator, "jacobian"):
-        raise InputError(f"backend: {simulator.name} has no gradients to certify; use backend: warp")
+        raise InputError(f"backend: {simulator.name} has no gradients to certify; {simulator.remedy}")
     spread = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
     part = objective.transitions.select(spread)
     states, controls = torch.from_numpy(part.states.copy()), torch.from_numpy(part.controls.copy())

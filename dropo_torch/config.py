@@ -37,6 +37,9 @@ class Config(pydantic.BaseModel):
     parameters: dict[str, dict[str, Any]] | None = pydantic.Field(
         None, description="name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
     )
+    effects: list[dict[str, Any]] = pydantic.Field(
+        [], description="physical effects that the model lacks: effect, target and its numbers"
+    )
     backend: Literal["mujoco", "warp", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
     optimizer: Literal["fisher", "cma", "adam"] = pydantic.Field("fisher", description="how φ is searched")
     epsilon: float | list[float] = pydantic.Field(1e-5, description="ε, variance added to every column, or one each")

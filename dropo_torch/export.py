@@ -23,17 +23,9 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     Raises:
         InputError: a source that is no XML file, or a parameter that MJCF cannot express.
     """
-    source, path = Path(source).resolve(), Path(path)
-    if source.suffix not in (".xml", ".urdf", ".mjcf"):
-        raise InputError(f"export: {source} is no XML model; only those can be written as MJCF")
-    try:
-        spec = mujoco.MjSpec.from_file(str(source))
-    except ValueError as error:
-        raise InputError(f"export: MuJoCo does not read {source}: {error}") from None
-    for folder in ("meshdir", "texturedir") if spec.meshes or spec.textures or spec.hfields or spec.skins else ():
-        setattr(spec, folder, str((source.parent / getattr(spec, folder)).resolve()))
+    spec, path = read_spec(source), Path(path)
     if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
-        _write_inertials(spec)
+        write_inertials(spec)
     model = spec.compile()
     for column, parameter in enumerate(space.parameters):
         for target in parameter.targets:
@@ -47,7 +39,25 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     _compare(path, space, values)
 
 
-def _write_inertials(spec: mujoco.MjSpec) -> None:
+def read_spec(source: str | Path) -> mujoco.MjSpec:
+    """Read a model that is to be written elsewhere: its asset folders become absolute.
+
+    Raises:
+        InputError: a source that is no XML file, or that MuJoCo does not read.
+    """
+    source = Path(source).resolve()
+    if source.suffix not in (".xml", ".urdf", ".mjcf"):
+        raise InputError(f"export: {source} is no XML model; only those can be written as MJCF")
+    try:
+        spec = mujoco.MjSpec.from_file(str(source))
+    except ValueError as error:
+        raise InputError(f"export: MuJoCo does not read {source}: {error}") from None
+    for folder in ("meshdir", "texturedir") if spec.meshes or spec.textures or spec.hfields or spec.skins else ():
+        setattr(spec, folder, str((source.parent / getattr(spec, folder)).resolve()))
+    return spec
+
+
+def write_inertials(spec: mujoco.MjSpec) -> None:
     """Give every body the inertial that it compiles to, explicitly."""
     compiled = spec.compile()
     for body in spec.bodies[1:]:

@@ -55,8 +55,11 @@ def quiet_mujoco() -> Iterator[None]:
         library.mju_setLogConfig(before)
 
 
-def load_model(model: mujoco.MjModel | str | Path) -> mujoco.MjModel:
+def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> mujoco.MjModel:
     """Return ``model``, compiled from MJCF, URDF or MJB when it is a path.
+
+    With ``general``, a free body whose centre of mass is its frame's is compiled without MuJoCo's short cuts for such
+    bodies, so that the centre and the axes may move.
 
     Raises:
         InputError: a missing file, or one that MuJoCo does not compile, with MuJoCo's reason.
@@ -70,7 +73,17 @@ def load_model(model: mujoco.MjModel | str | Path) -> mujoco.MjModel:
         with quiet_mujoco():
             if path.suffix == ".mjb":
                 return mujoco.MjModel.from_binary_path(str(path))
-            return mujoco.MjModel.from_xml_path(str(path))
+            if not general:
+                return mujoco.MjModel.from_xml_path(str(path))
+            spec = mujoco.MjSpec.from_file(str(path))
+            unsimplify(spec)
+            return spec.compile()
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise InputError(f"model: MuJoCo does not compile {path}: {reason}") from None
+
+
+def unsimplify(spec: mujoco.MjSpec) -> None:
+    """Let every body's centre and axes move after compilation."""
+    for body in spec.bodies[1:]:
+        body.simple = 0

@@ -206,7 +206,7 @@ class Objective:
             InputError: a simulator without gradients.
         """
         if not self.simulator.differentiable:
-            raise InputError(f"backend: {self.simulator.name} has no gradients; use warp")
+            raise InputError(f"backend: {self.simulator.name} has no gradients; {self.simulator.remedy}")
         leaf = torch.as_tensor(np.asarray(values), dtype=torch.float64).requires_grad_(True)
         chosen = torch.arange(len(self)) if rows is None else torch.as_tensor(rows)
         total: torch.Tensor | None = None

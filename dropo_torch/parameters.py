@@ -12,7 +12,7 @@ import copy
 import fnmatch
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -46,7 +46,9 @@ _OBJECTS = {
     "tendon": ("ntendon", "tendon"), "eq": ("neq", "equality"), "pair": ("npair", "pair"),
     "flex": ("nflex", "flex"),
 }  # fmt: skip
-_KEYS = ("field", "name", "index", "bounds", "limits", "unit", "scale", "relative", "scale_inertia")
+_KEYS = ("field", "name", "index", "bounds", "limits", "unit", "scale", "relative", "scale_inertia", "effect")
+#: Keys of a parameter that is a number of an effect.
+_EFFECT_KEYS = ("effect", "name", "index", "bounds", "limits", "unit", "scale")
 
 
 @dataclass(frozen=True)
@@ -72,6 +74,8 @@ class Parameter:
         limits: values outside are never simulated: samples are redrawn inside them.
         scale: ``"log"`` searches and distributes the logarithm of the value.
         targets: the numbers of the model that it writes.
+        effect: the effect of which it is a number, where it is no field.
+        quantity: which of the effect's numbers; empty for the only one.
     """
 
     name: str
@@ -84,10 +88,15 @@ class Parameter:
     limits: tuple[float, float] = (-np.inf, np.inf)
     scale: Literal["linear", "log"] = "linear"
     targets: tuple[Target, ...] = ()
+    effect: str = ""
+    quantity: str = ""
 
     @property
     def where(self) -> str:
         """The parameter's place in the model, such as ``body_mass of thigh``."""
+        if self.effect:
+            what = f"{self.quantity} of {self.effect}" if self.quantity else self.effect
+            return what + "".join(f" at {name}" for name in self.objects)
         component = "" if self.index is None else f"[{self.index}]"
         of = f" of {', '.join(self.objects)}" if self.objects else ""
         return f"{self.field or 'parameter'}{component}{of}"
@@ -172,6 +181,23 @@ class ParameterSpace:
             raise InputError(f"parameters: no value given for {missing[0]!r}")
         return np.array([float(values[n]) for n in self.names])
 
+    def with_limits(self, low: np.ndarray) -> ParameterSpace:
+        """Return the same space with the lower physical limits ``(d,)`` raised to those given."""
+        other = copy.copy(self)
+        other.__dict__.pop("limits", None)
+        other.parameters = tuple(
+            replace(p, limits=(max(p.limits[0], float(least)), p.limits[1]))
+            for p, least in zip(self.parameters, low, strict=True)
+        )
+        return other
+
+    def on(self, model: mujoco.MjModel) -> ParameterSpace:
+        """Return the same parameters, with the same targets and factors, of another model of the same robot."""
+        other = copy.copy(self)
+        other.__dict__.pop("nominal", None)
+        other.model = model
+        return other
+
     def named(self, values: np.ndarray) -> dict[str, float]:
         """Return a vector ``(d,)`` as name → value."""
         return dict(zip(self.names, (float(v) for v in values), strict=True))
@@ -239,6 +265,8 @@ def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> 
     for key in ("relative", "scale_inertia"):
         if not isinstance(spec.get(key, False), bool):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected true or false")
+    if "effect" in spec:
+        return _parse_effect(where, name, spec)
     field, index = _field_and_index(where, spec)
     if model is None and field:
         raise InputError(f"{where}: field {field!r} needs a MuJoCo model; this simulator has none")
@@ -262,6 +290,30 @@ def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> 
     return Parameter(
         name=name, low=low, high=high, field=field, objects=objects, index=index,
         unit=str(spec.get("unit", "") or ""), limits=limits, scale=scale, targets=targets,
+    )  # fmt: skip
+
+
+def _parse_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
+    """An entry that is a number of an effect; whether there is such an effect is checked where they are known."""
+    for key in spec:
+        if key not in _EFFECT_KEYS:
+            raise InputError(
+                f"{where}: {key} belongs to a field; a parameter of an effect has {', '.join(_EFFECT_KEYS)}"
+            )
+    for key in ("effect", "name", "index"):
+        if not isinstance(spec.get(key, ""), str | None):
+            raise InputError(f"{where}: {key} is {spec[key]!r}; expected a name")
+    scale = spec.get("scale", "linear")
+    if scale not in ("linear", "log"):
+        raise InputError(f"{where}: scale is {scale!r}; expected linear or log")
+    low, high = _interval(where, "bounds", spec.get("bounds"))
+    limits = _limits(where, "", False, spec, low, high)
+    if scale == "log" and low <= 0:
+        raise InputError(f"{where}: scale log needs positive bounds, got [{low:g}, {high:g}]")
+    return Parameter(
+        name=name, low=low, high=high, objects=(spec["name"],) if spec.get("name") else (),
+        unit=str(spec.get("unit", "") or ""), limits=limits, scale=scale, effect=str(spec["effect"]),
+        quantity=spec.get("index") or "",
     )  # fmt: skip
 
 

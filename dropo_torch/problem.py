@@ -21,6 +21,9 @@ import numpy as np
 
 from dropo_torch.bundled import BundledSim, bundled_sim
 from dropo_torch.config import Config
+from dropo_torch.effects import find_effect
+from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
+from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.errors import InputError, choices
 from dropo_torch.model import load_model
 from dropo_torch.objective import Objective
@@ -47,6 +50,7 @@ class Problem:
         observation: what its columns are.
         objective: the likelihood of the log.
         fingerprint: identifies config, model and log; an interrupted run continues only with the same.
+        effects: the physical effects of the config, or ``None``.
     """
 
     config: Config
@@ -57,6 +61,7 @@ class Problem:
     observation: Observation
     objective: Objective
     fingerprint: str
+    effects: EffectSet | None = None
 
 
 def make_problem(config: Config) -> Problem:
@@ -72,25 +77,23 @@ def make_problem(config: Config) -> Problem:
         if config.environment is not None:
             raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
         model_path = _model_path(config, sim)
-        space = _space(load_model(model_path), config, sim)
+        space = _space(load_model(model_path, general=_has_effects(config)), config, sim)
         source = space.model
     trajectories = _log(config, sim, space.model)
     frame_skip = _frame_skip(config, sim, space.model, trajectories)
-    simulator = make_simulator(
-        config.backend,
-        source,
-        parameters=space,
-        frame_skip=frame_skip,
-        num_threads=config.threads,
-        chunk_size=config.chunk_size,
-        device=config.device,
-    )
-    _check_log(trajectories, simulator, frame_skip)
     width = trajectories.observations.shape[1]
-    observation = _observation(config, sim, space.model, simulator, width)
+    effects, history = None, 0
+    if _has_effects(config):
+        observation = _observation(config, sim, space.model, _num_states(config, source), width)
+        space, effects = _effects(config, space, observation, frame_skip)
+        simulator, history = _with_effects(config, source, effects, space, trajectories)
+    else:
+        simulator = _backend(config, source, frame_skip, space)
+    _check_log(trajectories, simulator, frame_skip)
+    observation = _observation(config, sim, space.model, simulator.num_states, width)
     objective = Objective(
         simulator,
-        make_transitions(trajectories, observation, lag=config.lag),
+        make_transitions(trajectories, observation, lag=config.lag, history=history),
         observation,
         epsilon=config.epsilon,
         noise=config.noise,
@@ -106,7 +109,56 @@ def make_problem(config: Config) -> Problem:
         observation=observation,
         objective=objective,
         fingerprint=_fingerprint(config, space.model, trajectories),
+        effects=effects,
     )
+
+
+def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
+    """The simulator of the config's backend."""
+    return make_simulator(
+        config.backend,
+        source,
+        parameters=space,
+        frame_skip=frame_skip,
+        num_threads=config.threads,
+        chunk_size=config.chunk_size,
+        device=config.device,
+    )
+
+
+def _effects(
+    config: Config, space: ParameterSpace, observation: Observation, frame_skip: int
+) -> tuple[ParameterSpace, EffectSet]:
+    """The effects of a config, and its parameters with their limits."""
+    if space.model is None or len(observation.default_state) != space.model.nq + space.model.nv:
+        raise InputError("effects: they need a MuJoCo model; this simulator has none")
+    effects = place_effects(config.effects, space, plain_setting(space.model, observation, frame_skip), find_effect)
+    return space.with_limits(lowest(effects, space)), effects
+
+
+def _num_states(config: Config, source: Any) -> int:
+    return int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
+
+
+def _with_effects(
+    config: Config, source: Any, effects: EffectSet, space: ParameterSpace, trajectories: Trajectories
+) -> tuple[Simulator, int]:
+    """The simulator with effects in it, and the logged steps before each window that it needs."""
+    other = config.backend == "gymnasium"
+    step = source.timestep if other else float(source.opt.timestep)
+    if step is None:
+        raise InputError("effects: they need the adapter's timestep, the seconds of a step")
+
+    def make(model: mujoco.MjModel, frame_skip: int, parameters: ParameterSpace) -> Simulator:
+        if isinstance(source, MujocoEnvAdapter):
+            source.use_model(model)
+        return _backend(config, source if other else model, frame_skip, parameters)
+
+    return effect_simulator(
+        config.backend, effects, space, make, timestep=effects.setting.frame_skip * step,
+        longest=int(np.bincount(trajectories.episodes).max()), num_threads=config.threads,
+        chunk_size=config.chunk_size, owns_model=not other or isinstance(source, MujocoEnvAdapter),
+    )  # fmt: skip
 
 
 def _model_path(config: Config, sim: BundledSim | None) -> Path:
@@ -114,6 +166,11 @@ def _model_path(config: Config, sim: BundledSim | None) -> Path:
         both = "both model and sim are" if sim else "neither model nor sim is"
         raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
     return sim.model if sim is not None else config.path(str(config.model))
+
+
+def _has_effects(config: Config) -> bool:
+    """Whether the config names effects."""
+    return bool(config.effects) or any("effect" in p for p in (config.parameters or {}).values())
 
 
 def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None) -> ParameterSpace:
@@ -299,15 +356,15 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
 
 
 def _observation(
-    config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, simulator: Simulator, width: int
+    config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, num_states: int, width: int
 ) -> Observation:
-    if model is not None and simulator.num_states == model.nq + model.nv:
+    if model is not None and num_states == model.nq + model.nv:
         entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
         return parse_observation(model, entries, width)
     if config.observation is not None:
         raise InputError("observation: this simulator's states have no names; leave the key out")
-    if width != simulator.num_states:
-        raise InputError(f"data: {width} observed columns, but the simulator's state has {simulator.num_states}")
+    if width != num_states:
+        raise InputError(f"data: {width} observed columns, but the simulator's state has {num_states}")
     return generic_observation(width)
 
 

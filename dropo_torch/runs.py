@@ -12,6 +12,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from rich.console import Console
 from rich.table import Table
@@ -21,6 +22,7 @@ from dropo_torch.certify import Certificate, certify
 from dropo_torch.compare import Comparison, Run, compare
 from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
+from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit, refuse_dead_parameters, write_atomically
@@ -270,7 +272,7 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
     notes = []
     if problem.model_path is not None:
         try:
-            export_model(problem.model_path, problem.space, result.distribution.center, out / "model.xml")
+            notes += _write_model(problem, result.distribution.center, out / "model.xml")
         except InputError as error:
             notes.append(f"No model.xml was written: {error}.")
     write_fit_report(
@@ -283,6 +285,19 @@ def _write_fit(problem: Problem, result: Fit, out: Path) -> None:
         versions=versions(),
         space=problem.space,
     )
+
+
+def _write_model(problem: Problem, values: np.ndarray, path: Path) -> list[str]:
+    """Write the model with parameter values ``(d,)`` and effects; return what it lacks, in words."""
+    assert problem.model_path is not None
+    if problem.effects is None:
+        export_model(problem.model_path, problem.space, values, path)
+        return []
+    rest = write_model(problem.model_path, problem.effects.at(values), path, problem.space, values)
+    if not rest:
+        return []
+    names = ", ".join(p.effect.name + (f" at {p.target}" if p.target else "") for p in rest)
+    return [f"model.xml lacks what MJCF cannot express: {names}. The fitted config has it."]
 
 
 def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:

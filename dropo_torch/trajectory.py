@@ -141,10 +141,11 @@ class Transitions:
 
     Attributes:
         states: simulator states at the windows' starts, ``(T, nq + nv)``.
-        controls: the controls applied, ``(T, lag, nu)``.
+        controls: the controls applied, after those of ``history`` steps before, ``(T, history + lag, nu)``.
         measured: observed columns at the windows' ends, ``(T, n)``.
         rows: row of the log at which each window starts, ``(T,)``.
         episodes: episode of each window, ``(T,)``.
+        history: logged steps before a window whose controls come with it, for actuators that remember.
     """
 
     states: np.ndarray
@@ -152,6 +153,7 @@ class Transitions:
     measured: np.ndarray
     rows: np.ndarray
     episodes: np.ndarray
+    history: int = 0
 
     def __len__(self) -> int:
         """Return the number of windows T."""
@@ -160,11 +162,12 @@ class Transitions:
     @property
     def lag(self) -> int:
         """Number of logged steps λ of a window."""
-        return int(self.controls.shape[1])
+        return int(self.controls.shape[1]) - self.history
 
     def select(self, rows: np.ndarray | slice) -> Transitions:
         """Return the given windows."""
-        return Transitions(
+        return replace(
+            self,
             states=self.states[rows],
             controls=self.controls[rows],
             measured=self.measured[rows],
@@ -173,8 +176,13 @@ class Transitions:
         )
 
 
-def make_transitions(trajectories: Trajectories, observation: Observation, *, lag: int = 1) -> Transitions:
+def make_transitions(
+    trajectories: Trajectories, observation: Observation, *, lag: int = 1, history: int = 0
+) -> Transitions:
     """Cut a log into consecutive windows of ``lag`` transitions that never cross an episode's end.
+
+    With ``history``, the controls of so many logged steps before each window stand before its own; before an
+    episode's start its first control does.
 
     Raises:
         InputError: a log without an episode of ``lag`` transitions.
@@ -189,19 +197,21 @@ def make_transitions(trajectories: Trajectories, observation: Observation, *, la
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
     starts = [np.arange(a, b - lag + 1, lag) for a, b in itertools.pairwise(bounds)]
     rows = np.concatenate(starts)
+    first = np.repeat(bounds[:-1], [len(s) for s in starts])
     if rows.size == 0:
         longest = int(np.diff(bounds).max())
         raise InputError(
             f"{trajectories.source}: too short for lag {lag}: the longest episode has {longest} transitions; "
             f"lag must be at most {longest}"
         )
-    steps = rows[:, None] + np.arange(lag)
+    steps = np.maximum(rows[:, None] + np.arange(-history, lag), first[:, None])
     return Transitions(
         states=observation.states(trajectories.observations[rows]),
         controls=trajectories.actions[steps],
         measured=observation.observed(trajectories.next_observations[rows + lag - 1]),
         rows=rows,
         episodes=trajectories.episodes[rows],
+        history=history,
     )
 
 

@@ -282,6 +282,22 @@ def test_own_simulator(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
         assert found[name]["mean"] == pytest.approx(truth, rel=1e-3)
 
 
+def test_own_effect(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    example = load_example(ROOT / "examples" / "own_effect.py")
+    example.main(["--out", str(tmp_path), "--samples", "200"])
+    found = yaml.safe_load((tmp_path / "fit" / "fit.json").read_text())["parameters"]
+    assert found["catch_torque"]["mean"] == pytest.approx(example.TRUTH["torque"], rel=1e-3)
+    assert found["catch_reach"]["mean"] == pytest.approx(example.TRUTH["reach"], rel=1e-3)
+
+
+def test_every_effect_is_documented() -> None:
+    from dropo_torch.effects import VOCABULARY
+
+    rows = re.findall(r"^\| `(\w+)` \|.*\| (yes|no) \|$", (ROOT / "docs" / "effects.md").read_text(), re.MULTILINE)
+    ours = {n: e for n, e in VOCABULARY.items() if type(e).__module__.startswith("dropo_torch.")}
+    assert dict(rows) == {name: "yes" if effect.native else "no" for name, effect in ours.items()}
+
+
 @pytest.mark.skipif("DROPO_DATA" not in os.environ, reason="DROPO_DATA names no folder with DATA_EMPS.mat")
 def test_emps(capsys: pytest.CaptureFixture) -> None:
     found = sorted(Path(os.environ["DROPO_DATA"]).rglob("DATA_EMPS.mat"))

@@ -181,6 +181,9 @@ class ActuatorDelay(CommandEffect):
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         return [np.array([k * setting.signals.timestep]) for k in (0.4, 2.0, 5.0)]
 
+    def memory(self, values: np.ndarray) -> float:
+        return float(values[0])
+
     def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
         """Shift in time; a physics step takes the mean over it of what arrives."""
         whole, part = divmod(float(values[0]) / step, 1.0)
@@ -199,6 +202,10 @@ class ActuatorLag(CommandEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         return [np.array([k * setting.signals.timestep]) for k in (0.4, 2.0, 5.0)]
+
+    def memory(self, values: np.ndarray) -> float:
+        """Return the time after which a step is followed to 3e-4."""
+        return 8 * float(values[0])
 
     def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
         """Filter exactly; a physics step takes the mean over it of the filter's output."""
@@ -223,6 +230,9 @@ class ActuatorDeadband(CommandEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         return [np.array([share * self.command_scale(setting, target)]) for share in (0.03, 0.15)]
+
+    def memory(self, values: np.ndarray) -> float:
+        return 0.0
 
     def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
         return np.sign(signal) * np.maximum(np.abs(signal) - values[0], 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Literal
@@ -156,6 +157,10 @@ class Effect(abc.ABC):
     def unsense(self, start: np.ndarray, rate: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
         """Return observed columns ``(W, n)`` of the true state from measured ones and their rates."""
         return start
+
+    def memory(self, values: np.ndarray) -> float:
+        """Return the seconds that :meth:`command` or :meth:`sense` looks back; infinite for all of the past."""
+        return math.inf if self.acts_on_command else 0.0
 
     @property
     def acts_on_command(self) -> bool:

@@ -162,7 +162,7 @@ class FluidDrag(BodyEffect):
     """Drag of air or water on a body, with the square of its speed.
 
     It is MuJoCo's ellipsoid drag of the body's largest geom with equal blunt and slender coefficients, which makes it
-    the same from all sides.
+    the same from all sides. The medium is so thin that the mass of it that moves along does not count.
     """
 
     name = "fluid_drag"
@@ -173,6 +173,9 @@ class FluidDrag(BodyEffect):
         if m.opt.density > 0 or m.opt.viscosity > 0:
             return []
         return [t for t in super().targets(setting) if self.geom(m, t) is not None]
+
+    #: Density of the medium, kg/m³.
+    DENSITY = 1e-6
 
     @staticmethod
     def geom(model: mujoco.MjModel, target: str | None) -> int | None:
@@ -193,12 +196,12 @@ class FluidDrag(BodyEffect):
         if geom is None or values[0] == 0:
             return
         area = _largest_section(model, geom)
-        model.opt.density = 1.0
+        model.opt.density = self.DENSITY
         for g in range(model.ngeom):  # a body whose geoms all have coefficient zero feels nothing
             if model.geom_fluid[g, 0] == 0:
                 model.geom_fluid[g] = 0.0
                 model.geom_fluid[g, 0] = 1.0
-        model.geom_fluid[geom, 1:3] = values[0] / area
+        model.geom_fluid[geom, 1:3] = values[0] / (area * self.DENSITY)
 
 
 def _largest_section(model: mujoco.MjModel, geom: int) -> float:

@@ -80,6 +80,9 @@ class SensorDelay(SensorEffect):
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         return [np.array([k * setting.signals.timestep]) for k in (0.4, 1.5)]
 
+    def memory(self, values: np.ndarray) -> float:
+        return float(values[0])
+
     def sense(self, path: Path, column: int, values: np.ndarray) -> Path:
         """Interpolate the fine path at earlier instants; those before the window are not known."""
         delay = float(values[0])

@@ -164,6 +164,38 @@ class Twin:
         self.simulated_transitions += num_k * num_w * length
         return out, valid
 
+    def paths(
+        self, variants: Sequence[Variant], starts: np.ndarray, signals: np.ndarray, *, fine: bool = False
+    ) -> np.ndarray:
+        """Simulate from full states, under commands as they act.
+
+        Args:
+            variants: the hypotheses, K of them.
+            starts: true states, ``(K, W, nq + nv)``.
+            signals: commands of every physics step, ``(K, W, S, nu)``.
+            fine: return the states after every physics step instead of every logged one.
+
+        Returns:
+            States ``(K, W, S, nq + nv)`` or ``(K, W, S / skip, nq + nv)``, NaN where a simulation diverged.
+        """
+        count = signals.shape[2] if fine else signals.shape[2] // self.setting.frame_skip
+        out = np.full((*starts.shape[:2], count, starts.shape[2]), np.nan)
+        groups: dict[tuple[int, bool], list[int]] = {}
+        models: dict[int, mujoco.MjModel] = {}
+        for k, variant in enumerate(variants):
+            try:
+                models[k] = self.model(variant)
+            except ValueError:
+                continue
+            finer = max(round(self._base.opt.timestep / models[k].opt.timestep), 1)
+            groups.setdefault((finer, any(p.effect.has_force for p in variant.placed)), []).append(k)
+        for (finer, forced), members in groups.items():
+            out[members] = self._simulate(
+                [models[k] for k in members], [variants[k] for k in members], starts[members], signals[members],
+                finer, forced, fine, None,
+            )  # fmt: skip
+        return out
+
     def _group(
         self, variants: Sequence[Variant], models: list, part: list[int], windows: Windows, shown: np.ndarray,
         finer: int, forced: bool, fine: bool, out: np.ndarray, valid: np.ndarray, pushes: np.ndarray | None,

@@ -89,6 +89,8 @@ class Integration(WorldEffect):
         return [np.array([float(setting.model.opt.timestep) / self.FINER])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        if values[0] == model.opt.timestep:
+            return
         model.opt.timestep = values[0]
         if not _has_stiff_damping(model):
             model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4

@@ -113,7 +113,8 @@ class AdamOptimizer(Optimizer):
     def __init__(self, objective: Objective, *, settings: AdamSettings, seed: int) -> None:
         if not objective.simulator.differentiable:
             raise InputError(
-                f"optimizer: adam needs gradients, which backend {objective.simulator.name} has not; use backend: warp"
+                f"optimizer: adam needs gradients, which backend {objective.simulator.name} has not; "
+                + objective.simulator.remedy
             )
         self._objective = objective
         self._space: ParameterSpace = objective.simulator.parameters

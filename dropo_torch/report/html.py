@@ -193,7 +193,7 @@ def _parameter_rows(
     """The table of parameters, one dictionary a row."""
     specs = (config or {}).get("parameters")
     specs = specs if isinstance(specs, Mapping) else {}
-    places = {} if space is None else {p.name: p.where for p in space.parameters if p.field}
+    places = {} if space is None else {p.name: p.where for p in space.parameters if p.field or p.effect}
     scale = np.where(distribution.is_log, distribution.center, 1.0)
     shares = [words.box_shares(distribution, v) for v in (_reach(distribution, 0), _reach(distribution, 1))]
     middle, own = words.box_shares(distribution, distribution.center), words.box_shares(distribution, nominal)

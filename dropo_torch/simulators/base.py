@@ -22,6 +22,7 @@ class Simulator(abc.ABC):
 
     Attributes:
         differentiable: whether autograd reaches ``states``, ``controls`` and ``values``.
+        remedy: what to do about it where it does not.
         parameters: what varies, d parameters.
         frame_skip: physics steps of one logged transition.
         num_states: width of a state, ``nq + nv`` for a MuJoCo model.
@@ -30,6 +31,7 @@ class Simulator(abc.ABC):
     """
 
     differentiable: ClassVar[bool] = False
+    remedy: str = "use backend: warp"
     name: ClassVar[str]
     parameters: ParameterSpace
     frame_skip: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
@@ -63,6 +64,12 @@ class MujocoEnvAdapter:
         self.num_states = int(self._env.model.nq + self._env.model.nv)
         self.num_controls = int(self._env.model.nu)
         self.timestep: float | None = float(self._env.dt)
+
+    def use_model(self, model: mujoco.MjModel) -> None:
+        """Let the environment simulate another model of the same robot."""
+        model = copy.copy(model)
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._env.model = model
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """Write the parameters into the environment's model, and everything derived from them."""

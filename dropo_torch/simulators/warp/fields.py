@@ -95,9 +95,9 @@ class Fields:
                 factors.append(target.factor)
                 sources.append(source)
                 fields.add(target.field)
-        self._written = torch.tensor(written)
+        self._written = torch.tensor(written, dtype=torch.long)
         self._factors = torch.tensor(factors, dtype=torch.float64)
-        self._sources = torch.tensor(sources)
+        self._sources = torch.tensor(sources, dtype=torch.long)
         self._mixes = bool(fields & set(MIXED))
         self._weighs = bool(fields & _INERTIAL)
         wanted = [c for c in written if c < self._direct]

@@ -1,0 +1,229 @@
+"""Effects as a config names them: where they sit, and which of their numbers are parameters."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals
+from dropo_torch.errors import InputError, choices
+from dropo_torch.observation import Observation
+from dropo_torch.parameters import Parameter, ParameterSpace
+
+Find = Callable[[str], Effect]
+
+
+@dataclass(frozen=True)
+class Entry:
+    """An effect at a target: its fixed numbers, and the columns of parameter vectors that hold the others.
+
+    Attributes:
+        effect: the effect.
+        target: where it sits, ``None`` for the world.
+        fixed: its numbers, ``(p,)``; NaN where a parameter holds one.
+        columns: the parameter of each number, or -1, ``(p,)``.
+    """
+
+    effect: Effect
+    target: str | None
+    fixed: tuple[float, ...]
+    columns: tuple[int, ...]
+
+    @property
+    def varies(self) -> bool:
+        """Whether a parameter holds one of its numbers."""
+        return any(c >= 0 for c in self.columns)
+
+    @property
+    def place(self) -> str:
+        """What it is called in messages, such as ``actuator_delay at elbow``."""
+        return self.effect.name + (f" at {self.target}" if self.target else "")
+
+    def at(self, vector: np.ndarray) -> Placed:
+        """Return the effect under a parameter vector ``(d,)``."""
+        numbers = (f if c < 0 else float(vector[c]) for f, c in zip(self.fixed, self.columns, strict=True))
+        return Placed(self.effect, self.target, tuple(numbers))
+
+
+@dataclass(frozen=True)
+class EffectSet:
+    """The effects of a config, and the setting in which they are understood."""
+
+    entries: tuple[Entry, ...]
+    setting: Setting
+
+    def __len__(self) -> int:
+        """Return the number of effects."""
+        return len(self.entries)
+
+    def at(self, vector: np.ndarray) -> tuple[Placed, ...]:
+        """Return the effects under a parameter vector ``(d,)``."""
+        return tuple(entry.at(vector) for entry in self.entries)
+
+    def matching(self, wanted: Callable[[Effect], bool]) -> EffectSet:
+        """Return the effects of a kind."""
+        return EffectSet(tuple(e for e in self.entries if wanted(e.effect)), self.setting)
+
+    def look_back(self, space: ParameterSpace, *, sensors: bool) -> float:
+        """Return the most seconds that command filters (or sensors) remember, wherever the parameters may go."""
+        seconds = 0.0
+        for entry in self.entries:
+            if not (entry.effect.acts_on_sensor if sensors else entry.effect.acts_on_command):
+                continue
+            top = np.minimum(space.high + (space.high - space.low), space.limits[:, 1])
+            for vector in (space.low, space.high, top):
+                seconds = max(seconds, entry.effect.memory(np.asarray(entry.at(vector).values)))
+        return seconds
+
+
+def plain_setting(model: mujoco.MjModel, observation: Observation, frame_skip: int, size: float = 1.0) -> Setting:
+    """Return a setting that knows no log: everything moves, touches and has one size."""
+    ones = np.full(max(model.nv, model.nu, model.nbody, observation.size), size)
+    signals = Signals(
+        timestep=frame_skip * float(model.opt.timestep), position=np.tile([-size, size], (model.nq, 1)),
+        speed=ones[: model.nv], force=ones[: model.nv], inertia=ones[: model.nv], command=ones[: model.nu],
+        column=ones[: observation.size], linear_speed=ones[: model.nbody], contacts=np.ones(model.ngeom, dtype=bool),
+    )  # fmt: skip
+    return Setting(model, observation, signals, frame_skip)
+
+
+def place_effects(given: Sequence[Mapping[str, Any]], space: ParameterSpace, setting: Setting, find: Find) -> EffectSet:
+    """Read a config's ``effects`` and the parameters that are numbers of effects.
+
+    Every number of an effect stands in its entry or is a parameter. An effect whose numbers all are parameters needs
+    no entry. Where both give a number, the parameter does.
+
+    Args:
+        given: the config's ``effects``.
+        space: the parameters, those of effects among them.
+        setting: the model as given, and the log's columns.
+        find: returns an effect by its name.
+
+    Raises:
+        InputError: an unknown effect, target or number (the nearest is offered), a number that is missing.
+    """
+    numbers: dict[tuple[str, str | None], dict[str, float]] = {}
+    effects: dict[tuple[str, str | None], Effect] = {}
+    for i, document in enumerate(given):
+        effect, target = _located(f"effects[{i}]", document, "target", setting, find)
+        if (effect.name, target) in numbers:
+            raise InputError(f"effects[{i}]: {effect.name} stands there twice for {target or 'the world'}; keep one")
+        effects[effect.name, target] = effect
+        numbers[effect.name, target] = _numbers(f"effects[{i}]", document, effect.quantities(setting, target))
+    columns: dict[tuple[str, str | None], dict[str, int]] = {}
+    for column, parameter in enumerate(space.parameters):
+        if parameter.effect:
+            where = f"parameters.{parameter.name}"
+            document = {"effect": parameter.effect, "name": next(iter(parameter.objects), None)}
+            effect, target = _located(where, document, "name", setting, find)
+            key = effect.name, target
+            quantity = _quantity(where, parameter, effect.quantities(setting, target))
+            effects[key] = effect
+            if quantity in columns.setdefault(key, {}):
+                raise InputError(f"{where}: {quantity} of {effect.name} is already a parameter; keep one of them")
+            columns[key][quantity] = column
+    entries = [
+        _entry(effect, key[1], effect.quantities(setting, key[1]), numbers.get(key, {}), columns.get(key, {}))
+        for key, effect in effects.items()
+    ]
+    return EffectSet(tuple(entries), setting)
+
+
+def lowest(effects: EffectSet, space: ParameterSpace) -> np.ndarray:
+    """Return what each parameter cannot fall below ``(d,)``, by the effects' physics; minus infinity for fields.
+
+    Raises:
+        InputError: bounds that reach below.
+    """
+    s = effects.setting
+    settings = [plain_setting(s.model, s.observation, s.frame_skip, size) for size in (1.0, 3.0)]
+    least = np.full(len(space), -np.inf)
+    for entry in effects.entries:
+        pairs = zip(*(entry.effect.quantities(x, entry.target) for x in settings), strict=True)
+        for (one, other), column in zip(pairs, entry.columns, strict=True):
+            if column < 0:
+                continue
+            parameter = space.parameters[column]
+            if one.low == other.low:  # a bound that no log shifts is one of physics
+                least[column] = one.low
+            elif min(one.low, other.low) > 0:
+                least[column] = 0.1 * max(parameter.low, 0.0)
+            if parameter.low < least[column] or (min(one.low, other.low) > 0 and parameter.low <= 0):
+                raise InputError(
+                    f"parameters.{parameter.name}: bounds [{parameter.low:g}, {parameter.high:g}] allow a "
+                    f"{one.name} of {entry.effect.name} below {max(least[column], 0.0 if one.low > 0 else one.low):g}"
+                )
+    return least
+
+
+def _located(
+    where: str, document: Mapping[str, Any], key: str, setting: Setting, find: Find
+) -> tuple[Effect, str | None]:
+    """The effect and the target of an entry."""
+    name, target = document.get("effect"), document.get(key)
+    if name is None:
+        raise InputError(f"{where}: no effect named; expected effect: NAME, such as effect: joint_friction")
+    try:
+        effect = find(str(name))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
+    possible = effect.targets(setting)
+    if target not in possible:
+        names = [str(t) for t in possible if t is not None]
+        if possible == [None]:
+            raise InputError(f"{where}: {effect.name} belongs to the whole world; leave {key} out")
+        if target is None and names:
+            raise InputError(f"{where}: no {key} given; expected the {effect.kind}'s name" + choices("", names))
+        has = f"cannot be at {target!r}" if target is not None else "fits nowhere in this model"
+        raise InputError(f"{where}: {effect.name} {has}" + choices(target, names))
+    return effect, target
+
+
+def _numbers(where: str, document: Mapping[str, Any], quantities: Sequence[Quantity]) -> dict[str, float]:
+    """The numbers of an entry, by name."""
+    known = [q.name for q in quantities]
+    found = {}
+    for key, value in document.items():
+        if key in ("effect", "target"):
+            continue
+        if key not in known:
+            raise InputError(f"{where}: unknown key {key!r}" + choices(key, known))
+        if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+            unit = next(q.unit for q in quantities if q.name == key)
+            raise InputError(f"{where}: {key} is {value!r}; expected a number in {unit}")
+        found[key] = float(value)
+    return found
+
+
+def _quantity(where: str, parameter: Parameter, quantities: Sequence[Quantity]) -> str:
+    """Which number of an effect a parameter is."""
+    names = [q.name for q in quantities]
+    if not parameter.quantity and len(names) == 1:
+        return names[0]
+    if parameter.quantity not in names:
+        given = f"no number {parameter.quantity!r}" if parameter.quantity else "several numbers; add index: NAME"
+        raise InputError(f"{where}: {parameter.effect} has {given}" + choices(parameter.quantity, names))
+    return parameter.quantity
+
+
+def _entry(
+    effect: Effect, target: str | None, quantities: Sequence[Quantity], fixed: dict[str, float],
+    columns: dict[str, int],
+) -> Entry:  # fmt: skip
+    missing = [q for q in quantities if q.name not in fixed and q.name not in columns]
+    entry = Entry(
+        effect, target,
+        tuple(math.nan if q.name in columns else fixed.get(q.name, math.nan) for q in quantities),
+        tuple(columns.get(q.name, -1) for q in quantities),
+    )  # fmt: skip
+    if missing:
+        raise InputError(
+            f"effects: {entry.place} has no {missing[0].name}; give {missing[0].name}: a number in {missing[0].unit} "
+            "in its entry of effects, or make it a parameter"
+        )
+    return entry

@@ -1,0 +1,830 @@
+"""Effects: each against its own physics, in simulators, configs, fits and files."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import HOPPER
+
+from dropo_torch.certify import certify
+from dropo_torch.cli import main
+from dropo_torch.config import load_config, make_config
+from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
+from dropo_torch.effects.base import Setting
+from dropo_torch.effects.export import search_box, write_config, write_model
+from dropo_torch.effects.placing import lowest, place_effects, plain_setting
+from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
+from dropo_torch.errors import InputError
+from dropo_torch.fit import fit
+from dropo_torch.observation import generic_observation, parse_observation
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.problem import make_problem
+from dropo_torch.simulators import MujocoSimulator, make_simulator
+from dropo_torch.trajectory import Trajectories, make_transitions
+from sims.hopper import SIM
+
+#: A chain of two links, a free ball on a floor, a slide without friction.
+RIG = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 .1"/>
+    <body name="upper" pos="0 0 1">
+      <joint name="shoulder" type="hinge" axis="0 1 0" damping=".1" limited="true" range="-60 60"/>
+      <geom name="upper" type="capsule" size=".03" fromto="0 0 0 .1 0 -.4" mass="1.2"/>
+      <body name="lower" pos=".1 0 -.4">
+        <joint name="elbow" type="hinge" axis="0 1 0" stiffness=".3" springref="20"/>
+        <geom name="lower" type="capsule" size=".03" fromto="0 0 0 .05 0 -.3" mass=".7"/>
+      </body>
+    </body>
+    <body name="ball" pos="1 0 .099">
+      <freejoint name="root"/><geom name="ball" type="sphere" size=".1" mass="1"/>
+    </body>
+    <body name="cart" pos="-2 0 1">
+      <joint name="rail" type="slide" axis="1 0 0"/><geom name="cart" type="box" size=".1 .1 .1" mass="2"/>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="lift" joint="shoulder" gear="3"/><position name="bend" joint="elbow" kp="5"/>
+    <motor name="push" joint="rail" gear="2"/>
+  </actuator>
+</mujoco>"""
+SKIP = 4
+STEP = 0.005
+COLUMNS = ("shoulder", "elbow", "root", "rail")
+
+
+def general(xml: str = RIG) -> mujoco.MjModel:
+    spec = mujoco.MjSpec.from_string(xml)
+    for body in spec.bodies[1:]:
+        body.simple = 0
+    return spec.compile()
+
+
+def setting_of(model: mujoco.MjModel) -> Setting:
+    return plain_setting(model, parse_observation(model, None), SKIP)
+
+
+def some_states(model: mujoco.MjModel, number: int = 3) -> torch.Tensor:
+    rng = np.random.default_rng(0)
+    states = np.tile(np.concatenate([model.qpos0, np.zeros(model.nv)]), (number, 1))
+    for c in [0, 1, 9]:
+        states[:, c] += rng.uniform(-0.9, 0.9, number)
+    states[:, model.nq :] += rng.normal(0, 1.0, (number, model.nv))
+    return torch.from_numpy(states)
+
+
+def some_controls(model: mujoco.MjModel, steps: int, number: int = 3) -> torch.Tensor:
+    return torch.from_numpy(np.random.default_rng(1).uniform(-1, 1, (number, steps, model.nu)))
+
+
+def simulator_of(
+    model: mujoco.MjModel,
+    effects: list[dict],
+    parameters: dict | None = None,
+    backend: str = "mujoco",
+    skip: int = SKIP,
+) -> tuple[Any, int]:
+    """A simulator with effects; the cart's damping varies unless other parameters are given."""
+    given = parameters or {
+        "d": {"field": "dof_damping", "name": model.joint(model.njnt - 1).name, "bounds": [0.0, 1.0]}
+    }
+    space = ParameterSpace(model, given)
+    setting = plain_setting(model, parse_observation(model, None), skip)
+    found = place_effects(effects, space, setting, find_effect)
+    space = space.with_limits(lowest(found, space))
+
+    def make(changed: mujoco.MjModel, frame_skip: int, parameters: ParameterSpace) -> Any:
+        return make_simulator(backend, changed, parameters=parameters, frame_skip=frame_skip, num_threads=1)
+
+    step = float(model.opt.timestep)
+    return effect_simulator(backend, found, space, make, timestep=skip * step, longest=1000, num_threads=1)
+
+
+def entry(effect: Effect, target: str | None, values: np.ndarray, setting: Setting) -> dict:
+    names = [q.name for q in effect.quantities(setting, target)]
+    document: dict = {"effect": effect.name, **dict(zip(names, map(float, values), strict=True))}
+    return document if target is None else {**document, "target": target}
+
+
+def placements() -> list[Any]:
+    setting = setting_of(general())
+    return [
+        pytest.param(effect, target, id=f"{effect.name}-{target}")
+        for effect in VOCABULARY.values()
+        for target in effect.targets(setting)
+    ]
+
+
+def rolled(model: mujoco.MjModel, entries: list[dict], steps: int = 12) -> np.ndarray:
+    simulator, history = simulator_of(model, entries)
+    controls = some_controls(model, history + steps)[:, -(history + steps) :]
+    controls[:, :history] = controls[:, history : history + 1]
+    fixed = some_controls(model, steps)
+    controls[:, history:] = fixed
+    controls[:, :history] = fixed[:, :1]
+    return simulator.rollout(some_states(model), controls, torch.full((1, 1), 0.1, dtype=torch.float64)).numpy()
+
+
+@pytest.fixture(scope="module")
+def plain_path() -> np.ndarray:
+    model = general()
+    space = ParameterSpace(model, {"d": {"field": "dof_damping", "name": "rail", "bounds": [0.0, 1.0]}})
+    simulator = MujocoSimulator(model, parameters=space, frame_skip=SKIP, num_threads=1)
+    values = torch.full((1, 1), 0.1, dtype=torch.float64)
+    return simulator.rollout(some_states(model), some_controls(model, 12), values).numpy()
+
+
+def test_every_effect_is_tried() -> None:
+    assert {p.values[0].name for p in placements()} == set(VOCABULARY)
+
+
+@pytest.mark.parametrize(("effect", "target"), placements())
+def test_neutral_values_change_nothing(effect: Effect, target: str | None, plain_path: np.ndarray) -> None:
+    model = general()
+    setting = setting_of(model)
+    neutral = np.array([q.neutral for q in effect.quantities(setting, target)])
+    if effect.name == "actuator_saturation":
+        neutral[:] = 1e6  # what the log asks for is not known here
+    np.testing.assert_allclose(rolled(model, [entry(effect, target, neutral, setting)]), plain_path, rtol=0, atol=1e-9)
+
+
+#: What does not turn has no use for its centre or inertia; no force depends on where it is.
+_INVARIANT = (
+    ("center_of_mass", "cart"), ("inertia", "cart"), ("sensor_bias", "root.position[x]"),
+    ("sensor_bias", "root.position[y]"), ("sensor_bias", "rail.position"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("effect", "target"), placements())
+def test_values_that_matter_change_the_simulation(effect: Effect, target: str | None, plain_path: np.ndarray) -> None:
+    model = general()
+    setting = setting_of(model)
+    quantities = effect.quantities(setting, target)
+    values = effect.starts(setting, target)[-1]
+    for i, q in enumerate(quantities):
+        if values[i] == q.neutral and (len(quantities) == 1 or effect.name not in ("payload", "joint_stiffness")):
+            values[i] = np.clip(q.neutral + 0.3 * q.scale, q.low, q.high)
+    if effect.name == "joint_limit":
+        values = np.array([0.8, -0.8]) * 1.04
+    if target in ("upper", "lower", "cart") and effect.kind == "geom":
+        pytest.skip("touches nothing here")
+    path = rolled(model, [entry(effect, target, values, setting)])
+    if (effect.name, target) in _INVARIANT:
+        np.testing.assert_allclose(path, plain_path, atol=1e-9)
+        return
+    assert np.abs(np.nan_to_num(path, nan=1e3) - plain_path).max() > 1e-6
+
+
+def applied(xml: str, name: str, target: str | None, *values: float) -> tuple[mujoco.MjModel, mujoco.MjData]:
+    model = general(xml)
+    find_effect(name).apply(model, target, np.array(values))
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model, mujoco.MjData(model)
+
+
+@pytest.mark.parametrize(
+    "geom", ['type="sphere" size=".1"', 'type="capsule" size=".05 .2"', 'type="box" size=".1 .2 .3"']
+)
+def test_drag_is_the_square_of_the_speed_from_every_side(geom: str) -> None:
+    xml = f"""<mujoco><worldbody><body name="b"><freejoint/><geom {geom} mass="2"/></body>
+      <body name="other" pos="3 0 0"><freejoint/><geom size=".1"/></body></worldbody></mujoco>"""
+    model, data = applied(xml, "fluid_drag", "b", 0.7)
+    for velocity in np.random.default_rng(0).normal(0, 2, (5, 3)):
+        data.qvel[:] = 0
+        data.qvel[:3], data.qvel[6:9] = velocity, velocity
+        mujoco.mj_forward(model, data)
+        if "sphere" in geom:
+            wanted = -0.7 * np.linalg.norm(velocity) * velocity
+            np.testing.assert_allclose(data.qfrc_passive[:3], wanted, rtol=1e-5)
+        along = data.qfrc_passive[:3] @ velocity / np.linalg.norm(velocity) ** 3
+        assert along == pytest.approx(-0.7, rel=1e-4)
+        np.testing.assert_allclose(data.qfrc_passive[6:], 0, atol=1e-12)  # the other body feels nothing
+
+
+def test_a_payload_is_a_welded_point_mass() -> None:
+    loaded, data = applied(RIG, "payload", "lower", 0.4, 0.05, 0.02, -0.3)
+    inertial = '<body pos=".05 .02 -.3"><inertial pos="0 0 0" mass="0.4" diaginertia="1e-12 1e-12 1e-12"/></body>'
+    welded = general(RIG.replace('mass=".7"/>', f'mass=".7"/>{inertial}'))
+    other = mujoco.MjData(welded)
+    state = some_states(loaded)[0].numpy()
+    for m, d in ((loaded, data), (welded, other)):
+        d.qpos[:], d.qvel[:] = state[: m.nq], state[m.nq :]
+        mujoco.mj_forward(m, d)
+    np.testing.assert_allclose(data.qacc, other.qacc, rtol=1e-6, atol=1e-9)
+
+
+def test_a_payload_may_sit_on_a_free_body_off_its_centre() -> None:
+    model, _ = applied(RIG, "payload", "ball", 0.5, 0.05, 0.0, 0.0)
+    assert model.body("ball").mass[0] == pytest.approx(1.5)
+    np.testing.assert_allclose(model.body("ball").ipos, [0.05 / 3, 0, 0], atol=1e-12)
+
+
+SLIDE = """
+<mujoco><option timestep="0.005"/><worldbody>
+  <body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom name="cart" size=".1" mass="2"/></body>
+</worldbody><actuator><motor name="push" joint="rail"/></actuator></mujoco>"""
+
+
+def driven(
+    entries: list[dict], command: np.ndarray, start: tuple[float, float] = (0.0, 0.0), xml: str = SLIDE, **options: Any
+) -> np.ndarray:
+    """States ``(S, 2)`` of the cart under one command per physics step."""
+    model = general(xml)
+    simulator, history = simulator_of(model, entries, skip=1, **options)
+    before = np.repeat(command[:1], history)
+    controls = torch.from_numpy(np.concatenate([before, command])[None, :, None].astype(float))
+    values = torch.zeros(1, 1, dtype=torch.float64)
+    return simulator.rollout(torch.tensor([start], dtype=torch.float64), controls, values)[0, 0].numpy()
+
+
+def forces(path: np.ndarray, start: float = 0.0) -> np.ndarray:
+    """The force in every physics step of the 2 kg cart."""
+    return 2 * np.diff(path[:, 1], prepend=start) / STEP
+
+
+_NOTHING = {"effect": "actuator_delay", "target": "push"}
+COMMAND = np.repeat(np.random.default_rng(3).uniform(-1, 1, 8), 5)
+
+
+def test_dry_friction_slides_and_sticks() -> None:
+    held = driven([{"effect": "joint_friction", "target": "rail", "friction": 0.5}], np.full(200, 0.4))
+    assert abs(held[-1, 1]) < 1e-3  # MuJoCo's dry friction creeps
+    slid = driven([{"effect": "joint_friction", "target": "rail", "friction": 0.5}], np.full(400, 2.0))
+    assert forces(slid)[-1] == pytest.approx(1.5, rel=1e-3)
+
+
+@pytest.mark.parametrize("speed", [-1.5, 0.5])
+def test_passive_forces_of_a_joint(speed: float) -> None:
+    def passive(name: str, *values: float) -> float:
+        model, data = applied(
+            SLIDE.replace('type="slide"', 'type="slide" stiffness="2" springref="0.1"'), name, "rail", *values
+        )
+        data.qpos[0], data.qvel[0] = 0.3, speed
+        mujoco.mj_forward(model, data)
+        return float(data.qfrc_passive[0]) + 2 * (0.3 - 0.1)
+
+    assert passive("joint_damping", 0.7) == pytest.approx(-0.7 * speed)
+    assert passive("joint_quadratic_damping", 0.7) == pytest.approx(-0.7 * abs(speed) * speed)
+    assert passive("joint_stiffness", 5.0, -0.2) == pytest.approx(-5 * (0.3 + 0.2))
+    model, _ = applied(SLIDE, "armature", "rail", 0.4)
+    assert model.dof_M0[0] == pytest.approx(2.4)
+
+
+def test_inertia_and_centre_and_stops() -> None:
+    model, _ = applied(RIG, "inertia", "lower", 1.5)
+    np.testing.assert_allclose(model.body("lower").inertia, 1.5 * general().body("lower").inertia)
+    model, _ = applied(RIG, "center_of_mass", "lower", 0.01, 0.02, -0.03)
+    np.testing.assert_allclose(model.body("lower").ipos - general().body("lower").ipos, [0.01, 0.02, -0.03], atol=1e-12)
+    model, _ = applied(RIG, "joint_limit", "shoulder", 0.2, -0.1)
+    np.testing.assert_allclose(model.joint("shoulder").range, np.deg2rad([-60, 60]) + [0.2, -0.1])
+
+
+def test_a_geom_alone_decides_its_friction_and_softness() -> None:
+    """A box slides with the friction given, whatever the floor's; softness leaves the friction as it was."""
+    xml = """<mujoco><option timestep="0.001"/><worldbody>
+      <geom name="floor" type="plane" size="50 50 1" friction="1.3"/>
+      <body name="box" pos="0 0 .099">
+        <joint name="x" type="slide" axis="1 0 0"/><joint name="z" type="slide" axis="0 0 1"/>
+        <geom name="box" type="box" size=".1 .1 .1" friction="0.7"/>
+      </body></worldbody></mujoco>"""
+    for name, values, friction in (("contact_friction", (0.4,), 0.4), ("contact_stiffness", (0.03, 1.0), 1.3)):
+        model, data = applied(xml, name, "box", *values)
+        mujoco.mj_step(model, data, 1000)
+        assert np.allclose(data.contact[0].solref, values) == (name == "contact_stiffness")
+        assert data.contact[0].friction[0] == pytest.approx(friction)
+        if name == "contact_stiffness":
+            continue  # what is soft also slips before it holds
+        data.qvel[0] = 0.5
+        mujoco.mj_step(model, data, 20)
+        assert (0.5 - float(data.qvel[0])) / 0.02 == pytest.approx(9.81 * friction, rel=0.1)
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.1, 0.5])
+def test_stribeck_friction_at_a_steady_speed(speed: float) -> None:
+    numbers = {"coulomb": 0.3, "static": 0.8, "velocity": 0.1}
+    path = driven([{"effect": "joint_stribeck", "target": "rail", **numbers}], np.full(3, 2.0), (0.0, speed))
+    wanted = 0.3 + 0.5 * np.exp(-((speed / 0.1) ** 2))
+    assert 2.0 - forces(path, speed)[0] == pytest.approx(wanted, rel=0.02)
+
+
+def test_stribeck_friction_holds_what_is_below_its_static_value() -> None:
+    numbers = {"coulomb": 0.3, "static": 0.8, "velocity": 0.1}
+    assert abs(driven([{"effect": "joint_stribeck", "target": "rail", **numbers}], np.full(400, 0.7))[-1, 1]) < 1e-3
+    assert driven([{"effect": "joint_stribeck", "target": "rail", **numbers}], np.full(400, 0.9))[-1, 1] > 0.1
+
+
+def test_cogging_ripples_with_the_position() -> None:
+    numbers = {"amplitude": 0.7, "poles": 9.0, "phase": 0.4}
+    path = driven([{"effect": "joint_cogging", "target": "rail", **numbers}], np.zeros(50), (0.1, 1.0))
+    positions = np.append(0.1, path[:-1, 0])
+    np.testing.assert_allclose(forces(path, 1.0), 0.7 * np.sin(9 * positions + 0.4), atol=1e-9)
+
+
+def test_coupling_is_a_spring_between_neighbours() -> None:
+    model = general()
+    setting = setting_of(model)
+    states = some_states(model).numpy()
+    found = find_effect("joint_coupling").force(
+        setting, "elbow", np.array([2.0]), states[:, : model.nq], states[:, model.nq :]
+    )
+    assert found is not None
+    stretch = states[:, 1] - states[:, 0]
+    np.testing.assert_allclose(found[:, 1], -2 * stretch)
+    np.testing.assert_allclose(found[:, 0], 2 * stretch)
+
+
+def test_an_external_force_pushes_the_centre() -> None:
+    path = driven([{"effect": "external_force", "target": "cart", "x": 0.6, "y": 3.0, "z": 1.0}], np.zeros(5))
+    np.testing.assert_allclose(forces(path), 0.6, atol=1e-9)
+
+
+def test_gravity_and_ground_tilt_alike() -> None:
+    xml = """<mujoco><worldbody><geom name="floor" type="plane" size="5 5 1" condim="1"/><body name="ball" pos="0 0 .1">
+      <freejoint/><geom size=".1" condim="1"/></body></worldbody></mujoco>"""
+    for name, factor in (("gravity_tilt", -1.0), ("ground_slope", 1.0)):
+        model, data = applied(xml, name, None, 0.0, 0.1)
+        for _ in range(500):
+            mujoco.mj_step(model, data)
+        assert data.qvel[0] == pytest.approx(factor * 9.81 * np.sin(0.1) * (np.cos(0.1) if factor > 0 else 1), rel=0.01)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_a_delay_of_whole_steps_shifts_commands(backend: str) -> None:
+    path = driven([{"effect": "actuator_delay", "target": "push", "delay": 7 * STEP}], COMMAND, backend=backend)
+    late = np.concatenate([np.repeat(COMMAND[:1], 7), COMMAND[:-7]])
+    np.testing.assert_allclose(forces(path), late, atol=1e-9)
+
+
+def test_a_delay_of_part_of_a_step_gives_the_steps_mean() -> None:
+    path = driven([{"effect": "actuator_delay", "target": "push", "delay": 2.25 * STEP}], COMMAND)
+    padded = np.concatenate([np.repeat(COMMAND[:1], 3), COMMAND])
+    np.testing.assert_allclose(forces(path), 0.75 * padded[1:-2] + 0.25 * padded[:-3], atol=1e-9)
+
+
+def test_a_lag_answers_a_step_exponentially() -> None:
+    command = np.concatenate([np.zeros(10), np.ones(60)])
+    path = driven([{"effect": "actuator_lag", "target": "push", "time_constant": 0.05}], command)
+    begin, end = (np.arange(60) + np.array([[0], [1]])) * STEP / 0.05
+    mean = 1 - (np.exp(-begin) - np.exp(-end)) * 0.05 / STEP
+    np.testing.assert_allclose(forces(path)[10:], mean, atol=1e-9)
+
+
+def test_a_dead_band_swallows_and_play_holds() -> None:
+    path = driven([{"effect": "actuator_deadband", "target": "push", "width": 0.3}], np.array([0.2, 0.5, -0.9, -0.1]))
+    np.testing.assert_allclose(forces(path), [0, 0.2, -0.6, 0], atol=1e-9)
+    path = driven([{"effect": "actuator_backlash", "target": "push", "width": 0.4}], np.array([0.0, 1, 0.7, 0.5, 0.9]))
+    np.testing.assert_allclose(forces(path), [0, 0.8, 0.8, 0.7, 0.7], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "effects",
+    [
+        [{"effect": "actuator_delay", "target": "push", "delay": 3.4 * STEP}],
+        [{"effect": "actuator_lag", "target": "push", "time_constant": 0.4 * STEP}],
+        [
+            {"effect": "actuator_delay", "target": "push", "delay": 3.4 * STEP},
+            {"effect": "actuator_backlash", "target": "push", "width": 0.3},
+        ],
+    ],
+)
+def test_the_past_reaches_into_a_window(effects: list) -> None:
+    """Windows with their history continue what a whole episode does."""
+    whole = driven(effects, COMMAND)
+    simulator, history = simulator_of(general(SLIDE), effects, skip=1)
+    padded = np.concatenate([np.repeat(COMMAND[:1], history), COMMAND])
+    for at in range(20, 30):
+        controls = torch.from_numpy(padded[at : at + history + 5][None, :, None])
+        path = simulator.rollout(torch.from_numpy(whole[at - 1 : at]), controls, torch.zeros(1, 1, dtype=torch.float64))
+        tolerance = 1e-5 if len(effects) == 1 and "time_constant" in effects[0] else 1e-12
+        np.testing.assert_allclose(path[0, 0].numpy(), whole[at : at + 5], atol=tolerance)
+
+
+def test_saturation_and_gain_and_back_emf() -> None:
+    path = driven([{"effect": "actuator_saturation", "target": "push", "limit": 0.4}], np.array([1.0, -1, 0.2]))
+    np.testing.assert_allclose(forces(path), [0.4, -0.4, 0.2], atol=1e-9)
+    path = driven([{"effect": "actuator_gain", "target": "push", "gain": 0.7}], np.array([1.0, -1]))
+    np.testing.assert_allclose(forces(path), [0.7, -0.7], atol=1e-9)
+    path = driven([{"effect": "actuator_bias", "target": "push", "force": 0.2}], np.array([1.0, -1]))
+    np.testing.assert_allclose(forces(path), [1.2, -0.8], atol=1e-9)
+    path = driven([{"effect": "actuator_damping", "target": "push", "damping": 0.5}], np.array([1.0]), (0.0, 2.0))
+    assert forces(path, 2.0)[0] == pytest.approx(0.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_sensors_show_what_they_show(backend: str) -> None:
+    plain = driven([{"effect": "actuator_delay", "target": "push", "delay": 0.0}], COMMAND, (0.3, 1.0))
+    off = driven(
+        [{"effect": "sensor_bias", "target": "rail.position", "bias": 0.2}], COMMAND, (0.5, 1.0), backend=backend
+    )
+    np.testing.assert_allclose(off, plain + [0.2, 0.0], atol=1e-12)
+    off = driven([{"effect": "sensor_scale", "target": "rail.velocity", "factor": 2.0}], COMMAND, (0.3, 2.0))
+    np.testing.assert_allclose(off, plain * [1.0, 2.0], atol=1e-12)
+
+
+def test_a_late_sensor_shows_the_past() -> None:
+    command, delay = np.full(30, 1.5), 3.5 * STEP
+    path = driven([{"effect": "sensor_delay", "target": "rail.velocity", "delay": delay}], command, (0.0, 1.0))
+    times = STEP * np.arange(1, 31)
+    np.testing.assert_allclose(path[:, 1], 1.0 + 0.75 * times, atol=1e-9)  # 1.5 N on 2 kg, as it would be without delay
+    path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], np.zeros(30), (0.2, 1.0))
+    np.testing.assert_allclose(path[:, 0], 0.2 + times, atol=1e-9)
+
+
+@pytest.mark.parametrize("late", [(3, 0), (0, 2), (3, 2)])
+def test_a_window_of_late_measurements_begins_where_they_were_taken(late: tuple[int, int]) -> None:
+    """Under one command up to a window's start and another from there on, every late measurement is foretold."""
+    command = np.concatenate([np.full(20, 1.5), np.full(10, -2.0)])
+    true = np.concatenate([[[0.2, 1.0]], driven([{**_NOTHING, "delay": 0.0}], command, (0.2, 1.0))])
+    shown = np.stack([true[20 - late[i] : 31 - late[i], i] for i in (0, 1)], 1)
+    effects = [
+        {"effect": "sensor_delay", "target": f"rail.{column}", "delay": n * STEP}
+        for column, n in zip(("position", "velocity"), late, strict=True)
+    ]
+    simulator, history = simulator_of(general(SLIDE), effects, skip=1)
+    assert history == 1
+    controls = torch.from_numpy(command[20 - history :][None, :, None])
+    path = simulator.rollout(torch.from_numpy(shown[:1]), controls, torch.zeros(1, 1, dtype=torch.float64))
+    np.testing.assert_allclose(path[0, 0], shown[1:], atol=1e-9)
+
+
+def test_each_parameter_vector_has_its_own_numbers() -> None:
+    parameters = {
+        "delay": {"effect": "actuator_delay", "name": "push", "bounds": [0.0, 0.05]},
+        "friction": {"effect": "joint_friction", "name": "rail", "index": "friction", "bounds": [0.0, 0.5]},
+    }
+    simulator, history = simulator_of(general(SLIDE), [], parameters, skip=1)
+    controls = torch.from_numpy(np.concatenate([np.repeat(COMMAND[:1], history), COMMAND])[None, :, None])
+    values = torch.tensor([[0.0, 0.0], [2 * STEP, 0.0], [2 * STEP, 0.3]], dtype=torch.float64)
+    start = torch.tensor([[0.0, 3.0]], dtype=torch.float64)
+    path = simulator.rollout(start, controls, values)
+    for k, value in enumerate(values):
+        alone = simulator.simulate(start, controls, value[None])
+        assert torch.equal(alone[0, 0], path[0, k, -1])
+    shifted = np.concatenate([np.repeat(COMMAND[:1], 2), COMMAND[:-2]])
+    np.testing.assert_allclose(forces(path[0, 1].numpy(), 3.0), shifted, atol=1e-9)
+    np.testing.assert_allclose(forces(path[0, 2].numpy(), 3.0), shifted - 0.3, atol=1e-3)
+
+
+# In configs
+
+
+XML = (Path(__file__).parent / "arm.py").read_text().split('XML = """')[1].split('"""')[0]
+
+
+def record_arm(folder: Path, *, delay: int = 0, friction: float = 0.0, steps: int = 150) -> dict:
+    """Write an arm and its log, with what its model lacks: a delay of the elbow's command in steps, and friction."""
+    model = mujoco.MjModel.from_xml_string(XML)
+    find_effect("joint_friction").apply(model, "elbow", np.array([friction]))
+    data = mujoco.MjData(model)
+    actions = np.repeat(np.random.default_rng(0).uniform(-1, 1, (steps // 5, 2)), 5, 0)
+    fine = np.repeat(actions, 2, 0)
+    fine[delay:, 1] = fine[: len(fine) - delay, 1].copy()
+    fine[:delay, 1] = actions[0, 1]
+    path = [np.concatenate([data.qpos, data.qvel])]
+    for s, control in enumerate(fine):
+        data.ctrl[:] = control
+        mujoco.mj_step(model, data)
+        if s % 2:
+            path.append(np.concatenate([data.qpos, data.qvel]))
+    rows = np.array(path)
+    np.savez(
+        folder / "log.npz", observations=rows[:-1], next_observations=rows[1:], actions=actions,
+        terminals=np.arange(steps) == steps - 1,
+    )  # fmt: skip
+    (folder / "arm.xml").write_text(XML)
+    return {
+        "model": str(folder / "arm.xml"), "data": str(folder / "log.npz"), "frame_skip": 2, "samples": 20,
+        "threads": 1, "epsilon": 1e-9,
+    }  # fmt: skip
+
+
+DELAY = {"effect": "actuator_delay", "name": "bend", "index": "delay", "bounds": [0.0, 0.08], "unit": "s"}
+
+
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_a_fit_recovers_a_hidden_delay_and_friction(tmp_path: Path, backend: str) -> None:
+    document = {**record_arm(tmp_path, delay=3, friction=0.15), "backend": backend, "parameters": {"delay": DELAY}}
+    if backend == "mujoco":
+        document["parameters"]["friction"] = {"effect": "joint_friction", "name": "elbow", "bounds": [0.0, 0.5]}
+    else:
+        document["effects"] = [{"effect": "joint_friction", "target": "elbow", "friction": 0.15}]
+    problem = make_problem(make_config(document))
+    assert isinstance(problem.simulator, EffectSimulator)
+    mean = fit(problem.objective, samples=20, seed=0).distribution.summary()
+    assert mean["delay"]["mean"] == pytest.approx(0.03, abs=1e-5)
+    assert backend == "warp" or mean["friction"]["mean"] == pytest.approx(0.15, abs=1e-4)
+
+
+def test_fixed_native_effects_become_part_of_the_model_and_keep_gradients(tmp_path: Path) -> None:
+    base = record_arm(tmp_path, friction=0.15)
+    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0]}}
+    effects = [{"effect": "joint_friction", "target": "elbow", "friction": 0.15}]
+    errors = []
+    for backend in ("mujoco", "warp"):
+        problem = make_problem(make_config({**base, "backend": backend, "parameters": mass, "effects": effects}))
+        assert problem.simulator.differentiable == (backend == "warp")
+        assert not isinstance(problem.simulator, EffectSimulator)
+        if backend == "warp":
+            certify(problem.objective, max_transitions=10, points=1).check()
+        shown = problem.objective.simulated(np.array([[0.7]]))[:, 0]
+        errors.append(float((shown - torch.from_numpy(problem.objective.transitions.measured)).abs().max()))
+    assert max(errors) < 1e-6
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "values"),
+    [
+        ("payload", "lower", (0.2, 0.05, 0.0, -0.3)), ("payload", "ball", (0.2, 0.05, 0.0, 0.0)),
+        ("gravity_tilt", None, (0.1, 0.2)), ("ground_slope", None, (0.1, -0.05)), ("integration", None, (STEP / 8,)),
+        ("contact_friction", "floor", (0.3,)), ("joint_limit", "shoulder", (0.8, -0.8)),
+        ("actuator_saturation", "bend", (0.5,)),
+    ],
+)  # fmt: skip
+def test_warp_has_native_effects_as_mujoco_has(name: str, target: str | None, values: tuple[float, ...]) -> None:
+    model = general(RIG.replace('name="cart" type="box" size=".1 .1 .1"', 'name="cart" type="sphere" size=".1"'))
+    document = entry(find_effect(name), target, np.array(values), setting_of(model))
+    states, controls = some_states(model), some_controls(model, 3)
+    found = [
+        simulator_of(model, [document], backend=backend)[0].rollout(
+            states, controls, torch.full((1, 1), 0.1, dtype=torch.float64)
+        )
+        for backend in ("mujoco", "warp")
+    ]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-9)
+
+
+def test_gymnasium_environments_have_effects_around_them() -> None:
+    effects = [
+        {"effect": "actuator_delay", "target": "leg_joint", "delay": 0.008},
+        {"effect": "joint_friction", "target": "foot_joint", "friction": 0.3},
+        {"effect": "sensor_bias", "target": "thigh_joint.position", "bias": 0.01},
+    ]
+    document = {
+        "data": str(SIM.log), "observation": list(SIM.observation), "effects": effects, "threads": 1,
+        "parameters": {n: dict(p) for n, p in SIM.parameters.items()},
+    }  # fmt: skip
+    ours = make_problem(make_config({**document, "model": str(HOPPER), "frame_skip": SIM.frame_skip}))
+    theirs = make_problem(make_config({**document, "backend": "gymnasium", "environment": "Hopper-v5"}))
+    values = 0.5 * (ours.space.low + ours.space.high)[None]
+    few = np.arange(0, len(ours.objective), 20)
+    found = [p.objective.on(p.objective.transitions.select(few)).simulated(values) for p in (ours, theirs)]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-8)
+    force = [{"effect": "external_force", "target": "torso", "x": 1.0, "y": 0.0, "z": 0.0}]
+    with pytest.raises(InputError, match=r"backend gymnasium cannot have external_force at torso.*backend: mujoco"):
+        make_problem(make_config({**document, "backend": "gymnasium", "environment": "Hopper-v5", "effects": force}))
+
+
+@pytest.mark.parametrize(
+    ("effects", "parameters", "message"),
+    [
+        ([{"effect": "actuator_dellay", "target": "bend"}], {}, r"effects\[0\]: .*did you mean 'actuator_delay'"),
+        ([{"effect": "actuator_delay", "target": "bent", "delay": 0.1}], {}, "did you mean 'bend'"),
+        ([{"effect": "actuator_delay", "delay": 0.1}], {}, "no target given; expected the actuator's name"),
+        ([{"effect": "gravity_tilt", "target": "x", "roll": 0, "pitch": 0}], {}, "belongs to the whole world"),
+        ([{"effect": "actuator_delay", "target": "bend", "delai": 0.1}], {}, "unknown key 'delai'.*'delay'"),
+        ([{"effect": "actuator_delay", "target": "bend", "delay": "x"}], {}, "delay is 'x'; expected a number in s"),
+        ([{"effect": "actuator_delay", "target": "bend"}], {}, "has no delay; give delay: a number in s"),
+        ([{"target": "bend"}], {}, "no effect named"),
+        ([{"effect": "actuator_delay", "target": "bend", "delay": 0.1}] * 2, {}, "stands there twice"),
+        ([], {"x": {**DELAY, "index": "deley"}}, "parameters.x: .*did you mean 'delay'"),
+        ([], {"x": {**DELAY, "field": "body_mass"}}, "field belongs to a field"),
+        (
+            [],
+            {"x": {**DELAY, "bounds": [-0.1, 0.1]}},
+            "parameters.x: bounds .* allow a delay of actuator_delay below 0",
+        ),
+        ([], {"x": DELAY, "y": DELAY}, "already a parameter"),
+        ([], {"x": {"effect": "joint_cogging", "name": "elbow", "bounds": [0, 1]}}, "several numbers; add index"),
+        ([], {"x": {"effect": "joint_cogging", "name": "elbow", "index": "amplitude", "bounds": [0, 1]}}, "no poles"),
+        ([{"effect": "integration", "timestep": 0.003}], {}, "no whole number"),
+    ],
+)
+def test_errors_of_a_config(tmp_path: Path, effects: list, parameters: dict, message: str) -> None:
+    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0]}}
+    document = {**record_arm(tmp_path, steps=20), "effects": effects, "parameters": {**mass, **parameters}}
+    with pytest.raises(InputError, match=message):
+        make_problem(make_config(document))
+
+
+def test_what_warp_cannot_have_is_refused_in_one_line(tmp_path: Path) -> None:
+    base = {**record_arm(tmp_path, steps=20), "backend": "warp"}
+    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0]}}
+    cogging = {"effect": "joint_cogging", "target": "elbow", "amplitude": 1.0, "poles": 3.0, "phase": 0.0}
+    payload = {"effect": "payload", "target": "lower", "mass": 0.1, "x": 0, "y": 0, "z": -0.1}
+    varying = {"f": {"effect": "joint_friction", "name": "elbow", "bounds": [0, 1]}}
+    for extra, message in (
+        (
+            {"effects": [cogging], "parameters": mass},
+            "backend warp cannot have joint_cogging at elbow.*backend: mujoco",
+        ),
+        ({"parameters": {**mass, **varying}}, "joint_friction at elbow has a number that varies"),
+        ({"effects": [payload], "parameters": mass}, "payload at lower writes the same number.*'mass'"),
+    ):
+        with pytest.raises(InputError, match=message):
+            make_problem(make_config({**base, **extra}))
+
+
+def test_adam_says_why_it_has_no_gradients(tmp_path: Path) -> None:
+    document = {**record_arm(tmp_path, steps=20), "backend": "warp", "parameters": {"delay": DELAY}}
+    problem = make_problem(make_config(document))
+    assert not hasattr(problem.simulator, "jacobian")
+    with pytest.raises(InputError, match=r"adam needs gradients.*actuator_delay.*fisher or cma"):
+        fit(problem.objective, optimizer="adam", samples=4)
+
+
+def test_ones_own_effect_joins_the_vocabulary(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Wind(type(find_effect("external_force"))):  # type: ignore[misc]
+        name = "wind_test"
+
+    monkeypatch.setitem(VOCABULARY, "wind_test", VOCABULARY["payload"])
+    with pytest.raises(InputError, match="taken"):
+        register(Wind())
+    del VOCABULARY["wind_test"]
+    assert register(Wind()) is find_effect("wind_test")
+
+
+def test_history_stays_inside_its_episode() -> None:
+    actions = np.arange(8.0)[:, None]
+    states = np.zeros((8, 2))
+    log = Trajectories(states, states, actions, np.array([0, 0, 0, 0, 1, 0, 0, 1]))
+    found = make_transitions(log, generic_observation(2), lag=1, history=3)
+    assert found.lag == 1
+    assert found.controls[2, :, 0].tolist() == [0, 0, 1, 2]
+    assert found.controls[4, :, 0].tolist() == [1, 2, 3, 4]
+    assert found.controls[6, :, 0].tolist() == [5, 5, 5, 6]
+    assert found.select(slice(2, 4)).lag == 1
+
+
+def test_backends_agree_where_all_parameters_are_of_effects(tmp_path: Path) -> None:
+    effects = [
+        {"effect": "sensor_delay", "target": "elbow.velocity", "delay": 0.013},
+        {"effect": "sensor_scale", "target": "elbow.position", "factor": 1.1},
+    ]
+    document = {**record_arm(tmp_path, steps=40), "lag": 3, "parameters": {"delay": DELAY}, "effects": effects}
+    values = np.array([[0.01], [0.033]])
+    found = [
+        make_problem(make_config({**document, "backend": b})).objective.simulated(values) for b in ("mujoco", "warp")
+    ]
+    torch.testing.assert_close(*found, rtol=0, atol=1e-7)
+
+
+def test_a_sensor_shows_at_the_start_what_was_measured(tmp_path: Path) -> None:
+    effects = [
+        {"effect": "sensor_scale", "target": "rail.position", "factor": 1.3},
+        {"effect": "sensor_bias", "target": "rail.position", "bias": 0.2},
+    ]
+    shown = driven(effects, np.zeros(1), (0.7, 0.0))
+    np.testing.assert_allclose(shown[0], [0.7, 0.0], atol=1e-12)
+
+
+def test_a_free_body_may_carry_a_payload_in_a_config(tmp_path: Path) -> None:
+    (tmp_path / "rig.xml").write_text(RIG)
+    model = general()
+    states = some_states(model, 6).numpy()
+    np.savez(
+        tmp_path / "log.npz", observations=states[:-1], next_observations=states[1:], actions=np.zeros((5, model.nu)),
+        terminals=np.ones(5, dtype=bool),
+    )  # fmt: skip
+    payload = {"effect": "payload", "target": "ball", "x": 0.05, "y": 0, "z": 0}
+    parameters = {"mass": {"effect": "payload", "name": "ball", "index": "mass", "bounds": [0.1, 1.0]}}
+    document = {"model": "rig.xml", "data": "log.npz", "frame_skip": 1, "effects": [payload], "parameters": parameters}
+    problem = make_problem(make_config(document, base=tmp_path))
+    shown = problem.objective.simulated(np.array([[0.1], [0.9]]))
+    assert torch.isfinite(shown).all()
+    assert float((shown[:, 0] - shown[:, 1]).abs().max()) > 1e-4
+
+
+def test_a_run_says_what_its_model_file_lacks(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    effects = [{"effect": "joint_friction", "target": "elbow", "friction": 0.15}]
+    document = {**record_arm(tmp_path, delay=3, friction=0.15), "parameters": {"delay": DELAY}, "effects": effects}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
+    assert main(["fit", str(tmp_path / "config.yaml"), "--out", str(tmp_path / "out")]) == 0
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "out" / "model.xml"))
+    assert written.joint("elbow").frictionloss[0] == pytest.approx(0.15)
+    report = (tmp_path / "out" / "report.html").read_text()
+    assert "actuator_delay at bend" in report
+    assert "delay of actuator_delay at bend" in report
+    again = make_problem(load_config(tmp_path / "out" / "fitted_config.yaml"))
+    assert isinstance(again.simulator, EffectSimulator)
+
+
+# In files
+
+
+def native_placements() -> list[Any]:
+    return [p for p in placements() if p.values[0].native]
+
+
+@pytest.mark.parametrize(("effect", "target"), native_placements())
+def test_a_native_effect_survives_mjcf(effect: Effect, target: str | None, tmp_path: Path) -> None:
+    source = tmp_path / "rig.xml"
+    source.write_text(RIG)
+    model = general()
+    setting = setting_of(model)
+    values = effect.starts(setting, target)[-1]
+    for i, q in enumerate(effect.quantities(setting, target)):
+        if values[i] == q.neutral:
+            values[i] = np.clip(q.neutral + 0.1 * q.scale, q.low, q.high)
+    assert write_model(source, [Placed(effect, target, tuple(values))], tmp_path / "model.xml") == []
+    effect.apply(model, target, values)
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    state, control = some_states(model)[0].numpy(), some_controls(model, 50)[0].numpy()
+    paths = []
+    for m in (model, written):
+        data = mujoco.MjData(m)
+        data.qpos[:], data.qvel[:] = state[: m.nq], state[m.nq :]
+        for u in control:
+            data.ctrl[:] = u
+            mujoco.mj_step(m, data)
+        paths.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_allclose(*paths, rtol=0, atol=2e-5 * max(1.0, np.abs(paths[0]).max()))
+
+
+def test_a_found_config_fits(tmp_path: Path) -> None:
+    """The model and config that name a delay and a friction lead a fit to both."""
+    base = record_arm(tmp_path, delay=3, friction=0.15)
+    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0], "scale_inertia": True}}
+    config = make_config({**base, "parameters": mass})
+    problem = make_problem(config)
+    setting = plain_setting(problem.space.model, problem.observation, 2)
+    placed = [
+        Placed(find_effect("joint_friction"), "elbow", (0.14,)),
+        Placed(find_effect("actuator_delay"), "bend", (0.028,)),
+    ]
+    intervals = {placed[0].key: {"friction": (0.13, 0.15)}, placed[1].key: {"delay": (0.026, 0.030)}}
+    rest = write_model(tmp_path / "arm.xml", placed, tmp_path / "model.xml", problem.space, np.array([0.7]))
+    assert [p.effect.name for p in rest] == ["actuator_delay"]
+    write_config(config, problem.space, setting, placed, intervals, tmp_path / "model.xml", tmp_path / "config.yaml")
+    document = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert document["model"] == "model.xml"
+    assert document["parameters"]["elbow_friction"] == {
+        "field": "dof_frictionloss", "name": "elbow", "bounds": [0.1, 0.18], "unit": "N·m",
+    }  # fmt: skip
+    assert document["effects"] == [{"effect": "actuator_delay", "target": "bend", "delay": 0.028}]
+    found = make_problem(load_config(tmp_path / "config.yaml"))
+    result = fit(found.objective, samples=20, seed=0).distribution.summary()
+    assert result["elbow_friction"]["mean"] == pytest.approx(0.15, abs=1e-4)
+    assert result["bend_delay"]["mean"] == pytest.approx(0.03, abs=1e-5)
+    assert result["mass"]["mean"] == pytest.approx(0.7, abs=1e-3)
+
+
+_FRICTION = {"field": "dof_frictionloss", "name": "elbow", "bounds": [0.0, 0.5]}
+_MASS = {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.3]}
+
+
+@pytest.mark.parametrize(
+    ("declared", "name", "target", "numbers"),
+    [
+        pytest.param(_MASS, "payload", "lower", {"mass": 0.1, "x": 0, "y": 0, "z": 0}, id="several numbers"),
+        pytest.param({**_MASS, "relative": True}, "joint_friction", "elbow", {"friction": 0.15}, id="relative"),
+        pytest.param(_FRICTION, "joint_friction", "elbow", {"friction": 0.15}, id="the same number"),
+    ],
+)
+def test_what_no_field_expresses_stays_an_effect_of_the_old_model(
+    tmp_path: Path, declared: dict, name: str, target: str, numbers: dict
+) -> None:
+    config = make_config({**record_arm(tmp_path, friction=0.15), "parameters": {"declared": declared}})
+    problem = make_problem(config)
+    setting = plain_setting(problem.space.model, problem.observation, 2)
+    placed = Placed(find_effect(name), target, tuple(numbers.values()))
+    first = next(iter(numbers))
+    write_config(
+        config, problem.space, setting, [placed], {placed.key: {first: (0.05, 0.2)}}, tmp_path / "m.xml",
+        tmp_path / "config.yaml",
+    )  # fmt: skip
+    document = yaml.safe_load((tmp_path / "config.yaml").read_text())
+    assert document["model"] == str(tmp_path / "arm.xml")
+    assert document["parameters"][f"{target}_{first}"]["effect"] == name
+    make_problem(load_config(tmp_path / "config.yaml"))
+
+
+def test_a_config_of_a_bundled_simulation_names_its_parts(tmp_path: Path) -> None:
+    config = make_config({"sim": "hopper", "backend": "warp", "optimizer": "adam"})
+    problem = make_problem(config)
+    setting = plain_setting(problem.space.model, problem.observation, SIM.frame_skip)
+    placed = [
+        Placed(find_effect("actuator_backlash"), setting.names("actuator")[0], (0.1,)),
+        Placed(find_effect("joint_friction"), "foot_joint", (0.2,)),
+    ]
+    intervals = {placed[0].key: {"width": (0.05, 0.15)}, placed[1].key: {"friction": (0.1, 0.3)}}
+    write_model(SIM.model, placed, tmp_path / "model.xml")
+    write_config(config, problem.space, setting, placed, intervals, tmp_path / "model.xml", tmp_path / "config.yaml")
+    again = load_config(tmp_path / "config.yaml")
+    assert (again.sim, again.model, again.backend, again.optimizer) == (None, "model.xml", "warp", "fisher")
+    found = make_problem(again)
+    assert found.space.names == (*problem.space.names, f"{placed[0].target}_width", "foot_joint_friction")
+    assert found.objective.transitions.history == 100  # an episode's length
+
+
+def test_a_search_box_is_wide_enough_and_physical() -> None:
+    quantity = find_effect("actuator_delay").quantities(setting_of(general()), "push")[0]
+    assert search_box(0.02, (0.019, 0.021), quantity) == (0.016, 0.024)
+    assert search_box(0.02, (0.01, 0.03), quantity) == (0.0, 0.06)
