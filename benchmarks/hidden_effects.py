@@ -41,9 +41,8 @@ UNSCORED = {"poles", "phase", "reference", "velocity", "damping_ratio"}
 
 def run_case(case: Case, backend: str) -> dict[str, Any]:
     """Return the answer of the workflow to a case, the document of its gap.json."""
-    from dropo_torch.gap import find_gap
-
     from dropo_torch.config import load_config
+    from dropo_torch.gap import find_gap
     from dropo_torch.problem import make_problem
 
     with tempfile.TemporaryDirectory() as folder:

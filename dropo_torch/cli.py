@@ -1,4 +1,4 @@
-"""The command line: ``dropo fit``, ``dropo sweep-epsilon``, ``dropo certify``, ``dropo compare``, ``dropo demo``."""
+"""The command line: ``dropo fit``, ``gap``, ``sweep-epsilon``, ``certify``, ``compare`` and ``demo``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from dropo_torch.errors import InputError, choices
 
-COMMANDS = ("fit", "sweep-epsilon", "certify", "compare", "demo")
+COMMANDS = ("fit", "gap", "sweep-epsilon", "certify", "compare", "demo")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -84,6 +84,8 @@ def _dispatch(given: list[str]) -> int:
     config = load_config(parsed.config, overrides)
     if parsed.command == "fit":
         runs.run_fit(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
+    elif parsed.command == "gap":
+        runs.run_gap(config, parsed.out, console=console, source=parsed.config, resume=parsed.resume)
     elif parsed.command == "certify":
         runs.run_certify(config, parsed.out, console=console)
     elif parsed.command == "compare":
@@ -107,6 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=_Parser)
     fit = _command(commands, "fit", "fit the distribution to the log")
     fit.add_argument("--log", metavar="tensorboard", help="write the history as TensorBoard events, too")
+    _command(commands, "gap", "find where simulation and log disagree, and name the physical effect that is missing")
     sweep = _command(commands, "sweep-epsilon", "fit at several ε and choose one by the elbow")
     sweep.add_argument("--epsilons", metavar="1e-6,1e-5,...", help="the values to try")
     _command(commands, "certify", "compare the gradients of the warp backend with MuJoCo's own differences")

@@ -64,8 +64,12 @@ class Problem:
     effects: EffectSet | None = None
 
 
-def make_problem(config: Config) -> Problem:
+def make_problem(config: Config, *, general: bool = False) -> Problem:
     """Read, build and check everything that a config names.
+
+    Args:
+        config: the config.
+        general: compile free bodies so that their mass and its centre may change in any way, as effects need it.
 
     Raises:
         InputError: anything that does not fit, by key.
@@ -77,7 +81,7 @@ def make_problem(config: Config) -> Problem:
         if config.environment is not None:
             raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
         model_path = _model_path(config, sim)
-        space = _space(load_model(model_path, general=_has_effects(config)), config, sim)
+        space = _space(load_model(model_path, general=general or _has_effects(config)), config, sim)
         source = space.model
     trajectories = _log(config, sim, space.model)
     frame_skip = _frame_skip(config, sim, space.model, trajectories)

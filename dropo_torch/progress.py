@@ -59,5 +59,33 @@ class FitProgress:
             self._console.print(f"{self._label}: {status}", soft_wrap=True)
 
 
+class StageProgress:
+    """A progress line of a run in stages; elsewhere than on a terminal a line for every stage."""
+
+    def __init__(self, console: Console, label: str) -> None:
+        self._console, self._label, self._stage = console, label, ""
+        self._bar = Progress(
+            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=20), TimeElapsedColumn(),
+            console=console, transient=True, disable=not console.is_terminal,
+        )  # fmt: skip
+        self._task = self._bar.add_task(label, total=1.0)
+
+    def __enter__(self) -> StageProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def update(self, stage: str, share: float) -> None:
+        """Show a stage and how much of it is done."""
+        self._bar.update(self._task, completed=share, description=f"{self._label}: {stage}")
+        if not self._console.is_terminal and stage != self._stage:
+            self._console.print(f"{self._label}: {stage}", soft_wrap=True)
+        self._stage = stage
+
+
 def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import functools
 import json
+import math
 import platform
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -26,20 +28,22 @@ from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit, refuse_dead_parameters, write_atomically
+from dropo_torch.gap import Gap, add, find_gap
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem, make_problem
-from dropo_torch.progress import FitProgress
+from dropo_torch.progress import FitProgress, StageProgress
+from dropo_torch.report.gap_words import answer
 from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
-    "fit.json", "sweep.json", "compare.json", "certificate.json", "checkpoint.pkl", "sweep-progress.json",
-    "compare-progress.json", "distribution.yaml", "fitted_config.yaml",
+    "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "checkpoint.pkl", "gap-progress.pkl",
+    "sweep-progress.json", "compare-progress.json", "distribution.yaml", "fitted_config.yaml", "config.yaml",
     "model.xml", "report.html", "tensorboard",
 )  # fmt: skip
 #: The first of them: a folder with none of these holds no run.
-_MARKS = _RESULTS[:7]
+_MARKS = _RESULTS[:9]
 _PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")
 
 
@@ -190,6 +194,74 @@ def run_compare(
     write_compare_report(out / "report.html", comparison, config=config.document(), versions=versions())
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return comparison
+
+
+def run_gap(config: Config, out: Path, *, console: Console, source: Path | None = None, resume: bool = False) -> Gap:
+    """Find what the model lacks, and write ``gap.json``, ``report.html``, ``model.xml`` and ``config.yaml`` to ``out``.
+
+    Args:
+        config: the config.
+        out: the folder; results of an earlier run there are moved aside, never overwritten.
+        console: where progress and results are shown.
+        source: the config's file, which must not be the one that is written.
+        resume: continue an interrupted run in ``out``.
+    """
+    from dropo_torch.report import write_gap_report
+
+    problem = make_problem(config, general=True)
+    if source is not None and source.resolve() == (out / "config.yaml").resolve():
+        raise InputError(f"--out: {source} is the config of this run, which would replace it; name another folder")
+    store = out / "gap-progress.pkl"
+    _prepare(out, problem, resume=resume and store.exists())
+    with StageProgress(console, "gap") as progress:
+        gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update)
+    notes = add(problem, gap, out)
+    gap = replace(gap, notes=(*gap.notes, *notes))
+    write_atomically(out / "gap.json", json.dumps(plain_numbers(gap.document()), indent=2).encode() + b"\n")
+    name = config.sim or config.model or "model"
+    write_gap_report(
+        out / "report.html", gap, config=config.document(), versions=versions(), title=f"What {name} lacks",
+        model_note=" ".join(notes),
+    )  # fmt: skip
+    _show_gap(gap, out, console)
+    return gap
+
+
+def _show_gap(gap: Gap, out: Path, console: Console) -> None:
+    headline, items = answer(gap)
+    console.print(headline, highlight=False, markup=False)
+    for item in items:
+        console.print(f"  - {item}", highlight=False, markup=False)
+    table = Table("held-out data", "before", "after", "noise alone")
+    rows = (
+        ("one-step mean squared error", "mse", "{:.3g}"),
+        ("log-likelihood", "log_likelihood", "{:.1f}"),
+        (f"open-loop error over {gap.rollout_seconds:g} s", "rollout_rmse", "{:.3g}"),
+    )
+    for words, key, form in rows:
+        table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
+    console.print(table)
+    if gap.next_experiment:
+        console.print(gap.next_experiment, highlight=False, markup=False)
+    for note in gap.notes:
+        console.print(note, highlight=False, markup=False)
+    console.print(
+        f"{gap.simulated_transitions} simulated transitions, {gap.seconds:.1f} s; report: {out / 'report.html'}",
+        soft_wrap=True, highlight=False, markup=False,
+    )  # fmt: skip
+    if (out / "config.yaml").exists():
+        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True, markup=False)
+
+
+def plain_numbers(document: Any) -> Any:
+    """Return plain data in which numbers that are not finite are ``None``, as JSON has none."""
+    if isinstance(document, dict):
+        return {k: plain_numbers(v) for k, v in document.items()}
+    if isinstance(document, (list, tuple)):
+        return [plain_numbers(v) for v in document]
+    if isinstance(document, float) and not math.isfinite(document):
+        return None
+    return float(document) if isinstance(document, np.floating) else document
 
 
 def versions() -> dict[str, str]:

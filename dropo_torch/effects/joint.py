@@ -67,7 +67,8 @@ class JointQuadraticDamping(JointEffect):
         dof = setting.dof(str(target))
         scale = setting.signals.force[dof] / setting.signals.speed[dof] ** 2
         own = float(setting.model.dof_dampingpoly[dof, 0])
-        return (Quantity("coefficient", unit(setting, target, "N·m·s²/rad²", "N·s²/m²"), 0.0, -own, 30 * scale, scale),)
+        name = unit(setting, target, "N·m·s²/rad²", "N·s²/m²")
+        return (Quantity("coefficient", name, 0.0, -own, 30 * scale, scale),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         model.dof_dampingpoly[self.dof(model, target), 0] += values[0]
@@ -257,8 +258,10 @@ class JointLimit(JointEffect):
         """Begin at the model's stops and at the ends of the measured motion."""
         low, high = setting.model.jnt_range[setting.joint(str(target))]
         seen = setting.signals.position[setting.coordinate(str(target))]
-        shifts = [np.clip(seen[0] - low, -0.2 * (high - low), 0.4 * (high - low)), np.clip(seen[1] - high, -0.4 * (high - low), 0.2 * (high - low))]  # fmt: skip
-        return [np.array(s, dtype=float) for s in ((0.0, 0.0), (shifts[0], 0.0), (0.0, shifts[1]))]
+        out, inwards = 0.2 * (high - low), 0.4 * (high - low)
+        lower = float(np.clip(seen[0] - low, -out, inwards))
+        upper = float(np.clip(seen[1] - high, -inwards, out))
+        return [np.array(s) for s in ((0.0, 0.0), (lower, 0.0), (0.0, upper), (lower, upper))]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         model.jnt_range[joint_number(model, target)] += values

@@ -114,7 +114,10 @@ class SensorDelay(SensorEffect):
         return out
 
 
-def _hermite(left: np.ndarray, right: np.ndarray, slope: np.ndarray, next_slope: np.ndarray, part: np.ndarray) -> np.ndarray:  # fmt: skip
+def _hermite(
+    left: np.ndarray, right: np.ndarray, slope: np.ndarray, next_slope: np.ndarray, part: np.ndarray
+) -> np.ndarray:
     """Cubic interpolation between two values with their slopes a step."""
     t2, t3 = part**2, part**3
-    return (2 * t3 - 3 * t2 + 1) * left + (t3 - 2 * t2 + part) * slope + (3 * t2 - 2 * t3) * right + (t3 - t2) * next_slope  # fmt: skip
+    ends = (2 * t3 - 3 * t2 + 1) * left + (3 * t2 - 2 * t3) * right
+    return ends + (t3 - 2 * t2 + part) * slope + (t3 - t2) * next_slope

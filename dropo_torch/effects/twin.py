@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -63,6 +63,10 @@ class Windows:
         )  # fmt: skip
 
 
+#: Simulations below which handing work to threads costs more than it saves.
+ALONE = 200
+
+
 class Twin:
     """Simulates windows under variants of the model.
 
@@ -72,13 +76,14 @@ class Twin:
         num_threads: threads, 0 for all processors; results do not depend on it.
         chunk_size: simulations at a time.
         warp: simulate with the Warp backend wherever it can; MuJoCo does the rest, with the same physics.
+        standing: effects that every variant has, of the declared parameters' values ``(d,)``; those of the config.
     """
 
     def __init__(
         self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, chunk_size: int = 6000,
-        warp: bool = False,
+        warp: bool = False, standing: Callable[[np.ndarray], tuple[Placed, ...]] | None = None,
     ) -> None:  # fmt: skip
-        self.setting, self.space = setting, space
+        self.setting, self.space, self._standing = setting, space, standing
         self._warp = _warp_variants(space, num_threads) if warp else None
         self._base = copy.copy(setting.model)
         self._base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -135,6 +140,8 @@ class Twin:
             the simulation can know, of the same shape.
         """
         num_k, num_w, length = len(variants), len(windows), windows.length
+        if self._standing is not None:
+            variants = [replace(v, placed=(*self._standing(np.asarray(v.declared)), *v.placed)) for v in variants]
         shown = windows.measured[:, 0] if starts is None else starts
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
@@ -143,11 +150,12 @@ class Twin:
         models: list[mujoco.MjModel | None] = []
         for k, variant in enumerate(variants):
             try:
-                models.append(self.model(variant))
+                model = self.model(variant)
             except ValueError:
                 models.append(None)
                 continue
-            finer = round(self._base.opt.timestep / models[-1].opt.timestep)
+            models.append(model)
+            finer = round(self._base.opt.timestep / model.opt.timestep)
             forced = any(p.effect.has_force for p in variant.placed)
             fine = any(p.effect.acts_on_sensor for p in variant.placed)
             pushed = any(type(p.effect).wrench is not Effect.wrench for p in variant.placed)
@@ -351,7 +359,8 @@ class Twin:
         if rows not in self._batches:
             if len(self._batches) > 8:
                 self._batches.clear()
-            self._batches[rows] = mujoco.batch.Batch(self._base, rows, self._num_threads)
+            threads = 1 if rows < ALONE else self._num_threads
+            self._batches[rows] = mujoco.batch.Batch(self._base, rows, threads)
         return self._batches[rows]
 
 

@@ -24,7 +24,8 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
         return np.zeros(0)
     normal = np.einsum("awn,bwn->ab", slope, slope)
     diagonal = np.maximum(np.diag(normal), 1e-300)
-    inverse = np.linalg.pinv(normal / np.sqrt(np.outer(diagonal, diagonal)), rcond=1e-12) / np.sqrt(np.outer(diagonal, diagonal))  # fmt: skip
+    unit = np.sqrt(np.outer(diagonal, diagonal))
+    inverse = np.linalg.pinv(normal / unit, rcond=1e-12) / unit
     plain = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(1.0, fitted.cost.reduced))
     names = np.unique(blocks)
     if len(names) < 4:

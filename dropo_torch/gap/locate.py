@@ -9,6 +9,7 @@ import numpy as np
 from scipy import stats
 
 from dropo_torch.effects.base import Setting
+from dropo_torch.effects.twin import Windows
 from dropo_torch.gap.noise import FreeForces
 from dropo_torch.gap.result import Place, Residuals
 from dropo_torch.gap.screen import Candidate
@@ -67,7 +68,7 @@ def setting_states(setting: Setting, columns: np.ndarray) -> np.ndarray:
     return states
 
 
-def windows_velocity(setting: Setting, windows, at: int) -> np.ndarray:
+def windows_velocity(setting: Setting, windows: Windows, at: int) -> np.ndarray:
     """Return velocities ``(W, nv)`` at one instant of every window."""
     return setting_states(setting, windows.measured[:, at])[:, setting.model.nq :]
 
@@ -121,7 +122,9 @@ def place_of(kind: str, target: str | None) -> tuple[str, str | None]:
     return ("contact" if kind == "geom" else kind), target
 
 
-def places(setting: Setting, free: FreeForces, ranked: Sequence[Candidate], before: float, degrees: float) -> tuple[Place, ...]:  # fmt: skip
+def places(
+    setting: Setting, free: FreeForces, ranked: Sequence[Candidate], before: float, degrees: float
+) -> tuple[Place, ...]:
     """Return where a change could explain the gap, the largest share first.
 
     Args:
@@ -178,14 +181,18 @@ def guilty(free: FreeForces) -> int:
         return int(np.nanargmax(np.nanmedian(np.abs(free.forces) / free.errors, axis=0)))
 
 
-def residual_pictures(setting: Setting, before: FreeForces, after: FreeForces, dofs: Sequence[int]) -> tuple[Residuals, ...]:  # fmt: skip
+def residual_pictures(
+    setting: Setting, before: FreeForces, after: FreeForces, dofs: Sequence[int]
+) -> tuple[Residuals, ...]:
     """Return missing forces against what they go with, for some degrees of freedom."""
     names, found = dof_names(setting.model), []
     for dof in dofs:
         _, values, label, unit = regime(setting, before, dof)
         joint = int(setting.model.dof_jntid[dof])
         force = "N·m" if setting.model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE else "N"
-        variable = dict((v[1], v[0]) for v in reversed(list(regressors(setting, before, dof).values()))).get(label, values)
+        variable = dict((v[1], v[0]) for v in reversed(list(regressors(setting, before, dof).values()))).get(
+            label, values
+        )
         if "velocity of" in label and "change" not in label:
             variable = windows_velocity(setting, before.windows, before.windows.length // 2)[:, dof]
         found.append(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
 
 import mujoco
@@ -38,7 +39,8 @@ class Chart:
         """Return the chart of an observation."""
         taken = {c for q in observation.quaternions for c in q}
         plain = tuple(c for c in range(observation.size) if c not in taken)
-        turned = [f"{observation.labels[q[0]].split('[')[0]}.rotation[{a}]" for q in observation.quaternions for a in "xyz"]  # fmt: skip
+        stems = [observation.labels[q[0]].split("[")[0] for q in observation.quaternions]
+        turned = [f"{stem}.rotation[{axis}]" for stem in stems for axis in "xyz"]
         return cls(
             plain, observation.quaternions, tuple(observation.labels[c] for c in plain) + tuple(turned),
             tuple(observation.units[c] for c in plain) + ("rad",) * len(turned),
@@ -146,7 +148,8 @@ def cut_windows(log: Trajectories, observation: Observation, length: int, *, str
 
 def make_setting(problem: Problem, log: Trajectories) -> Setting:
     """Return where effects are looked for: the model, its columns, and the sizes of the log."""
-    model = problem.space.apply(start_values(problem))
+    model = copy.copy(problem.space.model)
+    assert model is not None
     frame_skip = problem.simulator.frame_skip
     states = problem.observation.states(log.observations)
     rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))

@@ -212,8 +212,8 @@ class Search:
             raise InputError(f"--resume: {self._checkpoint} is no checkpoint; run without --resume") from None
         if document.get("fingerprint") != self._fingerprint:
             raise InputError(
-                f"--resume: {self._checkpoint} is of another config, model or log; run without --resume, or name another "
-                "folder"
+                f"--resume: {self._checkpoint} is of another config, model or log; run without --resume, "
+                "or name another folder"
             )
         self.evidence = self.evidence.with_noise(document["noise"])
         for name in _KEPT:
@@ -256,9 +256,7 @@ class Search:
 
     def _is_done(self, current: Refit, base: Refit) -> bool:
         """Whether what is left is noise, or too small a part of the gap to tell anything."""
-        return not significant(current.cost, self.rules) or (
-            current.cost.excess < self.rules.least * base.cost.excess
-        )
+        return not significant(current.cost, self.rules) or (current.cost.excess < self.rules.least * base.cost.excess)
 
     @property
     def blocks(self) -> np.ndarray:
@@ -399,6 +397,8 @@ class Search:
                 continue
             placed = list(current.hypothesis.placed)
             placed[index] = first
-            current = refit(self._part(self._few), Hypothesis(current.hypothesis.declared, tuple(placed)), caps=self._caps)
+            current = refit(
+                self._part(self._few), Hypothesis(current.hypothesis.declared, tuple(placed)), caps=self._caps
+            )
             ties[index] = tuple(own if p is first else p for p in tied)
         return current, ties

@@ -180,9 +180,7 @@ def refit(
     return Refit(current, cost, residual, slope, starts, limits.scale, converged)
 
 
-def _step(
-    residual: np.ndarray, slope: np.ndarray, vector: np.ndarray, limits: Limits, damping: float
-) -> np.ndarray:
+def _step(residual: np.ndarray, slope: np.ndarray, vector: np.ndarray, limits: Limits, damping: float) -> np.ndarray:
     """Return the damped step in units of the scales; numbers at a bound that it would cross stay there."""
     if not len(slope):
         return np.zeros(0)
@@ -198,12 +196,13 @@ def _step(
         diagonal = np.diag(part).copy()
         diagonal[diagonal <= 0] = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)
         move[:] = 0.0
-        move[index] = np.linalg.lstsq(part + np.diag(damping * diagonal + 1e-12 * diagonal.max()), gradient[index], rcond=None)[0]  # fmt: skip
+        ridge = np.diag(damping * diagonal + 1e-12 * diagonal.max())
+        move[index] = np.linalg.lstsq(part + ridge, gradient[index], rcond=None)[0]
         after = vector + move * limits.scale
         tight = 1e-12 * limits.scale
-        stuck = free & (
-            ((after < limits.low) & (vector <= limits.low + tight)) | ((after > limits.high) & (vector >= limits.high - tight))
-        )  # fmt: skip
+        below = (after < limits.low) & (vector <= limits.low + tight)
+        above = (after > limits.high) & (vector >= limits.high - tight)
+        stuck = free & (below | above)
         if not stuck.any():
             break
         free &= ~stuck

@@ -16,7 +16,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.intervals import deviations
 from dropo_torch.gap.locate import dof_names, guilty, places, regime, residual_pictures
-from dropo_torch.gap.log import Chart, start_values, cut_windows, make_setting
+from dropo_torch.gap.log import Chart, cut_windows, make_setting, start_values
 from dropo_torch.gap.naming import Naming, Report, Rules, Search
 from dropo_torch.gap.noise import LENGTH, FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
@@ -70,8 +70,9 @@ def prepare(problem: Problem) -> Scene:
     train, held = hold_out(problem.trajectories)
     setting = make_setting(problem, train)
     twin = Twin(
-        setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp"
-    )
+        setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",
+        standing=None if problem.effects is None else problem.effects.at,
+    )  # fmt: skip
     begin = Hypothesis(tuple(float(v) for v in start_values(problem)))
     noise = _noise(problem, twin, train, begin)
     length, rough = _choose_window(twin, train, begin, noise)
@@ -163,7 +164,9 @@ def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap
     shown = _named(scene, naming, final, before) if naming.gap else ()
     dofs = _telling(scene.setting, shown, before) if naming.gap else []
     return Gap(
-        where=places(scene.setting, before, search.first, search.first_chi2, search.first_degrees) if naming.gap else (),
+        where=places(scene.setting, before, search.first, search.first_chi2, search.first_degrees)
+        if naming.gap
+        else (),
         effects=shown,
         before=score(evidence, held, naming.base.hypothesis),
         after=score(evidence, held, final.hypothesis if naming.named else naming.base.hypothesis),
@@ -219,7 +222,9 @@ def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces) -> tupl
         share = naming.shares[index] / excess if naming.shares else 1.0
         ties = tuple(p.key for p in naming.ties[index])
         sentence = placed.effect.sentence.format(target=placed.target)
-        found.append(NamedEffect(placed.effect.name, placed.target, numbers, float(np.clip(share, 0, 1)), ties, sentence))
+        found.append(
+            NamedEffect(placed.effect.name, placed.target, numbers, float(np.clip(share, 0, 1)), ties, sentence)
+        )
     return tuple(sorted(found, key=lambda e: -e.share_of_gap))
 
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.refit import Hypothesis, Refit, limits_of
+from dropo_torch.gap.refit import Hypothesis, Limits, Refit, limits_of
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
@@ -76,7 +76,6 @@ def screen(
         caps: factors of the windows' residuals.
         on_progress: called with the number of candidates done.
     """
-    setting, space = evidence.twin.setting, evidence.twin.space
     factor = np.repeat(caps, evidence.num_rows)
     shared = base.slope.reshape(len(base.slope), -1) * factor
     origin = base.residual.ravel() * factor
@@ -85,7 +84,7 @@ def screen(
     waiting = [c for c in candidates if c.key not in taken]
     for first in range(0, len(waiting), BATCH):
         part = waiting[first : first + BATCH]
-        for found in _predict(evidence, base, part, setting, space, shared, origin, factor):
+        for found in _predict(evidence, base, part, shared, origin, factor):
             known = best.get(found.key)
             if known is None or (known.dead, known.chi2) > (found.dead, found.chi2):
                 best[found.key] = found
@@ -95,14 +94,14 @@ def screen(
 
 
 def _predict(
-    evidence: Evidence, base: Refit, part: Sequence[Placed], setting: Setting, space, shared: np.ndarray,
-    origin: np.ndarray, factor: np.ndarray,
-) -> Iterator[Candidate]:  # fmt: skip
+    evidence: Evidence, base: Refit, part: Sequence[Placed], shared: np.ndarray, origin: np.ndarray, factor: np.ndarray
+) -> Iterator[Candidate]:
     """Simulate candidates at their starts and beside them, in one batch, and predict."""
-    hypotheses, spans = [], []
+    hypotheses: list[Hypothesis] = []
+    spans: list[tuple[int, np.ndarray, Limits, np.ndarray]] = []
     for placed in part:
         hypothesis = base.hypothesis.with_effect(placed)
-        limits = limits_of(hypothesis, space, setting)
+        limits = limits_of(hypothesis, evidence.twin.space, evidence.twin.setting)
         size = len(placed.values)
         vector, begin = hypothesis.vector, len(hypotheses)
         hypotheses.append(hypothesis)
@@ -116,9 +115,9 @@ def _predict(
         moving = np.array(_moved(placed, 0), dtype=int)
         spans.append((begin, np.array(signs), limits.of(moving - size), moving))
     found, _ = evidence.residuals([h.variant for h in hypotheses])
-    for placed, (begin, signs, limits, moving) in zip(part, spans, strict=True):
+    for placed, (begin, directions, limits, moving) in zip(part, spans, strict=True):
         residual = evidence.project(found[begin], base.starts).ravel() * factor
-        change = (found[begin + 1 : begin + 1 + len(moving)] - found[begin]) / (signs[:, None, None] * STEP)
+        change = (found[begin + 1 : begin + 1 + len(moving)] - found[begin]) / (directions[:, None, None] * STEP)
         slope = evidence.project_slope(change, base.starts).reshape(len(moving), -1) * factor
         dead = bool(np.abs(residual - origin).max() < DEAD and np.abs(slope).max(initial=0.0) < DEAD)
         columns = np.concatenate([shared, slope])
@@ -138,7 +137,9 @@ def _moved(placed: Placed, first: int) -> list[int]:
     return [first + i for i in (range(len(placed.values)) if chosen is None else chosen)]
 
 
-def _bounded(columns: np.ndarray, residual: np.ndarray, num_shared: int, values: np.ndarray, limits) -> np.ndarray:
+def _bounded(
+    columns: np.ndarray, residual: np.ndarray, num_shared: int, values: np.ndarray, limits: Limits
+) -> np.ndarray:
     """Least-squares move whose candidate part stays inside its bounds."""
     size = len(values)
     normal, gradient = columns @ columns.T, -(columns @ residual)
@@ -156,7 +157,9 @@ def _bounded(columns: np.ndarray, residual: np.ndarray, num_shared: int, values:
     return move
 
 
-def promising_pairs(base: Refit, candidates: Sequence[Candidate], caps: np.ndarray, count: int) -> list[tuple[Placed, Placed]]:  # fmt: skip
+def promising_pairs(
+    base: Refit, candidates: Sequence[Candidate], caps: np.ndarray, count: int
+) -> list[tuple[Placed, Placed]]:
     """Return the pairs of candidates that together predict the least χ², the best first."""
     factor = np.repeat(caps, base.residual.shape[1])
     shared = base.slope.reshape(len(base.slope), -1) * factor

@@ -55,7 +55,7 @@ def _motions(evidence: Evidence) -> list[tuple[str, Windows]]:
     commands = base.commands
     model = evidence.twin.setting.model
     limited = model.actuator_ctrllimited.astype(bool)[: commands.shape[2]] if model.nactuator == model.nu else None
-    low, high = (model.actuator_ctrlrange.T if limited is not None else (None, None))
+    low, high = model.actuator_ctrlrange.T if limited is not None else (None, None)
 
     def clipped(signal: np.ndarray) -> np.ndarray:
         if limited is None:

@@ -46,7 +46,9 @@ def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
     return log.select(slice(0, cut)), log.select(slice(cut, len(log)))
 
 
-def cut_held(twin: Twin, log: Trajectories, observation: Observation, hypothesis: Hypothesis, noise: np.ndarray, timestep: float) -> Held:  # fmt: skip
+def cut_held(
+    twin: Twin, log: Trajectories, observation: Observation, hypothesis: Hypothesis, noise: np.ndarray, timestep: float
+) -> Held:
     """Cut held-out data into single steps, and into stretches over which noise at the start does not take over."""
     longest = int(np.diff(np.append(-1, np.flatnonzero(log.terminals))).max())
     steps = spread(cut_windows(log, observation, 1, stride=1), MOST)

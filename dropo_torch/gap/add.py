@@ -1,0 +1,59 @@
+"""Putting named effects into the model and the config."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from dropo_torch.effects import find_effect
+from dropo_torch.effects.base import Placed
+from dropo_torch.effects.export import write_config, write_model
+from dropo_torch.errors import InputError
+from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.result import Gap
+from dropo_torch.problem import Problem
+
+
+def named(gap: Gap) -> list[Placed]:
+    """Return the named effects with their values; what has no name is left out."""
+    return [
+        Placed(find_effect(e.effect), e.target, tuple(s.value for s in e.parameters.values()))
+        for e in gap.effects
+        if e.effect != "unnamed"
+    ]
+
+
+def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
+    """Write ``model.xml`` with the effects that MJCF can express, and ``config.yaml`` that uses all of them.
+
+    The declared parameters stand in ``model.xml`` with the values that were fitted beside the effects.
+
+    Args:
+        problem: the problem that was searched.
+        gap: what was found.
+        folder: where to write.
+
+    Returns:
+        Remarks for a person: what the model file lacks, or why there is none.
+    """
+    placed = named(gap)
+    if not placed or problem.model_path is None:
+        return []
+    notes = []
+    values = problem.space.vector({n: after for n, (_, _, after) in gap.declared.items()})
+    before = () if problem.effects is None else problem.effects.at(values)
+    model = folder / "model.xml"
+    try:
+        rest = write_model(problem.model_path, [*before, *placed], model, problem.space, values)
+        if rest:
+            names = ", ".join(f"{p.effect.name} of {p.target}" if p.target else p.effect.name for p in rest)
+            notes.append(f"MJCF cannot express {names}: model.xml lacks it, config.yaml has it.")
+    except InputError as error:
+        notes.append(f"No model.xml was written: {error}.")
+    intervals = {
+        (e.effect, e.target): {n: (s.low, s.high) for n, s in e.parameters.items()}
+        for e in gap.effects
+        if e.effect != "unnamed"
+    }
+    setting = make_setting(problem, problem.trajectories)
+    write_config(problem.config, problem.space, setting, placed, intervals, model, folder / "config.yaml")
+    return notes
