@@ -40,14 +40,21 @@ UNSCORED = {"poles", "phase", "reference", "velocity", "damping_ratio"}
 
 
 def run_case(case: Case, backend: str) -> dict[str, Any]:
-    """Return the answer of the workflow to a case, the document of its gap.json."""
+    """Return the answer of the workflow to a case, the document of its gap.json; what Warp refuses runs on MuJoCo."""
     from dropo_torch.config import load_config
+    from dropo_torch.errors import InputError
     from dropo_torch.gap import find_gap
     from dropo_torch.problem import make_problem
 
     with tempfile.TemporaryDirectory() as folder:
-        config = load_config(case.write(folder), {"backend": backend})
-        return find_gap(make_problem(config)).document()
+        path = case.write(folder)
+        try:
+            problem = make_problem(load_config(path, {"backend": backend}), general=True)
+        except InputError as error:
+            if "does not simulate" not in str(error):
+                raise
+            problem = make_problem(load_config(path, {"backend": "mujoco"}), general=True)
+        return find_gap(problem).document()
 
 
 # --- judging one answer ---------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from dropo_torch.gap.refit import Refit
 
 
 def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
-    """Return standard errors of all numbers of a fit ``(q,)``, in their units.
+    """Return standard errors of all numbers of a fit ``(q,)``, in their units; infinite for those without influence.
 
     The larger of two: by the noise, inflated by χ² per degree of freedom; and by how much the blocks of the log
     disagree (the sandwich of cluster-robust errors), which also counts what the model still lacks.
@@ -23,9 +23,12 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
     if not size:
         return np.zeros(0)
     normal = np.einsum("awn,bwn->ab", slope, slope)
-    diagonal = np.maximum(np.diag(normal), 1e-300)
-    unit = np.sqrt(np.outer(diagonal, diagonal))
-    inverse = np.linalg.pinv(normal / unit, rcond=1e-12) / unit
+    diagonal = np.diag(normal)
+    known = diagonal > 1e-12 * diagonal.max(initial=0.0)
+    length = np.where(known, np.sqrt(np.maximum(diagonal, 0.0)), 1.0)
+    unit = np.outer(length, length)
+    shown = np.where(np.outer(known, known), normal / unit, np.eye(size))
+    inverse = np.linalg.pinv(shown, rcond=1e-12, hermitian=True) / unit
     plain = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(1.0, fitted.cost.reduced))
     names = np.unique(blocks)
     if len(names) < 4:
@@ -37,4 +40,4 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
     factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / 1.6449
     clustered = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)) * factor
     inflated = fitted.cost.reduced > 1.5
-    return (np.maximum(plain, clustered) if inflated else plain) * fitted.scale
+    return np.where(known, np.maximum(plain, clustered) if inflated else plain, np.inf) * fitted.scale

@@ -254,6 +254,13 @@ class Search:
         here = replace(current, residual=current.residual[rows], slope=current.slope[:, rows], starts=starts)
         return part.on(part.windows.select(rows)), here, self._caps[rows]
 
+    def _beats(self, better: Refit, worse: Refit) -> bool:
+        """Whether a hypothesis removes most of another's excess, or less of it all over the log."""
+        return (
+            better.cost.excess < (1 - self.rules.most) * worse.cost.excess
+            or paired(worse.cost, better.cost, self.blocks) >= self.rules.significance
+        )
+
     def _is_done(self, current: Refit, base: Refit) -> bool:
         """Whether what is left is noise, or too small a part of the gap to tell anything."""
         return not significant(current.cost, self.rules) or (current.cost.excess < self.rules.least * base.cost.excess)
@@ -297,7 +304,7 @@ class Search:
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
                 best = tried[0]
         gained = current.cost.excess - best.cost.excess
-        if gained < rules.least * base.cost.excess or paired(current.cost, best.cost, self.blocks) < rules.significance:
+        if gained < rules.least * base.cost.excess or not self._beats(best, current):
             return None
         return best
 
@@ -319,16 +326,18 @@ class Search:
             hypothesis = current.hypothesis
             for placed in group:
                 hypothesis = hypothesis.with_effect(placed)
-            fitted = refit(fewer, hypothesis, starts=here.starts, caps=caps, iterations=5)
-            rough.append(fitted)
+            rough.append(refit(fewer, hypothesis, starts=here.starts, caps=caps, iterations=2))
+        rough.sort(key=lambda r: r.cost.excess)
+        kept = [refit(fewer, r.hypothesis, starts=here.starts, caps=caps, iterations=5) for r in rough[:4]]
+        rough = sorted([*kept, *rough[4:]], key=lambda r: r.cost.excess)
+        for fitted in rough:
             for placed in fitted.hypothesis.placed[len(current.hypothesis.placed) :]:
                 self.trials.append(Trial(placed, fitted.cost.excess, before, self._round))
-        rough.sort(key=lambda r: r.cost.excess)
         if not rough:
             return []
         near = 3 * max(rough[0].cost.excess, 0.0) + self.rules.least * before + 10 * np.sqrt(2 * rough[0].cost.degrees)
         full = []
-        for number, fitted in enumerate(r for r in rough[:4] if r.cost.excess <= near):
+        for number, fitted in enumerate(r for r in rough[:3] if r.cost.excess <= near):
             self._report(stage, (len(groups) + number / 4) / (len(groups) + 2))
             full.append(refit(self._part(self._few), fitted.hypothesis, caps=self._caps))
         return sorted(full, key=lambda r: r.cost.excess)
@@ -339,17 +348,21 @@ class Search:
             before = current
             for index in range(len(current.hypothesis.placed)):
                 without = refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
-                alive = [c for c in self._screened(without) if not c.dead][:3]
+                alive = self._better(without, current)
                 for found in self._refits(without, [(c.placed,) for c in alive], "swapping")[:1]:
-                    if (
-                        found.cost.excess < current.cost.excess
-                        and paired(current.cost, found.cost, self.blocks) > self.rules.significance
-                    ):
+                    if found.cost.excess < current.cost.excess and self._beats(found, current):
                         current = found
                         break
             if current is before:
                 break
         return current
+
+    def _better(self, without: Refit, current: Refit) -> list[Candidate]:
+        """Candidates that promise to explain more than the effect that was left out does, the best first."""
+        ranked = [c for c in self._screened(without) if not c.dead]
+        fewer, _, caps = self._fewer_of(without, self._fewer)
+        here = refit(fewer, current.hypothesis, caps=caps, iterations=0)
+        return [c for c in ranked[:3] if c.chi2 < 0.8 * here.cost.chi2]
 
     def _prune(self, current: Refit, base: Refit) -> Refit:
         """Drop effects that are not needed, the least needed first."""
@@ -360,10 +373,7 @@ class Search:
             ]
             least = min(without, key=lambda r: r.cost.excess)
             needed = least.cost.excess - current.cost.excess
-            if (
-                needed >= self.rules.least * base.cost.excess
-                and paired(least.cost, current.cost, self.blocks) >= self.rules.significance
-            ):
+            if needed >= self.rules.least * base.cost.excess and self._beats(current, least):
                 break
             current = least
         return current
@@ -381,7 +391,7 @@ class Search:
         for fitted in self._refits(without, [(c.placed,) for c in order[:5]], "looking for ties"):
             other = fitted.hypothesis.placed[-1]
             close = fitted.cost.excess - current.cost.excess < max(
-                self.rules.least * without.cost.excess, 4 * np.sqrt(2 * current.cost.degrees)
+                0.3 * max(current.cost.excess, 0.0), 4 * np.sqrt(2 * current.cost.degrees)
             )
             if close and paired(fitted.cost, current.cost, self.blocks) < self.rules.tie:
                 found.append(other)
