@@ -135,6 +135,7 @@ class Effect(abc.ABC):
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         """Write the effect into a copy of the model; constants are derived afterwards."""
+        return
 
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

@@ -49,19 +49,30 @@ class Evidence:
         windows: the stretches of the log.
         noise: standard deviation of the measurement of each feature, ``(m,)``.
         rough: linearise statistically, over draws of the start noise, as contacts need it.
+        model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``; 1 by
+            default.
     """
 
-    def __init__(self, twin: Twin, windows: Windows, noise: np.ndarray, *, rough: bool) -> None:
+    def __init__(
+        self, twin: Twin, windows: Windows, noise: np.ndarray, *, rough: bool, model_error: np.ndarray | None = None
+    ) -> None:
         self.twin, self.windows, self.noise, self.rough = twin, windows, np.asarray(noise, dtype=float), rough
         self.chart = Chart.of(twin.setting.observation)
+        self.model_error = np.ones(self.num_rows) if model_error is None else model_error
 
     def on(self, windows: Windows) -> Evidence:
         """Return the same over other windows."""
-        return Evidence(self.twin, windows, self.noise, rough=self.rough)
+        same = windows.length == self.windows.length
+        error = self.model_error if same else None
+        return Evidence(self.twin, windows, self.noise, rough=self.rough, model_error=error)
 
     def with_noise(self, noise: np.ndarray) -> Evidence:
         """Return the same with another noise."""
-        return Evidence(self.twin, self.windows, noise, rough=self.rough)
+        return Evidence(self.twin, self.windows, noise, rough=self.rough, model_error=self.model_error)
+
+    def with_model_error(self, model_error: np.ndarray) -> Evidence:
+        """Return the same with another weight of each residual."""
+        return Evidence(self.twin, self.windows, self.noise, rough=self.rough, model_error=model_error)
 
     @property
     def num_rows(self) -> int:
@@ -88,7 +99,7 @@ class Evidence:
             residual = self.chart.difference(measured, columns) / self.noise
         shape = (len(variants), len(self.windows), self.num_rows)
         known = self.chart.known(valid).reshape(shape)
-        return np.where(known, residual.reshape(shape), 0.0), known
+        return np.where(known, residual.reshape(shape) / self.model_error, 0.0), known
 
     def linearise(self, variant: Variant) -> Starts:
         """Return how a hypothesis' residuals depend on the starts."""

@@ -190,9 +190,7 @@ def residual_pictures(
         _, values, label, unit = regime(setting, before, dof)
         joint = int(setting.model.dof_jntid[dof])
         force = "N·m" if setting.model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE else "N"
-        variable = dict((v[1], v[0]) for v in reversed(list(regressors(setting, before, dof).values()))).get(
-            label, values
-        )
+        variable = values
         if "velocity of" in label and "change" not in label:
             variable = windows_velocity(setting, before.windows, before.windows.length // 2)[:, dof]
         found.append(

@@ -313,17 +313,20 @@ class Search:
         fewer, here, caps = self._fewer_of(current, 2 * self._fewer)
         return here, screen(fewer, here, [c.placed for c in candidates], caps=caps), caps
 
-    def _refits(self, current: Refit, groups: Sequence[Sequence[Placed]], stage: str) -> list[Refit]:
+    def _refits(
+        self, current: Refit, groups: Sequence[Sequence[Placed]], stage: str, origin: Hypothesis | None = None
+    ) -> list[Refit]:
         """Refit the current hypothesis with each group of effects more; the best first.
 
-        All are fitted a little, on few windows; those that come near the best of them are then fitted in full.
+        All are fitted a little, on few windows; those that come near the best of them are then fitted in full. They
+        begin from ``origin``, by default the current hypothesis.
         """
         fewer, here, caps = self._fewer_of(current, 2 * self._fewer)
         before = cost_of(here.residual, here.starts, fewer.degrees(here.starts), caps).excess
         rough: list[Refit] = []
         for number, group in enumerate(groups):
             self._report(stage, number / (len(groups) + 2))
-            hypothesis = current.hypothesis
+            hypothesis = current.hypothesis if origin is None else origin
             for placed in group:
                 hypothesis = hypothesis.with_effect(placed)
             rough.append(refit(fewer, hypothesis, starts=here.starts, caps=caps, iterations=2))
@@ -385,10 +388,15 @@ class Search:
         alone = len(placed) == 1
         without = base if alone else refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
         ranked = self.first if alone else self._screened(without)
-        order = [c for c in ranked if not c.dead and c.key != own.key and len(c.placed.values) <= len(own.values)]
-        self._round = -1
-        found = []
-        for fitted in self._refits(without, [(c.placed,) for c in order[:5]], "looking for ties"):
+        twins = self._twins(own, ranked)
+        known = {own.key, *(t.key for t in twins)}
+        fits = [c for c in ranked if not c.dead and len(c.placed.values) <= len(own.values)]
+        order = [c.placed for c in fits if c.key not in known][: max(5 - len(twins), 2)]
+        self._round, found = -1, []
+        origin = current.hypothesis.without(index)
+        alike = [refit(self._part(self._few), origin.with_effect(p), caps=self._caps, iterations=3) for p in twins]
+        others = self._refits(without, [(p,) for p in order], "looking for ties", origin)
+        for fitted in (*alike, *others):
             other = fitted.hypothesis.placed[-1]
             close = fitted.cost.excess - current.cost.excess < max(
                 0.3 * max(current.cost.excess, 0.0), 4 * np.sqrt(2 * current.cost.degrees)
@@ -396,6 +404,27 @@ class Search:
             if close and paired(fitted.cost, current.cost, self.blocks) < self.rules.tie:
                 found.append(other)
         return tuple(found), without.cost.excess - current.cost.excess
+
+    def _twins(self, own: Placed, ranked: Sequence[Candidate]) -> list[Placed]:
+        """Candidates of as many numbers whose derivatives point the same way, with the values that do the same."""
+        mine = next((c for c in ranked if c.key == own.key), None)
+        if mine is None or len(mine.slope) != 1 or len(own.values) != 1:
+            return []
+        setting = self.evidence.twin.setting
+        quantity = own.effect.quantities(setting, own.target)[0]
+        found = []
+        for other in ranked:
+            if other.key == own.key or other.dead or len(other.slope) != 1 or len(other.placed.values) != 1:
+                continue
+            a, b = mine.slope[0], other.slope[0]
+            cosine = float(a @ b / max(np.linalg.norm(a) * np.linalg.norm(b), 1e-300))
+            if abs(cosine) < 0.9999:
+                continue
+            theirs = other.placed.effect.quantities(setting, other.placed.target)[0]
+            ratio = float(a @ b / (b @ b)) / quantity.scale * theirs.scale
+            value = theirs.neutral + ratio * (own.values[0] - quantity.neutral)
+            found.append(other.placed.at([float(np.clip(value, theirs.low, theirs.high))]))
+        return found
 
     def _canonical(self, current: Refit, ties: list[tuple[Placed, ...]]) -> tuple[Refit, list[tuple[Placed, ...]]]:
         """Among exact ties name the one with the fewest numbers that the vocabulary lists first."""

@@ -29,6 +29,8 @@ from dropo_torch.trajectory import Trajectories
 #: Logged steps of a window that are tried, the longest first, and the roughness that ends the search.
 LENGTHS = (30, 15, 8, 4)
 ROUGH = 0.03
+#: Typical error at a window's end, relative to the motion, from which on contacts come at other times than measured.
+FAR_OFF = 0.08
 #: Windows of the last fit, at most, and short ones for the noise.
 MOST, SHORT = 120, 160
 #: Half-width of a 90 % interval in standard errors.
@@ -109,10 +111,20 @@ def _choose_window(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np
         if length > longest:
             continue
         windows = spread(cut_windows(train, twin.setting.observation, length), 24)
-        rough = Evidence(twin, windows, noise, rough=True).linearise(begin.variant).roughness
-        if rough < ROUGH:
+        evidence = Evidence(twin, windows, noise, rough=True)
+        rough = evidence.linearise(begin.variant).roughness
+        if rough < ROUGH and (not touches or _end_error(evidence, begin) < FAR_OFF):
             return length, touches
     return min(LENGTHS[-1], longest), True
+
+
+def _end_error(evidence: Evidence, begin: Hypothesis) -> float:
+    """Typical error at the windows' ends, relative to the motion's own deviation; the median over features."""
+    found, _ = evidence.residuals([begin.variant])
+    end = found[0, :, -evidence.chart.size :] * evidence.noise
+    measured = evidence.windows.measured
+    size = evidence.chart.difference(measured[:, 0], np.broadcast_to(measured[:1, 0], measured[:, 0].shape)).std(0)
+    return float(np.median(np.nanmedian(np.abs(end), axis=0) / np.maximum(size, 1e-12)))
 
 
 def find_gap(
@@ -141,13 +153,29 @@ def find_gap(
     rules = rules or Rules()
     report("preparing", 0.0)
     scene = prepare(problem)
+    vocabulary = list(effects or VOCABULARY.values())
     search = Search(
-        scene.evidence, list(effects or VOCABULARY.values()), rules=rules, report=report, checkpoint=checkpoint,
-        resume=resume, fingerprint=problem.fingerprint,
+        scene.evidence, vocabulary, rules=rules, report=report, checkpoint=checkpoint, resume=resume,
+        fingerprint=problem.fingerprint,
     )  # fmt: skip
     naming = search.run(scene.begin)
+    shorter = _shorter(scene)
+    if naming.gap and not naming.named and shorter is not None:
+        second = Search(shorter, vocabulary, rules=rules, report=report)
+        found = second.run(scene.begin)
+        if found.named:
+            search, naming = second, found
     report("verifying", 0.0)
     return _result(scene, search, naming, started)
+
+
+def _shorter(scene: Scene) -> Evidence | None:
+    """Windows a quarter as long, in which a large gap bends the simulation less; ``None`` if they are short."""
+    length = scene.evidence.windows.length // 4
+    if length < LENGTHS[-1]:
+        return None
+    windows = spread(cut_windows(scene.train, scene.problem.observation, length), MOST)
+    return Evidence(scene.twin, windows, scene.noise, rough=scene.evidence.rough)
 
 
 def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap:
@@ -155,7 +183,7 @@ def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap
     noise = search.evidence.noise
     final = naming.final
     if naming.named:
-        final = refit(search.evidence, naming.final.hypothesis, iterations=6)
+        final = _last_fit(search.evidence, naming.final.hypothesis)
     short = _short(problem, scene.train)
     before = free_forces(twin, short, naming.base.hypothesis.variant, noise)
     after = free_forces(twin, short, final.hypothesis.variant, noise) if naming.named else before
@@ -177,7 +205,7 @@ def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap
         noise=tuple(noise.tolist()),
         labels=evidence.chart.labels,
         units=evidence.chart.units,
-        reduced=(naming.base.cost.reduced, final.cost.reduced if naming.named else naming.base.cost.reduced),
+        reduced=(naming.base.cost.reduced, naming.final.cost.reduced),
         ranking=_ranking(scene.setting, naming),
         residuals=residual_pictures(scene.setting, before, after, dofs),
         cannot_judge=naming.silent,
@@ -188,6 +216,25 @@ def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap
         backend=problem.config.backend,
         seed=problem.config.seed,
     )
+
+
+def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Refit:
+    """Fit the named effects on all windows.
+
+    Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
+    error of a real model grows with the lead, and differs between columns.
+    """
+    final = refit(evidence, hypothesis, iterations=6)
+    for _ in range(3):
+        if final.cost.reduced < 3:
+            break
+        size = np.sqrt(np.median(final.residual**2, axis=0) / 0.455) * evidence.model_error
+        lead = size.reshape(-1, evidence.chart.size)
+        smooth = np.maximum(np.maximum.accumulate(lead, axis=0), 1.0)
+        smooth[0] = 1.0
+        evidence = evidence.with_model_error(smooth.ravel())
+        final = refit(evidence, final.hypothesis, iterations=6)
+    return final
 
 
 def _declared(scene: Scene, naming: Naming, final: Refit) -> Mapping[str, tuple[float, float, float]]:
