@@ -22,6 +22,7 @@ from dropo_torch.gap.noise import LENGTH, FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Gap, NamedEffect, Ranked, Strength
 from dropo_torch.gap.suggest import suggest
+from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, score, spread
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import Trajectories
@@ -29,6 +30,8 @@ from dropo_torch.trajectory import Trajectories
 #: Logged steps of a window that are tried, the longest first, and the roughness that ends the search.
 LENGTHS = (30, 15, 8, 4)
 ROUGH = 0.03
+#: Roughness from which on windows are linearised statistically.
+BENT = 0.001
 #: Typical error at a window's end, relative to the motion, from which on contacts come at other times than measured.
 FAR_OFF = 0.08
 #: Windows of the last fit, at most, and short ones for the noise.
@@ -114,7 +117,7 @@ def _choose_window(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np
         evidence = Evidence(twin, windows, noise, rough=True)
         rough = evidence.linearise(begin.variant).roughness
         if rough < ROUGH and (not touches or _end_error(evidence, begin) < FAR_OFF):
-            return length, touches
+            return length, rough > BENT
     return min(LENGTHS[-1], longest), True
 
 
@@ -215,6 +218,7 @@ def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
+        symbolic=describe(scene.setting, before, guilty(before)) if naming.gap and not naming.named else "",
     )
 
 
