@@ -93,7 +93,7 @@ class Twin:
         self._default = np.array(setting.observation.default_state)
         self._num_threads, self._chunk = num_threads, chunk_size
         self._batches: dict[int, mujoco.batch.Batch] = {}
-        self._rates = _rate_columns(setting)
+        self.rates = _rate_columns(setting)
         self._commands: np.ndarray | None = None
         self._filtered: dict[tuple, np.ndarray] = {}
         self.simulated_transitions = 0
@@ -223,7 +223,7 @@ class Twin:
             columns = np.concatenate([starts[position][:, None, index], path[position][..., index]], 1)
             begin = Path(
                 columns=columns[:, ::every], fine=columns, valid=np.ones(columns[:, ::every].shape, dtype=bool),
-                step=self._base.opt.timestep, rates=self._rates,
+                step=self._base.opt.timestep, rates=self.rates,
             )  # fmt: skip
             for placed in variants[k].placed:
                 if placed.effect.acts_on_sensor:

@@ -14,7 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.fit import write_atomically
 from dropo_torch.gap.evidence import Cost, Evidence, caps_of, cost_of
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.screen import Candidate, all_candidates, promising_pairs, screen
+from dropo_torch.gap.screen import Candidate, all_candidates, promising_families, promising_pairs, screen
 
 
 @dataclass(frozen=True)
@@ -151,7 +151,8 @@ class Search:
         rules = self.rules
         stage = self._restored() or self._based(begin)
         if not significant(stage.base.cost, rules):
-            return Naming(stage.base, stage.base, gap=False, named=False)
+            silent = tuple(c.key for c in self._screened(stage.base) if c.dead)
+            return Naming(stage.base, stage.base, gap=False, named=False, silent=silent)
         while not stage.done:
             stage = self._round_of(stage)
             self._save(stage)
@@ -301,6 +302,10 @@ class Search:
         if left > 1 - rules.most:
             pairs = promising_pairs(*self._aligned(current, alive[:16]), 5)
             tried = self._refits(current, pairs, "refitting pairs")
+            if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
+                best = tried[0]
+            families = promising_families(*self._fewer_of(current, self._fewer)[1:], alive)
+            tried = self._refits(current, families, "refitting families")
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
                 best = tried[0]
         gained = current.cost.excess - best.cost.excess

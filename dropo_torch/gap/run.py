@@ -21,9 +21,9 @@ from dropo_torch.gap.naming import Naming, Report, Rules, Search
 from dropo_torch.gap.noise import LENGTH, FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Gap, NamedEffect, Ranked, Strength
-from dropo_torch.gap.suggest import suggest
+from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
-from dropo_torch.gap.verify import cut_held, floor_score, hold_out, score, spread
+from dropo_torch.gap.verify import Held, constant_velocity, cut_held, floor_score, hold_out, score, spread
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import Trajectories
 
@@ -218,6 +218,7 @@ def _result(scene: Scene, search: Search, naming: Naming, started: float) -> Gap
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
+        notes=_notes(scene, evidence, held, final.hypothesis),
         symbolic=describe(scene.setting, before, guilty(before)) if naming.gap and not naming.named else "",
     )
 
@@ -239,6 +240,26 @@ def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Refit:
         evidence = evidence.with_model_error(smooth.ravel())
         final = refit(evidence, final.hypothesis, iterations=6)
     return final
+
+
+def _notes(scene: Scene, evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[str, ...]:
+    """What a person should know before trusting the result."""
+    notes = []
+    still = [
+        name
+        for name, speed in zip(dof_names(scene.setting.model), scene.setting.signals.speed, strict=True)
+        if speed <= 0
+    ]
+    if still:
+        notes.append(f"No velocity of {', '.join(still)} is in this log: effects there cannot be judged.")
+    simulated = score(evidence, held, hypothesis).rollout_rmse
+    constant = constant_velocity(evidence, held)
+    if simulated > constant:
+        notes.append(
+            f"The model predicts worse than constant velocity does (open loop {simulated:.3g} against {constant:.3g}): "
+            "it has no skill on this log, and names should not be trusted."
+        )
+    return tuple(notes)
 
 
 def _declared(scene: Scene, naming: Naming, final: Refit) -> Mapping[str, tuple[float, float, float]]:
@@ -276,7 +297,23 @@ def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces) -> tupl
         found.append(
             NamedEffect(placed.effect.name, placed.target, numbers, float(np.clip(share, 0, 1)), ties, sentence)
         )
-    return tuple(sorted(found, key=lambda e: -e.share_of_gap))
+    return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)
+
+
+def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[NamedEffect, ...]:
+    """Return effects that were named at every one of three or more targets as one, with target ``*``."""
+    kept = list(effects)
+    for name in dict.fromkeys(e.effect for e in effects):
+        members = [e for e in kept if e.effect == name and len(e.parameters) == 1]
+        effect = VOCABULARY.get(name)
+        if effect is None or len(members) < 3 or len(members) < len(effect.targets(setting)):
+            continue
+        numbers = {str(e.target): next(iter(e.parameters.values())) for e in members}
+        share = min(1.0, sum(e.share_of_gap for e in members))
+        where = effect.kind + "s"
+        whole = NamedEffect(name, "*", numbers, share, (), effect.sentence.format(target=f"all {where}"))
+        kept = [whole if e is members[0] else e for e in kept if e not in members[1:]]
+    return tuple(kept)
 
 
 def _telling(setting: Setting, shown: Sequence[NamedEffect], free: FreeForces) -> list[int]:
@@ -294,7 +331,7 @@ def _next_experiment(scene: Scene, search: Search, naming: Naming, final: Refit)
             placed = list(final.hypothesis.placed)
             rival = Hypothesis(final.hypothesis.declared, (*placed[:index], other, *placed[index + 1 :]))
             return suggest(search.evidence, final.hypothesis, rival, placed[index], other)
-    return None
+    return excite(naming.silent)
 
 
 def _ranking(setting: Setting, naming: Naming) -> tuple[Ranked, ...]:

@@ -19,8 +19,8 @@ from dropo_torch.gap.refit import Hypothesis, Limits, Refit, limits_of
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
-#: A candidate whose derivatives are smaller than this, in whitened units for a change by its scale, does nothing here.
-DEAD = 1e-3
+#: A candidate that moves the screened windows by fewer standard deviations of the noise cannot be judged by them.
+DEAD = 1.5
 #: Candidates that one batch of simulations holds.
 BATCH = 24
 
@@ -119,7 +119,8 @@ def _predict(
         residual = evidence.project(found[begin], base.starts).ravel() * factor
         change = (found[begin + 1 : begin + 1 + len(moving)] - found[begin]) / (directions[:, None, None] * STEP)
         slope = evidence.project_slope(change, base.starts).reshape(len(moving), -1) * factor
-        dead = bool(np.abs(residual - origin).max() < DEAD and np.abs(slope).max(initial=0.0) < DEAD)
+        lengths = np.sqrt((slope**2).sum(1))
+        dead = bool(np.linalg.norm(residual - origin) < DEAD and lengths.max(initial=0.0) < DEAD)
         columns = np.concatenate([shared, slope])
         start = np.array(placed.values)
         move = _bounded(columns, residual, len(shared), start[moving], limits)
@@ -157,6 +158,39 @@ def _bounded(
     return move
 
 
+def promising_families(base: Refit, caps: np.ndarray, candidates: Sequence[Candidate]) -> list[list[Placed]]:
+    """Return the effects of one number that, at all their targets together, predict the least χ²; two at most.
+
+    Friction or damping is seldom missing in one joint only. A family is offered where it promises less than half of
+    what its best single member leaves.
+    """
+    factor = np.repeat(caps, base.residual.shape[1])
+    shared = base.slope.reshape(len(base.slope), -1) * factor
+    origin = base.residual.ravel() * factor
+    families: dict[str, list[Candidate]] = {}
+    for c in candidates:
+        if not c.dead and len(c.placed.values) == 1:
+            families.setdefault(c.placed.effect.name, []).append(c)
+    found = []
+    for members in families.values():
+        if len(members) < 2:
+            continue
+        columns = [*shared, *(c.slope[0] for c in members), *(c.residual - origin for c in members)]
+        left = _left(origin, np.stack(columns))
+        if left < 0.5 * min(c.chi2 for c in members):
+            found.append((left, [c.placed for c in members]))
+    return [members for _, members in sorted(found, key=lambda item: item[0])[:2]]
+
+
+def _left(origin: np.ndarray, columns: np.ndarray) -> float:
+    """χ² that is left of residuals beside columns."""
+    norm = np.sqrt((columns**2).sum(1))
+    columns = columns[norm > 0] / norm[norm > 0, None]
+    gradient = columns @ origin
+    normal = columns @ columns.T + 1e-9 * np.eye(len(columns))
+    return float(origin @ origin - gradient @ np.linalg.solve(normal, gradient))
+
+
 def promising_pairs(
     base: Refit, candidates: Sequence[Candidate], caps: np.ndarray, count: int
 ) -> list[tuple[Placed, Placed]]:
@@ -171,10 +205,6 @@ def promising_pairs(
         columns = np.concatenate(
             [shared, first.slope, second.slope, [first.residual - origin], [second.residual - origin]]
         )
-        norm = np.sqrt((columns**2).sum(1))
-        columns = columns[norm > 0] / norm[norm > 0, None]
-        normal = columns @ columns.T + 1e-9 * np.eye(len(columns))
-        gradient = columns @ origin
-        found.append((float(origin @ origin - gradient @ np.linalg.solve(normal, gradient)), a, b))
+        found.append((_left(origin, columns), a, b))
     found.sort()
     return [(alive[a].placed, alive[b].placed) for _, a, b in found[:count]]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -41,6 +42,35 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
             "on this robot they may be the same thing."
         )
     return f"To tell {names}, record {words}: over {WINDOWS} windows it would separate them by {most:.0f} σ."
+
+
+def excite(silent: Sequence[tuple[str, str | None]]) -> str | None:
+    """Return what a log would have to show so that candidates that it cannot judge can be judged."""
+    if not silent:
+        return None
+    wanted: dict[str, list[str]] = {}
+    for name, target in silent:
+        motion = next((words for start, words in _MOTIONS if name.startswith(start)), "moves more")
+        wanted.setdefault(motion, []).append(f"{name} of {target}" if target else name)
+    parts = []
+    for motion, names in wanted.items():
+        more = " and others" if len(names) > 4 else ""
+        parts.append(f"{motion} (for {', '.join(names[:4])}{more})")
+    return "To judge what this log cannot, record a motion that " + "; ".join(parts) + "."
+
+
+#: What a motion must do to show effects whose names start so.
+_MOTIONS = (
+    ("joint_limit", "reaches the stops"),
+    ("joint", "moves these joints further, faster and to and fro"),
+    ("armature", "accelerates these joints"),
+    ("actuator_saturation", "asks for larger forces"),
+    ("actuator", "commands these actuators more, and changes the commands faster"),
+    ("sensor", "moves these columns further"),
+    ("contact", "slides and presses on these geoms"),
+    ("ground", "slides and presses on the ground"),
+    ("fluid_drag", "moves these bodies fast"),
+)
 
 
 def _called(placed: Placed) -> str:

@@ -134,6 +134,17 @@ def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     return np.sqrt((error**2 * known).sum((0, 1)) / np.maximum(known.sum((0, 1)), 1))
 
 
+def constant_velocity(evidence: Evidence, held: Held) -> float:
+    """Return the open-loop error of positions that go on with the velocity at the start."""
+    windows = held.rollouts
+    time = np.arange(windows.length + 1)[None, :, None] * evidence.twin.setting.signals.timestep
+    rate_of = evidence.twin.rates
+    rates = np.where(rate_of >= 0, windows.measured[:, 0][:, np.maximum(rate_of, 0)], windows.rates)
+    moved = windows.measured[:, :1] + rates[:, None] * time
+    error = evidence.chart.difference(windows.measured, moved)[:, 1:]
+    return float(np.sqrt((error[..., position_features(evidence)] ** 2).mean()))
+
+
 def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     """Return the open-loop error of each feature that noise at start and end alone would make, ``(m,)``."""
     m = evidence.chart.size
