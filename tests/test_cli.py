@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import os
 import pickle
@@ -424,8 +425,10 @@ def test_the_demo_takes_other_parameters(tmp_path: Path) -> None:
 
 
 def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
+    """A command of its own, which Ctrl-C reaches even where the tests run in the background."""
     command = [sys.executable, "-m", "dropo_torch.cli", *map(str, arguments)]
-    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, **options)
+    listen = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen, **options)
 
 
 def test_a_reader_that_has_seen_enough_does_not_stop_a_fit(folder: Folder, tmp_path: Path) -> None:
