@@ -24,7 +24,9 @@ class Rules:
     Attributes:
         gate: excess in standard deviations of χ² from which on something is missing.
         least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
-        most: share of the excess that the named effects must remove together.
+        most: share of the excess that an effect removes without further question.
+        accounted: share of the first excess that the named effects must remove together, or nothing has a name.
+        hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         enough: share of the excess at which a single effect ends the search for more at once.
         least: share of the first excess below which an effect is not named.
         significance: paired standard errors, over blocks of the log, by which one hypothesis beats another.
@@ -36,6 +38,8 @@ class Rules:
     gate: float = 5.0
     least_reduced: float = 1.1
     most: float = 0.8
+    accounted: float = 0.97
+    hopeless: float = 0.8
     enough: float = 0.99
     least: float = 3e-3
     significance: float = 3.0
@@ -158,7 +162,7 @@ class Search:
             self._save(stage)
         base, current = stage.base, self._prune(stage.current, stage.base)
         removed = 1 - max(current.cost.excess, 0.0) / base.cost.excess
-        if not current.hypothesis.placed or removed < rules.most:
+        if not current.hypothesis.placed or removed < rules.accounted:
             best = tuple(sorted(self.trials, key=lambda t: t.excess)[:3])
             return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent), best=best)
         ties, shares = [], []
@@ -308,6 +312,8 @@ class Search:
             tried = self._refits(current, families, "refitting families")
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
                 best = tried[0]
+        if best.cost.excess > rules.hopeless * current.cost.excess:
+            return None
         gained = current.cost.excess - best.cost.excess
         if gained < rules.least * base.cost.excess or not self._beats(best, current):
             return None
