@@ -32,7 +32,7 @@ from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import Chart, cut_windows
 from dropo_torch.gap.naming import Rules
 from dropo_torch.gap.noise import free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
 from dropo_torch.gap.run import _short
 from dropo_torch.gap.screen import all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, score
@@ -337,14 +337,15 @@ def test_refit_finds_effect_and_declared_mass_together() -> None:
     assert fitted.cost.reduced < 1.2
 
 
-def test_refit_stays_in_bounds() -> None:
-    """The true mass is above its bounds, and the log has less damping than the least that is allowed."""
+@pytest.mark.parametrize("begin", [(0.35, 0.5), (9.0, -4.0)])
+def test_refit_stays_in_bounds(begin: tuple[float, float]) -> None:
+    """The true mass is above its bounds, so the fit ends at the bound, wherever it begins."""
     parameters = {"pole_mass": {**CART_POLE.declared["pole_mass"], "bounds": [0.3, 0.4]}}
     scene = prepare(load(hidden(), parameters=parameters))
-    begin = Hypothesis((0.35,), (Placed(find_effect("joint_friction"), "rail", (0.5,)),))
-    mass, friction = refit(scene.evidence, begin).hypothesis.vector
-    assert mass == pytest.approx(0.4, rel=1e-9)
-    assert friction == 0
+    hypothesis = Hypothesis(begin[:1], (Placed(find_effect("joint_friction"), "rail", begin[1:]),))
+    limits, fitted = limits_of(hypothesis, scene.problem.space, scene.setting), refit(scene.evidence, hypothesis)
+    assert fitted.hypothesis.vector[0] == pytest.approx(0.4, rel=1e-9)
+    assert np.all((limits.low <= fitted.hypothesis.vector) & (fitted.hypothesis.vector <= limits.high))
 
 
 @pytest.mark.parametrize(
