@@ -390,7 +390,11 @@ def test_refit_stays_in_bounds(begin: tuple[float, float]) -> None:
     parameters = {"pole_mass": {**CART_POLE.declared["pole_mass"], "bounds": [0.3, 0.4]}}
     scene = prepare(load(hidden(), parameters=parameters))
     hypothesis = Hypothesis(begin[:1], (Placed(find_effect("joint_friction"), "rail", begin[1:]),))
-    limits, fitted = limits_of(hypothesis, scene.problem.space, scene.setting), refit(scene.evidence, hypothesis)
+    limits, starts = (
+        limits_of(hypothesis, scene.problem.space, scene.setting),
+        scene.evidence.linearise(scene.begin.variant),
+    )
+    fitted = refit(scene.evidence, hypothesis, starts=starts)
     assert fitted.hypothesis.vector[0] == pytest.approx(0.4, rel=1e-9)
     assert np.all((limits.low <= fitted.hypothesis.vector) & (fitted.hypothesis.vector <= limits.high))
 
