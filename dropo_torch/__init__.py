@@ -6,6 +6,7 @@
 >>> result.distribution.save("distribution.json")
 """
 
+from dropo_torch import gap
 from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.diagnostics import Diagnostics, diagnose
 from dropo_torch.distribution import Distribution
@@ -46,6 +47,7 @@ __all__ = [
     "diagnose",
     "export_model",
     "fit",
+    "gap",
     "load_config",
     "log_likelihood",
     "make_config",

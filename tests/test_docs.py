@@ -290,6 +290,23 @@ def test_own_effect(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert found["catch_reach"]["mean"] == pytest.approx(example.TRUTH["reach"], rel=1e-3)
 
 
+def test_crane(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    """Its gap is the one that the page tells of; the true strengths lie in the intervals."""
+    from dropo_torch.effects import find_effect
+    from dropo_torch.gap import find_gap
+
+    example = load_example(ROOT / "examples" / "crane.py")
+    example.main(["--out", str(tmp_path)])
+    problem = make_problem(make_config(yaml.safe_load((tmp_path / "crane.yaml").read_text()), base=tmp_path))
+    gap = find_gap(problem, effects=[find_effect("joint_damping"), find_effect("actuator_delay")])
+    found = {(e.effect, e.target): next(iter(e.parameters.values())) for e in gap.effects}
+    friction, delay = found[("joint_damping", "rail")], found[("actuator_delay", "drive")]
+    assert len(found) == 2
+    assert friction.value == pytest.approx(example.FRICTION, rel=2e-3)
+    assert delay.value == pytest.approx(5e-3 * example.LATE, rel=2e-3)
+    assert gap.after.mse < 1.1 * gap.noise_floor.mse < 0.1 * gap.before.mse
+
+
 def test_every_effect_is_documented() -> None:
     from dropo_torch.effects import VOCABULARY
 

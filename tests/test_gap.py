@@ -1,0 +1,700 @@
+"""From a log to the missing effect: each stage by its laws, and the whole on logs in which effects are hidden."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import functools
+import json
+import pickle
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+from arm import Folder
+from conftest import BOX_XML
+
+import dropo_torch as dropo
+from benchmarks.hidden.systems import CART_POLE
+from benchmarks.hidden.truths import Case, Effect, simulate_truth
+from dropo_torch.cli import main
+from dropo_torch.config import load_config
+from dropo_torch.effects import VOCABULARY, Placed, find_effect
+from dropo_torch.errors import InputError
+from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
+from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of
+from dropo_torch.gap.intervals import deviations
+from dropo_torch.gap.locate import guilty, regime
+from dropo_torch.gap.log import Chart, cut_windows
+from dropo_torch.gap.naming import Rules
+from dropo_torch.gap.noise import free_forces
+from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
+from dropo_torch.gap.run import _short
+from dropo_torch.gap.screen import all_candidates, screen
+from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
+from dropo_torch.observation import parse_observation
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.runs import plain_numbers
+
+#: The vocabulary of searches that are not about the whole of it.
+FEW = (
+    "joint_damping", "joint_friction", "joint_stiffness", "gravity_tilt", "actuator_gain", "actuator_delay",
+    "actuator_lag",
+)  # fmt: skip
+#: What cannot take energy out of a joint.
+WITHOUT_FRICTION = ("joint_stiffness", "actuator_gain", "actuator_lag")
+DAMPING = Effect("joint_damping", "hinge", {"damping": 0.02})
+DELAY = Effect("actuator_delay", "push", {"delay": 0.012})
+LAG = Effect("actuator_lag", "push", {"time_constant": 0.02})
+FRICTION = Effect("joint_friction", "rail", {"friction": 0.3})
+STIFFNESS = Effect("joint_stiffness", "hinge", {"stiffness": 0.2, "reference": 0.0})
+UNEVEN = {"friction": 1.0, "waves": 6.0, "phase": 0.3}
+HYSTERESIS = Effect("hysteresis", "hinge", {"stiffness": 0.5, "yield": 0.4})
+SIZE = {"episodes": 4, "transitions": 100}
+FILES = {"gap.json", "report.html", "model.xml", "config.yaml", "gap-progress.pkl"}
+
+
+def wrong(reason: str, raises: type[BaseException] = AssertionError) -> pytest.MarkDecorator:
+    """Mark a law that does not hold yet."""
+    return pytest.mark.xfail(reason=reason, raises=raises, strict=True)
+
+
+@functools.cache
+def hidden(*names: str) -> Case:
+    """A cart-pole's log with effects hidden in it."""
+    known = {e.name: e for e in (DAMPING, DELAY, LAG, FRICTION, STIFFNESS, HYSTERESIS)}
+    return simulate_truth(CART_POLE, [known[n] for n in names], 3, **SIZE)
+
+
+def load(case: Case, **changes: Any) -> Problem:
+    with tempfile.TemporaryDirectory() as folder:
+        config = {**case.config, "threads": 1, **changes}
+        path = dataclasses.replace(case, config=config).write(folder)
+        return make_problem(load_config(path), general=True)
+
+
+@functools.cache
+def scene_of(*names: str) -> Scene:
+    return prepare(load(hidden(*names)))
+
+
+def search(case: Case, effects: tuple[str, ...], report: Callable = lambda *_: None, **given: Any) -> Gap:
+    changes = {k: given.pop(k) for k in ("threads", "noise") if k in given}
+    return find_gap(load(case, **changes), effects=[VOCABULARY[e] for e in effects], report=report, **given)
+
+
+@functools.cache
+def found(names: tuple[str, ...], effects: tuple[str, ...] = FEW) -> Gap:
+    return search(hidden(*names), effects)
+
+
+def lasting(gap: Gap) -> dict[str, Any]:
+    """What a result says, without what it took."""
+    return {k: v for k, v in plain_numbers(gap.document()).items() if k not in ("seconds", "simulated_transitions")}
+
+
+def true(case: Case) -> Hypothesis:
+    """What is hidden, as a hypothesis."""
+    placed = [Placed(find_effect(e.name), e.target, tuple(e.parameters.values())) for e in case.effects]
+    return Hypothesis(tuple(case.declared.values()), tuple(placed))
+
+
+# --- the whole ------------------------------------------------------------------------------------------------
+
+
+def test_nothing_is_named_where_nothing_is_missing() -> None:
+    gap = found(())
+    assert not gap.found
+    assert gap.effects == ()
+    assert gap.where == ()
+    assert gap.before == gap.after
+    assert gap.reduced[0] == pytest.approx(1, abs=0.1)
+    assert gap.declared["pole_mass"][2] == pytest.approx(hidden().declared["pole_mass"], rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    "names", [("joint_damping",), ("actuator_delay",), ("actuator_lag",), ("joint_damping", "actuator_lag")]
+)
+def test_hidden_effects_are_named(names: tuple[str, ...]) -> None:
+    gap, case = found(names), hidden(*names)
+    assert {(e.effect, e.target) for e in gap.effects} == {(e.name, e.target) for e in case.effects}
+    for truth in case.effects:
+        (told,) = [e for e in gap.effects if e.effect == truth.name]
+        for name, value in truth.parameters.items():
+            strength = told.parameters[name]
+            assert strength.value == pytest.approx(value, rel=0.05)
+            half = 0.5 * (strength.high - strength.low)
+            assert strength.low - half <= value <= strength.high + half
+            assert half < 0.05 * value
+        assert told.share_of_gap > 0.3
+        assert told.sentence
+    assert gap.declared["pole_mass"][2] == pytest.approx(case.declared["pole_mass"], rel=5e-3)
+    assert gap.reduced[0] > 50 > 1.2 > gap.reduced[1]
+
+
+@pytest.mark.parametrize("names", [("joint_damping",), ("actuator_delay",), ("joint_damping", "actuator_lag")])
+def test_held_out_scores_fall_to_noise(names: tuple[str, ...]) -> None:
+    gap = found(names)
+    assert gap.before.mse > 3 * gap.noise_floor.mse
+    assert gap.after.mse < 1.3 * gap.noise_floor.mse
+    assert gap.before.log_likelihood < gap.after.log_likelihood
+    assert gap.after.log_likelihood == pytest.approx(gap.noise_floor.log_likelihood, rel=0.05)
+    assert gap.after.rollout_rmse < 0.1 * gap.before.rollout_rmse
+
+
+def test_what_the_vocabulary_lacks_has_no_name() -> None:
+    gap = found(("hysteresis",), WITHOUT_FRICTION)
+    assert gap.found
+    (told,) = gap.effects
+    assert (told.effect, told.target) == ("unnamed", "hinge")
+    assert told.parameters["force"].value > 0.05
+    assert gap.after == gap.before
+    assert gap.declared["pole_mass"][1] == gap.declared["pole_mass"][2]
+
+
+@wrong("a force along a slide is given in N·m")
+def test_unnamed_force_has_the_unit_of_its_joint() -> None:
+    case = simulate_truth(CART_POLE, [Effect("uneven_friction", "rail", UNEVEN)], 3, **SIZE)
+    (told,) = search(case, ("joint_stiffness",)).effects
+    assert (told.effect, told.target) == ("unnamed", "rail")
+    assert told.parameters["force"].unit == "N"
+
+
+@pytest.mark.slow
+@wrong("one effect that removes most of the excess is named, however much is left")
+@pytest.mark.parametrize("yield_at", [0.1, 0.4])
+def test_outsider_is_not_named_while_it_misfits_by_far(yield_at: float) -> None:
+    outsider = Effect("hysteresis", "hinge", {"stiffness": 0.2 / yield_at, "yield": yield_at})
+    gap = search(simulate_truth(CART_POLE, [outsider], 3, **SIZE), tuple(VOCABULARY))
+    assert [e.effect for e in gap.effects] == ["unnamed"] or gap.reduced[1] < 10
+
+
+@wrong("starts of velocities that are not observed are taken for known")
+def test_log_without_velocities_gives_no_false_alarm() -> None:
+    log = hidden().trajectories
+    positions = dataclasses.replace(
+        log, observations=log.observations[:, :2], next_observations=log.next_observations[:, :2]
+    )
+    case = dataclasses.replace(hidden(), trajectories=positions, config={**hidden().config, "observation": ["qpos"]})
+    with contextlib.suppress(InputError):
+        assert not search(case, ("joint_damping",)).found
+
+
+@wrong("mask is not looked at")
+def test_masked_column_is_not_compared() -> None:
+    case = hidden("joint_damping")
+    spoiled = case.trajectories.next_observations.copy()
+    spoiled[:, 0] += 0.01 * np.sin(np.arange(len(spoiled)))
+    log = dataclasses.replace(hidden().trajectories, next_observations=spoiled)
+    case = dataclasses.replace(
+        hidden(), trajectories=log, config={**hidden().config, "mask": ["rail.position"], "noise": list(case.noise)}
+    )
+    assert not search(case, ("joint_friction",)).found
+
+
+def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
+    """The first run of :func:`cart` searches with all effects."""
+    document = json.loads((cart / "out" / "gap.json").read_text())
+    (told,) = document["effects"]
+    assert (told["effect"], told["target"]) == ("joint_damping", "hinge")
+    assert told["parameters"]["damping"]["value"] == pytest.approx(0.02, rel=0.05)
+    assert {"effect": "sensor_delay", "target": "hinge.position"} not in document["cannot_judge"]
+
+
+NUMBER = (int, float)
+CONTRACT: dict[str, Any] = {
+    "schema": str, "where": list, "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
+    "noise": dict, "chi2_per_degree": dict, "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
+    "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [((),), (("joint_damping", "actuator_lag"),), (("hysteresis",), WITHOUT_FRICTION)],
+    ids=["null", "two", "unnamed"],
+)
+def test_document_keeps_its_contract(arguments: tuple) -> None:
+    document = json.loads(json.dumps(plain_numbers(found(*arguments).document()), allow_nan=False))
+    assert document["schema"] == "dropo-torch/gap/1"
+    assert set(document) == set(CONTRACT)
+    assert not [key for key, kind in CONTRACT.items() if not isinstance(document[key], kind)]
+    assert set(document["gap"]) == {"before", "after", "noise_floor"}
+    for scores in document["gap"].values():
+        assert set(scores) == {"mse", "log_likelihood", "rollout_rmse"}
+        assert all(isinstance(v, NUMBER) for v in scores.values())
+    for e in document["effects"]:
+        assert set(e) == {"effect", "target", "parameters", "share_of_gap", "indistinguishable_from"}
+        assert 0 <= e["share_of_gap"] <= 1
+        assert all(set(s) == {"value", "low", "high", "unit"} for s in e["parameters"].values())
+        assert all(isinstance(s["value"], NUMBER) for s in e["parameters"].values())
+    for place in document["where"]:
+        assert set(place) == {"kind", "name", "share", "when"}
+        assert place["kind"] in ("joint", "body", "actuator", "sensor", "contact", "world")
+        assert 0 <= place["share"] <= 1
+    shares = [place["share"] for place in document["where"]]
+    assert shares == sorted(shares, reverse=True)
+    assert all(set(r) == {"effect", "target", "values", "left", "round"} for r in document["ranking"])
+    assert set(document["declared"]["pole_mass"]) == {"given", "alone", "with_effects"}
+    assert list(document["noise"]) == ["rail.position", "hinge.position", "rail.velocity", "hinge.velocity"]
+    assert set(document["chi2_per_degree"]) == {"before", "after"}
+
+
+def test_every_key_of_gap_json_is_documented() -> None:
+    text = (Path(__file__).parents[1] / "docs" / "gap.md").read_text()
+    assert not [key for key in CONTRACT if f"`{key}`" not in text]
+    assert not [name for name in FILES if f"`{name}`" not in text]
+    assert not [f.name for f in dataclasses.fields(Rules) if f"`{f.name}`" not in text]
+
+
+@pytest.mark.parametrize("threads", [1, 2])
+def test_result_is_reproducible_and_independent_of_threads(threads: int) -> None:
+    again = search(hidden("joint_damping"), FEW, threads=threads)
+    assert lasting(again) == lasting(found(("joint_damping",)))
+    assert again.simulated_transitions == found(("joint_damping",)).simulated_transitions
+
+
+# --- the log --------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def box_chart() -> tuple[Chart, np.ndarray]:
+    """The chart of a free body beside a hinge, and random columns of it."""
+    model = mujoco.MjModel.from_xml_string(BOX_XML)
+    observation = parse_observation(model, ["qpos", "qvel"])
+    columns = np.random.default_rng(0).standard_normal((2, 50, observation.size))
+    for q in observation.quaternions:
+        columns[..., list(q)] /= np.linalg.norm(columns[..., list(q)], axis=-1, keepdims=True)
+    return Chart.of(observation), columns
+
+
+def same(chart: Chart, first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether columns are equal, orientations up to the quaternion's sign."""
+    plain = np.allclose(first[..., list(chart.plain)], second[..., list(chart.plain)], atol=1e-12)
+    inner = [np.abs((first[..., list(q)] * second[..., list(q)]).sum(-1)) for q in chart.quaternions]
+    return plain and all(np.allclose(i, 1.0, atol=1e-12) for i in inner)
+
+
+def test_move_undoes_difference(box_chart: tuple[Chart, np.ndarray]) -> None:
+    chart, (start, end) = box_chart
+    assert chart.size == start.shape[-1] - 1
+    assert same(chart, chart.move(start, chart.difference(end, start)), end)
+    assert np.all(chart.difference(start, start) == 0)
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5])
+def test_difference_undoes_move(box_chart: tuple[Chart, np.ndarray], size: float) -> None:
+    chart, (start, _) = box_chart
+    delta = size * np.random.default_rng(1).standard_normal((len(start), chart.size))
+    assert chart.difference(chart.move(start, delta), start) == pytest.approx(delta, abs=1e-14 + 1e-9 * size)
+
+
+def test_difference_ignores_the_sign_of_quaternions(box_chart: tuple[Chart, np.ndarray]) -> None:
+    chart, (start, end) = box_chart
+    flipped = end.copy()
+    for q in chart.quaternions:
+        flipped[..., list(q)] *= -1
+    assert chart.difference(flipped, start) == pytest.approx(chart.difference(end, start), abs=1e-12)
+
+
+def test_windows_share_no_measurement_and_cross_no_end() -> None:
+    problem = load(hidden())
+    log, length = problem.trajectories, 30
+    windows = cut_windows(log, problem.observation, length)
+    assert len(windows) == 4 * (100 // (length + 1))
+    observed = problem.observation.observed(log.observations)
+    ends = problem.observation.observed(log.next_observations)
+    for measured, episode, step in zip(windows.measured, windows.episodes, windows.steps, strict=True):
+        row = 100 * episode + step
+        assert np.array_equal(measured[:-1], observed[row : row + length])
+        assert np.array_equal(measured[-1], ends[row + length - 1])
+    assert len(cut_windows(log, problem.observation, 101)) == 0
+
+
+# --- the noise ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [(), ("joint_damping",), ("actuator_lag",), ("joint_friction",)])
+def test_noise_is_estimated_beside_a_missing_effect(names: tuple[str, ...]) -> None:
+    assert scene_of(*names).noise == pytest.approx(np.array(hidden(*names).noise), rel=0.35)
+
+
+def test_given_noise_is_used() -> None:
+    assert prepare(load(hidden(), noise=[1e-4, 2e-4, 3e-3, 4e-3])).noise == pytest.approx([1e-4, 2e-4, 3e-3, 4e-3])
+
+
+def test_free_forces_are_those_that_are_missing() -> None:
+    scene = scene_of("joint_damping")
+    variant = dataclasses.replace(true(hidden("joint_damping")), placed=()).variant
+    free = free_forces(scene.twin, _short(scene.problem, scene.train), variant, scene.noise)
+    speed = free.windows.measured[:, :, 3].mean(1)
+    slope = (free.forces[:, 1] * speed).sum() / (speed**2).sum()
+    assert slope == pytest.approx(-0.02, rel=0.05)
+    assert guilty(free) == 1
+
+
+# --- the evidence ---------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("names", [(), ("joint_damping",), ("actuator_lag",), ("joint_damping", "actuator_lag")])
+@pytest.mark.parametrize("rough", [False, True])
+def test_true_model_leaves_the_noise_alone(names: tuple[str, ...], rough: bool) -> None:
+    """χ² per degree of freedom is near 1 although every start is noisy; as measured they would dominate."""
+    scene, case = scene_of(*names), hidden(*names)
+    evidence = Evidence(scene.twin, scene.evidence.windows, np.array(case.noise), rough=rough)
+    starts = evidence.linearise(true(case).variant)
+    residuals, _ = evidence.residuals([true(case).variant])
+    cost = cost_of(evidence.project(residuals[0], starts), starts, evidence.degrees(starts))
+    assert cost.reduced == pytest.approx(1, abs=5 * np.sqrt(2 / cost.degrees))
+    assert (residuals**2).sum() > 1.5 * cost.chi2
+
+
+def test_projection_is_one() -> None:
+    """P² = P, and what the starts change to first order is gone."""
+    evidence = scene_of().evidence
+    starts = evidence.linearise(scene_of().begin.variant)
+    vectors = np.random.default_rng(0).standard_normal((len(evidence.windows), evidence.num_rows))
+    once = evidence.project(vectors, starts)
+    assert evidence.project(once, starts) == pytest.approx(once, abs=1e-12)
+    assert evidence.project_slope(np.moveaxis(starts.basis, -1, 0), starts) == pytest.approx(0, abs=1e-9)
+
+
+def test_diverged_windows_stay_finite() -> None:
+    evidence = scene_of().evidence
+    starts = evidence.linearise(scene_of().begin.variant)
+    lost = np.full((len(evidence.windows), evidence.num_rows), np.nan)
+    assert np.isfinite(evidence.project(lost, starts)).all()
+    assert (evidence.project(lost, starts) ** 2).sum() > 1e6
+
+
+# --- fits and screening ---------------------------------------------------------------------------------------
+
+
+def test_refit_finds_effect_and_declared_mass_together() -> None:
+    scene, case = scene_of("joint_damping"), hidden("joint_damping")
+    begin = Hypothesis((0.6,), (Placed(find_effect("joint_damping"), "hinge", (0.0,)),))
+    fitted = refit(scene.evidence, begin)
+    assert fitted.converged
+    assert fitted.hypothesis.vector == pytest.approx(true(case).vector, rel=0.01)
+    assert fitted.cost.reduced < 1.2
+
+
+@pytest.mark.parametrize("begin", [(0.35, 0.5), (9.0, -4.0)])
+def test_refit_stays_in_bounds(begin: tuple[float, float]) -> None:
+    """The true mass is above its bounds, so the fit ends at the bound, wherever it begins."""
+    parameters = {"pole_mass": {**CART_POLE.declared["pole_mass"], "bounds": [0.3, 0.4]}}
+    scene = prepare(load(hidden(), parameters=parameters))
+    hypothesis = Hypothesis(begin[:1], (Placed(find_effect("joint_friction"), "rail", begin[1:]),))
+    limits, starts = (
+        limits_of(hypothesis, scene.problem.space, scene.setting),
+        scene.evidence.linearise(scene.begin.variant),
+    )
+    fitted = refit(scene.evidence, hypothesis, starts=starts)
+    assert fitted.hypothesis.vector[0] == pytest.approx(0.4, rel=1e-9)
+    assert np.all((limits.low <= fitted.hypothesis.vector) & (fitted.hypothesis.vector <= limits.high))
+
+
+@pytest.mark.parametrize(
+    ("name", "rank"),
+    [("joint_damping", 1), ("joint_friction", 1), ("joint_stiffness", 1), ("actuator_lag", 1), ("actuator_delay", 2)],
+)
+def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
+    """A delay is not linear in its length, so that a lag may promise as much; the refit decides."""
+    scene, (truth,) = scene_of(name), hidden(name).effects
+    base = refit(scene.evidence, scene.begin)
+    candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
+    ranked = screen(scene.evidence, base, candidates, caps=np.ones(len(scene.evidence.windows)))
+    assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
+    assert len({c.key for c in ranked}) == len(ranked)
+
+
+# --- intervals ------------------------------------------------------------------------------------------------
+
+W, N, Q = 24, 10, 3
+
+
+def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
+    """Least squares on a linear model without a signal; ``shared`` errors are the same all over a block of windows."""
+    slope = rng.standard_normal((Q, W, N)) + rng.standard_normal((Q, W, 1))
+    error = rng.standard_normal((W, N)) + shared * np.repeat(rng.standard_normal((W // 3, 1)), 3, 0)
+    flat = slope.reshape(Q, -1)
+    values = np.linalg.solve(flat @ flat.T, flat @ error.ravel())
+    residual = error - np.einsum("q,qwn->wn", values, slope)
+    cost = Cost((residual**2).sum(1), np.zeros(W), W * N - Q)
+    starts = Starts(np.zeros((W, N, 0)), np.ones((W, N)), np.zeros((W, N)), 0.0)
+    return Refit(Hypothesis(tuple(values)), cost, residual, slope, starts, np.ones(Q), True)
+
+
+@pytest.mark.parametrize("shared", [0.0, 2.0])
+def test_intervals_cover_as_often_as_they_say(shared: float) -> None:
+    rng, blocks = np.random.default_rng(0), np.repeat(np.arange(W // 3), 3)
+    fits = [linear_fit(rng, shared) for _ in range(300)]
+    inside = [np.abs(f.hypothesis.vector) < 1.6449 * deviations(f, blocks) for f in fits]
+    assert 0.84 < np.mean(inside) < 0.97
+
+
+def test_number_without_influence_is_not_known() -> None:
+    fitted = linear_fit(np.random.default_rng(0))
+    silent = dataclasses.replace(fitted, slope=fitted.slope * np.array([1.0, 0.0, 1.0])[:, None, None])
+    errors = deviations(silent, np.arange(W))
+    assert np.isinf(errors[1])
+    assert np.isfinite(errors[[0, 2]]).all()
+
+
+# --- verification and places ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("episodes", [1, 3, 4, 9])
+def test_last_quarter_is_held_out(episodes: int) -> None:
+    log = simulate_truth(CART_POLE, (), 0, episodes=episodes, transitions=20).trajectories
+    train, held = hold_out(log)
+    assert np.array_equal(np.concatenate([train.observations, held.observations]), log.observations)
+    assert 0.1 <= len(held) / len(log) <= 0.3
+    assert train.terminals[-1]
+    assert held.terminals[-1]
+    if episodes >= 4:
+        assert (train.num_episodes, held.num_episodes) == (episodes - episodes // 4, episodes // 4)
+
+
+def test_scores_order_by_how_wrong_a_model_is() -> None:
+    scene, case = scene_of("joint_damping"), hidden("joint_damping")
+    right = true(case)
+    held = cut_held(scene.twin, scene.held, scene.problem.observation, right, scene.noise, 0.01)
+    models = [right.at(np.array([right.declared[0], d])) for d in (0.02, 0.03, 0.05)]
+    best, worse, worst = (score(scene.evidence, held, m) for m in models)
+    floor = floor_score(scene.evidence, held, right)
+    assert best.mse < worse.mse < worst.mse
+    assert best.rollout_rmse < worse.rollout_rmse < worst.rollout_rmse
+    assert best.log_likelihood > worse.log_likelihood > worst.log_likelihood
+    assert best.mse == pytest.approx(floor.mse, rel=0.2)
+    assert best.log_likelihood == pytest.approx(floor.log_likelihood, rel=0.02)
+
+
+@wrong("four draws are too few where few stretches are held out")
+def test_open_loop_floor_is_that_of_many_draws() -> None:
+    scene = scene_of()
+    held = cut_held(scene.twin, scene.held, scene.problem.observation, scene.begin, scene.noise, 0.01)
+    evidence = scene.evidence.on(held.rollouts)
+    shape = (400, len(held.rollouts), evidence.chart.size)
+    draws = np.concatenate([np.zeros((1, *shape[1:])), np.random.default_rng(0).standard_normal(shape)])
+    residuals, _ = evidence.residuals([scene.begin.variant] * len(draws), draws)
+    change = (residuals[1:] - residuals[:1]).reshape(len(draws) - 1, shape[1], -1, shape[2])[:, :, 1:]
+    expected = np.sqrt((change**2).mean((0, 1, 2)) + 1) * scene.noise
+    assert rollout_floor(evidence, scene.begin) == pytest.approx(expected, rel=0.3)
+
+
+@pytest.mark.parametrize(
+    ("name", "dof", "words"),
+    [
+        ("joint_friction", 0, "with the direction in which rail moves"),
+        ("joint_damping", 1, "in proportion to the velocity of hinge"),
+        ("actuator_lag", 0, "when the command of push changes"),
+        ("joint_stiffness", 1, "with the position of hinge"),
+    ],
+)
+def test_regime_is_told(name: str, dof: int, words: str) -> None:
+    scene = scene_of(name)
+    base = refit(scene.evidence, scene.begin).hypothesis
+    free = free_forces(scene.twin, _short(scene.problem, scene.train), base.variant, scene.noise)
+    assert guilty(free) == dof
+    assert regime(scene.setting, free, dof)[0] == words
+
+
+def test_place_is_told() -> None:
+    place = found(("joint_damping",)).where[0]
+    assert (place.kind, place.name, place.when) == ("joint", "hinge", "in proportion to the velocity of hinge")
+    assert place.share > 0.99
+    place = found(("actuator_lag",)).where[0]
+    assert (place.kind, place.name, place.when) == ("actuator", "push", "when the command of push changes")
+
+
+# --- resume ---------------------------------------------------------------------------------------------------
+
+TWO = ("joint_damping", "actuator_lag")
+
+
+class Stopped(Exception):
+    pass
+
+
+def test_interrupted_search_goes_on_to_the_same_result(tmp_path: Path) -> None:
+    store = tmp_path / "gap-progress.pkl"
+
+    def stop(stage: str, _share: float) -> None:
+        if store.exists() and pickle.loads(store.read_bytes())["stage"].number == 1:
+            raise Stopped(stage)
+
+    with pytest.raises(Stopped):
+        search(hidden(*TWO), FEW, stop, checkpoint=store)
+    stages: list[str] = []
+    gap = search(hidden(*TWO), FEW, lambda stage, _: stages.append(stage), checkpoint=store, resume=True)
+    assert lasting(gap) == lasting(found(TWO))
+    assert gap.simulated_transitions < found(TWO).simulated_transitions
+    assert "fitting the declared parameters" not in stages
+
+
+def test_checkpoint_of_another_problem_is_refused(tmp_path: Path) -> None:
+    store = tmp_path / "gap-progress.pkl"
+    search(hidden(), ("joint_damping",), checkpoint=store)
+    with pytest.raises(InputError, match="another config, model or log") as error:
+        search(hidden("joint_damping"), ("joint_damping",), checkpoint=store, resume=True)
+    assert "\n" not in str(error.value)
+
+
+@wrong("the fingerprint does not have the vocabulary")
+def test_checkpoint_of_another_vocabulary_gives_no_other_answer(tmp_path: Path) -> None:
+    store, case = tmp_path / "gap-progress.pkl", hidden("joint_damping")
+    search(case, ("joint_damping",), checkpoint=store)
+    with contextlib.suppress(InputError):
+        gap = search(case, ("joint_stiffness",), checkpoint=store, resume=True)
+        assert "joint_damping" not in {e.effect for e in gap.effects}
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"", b"hello", pickle.dumps({})[:-1],
+        pytest.param(b"garbage\n", marks=wrong("ValueError of pickle is not caught", ValueError)),
+        pytest.param(pickle.dumps([1]), marks=wrong("a pickle that is no mapping", AttributeError)),
+    ],
+)  # fmt: skip
+def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
+    store = tmp_path / "gap-progress.pkl"
+    store.write_bytes(content)
+    with pytest.raises(InputError, match="is no checkpoint"):
+        search(hidden(), ("joint_damping",), checkpoint=store, resume=True)
+
+
+# --- the command ----------------------------------------------------------------------------------------------
+
+
+def run(*arguments: object) -> int:
+    return main([str(a) for a in (*arguments, "--threads", 1)])
+
+
+@pytest.fixture(scope="module")
+def cart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the config of a log with hidden damping, and ``out`` with what the command made of it."""
+    folder = tmp_path_factory.mktemp("cart")
+    hidden("joint_damping").write(folder)
+    assert run("gap", folder / "config.yaml", "--out", folder / "out") == 0
+    return folder
+
+
+@pytest.fixture
+def one_effect(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A search that is soon over."""
+    monkeypatch.setattr("dropo_torch.gap.run.VOCABULARY", {"joint_damping": VOCABULARY["joint_damping"]})
+
+
+@pytest.fixture
+def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Run a command that must fail with exit code 2 and one line; return the line."""
+
+    def attempt(*arguments: object) -> str:
+        code = run(*arguments)
+        _, error = capfd.readouterr()
+        assert code == 2, error
+        assert error.startswith("dropo: ")
+        assert error.count("\n") == 1
+        return error
+
+    return attempt
+
+
+def test_command_writes_its_files(cart: Path) -> None:
+    assert {p.name for p in (cart / "out").iterdir()} == FILES
+    assert "hinge" in (cart / "out" / "report.html").read_text()
+
+
+def test_model_has_the_effect(cart: Path) -> None:
+    model = mujoco.MjModel.from_xml_path(str(cart / "out" / "model.xml"))
+    assert model.dof_damping[1] == pytest.approx(0.01 + 0.02, rel=0.02)
+    assert model.body("pole").mass[0] == pytest.approx(hidden("joint_damping").declared["pole_mass"], rel=5e-3)
+
+
+def test_config_is_one_that_a_fit_accepts(cart: Path, tmp_path: Path) -> None:
+    assert run("fit", cart / "out" / "config.yaml", "--out", tmp_path / "fit", "--samples", 20) == 0
+    fitted = json.loads((tmp_path / "fit" / "fit.json").read_text())["parameters"]
+    means = {name: entry["mean"] for name, entry in fitted.items()}
+    assert means.pop("pole_mass") == pytest.approx(hidden("joint_damping").declared["pole_mass"], rel=0.05)
+    assert means == {"hinge_damping": pytest.approx(0.01 + 0.02, rel=1e-3)}  # the model's own and what was missing
+
+
+@pytest.mark.usefixtures("one_effect")
+def test_earlier_run_is_moved_aside(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hidden().write(tmp_path)
+    out = tmp_path / "out"
+    assert run("gap", tmp_path / "config.yaml", "--out", out) == 0
+    (out / "mine.txt").write_text("mine")
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    assert run("gap", tmp_path / "config.yaml", "--out", out) == 0
+    assert (out / "mine.txt").read_text() == "mine"
+    aside = {p.name: p.read_bytes() for p in (out / "previous-1").iterdir()}
+    assert aside == {name: content for name, content in before.items() if name != "mine.txt"}
+    assert (out / "gap.json").exists()
+    assert "previous-2" not in {p.name for p in out.iterdir()}
+
+
+@wrong("the log is looked at only after an earlier run was moved")
+@pytest.mark.usefixtures("one_effect")
+def test_refused_log_leaves_an_earlier_run_in_place(tmp_path: Path) -> None:
+    config = hidden().write(tmp_path)
+    assert run("gap", config, "--out", tmp_path / "out") == 0
+    simulate_truth(CART_POLE, (), 0, episodes=1, transitions=20).write(tmp_path)
+    assert run("gap", config, "--out", tmp_path / "out") == 2
+    assert (tmp_path / "out" / "gap.json").exists()
+
+
+def test_no_data_is_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
+    config = hidden().write(tmp_path)
+    (tmp_path / "log.npz").unlink()
+    assert "log.npz" in refused("gap", config, "--out", tmp_path / "out")
+    document = yaml.safe_load(config.read_text())
+    del document["data"]
+    config.write_text(yaml.safe_dump(document))
+    assert "data" in refused("gap", config, "--out", tmp_path / "out")
+
+
+def test_short_log_is_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
+    config = simulate_truth(CART_POLE, (), 0, episodes=1, transitions=20).write(tmp_path)
+    assert "expected at least 5" in refused("gap", config, "--out", tmp_path / "out")
+
+
+def test_simulator_without_a_model_is_refused(tmp_path: Path, refused: Callable[..., str]) -> None:
+    config = Folder(tmp_path).config(
+        backend="gymnasium", environment="adapter.py:make", model=..., frame_skip=...,
+        parameters={"upper_mass": {"bounds": [1, 2]}},
+    )  # fmt: skip
+    assert "no MuJoCo model" in refused("gap", config, "--out", tmp_path / "out")
+
+
+def test_folder_that_is_a_file_is_refused(cart: Path, tmp_path: Path, refused: Callable[..., str]) -> None:
+    (tmp_path / "out").write_text("mine")
+    assert "is a file" in refused("gap", cart / "config.yaml", "--out", tmp_path / "out")
+    assert (tmp_path / "out").read_text() == "mine"
+
+
+def test_own_config_is_not_replaced(cart: Path, refused: Callable[..., str]) -> None:
+    before = {p: p.read_bytes() for p in cart.iterdir() if p.is_file()}
+    assert "is the config of this run" in refused("gap", cart / "config.yaml", "--out", cart)
+    assert {p: p.read_bytes() for p in cart.iterdir() if p.is_file()} == before
+
+
+# --- from Python ----------------------------------------------------------------------------------------------
+
+
+def test_functions_are_where_they_are_looked_for() -> None:
+    assert dropo.gap.find_gap is find_gap
+    assert dropo.gap.prepare is prepare
+    assert dropo.gap.add is add
+
+
+def test_add_writes_nothing_where_nothing_is_named(tmp_path: Path) -> None:
+    assert add(load(hidden()), found(()), tmp_path) == []
+    assert list(tmp_path.iterdir()) == []
