@@ -91,8 +91,8 @@ class Objective:
         self._states = torch.from_numpy(np.ascontiguousarray(transitions.states, dtype=np.float64))
         self._controls = torch.from_numpy(np.ascontiguousarray(transitions.controls, dtype=np.float64))
         measured = torch.from_numpy(np.ascontiguousarray(transitions.measured, dtype=np.float64))
-        quaternions = [q for q in observation.quaternions if not _masked(observation, mask) & set(q)]
-        taken = {c for q in observation.quaternions for c in q} | _masked(observation, mask)
+        quaternions = [q for q in observation.quaternions if not masked_columns(observation, mask) & set(q)]
+        taken = {c for q in observation.quaternions for c in q} | masked_columns(observation, mask)
         self._plain = [c for c in range(observation.size) if c not in taken]
         self._quaternions = [list(q) for q in quaternions]
         if not self._plain and not self._quaternions:
@@ -403,7 +403,7 @@ def _blocks(total: int, rows: int) -> Iterator[slice]:
     return (slice(a, min(a + rows, total)) for a in range(0, total, rows))
 
 
-def _masked(observation: Observation, mask: Sequence[str | int]) -> set[int]:
+def masked_columns(observation: Observation, mask: Sequence[str | int]) -> set[int]:
     """Observed columns that the mask names; one column of a quaternion stands for all four."""
     found: set[int] = set()
     for entry in mask:

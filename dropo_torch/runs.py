@@ -28,7 +28,7 @@ from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit, refuse_dead_parameters, write_atomically
-from dropo_torch.gap import Gap, add, find_gap
+from dropo_torch.gap import Gap, add, find_gap, prepare
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem, make_problem
@@ -212,9 +212,11 @@ def run_gap(config: Config, out: Path, *, console: Console, source: Path | None 
     if source is not None and source.resolve() == (out / "config.yaml").resolve():
         raise InputError(f"--out: {source} is the config of this run, which would replace it; name another folder")
     store = out / "gap-progress.pkl"
-    _prepare(out, problem, resume=resume and store.exists())
     with StageProgress(console, "gap") as progress:
-        gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update)
+        progress.update("preparing", 0.0)
+        scene = prepare(problem)  # before an earlier run is moved aside
+        _prepare(out, problem, resume=resume and store.exists())
+        gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update, scene=scene)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
     write_atomically(out / "gap.json", json.dumps(plain_numbers(gap.document()), indent=2).encode() + b"\n")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import abc
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
 import mujoco
@@ -66,13 +66,13 @@ class Signals:
 
 @dataclass(frozen=True)
 class Setting:
-    """Where effects are looked for: the model as given, the columns of the log, and its sizes."""
+    """Where effects are looked for: the model as given, the columns of the log (some masked), and its sizes."""
 
     model: mujoco.MjModel
     observation: Observation
     signals: Signals
     frame_skip: int
-    lists: dict[str, list[str]] = field(default_factory=dict)
+    masked: frozenset[int] = frozenset()
 
     def joint(self, name: str) -> int:
         """Return a joint's number."""

@@ -18,7 +18,8 @@ class SensorEffect(Effect):
     def targets(self, setting: Setting) -> list[str | None]:
         turned = {c for q in setting.observation.quaternions for c in q}
         labels = setting.observation.labels
-        return [n for c, n in enumerate(labels) if c not in turned and setting.signals.column[c] > 0]
+        left_out = turned | setting.masked
+        return [n for c, n in enumerate(labels) if c not in left_out and setting.signals.column[c] > 0]
 
     @staticmethod
     def column(setting: Setting, target: str | None) -> int:

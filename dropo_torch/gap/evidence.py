@@ -57,7 +57,7 @@ class Evidence:
         self, twin: Twin, windows: Windows, noise: np.ndarray, *, rough: bool, model_error: np.ndarray | None = None
     ) -> None:
         self.twin, self.windows, self.noise, self.rough = twin, windows, np.asarray(noise, dtype=float), rough
-        self.chart = Chart.of(twin.setting.observation)
+        self.chart = Chart.of(twin.setting.observation, twin.setting.masked)
         self.model_error = np.ones(self.num_rows) if model_error is None else model_error
 
     def on(self, windows: Windows) -> Evidence:

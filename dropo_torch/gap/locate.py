@@ -189,7 +189,9 @@ def residual_pictures(
     for dof in dofs:
         _, values, label, unit = regime(setting, before, dof)
         joint = int(setting.model.dof_jntid[dof])
-        force = "N·m" if setting.model.jnt_type[joint] != mujoco.mjtJoint.mjJNT_SLIDE else "N"
+        moves = dof - int(setting.model.jnt_dofadr[joint])
+        kind = int(setting.model.jnt_type[joint])
+        force = "N" if kind == int(mujoco.mjtJoint.mjJNT_SLIDE) or (kind == 0 and moves < 3) else "N·m"
         variable = values
         if "velocity of" in label and "change" not in label:
             variable = windows_velocity(setting, before.windows, before.windows.length // 2)[:, dof]

@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Setting, Signals
 from dropo_torch.effects.twin import Windows
+from dropo_torch.objective import masked_columns
 from dropo_torch.observation import Observation
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import Trajectories
@@ -27,23 +28,25 @@ class Chart:
         quaternions: columns of each observed quaternion.
         labels: names of the features, ``(m,)``.
         units: their units.
+        masked: observed columns that are not compared.
     """
 
     plain: tuple[int, ...]
     quaternions: tuple[tuple[int, int, int, int], ...]
     labels: tuple[str, ...]
     units: tuple[str, ...]
+    masked: frozenset[int] = frozenset()
 
     @classmethod
-    def of(cls, observation: Observation) -> Chart:
-        """Return the chart of an observation."""
+    def of(cls, observation: Observation, masked: frozenset[int] = frozenset()) -> Chart:
+        """Return the chart of an observation; masked columns are features that are never known."""
         taken = {c for q in observation.quaternions for c in q}
         plain = tuple(c for c in range(observation.size) if c not in taken)
         stems = [observation.labels[q[0]].split("[")[0] for q in observation.quaternions]
         turned = [f"{stem}.rotation[{axis}]" for stem in stems for axis in "xyz"]
         return cls(
             plain, observation.quaternions, tuple(observation.labels[c] for c in plain) + tuple(turned),
-            tuple(observation.units[c] for c in plain) + ("rad",) * len(turned),
+            tuple(observation.units[c] for c in plain) + ("rad",) * len(turned), masked,
         )  # fmt: skip
 
     @property
@@ -68,6 +71,7 @@ class Chart:
 
     def known(self, valid: np.ndarray) -> np.ndarray:
         """Return which features ``(..., m)`` are known, of columns ``(..., n)``."""
+        valid = valid & ~np.isin(np.arange(valid.shape[-1]), list(self.masked))
         parts = [valid[..., list(self.plain)]]
         parts += [np.repeat(valid[..., list(q)].all(-1, keepdims=True), 3, -1) for q in self.quaternions]
         return np.concatenate(parts, -1)
@@ -189,7 +193,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
         linear_speed=np.sqrt(speed / len(rows)),
         contacts=touches,
     )
-    return Setting(model, problem.observation, signals, frame_skip)
+    masked = frozenset(masked_columns(problem.observation, problem.config.mask))
+    return Setting(model, problem.observation, signals, frame_skip, masked)
 
 
 def _velocity(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:

@@ -27,7 +27,6 @@ class Rules:
         most: share of the excess that an effect removes without further question.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
-        enough: share of the excess at which a single effect ends the search for more at once.
         least: share of the first excess below which an effect is not named.
         significance: paired standard errors, over blocks of the log, by which one hypothesis beats another.
         tie: paired standard errors within which two hypotheses tie.
@@ -40,7 +39,6 @@ class Rules:
     most: float = 0.8
     accounted: float = 0.97
     hopeless: float = 0.8
-    enough: float = 0.99
     least: float = 3e-3
     significance: float = 3.0
     tie: float = 2.0
@@ -213,9 +211,10 @@ class Search:
             return None
         try:
             document = pickle.loads(self._checkpoint.read_bytes())
-        except (pickle.UnpicklingError, EOFError, AttributeError):
+            known = document.get("fingerprint")
+        except Exception:  # whatever bytes that are no checkpoint make of a pickle
             raise InputError(f"--resume: {self._checkpoint} is no checkpoint; run without --resume") from None
-        if document.get("fingerprint") != self._fingerprint:
+        if known != self._fingerprint:
             raise InputError(
                 f"--resume: {self._checkpoint} is of another config, model or log; run without --resume, "
                 "or name another folder"

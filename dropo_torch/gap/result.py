@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -163,7 +164,10 @@ class Gap:
             "where": [{"kind": p.kind, "name": p.name, "share": p.share, "when": p.when} for p in self.where],
             "effects": [_effect(e) for e in self.effects],
             "gap": {
-                name: {"mse": s.mse, "log_likelihood": s.log_likelihood, "rollout_rmse": s.rollout_rmse}
+                name: {
+                    "mse": _finite(s.mse), "log_likelihood": _finite(s.log_likelihood),
+                    "rollout_rmse": _finite(s.rollout_rmse),
+                }
                 for name, s in (("before", self.before), ("after", self.after), ("noise_floor", self.noise_floor))
             },
             "next_experiment": self.next_experiment,
@@ -186,12 +190,18 @@ class Gap:
         }  # fmt: skip
 
 
+def _finite(value: float) -> float | None:
+    """A number as JSON has it; ``None`` for one that is not finite."""
+    return float(value) if math.isfinite(value) else None
+
+
 def _effect(e: NamedEffect) -> dict[str, Any]:
     return {
         "effect": e.effect,
         "target": e.target,
         "parameters": {
-            n: {"value": s.value, "low": s.low, "high": s.high, "unit": s.unit} for n, s in e.parameters.items()
+            n: {"value": _finite(s.value), "low": _finite(s.low), "high": _finite(s.high), "unit": s.unit}
+            for n, s in e.parameters.items()
         },
         "share_of_gap": e.share_of_gap,
         "indistinguishable_from": [{"effect": n, "target": t} for n, t in e.indistinguishable_from],

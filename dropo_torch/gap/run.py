@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import mujoco
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY, Effect
@@ -24,6 +25,7 @@ from dropo_torch.gap.result import Gap, NamedEffect, Ranked, Strength
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.verify import Held, constant_velocity, cut_held, floor_score, hold_out, score, spread
+from dropo_torch.observation import joint_name
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import Trajectories
 
@@ -72,6 +74,7 @@ def prepare(problem: Problem) -> Scene:
     """
     if problem.space.model is None or problem.observation.size == 0:
         raise InputError("gap: this simulator is no MuJoCo model; effects can only be looked for in one")
+    _check_observed(problem)
     train, held = hold_out(problem.trajectories)
     setting = make_setting(problem, train)
     twin = Twin(
@@ -83,6 +86,22 @@ def prepare(problem: Problem) -> Scene:
     length, rough = _choose_window(twin, train, begin, noise)
     windows = spread(cut_windows(train, problem.observation, length), MOST)
     return Scene(problem, setting, twin, train, held, noise, Evidence(twin, windows, noise, rough=rough), begin)
+
+
+def _check_observed(problem: Problem) -> None:
+    """A window needs its start: where a position is observed, its velocity must be, too."""
+    model, columns = problem.space.model, set(problem.observation.columns)
+    assert model is not None
+    for joint in range(model.njnt):
+        width = {0: (7, 6), 1: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
+        positions = range(int(model.jnt_qposadr[joint]), int(model.jnt_qposadr[joint]) + width[0])
+        velocities = range(int(model.jnt_dofadr[joint]), int(model.jnt_dofadr[joint]) + width[1])
+        missing = [v for v in velocities if model.nq + v not in columns]
+        if columns.intersection(positions) and missing:
+            raise InputError(
+                f"gap: the velocity of {joint_name(model, joint)} is not observed; derive velocities from positions "
+                "(data: preprocess), and name them in observation"
+            )
 
 
 def _noise(problem: Problem, twin: Twin, train: Trajectories, begin: Hypothesis) -> np.ndarray:
@@ -138,6 +157,7 @@ def find_gap(
     checkpoint: Path | None = None,
     resume: bool = False,
     report: Report = lambda stage, share: None,
+    scene: Scene | None = None,
 ) -> Gap:
     """Find where simulation and log disagree, name the missing effects, and verify them on held-out data.
 
@@ -148,6 +168,7 @@ def find_gap(
         checkpoint: file in which the state between rounds is kept.
         resume: go on from it.
         report: called with a stage and its share done.
+        scene: what :func:`prepare` made of the problem; made here by default.
 
     Raises:
         InputError: a log or simulator in which nothing can be looked for.
@@ -155,11 +176,11 @@ def find_gap(
     started = time.perf_counter()
     rules = rules or Rules()
     report("preparing", 0.0)
-    scene = prepare(problem)
+    scene = scene or prepare(problem)
     vocabulary = list(effects or VOCABULARY.values())
     search = Search(
         scene.evidence, vocabulary, rules=rules, report=report, checkpoint=checkpoint, resume=resume,
-        fingerprint=problem.fingerprint,
+        fingerprint=f"{problem.fingerprint} {rules} {[e.name for e in vocabulary]}",
     )  # fmt: skip
     naming = search.run(scene.begin)
     shorter = _shorter(scene)
@@ -278,7 +299,8 @@ def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces) -> tupl
         force = float(np.sqrt(np.nanmean(free.forces[:, dof] ** 2)))
         words = regime(setting, free, dof)[0]
         name = dof_names(setting.model)[dof]
-        strength = {"force": Strength(force, float("nan"), float("nan"), "N·m")}
+        slides = setting.model.jnt_type[setting.model.dof_jntid[dof]] == mujoco.mjtJoint.mjJNT_SLIDE
+        strength = {"force": Strength(force, float("nan"), float("nan"), "N" if slides else "N·m")}
         text = f"something that no known effect explains, at {name}" + (f", {words}" if words else "")
         return (NamedEffect("unnamed", name, strength, 1.0, (), text),)
     errors = deviations(final, scene.evidence.windows.episodes)

@@ -18,6 +18,8 @@ from dropo_torch.trajectory import Trajectories
 SECONDS = (3.0, 1.0, 0.3, 0.1)
 #: Share of the motion's own deviation that noise at the start may grow to in an open-loop prediction.
 GROWTH = 0.1
+#: Simulations from which the error that noise alone makes is estimated, at least.
+DRAWS = 150
 #: Most windows that are scored.
 MOST = 600
 
@@ -148,7 +150,8 @@ def constant_velocity(evidence: Evidence, held: Held) -> float:
 def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     """Return the open-loop error of each feature that noise at start and end alone would make, ``(m,)``."""
     m = evidence.chart.size
-    draws = np.random.default_rng(5).standard_normal((4, len(evidence.windows), m))
+    count = max(4, -(-DRAWS // len(evidence.windows)))
+    draws = np.random.default_rng(5).standard_normal((count, len(evidence.windows), m))
     moved = np.concatenate([np.zeros((1, len(evidence.windows), m)), draws])
     found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)
     change = np.nan_to_num(found[1:] - found[:1], nan=1e3).reshape(len(draws), len(evidence.windows), -1, m)[:, :, 1:]
