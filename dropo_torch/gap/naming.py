@@ -103,6 +103,13 @@ def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
     return float(sums.sum() / max(error, 1e-12))
 
 
+def simplest(fitted: Sequence[Refit]) -> Refit:
+    """Return, of hypotheses that are about as good as the best, the one with the fewest numbers."""
+    best = fitted[0].cost
+    near = best.excess + max(0.3 * max(best.excess, 0.0), 4 * np.sqrt(2 * best.degrees))
+    return min((r for r in fitted if r.cost.excess <= near), key=lambda r: (len(r.hypothesis.vector), r.cost.excess))
+
+
 @dataclass(frozen=True)
 class Stage:
     """Where a search stands: the declared parameters alone, the hypothesis so far, and rounds done."""
@@ -300,7 +307,7 @@ class Search:
         singles = self._refits(current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
         if not singles:
             return None
-        best = singles[0]
+        best = simplest(singles)
         left = best.cost.excess / current.cost.excess
         if left > 1 - rules.most:
             pairs = promising_pairs(*self._aligned(current, alive[:16]), 5)
