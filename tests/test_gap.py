@@ -20,7 +20,8 @@ from arm import Folder
 from conftest import BOX_XML
 
 import dropo_torch as dropo
-from benchmarks.hidden.systems import CART_POLE
+import dropo_torch.gap as gap_package
+from benchmarks.hidden.systems import CART_POLE, TORQUE_ARM
 from benchmarks.hidden.truths import Case, Effect, simulate_truth
 from dropo_torch.cli import main
 from dropo_torch.config import load_config
@@ -34,7 +35,7 @@ from dropo_torch.gap.log import Chart, cut_windows
 from dropo_torch.gap.naming import Rules
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
-from dropo_torch.gap.run import _short
+from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
 from dropo_torch.observation import parse_observation
@@ -322,7 +323,7 @@ def test_given_noise_is_used() -> None:
 def test_free_forces_are_those_that_are_missing() -> None:
     scene = scene_of("joint_damping")
     variant = dataclasses.replace(true(hidden("joint_damping")), placed=()).variant
-    free = free_forces(scene.twin, _short(scene.problem, scene.train), variant, scene.noise)
+    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), variant, scene.noise)
     speed = free.windows.measured[:, :, 3].mean(1)
     slope = (free.forces[:, 1] * speed).sum() / (speed**2).sum()
     assert slope == pytest.approx(-0.02, rel=0.05)
@@ -490,7 +491,7 @@ def test_open_loop_floor_is_that_of_many_draws() -> None:
 def test_regime_is_told(name: str, dof: int, words: str) -> None:
     scene = scene_of(name)
     base = refit(scene.evidence, scene.begin).hypothesis
-    free = free_forces(scene.twin, _short(scene.problem, scene.train), base.variant, scene.noise)
+    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), base.variant, scene.noise)
     assert guilty(free) == dof
     assert regime(scene.setting, free, dof)[0] == words
 
@@ -686,3 +687,31 @@ def test_functions_are_where_they_are_looked_for() -> None:
 def test_add_writes_nothing_where_nothing_is_named(tmp_path: Path) -> None:
     assert add(load(hidden()), found(()), tmp_path) == []
     assert list(tmp_path.iterdir()) == []
+
+
+def test_the_steps_one_by_one_say_what_the_whole_says() -> None:
+    problem = load(hidden("joint_damping"))
+    few = [VOCABULARY[n] for n in ("joint_damping", "joint_stiffness")]
+    whole = gap_package.find_gap(problem, effects=few)
+    scene = gap_package.prepare(problem)
+    assert gap_package.locate(scene, effects=few)[0].share > 0.9
+    naming = gap_package.name(scene, effects=few)
+    assert [p.key for p in naming.final.hypothesis.placed] == [(e.effect, e.target) for e in whole.effects]
+    before, floor = gap_package.verify(scene, naming.base.hypothesis)
+    after, _ = gap_package.verify(scene, naming.final.hypothesis)
+    assert before.mse > 10 * floor.mse
+    assert after.mse < 2 * floor.mse
+
+
+@pytest.mark.slow
+def test_a_family_of_friction_at_every_joint_is_one_effect() -> None:
+    case = simulate_truth(
+        TORQUE_ARM, [Effect("joint_friction", j, {"friction": f}) for j, f in FRICTION_EVERYWHERE.items()], 3, **SIZE
+    )
+    (told,) = search(case, ("joint_friction", "joint_damping", "actuator_delay")).effects
+    assert (told.effect, told.target) == ("joint_friction", "*")
+    for joint, friction in FRICTION_EVERYWHERE.items():
+        assert told.parameters[joint].value == pytest.approx(friction, rel=0.05)
+
+
+FRICTION_EVERYWHERE = {"yaw": 0.3, "shoulder": 0.4, "elbow": 0.2}

@@ -1,7 +1,26 @@
-"""What is the model missing? Find it, name it, add it, show the gap shrink."""
+"""What is the model missing? Locate it, name it, add it, verify that the gap shrinks."""
 
 from dropo_torch.gap.add import add
+from dropo_torch.gap.naming import Naming, Rules
+from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, NamedEffect, Place, Score, Strength
-from dropo_torch.gap.run import Scene, find_gap, prepare
+from dropo_torch.gap.run import find_gap, locate, name, verify
+from dropo_torch.gap.scene import Scene, prepare
 
-__all__ = ["Gap", "NamedEffect", "Place", "Scene", "Score", "Strength", "add", "find_gap", "prepare"]
+__all__ = [
+    "Gap",
+    "Hypothesis",
+    "NamedEffect",
+    "Naming",
+    "Place",
+    "Rules",
+    "Scene",
+    "Score",
+    "Strength",
+    "add",
+    "find_gap",
+    "locate",
+    "name",
+    "prepare",
+    "verify",
+]

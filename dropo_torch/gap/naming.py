@@ -180,12 +180,25 @@ class Search:
             base, current, True, True, tuple(ties), tuple(self.trials), tuple(self.silent), shares=tuple(shares)
         )
 
-    def _based(self, begin: Hypothesis) -> Stage:
-        """Fit the declared parameters alone."""
+    def start(self, begin: Hypothesis) -> Refit:
+        """Fit the declared parameters alone, with the influence of single windows capped."""
         self._report("fitting the declared parameters", 0.0)
         base = self._renoise(refit(self._part(self._few), begin))
         self._caps = caps_of(base.cost.windows, base.cost.degrees)
-        base = refit(self._part(self._few), base.hypothesis, caps=self._caps, iterations=4)
+        return refit(self._part(self._few), base.hypothesis, caps=self._caps, iterations=4)
+
+    def look(self, base: Refit) -> list[Candidate]:
+        """Screen every candidate beside the declared parameters alone, and keep what that says."""
+        ranked = self._screened(base)
+        self.silent = [c.key for c in ranked if c.dead]
+        fewer, here, caps = self._fewer_of(base, self._fewer)
+        self.first, self.first_degrees = ranked, fewer.degrees(here.starts)
+        self.first_chi2 = float(((here.residual * caps[:, None]) ** 2).sum())
+        return ranked
+
+    def _based(self, begin: Hypothesis) -> Stage:
+        """The first stage: the declared parameters alone."""
+        base = self.start(begin)
         stage = Stage(base, base, 0, False)
         self._save(stage)
         return stage
@@ -296,13 +309,8 @@ class Search:
     def _next(self, current: Refit, base: Refit, number: int) -> Refit | None:
         """The hypothesis with one or two more effects that removes the most, or ``None``."""
         rules = self.rules
-        ranked = self._screened(current)
+        ranked = self.look(current) if number == 0 else self._screened(current)
         self._round = number
-        if number == 0:
-            self.silent = [c.key for c in ranked if c.dead]
-            fewer, here, caps = self._fewer_of(current, self._fewer)
-            self.first, self.first_degrees = ranked, fewer.degrees(here.starts)
-            self.first_chi2 = float(((here.residual * caps[:, None]) ** 2).sum())
         alive = [c for c in ranked if not c.dead]
         singles = self._refits(current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
         if not singles:
