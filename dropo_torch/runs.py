@@ -209,8 +209,11 @@ def run_gap(config: Config, out: Path, *, console: Console, source: Path | None 
     from dropo_torch.report import write_gap_report
 
     problem = make_problem(config, general=True)
-    if source is not None and source.resolve() == (out / "config.yaml").resolve():
-        raise InputError(f"--out: {source} is the config of this run, which would replace it; name another folder")
+    written = out / "config.yaml"
+    if written.exists() and (not (out / "gap.json").exists() or (source and source.resolve() == written.resolve())):
+        raise InputError(
+            f"--out: {written} is no result of an earlier run, or the config of this one; name another folder"
+        )
     store = out / "gap-progress.pkl"
     with StageProgress(console, "gap") as progress:
         progress.update("preparing", 0.0)
@@ -309,6 +312,8 @@ def _prepare(out: Path, problem: Problem, *, resume: bool) -> None:
         for stale in out.glob(f".{name}.*.tmp"):  # a write that kill -9 cut short
             stale.unlink()
     present = [name for name in _RESULTS if (out / name).exists()]
+    if not (out / "gap.json").exists() and "config.yaml" in present:
+        present.remove("config.yaml")  # one of the user's own
     source = problem.model_path
     if source is not None and source.name in present and source.resolve() == (out / source.name).resolve():
         raise InputError(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import gymnasium
@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from dropo_torch.effects import VOCABULARY
 from dropo_torch.objective import Objective
 from dropo_torch.observation import generic_observation
 from dropo_torch.optimizers import Optimizer
@@ -21,6 +22,16 @@ from dropo_torch.trajectory import Transitions
 
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True, max_examples=60, database=None)
 hypothesis.settings.load_profile("tests")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def own_effects_leave_with_their_module() -> Iterator[None]:
+    """Effects that a module registers are not in the vocabulary of the next."""
+    known = dict(VOCABULARY)
+    yield
+    VOCABULARY.clear()
+    VOCABULARY.update(known)
+
 
 HOPPER = Path(gymnasium.__file__).parent / "envs" / "mujoco" / "assets" / "hopper.xml"
 HOPPER_BODIES = ("torso", "thigh", "leg", "foot")

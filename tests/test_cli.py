@@ -153,8 +153,11 @@ def test_a_config_that_cannot_be_opened_gives_one_line(name: str, refused: Calla
 
 WRONG_LINES: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown command": ("fitt CONFIG --out OUT", ("unknown command 'fitt'", "did you mean 'fit'")),
-    "option before the command": ("--foo fit CONFIG --out OUT", ("--foo", "fit|sweep-epsilon|certify|compare|demo")),
-    "no command": ("--foo", ("--foo", "fit|sweep-epsilon|certify|compare|demo")),
+    "option before the command": (
+        "--foo fit CONFIG --out OUT",
+        ("--foo", "fit|gap|sweep-epsilon|certify|compare|demo"),
+    ),
+    "no command": ("--foo", ("--foo", "fit|gap|sweep-epsilon|certify|compare|demo")),
     "no config": ("fit --out OUT", ("CONFIG", "usage: dropo fit")),
     "no folder": ("fit CONFIG", ("--out", "usage: dropo fit")),
     "folder without value": ("fit CONFIG --out", ("--out: expected one argument",)),

@@ -323,8 +323,8 @@ def test_stribeck_friction_holds_what_is_below_its_static_value() -> None:
 def test_cogging_ripples_with_the_position() -> None:
     numbers = {"amplitude": 0.7, "poles": 9.0, "phase": 0.4}
     path = driven([{"effect": "joint_cogging", "target": "rail", **numbers}], np.zeros(50), (0.1, 1.0))
-    positions = np.append(0.1, path[:-1, 0])
-    np.testing.assert_allclose(forces(path, 1.0), 0.7 * np.sin(9 * positions + 0.4), atol=1e-9)
+    middle = np.append(0.1, path[:-1, 0]) + 0.5 * STEP * np.append(1.0, path[:-1, 1])
+    np.testing.assert_allclose(forces(path, 1.0), 0.7 * np.sin(9 * middle + 0.4), atol=1e-9)
 
 
 def test_coupling_is_a_spring_between_neighbours() -> None:

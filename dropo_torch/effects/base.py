@@ -113,6 +113,12 @@ class Effect(abc.ABC):
     sentence: ClassVar[str]
     native: ClassVar[bool] = True
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle by name: whoever reads it must have registered the effect, too."""
+        from dropo_torch.effects import find_effect
+
+        return find_effect, (self.name,)
+
     @abc.abstractmethod
     def targets(self, setting: Setting) -> list[str | None]:
         """Return where the effect can sit in this model; ``[None]`` for the world."""
