@@ -210,10 +210,10 @@ def run_gap(config: Config, out: Path, *, console: Console, source: Path | None 
 
     problem = make_problem(config, general=True)
     written = out / "config.yaml"
-    if written.exists() and (not (out / "gap.json").exists() or (source and source.resolve() == written.resolve())):
-        raise InputError(
-            f"--out: {written} is no result of an earlier run, or the config of this one; name another folder"
-        )
+    if source is not None and source.resolve() == written.resolve():
+        raise InputError(f"--out: {source} is the config of this run, which would replace it; name another folder")
+    if written.exists() and not (out / "gap.json").exists():
+        raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
     store = out / "gap-progress.pkl"
     with StageProgress(console, "gap") as progress:
         progress.update("preparing", 0.0)
