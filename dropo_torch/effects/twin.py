@@ -98,6 +98,12 @@ class Twin:
         self._filtered: dict[tuple, np.ndarray] = {}
         self.simulated_transitions = 0
 
+    def also(self, placed: Placed) -> Twin:
+        """Return the same with one more effect in every variant."""
+        before, twin = self._standing, copy.copy(self)
+        twin._standing = lambda declared: (*(before(declared) if before is not None else ()), placed)
+        return twin
+
     def model(self, variant: Variant) -> mujoco.MjModel:
         """Return the model of a variant, with its derived constants.
 

@@ -74,6 +74,10 @@ class Evidence:
         """Return the same with another weight of each residual."""
         return Evidence(self.twin, self.windows, self.noise, rough=self.rough, model_error=model_error)
 
+    def with_twin(self, twin: Twin) -> Evidence:
+        """Return the same by another simulation."""
+        return Evidence(twin, self.windows, self.noise, rough=self.rough, model_error=self.model_error)
+
     @property
     def num_rows(self) -> int:
         """Residuals of a window."""

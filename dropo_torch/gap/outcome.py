@@ -11,7 +11,7 @@ import numpy as np
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.intervals import deviations
+from dropo_torch.gap.intervals import deviations, step_errors
 from dropo_torch.gap.locate import dof_names, guilty, places, regime, residual_pictures
 from dropo_torch.gap.naming import Naming, Search
 from dropo_torch.gap.noise import FreeForces, free_forces
@@ -45,7 +45,7 @@ def make_result(scene: Scene, search: Search, naming: Naming, started: float) ->
     after = free_forces(twin, short, final.hypothesis.variant, noise) if naming.named else before
     evidence = search.evidence
     held = cut_held(twin, scene.held, problem.observation, final.hypothesis, noise, scene.setting.signals.timestep)
-    shown = _named(scene, naming, final, before) if naming.gap else ()
+    shown = _named(scene, naming, final, before, evidence) if naming.gap else ()
     dofs = _telling(scene.setting, shown, before) if naming.gap else []
     return Gap(
         where=found_places(scene, search, before) if naming.gap else (),
@@ -126,7 +126,7 @@ def _declared(scene: Scene, naming: Naming, final: Refit) -> Mapping[str, tuple[
     return {n: (a, b, c) for n, a, b, c in rows}
 
 
-def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces) -> tuple[NamedEffect, ...]:
+def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces, evidence: Evidence) -> tuple[NamedEffect, ...]:
     """The named effects, the strongest first; or the one that has no name."""
     setting = scene.setting
     if not naming.named:
@@ -139,13 +139,14 @@ def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces) -> tupl
         text = f"something that no known effect explains, at {name}" + (f", {words}" if words else "")
         return (NamedEffect("unnamed", name, strength, 1.0, (), text),)
     errors = deviations(final, scene.evidence.windows.episodes)
+    biases = step_errors(evidence, final)
     position, found = len(final.hypothesis.declared), []
     excess = naming.base.cost.excess
     for index, placed in enumerate(final.hypothesis.placed):
         quantities = placed.effect.quantities(setting, placed.target)
         numbers = {}
         for i, (q, value) in enumerate(zip(quantities, placed.values, strict=True)):
-            half = Z90 * errors[position + i]
+            half = Z90 * errors[position + i] + biases[position + i]
             numbers[q.name] = Strength(value, max(value - half, q.low), min(value + half, q.high), q.unit)
         position += len(placed.values)
         share = naming.shares[index] / excess if naming.shares else 1.0
