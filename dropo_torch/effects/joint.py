@@ -187,7 +187,8 @@ class JointCogging(JointEffect):
     name = "joint_cogging"
     sentence = "a force at {target} that ripples with its position, as of a motor's magnets or a gear's teeth"
     native = False
-    #: Ripples per radian (per metre: times 50) that are tried.
+    #: Ripples of a turn that are tried, and how many of a slide, each half a wave more over the measured range.
+    WAVES = 40
     POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
@@ -201,9 +202,11 @@ class JointCogging(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         low, high = setting.signals.position[setting.coordinate(str(target))]
-        factor = 1.0 if not setting.is_slide(str(target)) else 50.0
         amplitude = 0.1 * self.quantities(setting, target)[0].scale
-        poles = [factor * n for n in self.POLES if factor * n * (high - low) > 2 * np.pi]
+        if setting.is_slide(str(target)):  # so dense that no ripple is half a wave off over the whole range
+            poles = [float(np.pi * n / max(high - low, 1e-9)) for n in range(2, 2 + self.WAVES)]
+        else:
+            poles = [float(n) for n in self.POLES if n * (high - low) > 2 * np.pi]
         return [np.array([amplitude, n, 0.0]) for n in poles]
 
     def screened(self) -> list[int]:

@@ -138,7 +138,7 @@ def _named(scene: Scene, naming: Naming, final: Refit, free: FreeForces, evidenc
         strength = {"force": Strength(force, float("nan"), float("nan"), "N" if slides else "N·m")}
         text = f"something that no known effect explains, at {name}" + (f", {words}" if words else "")
         return (NamedEffect("unnamed", name, strength, 1.0, (), text),)
-    errors = deviations(final, scene.evidence.windows.episodes)
+    errors = deviations(final, evidence.windows.episodes)
     biases = step_errors(evidence, final)
     position, found = len(final.hypothesis.declared), []
     excess = naming.base.cost.excess
