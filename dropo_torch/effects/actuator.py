@@ -140,10 +140,8 @@ class ActuatorSaturation(ActuatorEffect):
         return [t for t in found if not m.actuator_forcelimited[actuator_number(m, t)]]
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        m, i = setting.model, actuator_number(setting.model, target)
         largest = self.largest(setting, target)
         low = 0.02 * largest
-        del m, i
         return (Quantity("limit", _unit(setting, target, "N·m", "N"), 4 * largest, low, 4 * largest, largest),)
 
     def largest(self, setting: Setting, target: str | None) -> float:

@@ -68,7 +68,6 @@ class Naming:
         ties: for each named effect, the candidates that do as well in its place.
         trials: what was refitted, in order.
         silent: candidates that change nothing on this log, which it therefore cannot judge.
-        best: the wrong candidates that removed the most, where nothing could be named.
         shares: excess that comes back when each named effect alone is left out.
     """
 
@@ -79,7 +78,6 @@ class Naming:
     ties: tuple[tuple[Placed, ...], ...] = ()
     trials: tuple[Trial, ...] = ()
     silent: tuple[tuple[str, str | None], ...] = ()
-    best: tuple[Trial, ...] = ()
     shares: tuple[float, ...] = ()
 
 
@@ -168,8 +166,7 @@ class Search:
         base, current = stage.base, self._prune(stage.current, stage.base)
         removed = 1 - max(current.cost.excess, 0.0) / base.cost.excess
         if not current.hypothesis.placed or removed < rules.accounted:
-            best = tuple(sorted(self.trials, key=lambda t: t.excess)[:3])
-            return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent), best=best)
+            return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent))
         ties, shares = [], []
         for index in range(len(current.hypothesis.placed)):
             tied, share = self._ties(current, index, base)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -155,7 +155,6 @@ class Gap:
     seed: int = 0
     notes: tuple[str, ...] = ()
     symbolic: str = ""
-    extra: Mapping[str, Any] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``gap.json``."""
