@@ -131,6 +131,10 @@ class Effect(abc.ABC):
         """Return the values from which a search begins, each ``(p,)``; by default the neutral ones."""
         return [np.array([q.neutral for q in self.quantities(setting, target)])]
 
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        """Return starts near a simpler effect that this one contains, each ``(p,)``; none where it contains none."""
+        return []
+
     def screened(self) -> list[int] | None:
         """Return which quantities the screening moves beside each start; ``None`` for all."""
         return None

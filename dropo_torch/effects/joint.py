@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting
 from dropo_torch.observation import joint_name
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
@@ -130,6 +130,12 @@ class JointStribeck(JointEffect):
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         force, _, speed = (q.scale for q in self.quantities(setting, target))
         return [np.array([0.1 * force, 0.2 * force, 0.1 * speed]), np.array([0.1 * force, 0.2 * force, 0.4 * speed])]
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        if simpler.effect.name != JointFriction.name or simpler.values[0] <= 0:
+            return []
+        friction, speed = simpler.values[0], self.quantities(setting, simpler.target)[2].scale
+        return [np.array([0.95 * friction, 1.5 * friction, share * speed]) for share in (0.05, 0.15, 0.4)]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         add_friction(model, self.dof(model, target), max(values[0], values[1], 0.0))

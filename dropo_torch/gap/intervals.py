@@ -54,12 +54,13 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
 def step_errors(evidence: Evidence, fitted: Refit) -> np.ndarray:
     """Return by how much the simulation's own step may bias each number ``(q,)``, in their units.
 
-    The fit is repeated with half the step. Dry friction, ripples and stops are resolved by the step only so well, and
+    The fit is repeated with half the step, on the windows and weights of the fit. Dry friction, ripples and stops are resolved by the step only so well, and
     with little noise that is more than the standard errors. Zero where the fit leaves no more than noise.
     """
     vector = fitted.hypothesis.vector
     finer = find_effect("integration")
-    if fitted.cost.reduced < BIASED or any(p.effect is finer for p in fitted.hypothesis.placed):
+    as_noise = fitted.cost.reduced < BIASED and not (evidence.model_error > 1).any()
+    if as_noise or any(p.effect is finer for p in fitted.hypothesis.placed):
         return np.zeros(len(vector))
     step = float(evidence.twin.setting.model.opt.timestep)
     other = evidence.with_twin(evidence.twin.also(Placed(finer, None, (step / 2,))))

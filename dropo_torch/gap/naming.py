@@ -26,6 +26,8 @@ class Rules:
         least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
         most: share of the excess that an effect removes without further question.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
+        free: numbers of the named effects beyond which each halves what they may leave, for many numbers together
+            imitate what none of them is.
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         least: share of the first excess below which an effect is not named.
         significance: paired standard errors, over blocks of the log, by which one hypothesis beats another.
@@ -38,6 +40,7 @@ class Rules:
     least_reduced: float = 1.1
     most: float = 0.8
     accounted: float = 0.97
+    free: int = 3
     hopeless: float = 0.8
     least: float = 3e-3
     significance: float = 3.0
@@ -88,6 +91,14 @@ Report = Callable[[str, float], None]
 def significant(cost: Cost, rules: Rules) -> bool:
     """Return whether a misfit is more than noise."""
     return cost.excess > rules.gate * np.sqrt(2 * cost.degrees) and cost.reduced > rules.least_reduced
+
+
+def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
+    """Return the share of the first excess that named effects may leave; an effect at many places counts once."""
+    sizes = {p.effect.name: 0 for p in hypothesis.placed}
+    for p in hypothesis.placed:
+        sizes[p.effect.name] = 1 if len(p.values) == 1 else sizes[p.effect.name] + len(p.values)
+    return (1 - rules.accounted) * 0.5 ** max(0, sum(sizes.values()) - rules.free)
 
 
 def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
@@ -164,8 +175,8 @@ class Search:
             stage = self._round_of(stage)
             self._save(stage)
         base, current = stage.base, self._prune(stage.current, stage.base)
-        removed = 1 - max(current.cost.excess, 0.0) / base.cost.excess
-        if not current.hypothesis.placed or removed < rules.accounted:
+        left = max(current.cost.excess, 0.0) / base.cost.excess
+        if not current.hypothesis.placed or left > allowance(current.hypothesis, rules):
             return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent))
         ties, shares = [], []
         for index in range(len(current.hypothesis.placed)):
@@ -206,6 +217,8 @@ class Search:
         found = self._next(stage.current, base, stage.number)
         if found is None:
             return replace(stage, done=True)
+        if not self._is_done(found, base):
+            found = self._extended(found, base)
         if not self._is_done(found, base) and len(found.hypothesis.placed) > 1:
             found = self._swap(found, base)
         number = stage.number + 1
@@ -380,6 +393,26 @@ class Search:
                         break
             if current is before:
                 break
+        return current
+
+    def _extended(self, current: Refit, base: Refit) -> Refit:
+        """Put effects that contain an accepted one in its place, where that explains more."""
+        setting = self.evidence.twin.setting
+        for index, own in enumerate(current.hypothesis.placed):
+            groups = [
+                (Placed(effect, own.target, tuple(float(v) for v in start)),)
+                for effect in self.effects
+                for start in effect.extends(setting, own)
+            ]
+            if not groups:
+                continue
+            without = refit(self._part(self._few), current.hypothesis.without(index), caps=self._caps)
+            origin = current.hypothesis.without(index)
+            for found in self._refits(without, groups, "refining", origin)[:1]:
+                gained = current.cost.excess - found.cost.excess
+                if gained >= self.rules.least * base.cost.excess and self._beats(found, current):
+                    current = found
+                    break
         return current
 
     def _better(self, without: Refit, current: Refit) -> list[Candidate]:

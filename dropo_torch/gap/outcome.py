@@ -37,15 +37,15 @@ def make_result(scene: Scene, search: Search, naming: Naming, started: float) ->
     """
     problem, twin = scene.problem, scene.twin
     noise = search.evidence.noise
-    final = naming.final
+    final, weighted = naming.final, search.evidence
     if naming.named:
-        final = _last_fit(search.evidence, naming.final.hypothesis)
+        final, weighted = _last_fit(search.evidence, naming.final.hypothesis)
     short = short_windows(problem, scene.train)
     before = free_forces(twin, short, naming.base.hypothesis.variant, noise)
     after = free_forces(twin, short, final.hypothesis.variant, noise) if naming.named else before
     evidence = search.evidence
     held = cut_held(twin, scene.held, problem.observation, final.hypothesis, noise, scene.setting.signals.timestep)
-    shown = _named(scene, naming, final, before, evidence) if naming.gap else ()
+    shown = _named(scene, naming, final, before, weighted) if naming.gap else ()
     dofs = _telling(scene.setting, shown, before) if naming.gap else []
     return Gap(
         where=found_places(scene, search, before) if naming.gap else (),
@@ -79,8 +79,8 @@ def found_places(scene: Scene, search: Search, free: FreeForces) -> tuple[Place,
     return places(scene.setting, free, search.first, search.first_chi2, search.first_degrees)
 
 
-def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Refit:
-    """Fit the named effects on all windows.
+def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> tuple[Refit, Evidence]:
+    """Fit the named effects on all windows; return with it the evidence as it was weighted.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
     error of a real model grows with the lead, and differs between columns.
@@ -95,7 +95,7 @@ def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Refit:
         smooth[0] = 1.0
         evidence = evidence.with_model_error(smooth.ravel())
         final = refit(evidence, final.hypothesis, iterations=6)
-    return final
+    return final, evidence
 
 
 def _notes(scene: Scene, evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[str, ...]:

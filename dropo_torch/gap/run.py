@@ -98,14 +98,17 @@ def _name(
     scene: Scene, vocabulary: list[Effect], rules: Rules, checkpoint: Path | None, resume: bool, report: Report
 ) -> tuple[Search, Naming]:
     """Search; where nothing has a name, once more over shorter windows."""
+    known = f"{scene.problem.fingerprint} {rules} {[e.name for e in vocabulary]}"
     search = Search(
-        scene.evidence, vocabulary, rules=rules, report=report, checkpoint=checkpoint, resume=resume,
-        fingerprint=f"{scene.problem.fingerprint} {rules} {[e.name for e in vocabulary]}",
-    )  # fmt: skip
+        scene.evidence, vocabulary, rules=rules, report=report, checkpoint=checkpoint, resume=resume, fingerprint=known
+    )
     naming = search.run(scene.begin)
     shorter = shorter_windows(scene)
     if naming.gap and not naming.named and shorter is not None:
-        second = Search(shorter, vocabulary, rules=rules, report=report)
+        again = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}-shorter")
+        second = Search(
+            shorter, vocabulary, rules=rules, report=report, checkpoint=again, resume=resume, fingerprint=known
+        )
         found = second.run(scene.begin)
         if found.named:
             return second, found
