@@ -54,8 +54,9 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
 def step_errors(evidence: Evidence, fitted: Refit) -> np.ndarray:
     """Return by how much the simulation's own step may bias each number ``(q,)``, in their units.
 
-    The fit is repeated with half the step, on the windows and weights of the fit. Dry friction, ripples and stops are resolved by the step only so well, and
-    with little noise that is more than the standard errors. Zero where the fit leaves no more than noise.
+    The fit is repeated with half the step, on the windows and weights of the fit. Dry friction, ripples and stops are
+    resolved by the step only so well, and with little noise that is more than the standard errors. Zero where the fit
+    leaves no more than noise.
     """
     vector = fitted.hypothesis.vector
     finer = find_effect("integration")
