@@ -11,6 +11,7 @@ import argparse
 import json
 import math
 import multiprocessing
+import os
 import sys
 import tempfile
 import time
@@ -39,7 +40,7 @@ NEUTRAL = {"gain": 1.0, "factor": 1.0}
 UNSCORED = {"poles", "phase", "reference", "velocity", "damping_ratio"}
 
 
-def run_case(case: Case, backend: str) -> dict[str, Any]:
+def run_case(case: Case, backend: str, threads: int = 0) -> dict[str, Any]:
     """Return the answer of the workflow to a case, the document of its gap.json; what Warp refuses runs on MuJoCo."""
     from dropo_torch.config import load_config
     from dropo_torch.errors import InputError
@@ -49,11 +50,11 @@ def run_case(case: Case, backend: str) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         path = case.write(folder)
         try:
-            problem = make_problem(load_config(path, {"backend": backend}), general=True)
+            problem = make_problem(load_config(path, {"backend": backend, "threads": threads}), general=True)
         except InputError as error:
             if "does not simulate" not in str(error):
                 raise
-            problem = make_problem(load_config(path, {"backend": "mujoco"}), general=True)
+            problem = make_problem(load_config(path, {"backend": "mujoco", "threads": threads}), general=True)
         return find_gap(problem).document()
 
 
@@ -141,7 +142,7 @@ def reductions(gap: Mapping[str, Any]) -> dict[str, float]:
 # --- running them ---------------------------------------------------------------------------------------------
 
 
-def attempt(spec: CaseSpec, backend: str) -> dict[str, Any]:
+def attempt(spec: CaseSpec, backend: str, threads: int = 0) -> dict[str, Any]:
     """Make a case, run it and judge the answer; what fails is recorded with its traceback."""
     result: dict[str, Any] = {"name": spec.name, "kind": spec.kind, "system": spec.system, "seed": spec.seed[0]}
     try:
@@ -149,7 +150,7 @@ def attempt(spec: CaseSpec, backend: str) -> dict[str, Any]:
         result["hidden"] = [[e.name, e.target, dict(e.parameters)] for e in case.effects]
         result["equivalents"], result["gap_ratio"] = case.equivalents, case.gap_ratio
         started = time.perf_counter()
-        document = run_case(case, backend)
+        document = run_case(case, backend, threads)
         result["seconds"] = time.perf_counter() - started
         result.update(judge(case, document), document=document)
     except Exception:  # a case that fails must not stop the others
@@ -162,12 +163,13 @@ def _plain(value: Any) -> Any:
 
 
 def attempts(specs: Sequence[CaseSpec], backend: str, jobs: int) -> Iterator[dict[str, Any]]:
-    """Yield the cases' results as they come."""
+    """Yield the cases' results as they come; side by side, each has its part of the processors."""
     if jobs == 1:
         yield from (attempt(s, backend) for s in specs)
         return
     with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        waiting = {pool.submit(attempt, s, backend): s for s in specs}
+        threads = max(1, (os.cpu_count() or 1) // jobs)
+        waiting = {pool.submit(attempt, s, backend, threads): s for s in specs}
         for done in as_completed(waiting):
             try:
                 yield done.result()
