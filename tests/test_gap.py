@@ -32,7 +32,7 @@ from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of
 from dropo_torch.gap.intervals import deviations
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import Chart, cut_windows
-from dropo_torch.gap.naming import Rules
+from dropo_torch.gap.naming import Rules, allowance
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
 from dropo_torch.gap.scene import short_windows
@@ -111,6 +111,31 @@ def test_nothing_is_named_where_nothing_is_missing() -> None:
     assert gap.before == gap.after
     assert gap.reduced[0] == pytest.approx(1, abs=0.1)
     assert gap.declared["pole_mass"][2] == pytest.approx(hidden().declared["pole_mass"], rel=1e-3)
+
+
+def placed(name: str, *values: float, target: str = "rail") -> Placed:
+    return Placed(find_effect(name), target, values)
+
+
+def test_many_numbers_may_leave_less_of_the_gap() -> None:
+    rules = Rules(accounted=0.97, free=3)
+    friction, spring = placed("joint_friction", 0.3), placed("joint_stiffness", 0.2, 0.0)
+    ripple = placed("joint_cogging", 0.1, 6.0, 0.0)
+    left = [allowance(Hypothesis((), p), rules) for p in ((friction,), (friction, spring), (ripple, spring))]
+    assert left == pytest.approx([0.03, 0.03, 0.0075])
+    family = tuple(placed("joint_friction", 0.1, target=j) for j in ("rail", "hinge", "a", "b", "c"))
+    assert allowance(Hypothesis((), family), rules) == pytest.approx(0.03)
+
+
+def test_friction_that_is_larger_at_rest_is_found_from_plain_friction() -> None:
+    stribeck, setting = find_effect("joint_stribeck"), scene_of().setting
+    assert stribeck.extends(setting, placed("joint_damping", 0.3)) == []
+    for start in stribeck.extends(setting, placed("joint_friction", 0.3)):
+        assert start[0] < 0.3 < start[1]
+    truth = Effect("joint_stribeck", "rail", {"coulomb": 0.2, "static": 0.45, "velocity": 0.3})
+    gap = search(simulate_truth(CART_POLE, [truth], 3, **SIZE), ("joint_friction", "joint_damping", "joint_stribeck"))
+    assert [e.effect for e in gap.effects] == ["joint_stribeck"]
+    assert gap.effects[0].parameters["coulomb"].value == pytest.approx(0.2, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -527,6 +552,16 @@ def test_interrupted_search_goes_on_to_the_same_result(tmp_path: Path) -> None:
     assert lasting(gap) == lasting(found(TWO))
     assert gap.simulated_transitions < found(TWO).simulated_transitions
     assert "fitting the declared parameters" not in stages
+
+
+def test_second_search_over_shorter_windows_goes_on_too(tmp_path: Path) -> None:
+    store, names = tmp_path / "gap-progress.pkl", ("joint_stiffness",)
+    plain = search(hidden("hysteresis"), names, checkpoint=store)
+    assert [e.effect for e in plain.effects] == ["unnamed"]
+    stages: list[str] = []
+    gap = search(hidden("hysteresis"), names, lambda stage, _: stages.append(stage), checkpoint=store, resume=True)
+    assert lasting(gap) == lasting(plain)
+    assert set(stages) <= {"preparing", "verifying"}
 
 
 def test_checkpoint_of_another_problem_is_refused(tmp_path: Path) -> None:
