@@ -41,6 +41,7 @@ _RESULTS = (
     "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "checkpoint.pkl", "gap-progress.pkl",
     "sweep-progress.json", "compare-progress.json", "distribution.yaml", "fitted_config.yaml", "config.yaml",
     "model.xml", "report.html", "tensorboard", "gap-progress-shorter.pkl",
+    "gap-progress-contact.pkl",
 )  # fmt: skip
 #: The first of them: a folder with none of these holds no run.
 _MARKS = _RESULTS[:9]

@@ -444,7 +444,7 @@ def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
     residual = error - np.einsum("q,qwn->wn", values, slope)
     cost = Cost((residual**2).sum(1), np.zeros(W), W * N - Q)
     starts = Starts(np.zeros((W, N, 0)), np.ones((W, N)), np.zeros((W, N)), 0.0)
-    return Refit(Hypothesis(tuple(values)), cost, residual, slope, starts, np.ones(Q), True)
+    return Refit(Hypothesis(tuple(values)), cost, residual, slope, starts, np.ones(Q), True, np.ones(W))
 
 
 @pytest.mark.parametrize("shared", [0.0, 2.0])

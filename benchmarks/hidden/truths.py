@@ -283,15 +283,32 @@ def largest_geom(model: mujoco.MjModel, body: int) -> int:
     return first + int(np.argmax(model.geom_rbound[first : first + count]))
 
 
+def semi_axes(model: mujoco.MjModel, geom: int) -> np.ndarray:
+    """The half-lengths of the ellipsoid that stands for a geom in a medium."""
+    kind, (a, b, c) = int(model.geom_type[geom]), model.geom_size[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
+        return np.array([a, a, a])
+    if kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
+        return np.array([a, a, a + b])
+    return np.array([a, a, b]) if kind == mujoco.mjtGeom.mjGEOM_CYLINDER else np.array([a, b, c])
+
+
 def _drag(plant: Plant, body: str, x: Mapping[str, float]) -> Force:
+    """Drag against a geom's motion with the area that faces it, 1 for the broadest side; none against its rotation."""
     number = plant.model.body(body).id
     geom = largest_geom(plant.model, number)
+    axes = semi_axes(plant.model, geom)
+    facing = axes.prod() / axes
+    facing /= facing.max()
     twist, torque = np.zeros(6), np.zeros(3)
 
     def force(p: Plant) -> None:
         mujoco.mj_objectVelocity(p.model, p.data, mujoco.mjtObj.mjOBJ_GEOM, geom, twist, 0)
         velocity = twist[3:]
-        push = -x["coefficient"] * math.sqrt(float(velocity @ velocity)) * velocity
+        along = p.data.geom_xmat[geom].reshape(3, 3).T @ velocity
+        least = max(float(((facing * along) ** 2).sum()), 1e-300)
+        area = math.sqrt(float((facing**4 * along**2).sum()) / least)
+        push = -x["coefficient"] * area * math.sqrt(float(velocity @ velocity)) * velocity
         mujoco.mj_applyFT(p.model, p.data, push, torque, p.data.geom_xpos[geom], number, p.force)
 
     return force

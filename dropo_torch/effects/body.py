@@ -161,8 +161,9 @@ class ExternalForce(BodyEffect):
 class FluidDrag(BodyEffect):
     """Drag of air or water on a body, with the square of its speed.
 
-    It is MuJoCo's ellipsoid drag of the body's largest geom with equal blunt and slender coefficients, which makes it
-    the same from all sides. The medium is so thin that the mass of it that moves along does not count.
+    It is MuJoCo's drag of the ellipsoid that stands for the body's largest geom, by the area that faces the motion: the
+    coefficient is that of motion with the broadest side ahead. The coefficients that also brake rotation are zero, and
+    the medium is so thin that the mass of it that moves along does not count.
     """
 
     name = "fluid_drag"
@@ -201,7 +202,7 @@ class FluidDrag(BodyEffect):
             if model.geom_fluid[g, 0] == 0:
                 model.geom_fluid[g] = 0.0
                 model.geom_fluid[g, 0] = 1.0
-        model.geom_fluid[geom, 1:3] = values[0] / (area * self.DENSITY)
+        model.geom_fluid[geom, 1] = values[0] / (area * self.DENSITY)
 
 
 def _largest_section(model: mujoco.MjModel, geom: int) -> float:

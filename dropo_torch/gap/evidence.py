@@ -7,6 +7,7 @@ P = I − QQᵀ from the QR factors of ∂r/∂x₀. What is left, P r, is compa
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,6 +22,8 @@ PAIRS, SEED = 16, 11
 LOST = 1e3
 #: Largest share of all windows' χ² that one window may have.
 CAP = 0.03
+#: Expected χ² of a window, times this: from there on a robust cost grows with the logarithm only.
+TAIL = 3.0
 
 
 @dataclass(frozen=True)
@@ -51,32 +54,48 @@ class Evidence:
         rough: linearise statistically, over draws of the start noise, as contacts need it.
         model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``; 1 by
             default.
+        robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost).
     """
 
     def __init__(
-        self, twin: Twin, windows: Windows, noise: np.ndarray, *, rough: bool, model_error: np.ndarray | None = None
-    ) -> None:
+        self, twin: Twin, windows: Windows, noise: np.ndarray, *, rough: bool,
+        model_error: np.ndarray | None = None, robust: bool = False,
+    ) -> None:  # fmt: skip
         self.twin, self.windows, self.noise, self.rough = twin, windows, np.asarray(noise, dtype=float), rough
         self.chart = Chart.of(twin.setting.observation, twin.setting.masked)
         self.model_error = np.ones(self.num_rows) if model_error is None else model_error
+        self.robust = robust
 
     def on(self, windows: Windows) -> Evidence:
         """Return the same over other windows."""
-        same = windows.length == self.windows.length
-        error = self.model_error if same else None
-        return Evidence(self.twin, windows, self.noise, rough=self.rough, model_error=error)
+        other = self._with(windows=windows)
+        return other if windows.length == self.windows.length else other._with(model_error=np.ones(other.num_rows))
 
     def with_noise(self, noise: np.ndarray) -> Evidence:
         """Return the same with another noise."""
-        return Evidence(self.twin, self.windows, noise, rough=self.rough, model_error=self.model_error)
+        return self._with(noise=np.asarray(noise, dtype=float))
 
     def with_model_error(self, model_error: np.ndarray) -> Evidence:
         """Return the same with another weight of each residual."""
-        return Evidence(self.twin, self.windows, self.noise, rough=self.rough, model_error=model_error)
+        return self._with(model_error=model_error)
 
     def with_twin(self, twin: Twin) -> Evidence:
         """Return the same by another simulation."""
-        return Evidence(twin, self.windows, self.noise, rough=self.rough, model_error=self.model_error)
+        return self._with(twin=twin)
+
+    def robustly(self) -> Evidence:
+        """Return the same with a cost to which windows that are far off contribute by the logarithm only."""
+        return self._with(robust=True)
+
+    def _with(self, **changes: object) -> Evidence:
+        other = copy.copy(self)
+        for name, value in changes.items():
+            setattr(other, name, value)
+        return other
+
+    def tail(self, starts: Starts) -> float | None:
+        """χ² of a window from which on the cost grows slowly; ``None`` where it never does."""
+        return TAIL * self.degrees(starts) / len(self.windows) if self.robust else None
 
     @property
     def num_rows(self) -> int:
@@ -187,14 +206,31 @@ class Cost:
         return self.chi2 / max(self.degrees, 1.0)
 
 
-def cost_of(projected: np.ndarray, starts: Starts, degrees: float, caps: np.ndarray | None = None) -> Cost:
-    """Return the cost of projected residuals ``(W, N)``; ``caps`` are factors of the windows' residuals."""
+def cost_of(
+    projected: np.ndarray, starts: Starts, degrees: float, caps: np.ndarray | None = None, tail: float | None = None
+) -> Cost:
+    """Return the cost of projected residuals ``(W, N)``.
+
+    Args:
+        projected: the residuals.
+        starts: the linearisation by the starts.
+        degrees: degrees of freedom of all windows.
+        caps: factors of the windows' residuals, ``(W,)``.
+        tail: of :meth:`Evidence.tail`; then a window with as much as noise makes still costs its degrees of freedom.
+    """
     chi2 = (projected**2).sum(-1)
     weights = starts.weights
     penalty = -2 * np.log(np.where(weights > 0, weights, 1.0)).sum(-1)
     if caps is not None:
         chi2, penalty = chi2 * caps**2, penalty * caps**2
+    if tail is not None:
+        chi2 = tail * np.log1p(chi2 / tail) / (TAIL * np.log1p(1 / TAIL))
     return Cost(chi2, penalty, degrees)
+
+
+def robust_factors(chi2: np.ndarray, tail: float | None) -> np.ndarray:
+    """Return factors of the windows' residuals ``(W,)`` under which least squares has the robust cost's gradient."""
+    return np.ones(len(chi2)) if tail is None else 1 / np.sqrt(1 + chi2 / tail)
 
 
 def caps_of(chi2: np.ndarray, degrees: float) -> np.ndarray:

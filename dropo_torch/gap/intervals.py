@@ -26,7 +26,7 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
         fitted: a fit with its projected residuals and derivatives.
         blocks: block of each window ``(W,)``: its trajectory.
     """
-    slope = fitted.slope
+    slope, residual = fitted.slope * fitted.factor[:, None], fitted.residual * fitted.factor[:, None]
     size = len(slope)
     if not size:
         return np.zeros(0)
@@ -42,7 +42,7 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
     if len(names) < 4:
         blocks = (np.arange(len(blocks)) * 10) // max(len(blocks), 1)
         names = np.unique(blocks)
-    scores = np.einsum("awn,wn->wa", slope, fitted.residual)
+    scores = np.einsum("awn,wn->wa", slope, residual)
     sums = np.stack([scores[blocks == b].sum(0) for b in names])
     middle = sums.T @ sums * len(names) / max(len(names) - 1, 1)
     factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / 1.6449

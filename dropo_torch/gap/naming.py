@@ -39,7 +39,7 @@ class Rules:
     gate: float = 5.0
     least_reduced: float = 1.1
     most: float = 0.8
-    accounted: float = 0.97
+    accounted: float = 0.95
     free: int = 3
     hopeless: float = 0.8
     least: float = 3e-3
@@ -72,6 +72,7 @@ class Naming:
         trials: what was refitted, in order.
         silent: candidates that change nothing on this log, which it therefore cannot judge.
         shares: excess that comes back when each named effect alone is left out.
+        partial: whether they leave nothing in most of the log, but something else remains in the rest.
     """
 
     base: Refit
@@ -82,7 +83,11 @@ class Naming:
     trials: tuple[Trial, ...] = ()
     silent: tuple[tuple[str, str | None], ...] = ()
     shares: tuple[float, ...] = ()
+    partial: bool = False
 
+
+#: χ² per degree of freedom of the typical window that is far off, and of one that is right.
+FAR, CLEAR = 20.0, 1.5
 
 #: ``report(stage, share)`` as the work goes on.
 Report = Callable[[str, float], None]
@@ -99,6 +104,17 @@ def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
     for p in hypothesis.placed:
         sizes[p.effect.name] = 1 if len(p.values) == 1 else sizes[p.effect.name] + len(p.values)
     return (1 - rules.accounted) * 0.5 ** max(0, sum(sizes.values()) - rules.free)
+
+
+def clears(base: Refit, current: Refit) -> bool:
+    """Whether effects leave no more than noise in most windows of a log that was far off in most of them.
+
+    What only imitates the truth makes all windows better and none of them right.
+    """
+    before, after = (
+        float(np.median((r.residual**2).sum(-1))) * len(r.residual) / r.cost.degrees for r in (base, current)
+    )
+    return before > FAR and after < CLEAR
 
 
 def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
@@ -176,7 +192,8 @@ class Search:
             self._save(stage)
         base, current = stage.base, self._prune(stage.current, stage.base)
         left = max(current.cost.excess, 0.0) / base.cost.excess
-        if not current.hypothesis.placed or left > allowance(current.hypothesis, rules):
+        partial = self.evidence.robust and clears(base, current)
+        if not current.hypothesis.placed or not (partial or left <= allowance(current.hypothesis, rules)):
             return Naming(base, base, True, False, trials=tuple(self.trials), silent=tuple(self.silent))
         ties, shares = [], []
         for index in range(len(current.hypothesis.placed)):
@@ -185,14 +202,16 @@ class Search:
             shares.append(share)
         current, ties = self._canonical(current, ties)
         return Naming(
-            base, current, True, True, tuple(ties), tuple(self.trials), tuple(self.silent), shares=tuple(shares)
-        )
+            base, current, True, True, tuple(ties), tuple(self.trials), tuple(self.silent), shares=tuple(shares),
+            partial=partial,
+        )  # fmt: skip
 
     def start(self, begin: Hypothesis) -> Refit:
         """Fit the declared parameters alone, with the influence of single windows capped."""
         self._report("fitting the declared parameters", 0.0)
         base = self._renoise(refit(self._part(self._few), begin))
-        self._caps = caps_of(base.cost.windows, base.cost.degrees)
+        robust = self.evidence.robust
+        self._caps = np.ones(len(base.factor)) if robust else caps_of(base.cost.windows, base.cost.degrees)
         return refit(self._part(self._few), base.hypothesis, caps=self._caps, iterations=4)
 
     def look(self, base: Refit) -> list[Candidate]:
@@ -201,7 +220,7 @@ class Search:
         self.silent = [c.key for c in ranked if c.dead]
         fewer, here, caps = self._fewer_of(base, self._fewer)
         self.first, self.first_degrees = ranked, fewer.degrees(here.starts)
-        self.first_chi2 = float(((here.residual * caps[:, None]) ** 2).sum())
+        self.first_chi2 = float(((here.residual * (caps * here.factor)[:, None]) ** 2).sum())
         return ranked
 
     def _based(self, begin: Hypothesis) -> Stage:
@@ -218,7 +237,7 @@ class Search:
         if found is None:
             return replace(stage, done=True)
         if not self._is_done(found, base):
-            found = self._extended(found, base)
+            found = self._everywhere(found) if self.evidence.robust else self._extended(found, base)
         if not self._is_done(found, base) and len(found.hypothesis.placed) > 1:
             found = self._swap(found, base)
         number = stage.number + 1
@@ -285,7 +304,10 @@ class Search:
             current.starts, basis=current.starts.basis[rows], weights=current.starts.weights[rows],
             shift=current.starts.shift[rows],
         )  # fmt: skip
-        here = replace(current, residual=current.residual[rows], slope=current.slope[:, rows], starts=starts)
+        here = replace(
+            current, residual=current.residual[rows], slope=current.slope[:, rows], starts=starts,
+            factor=current.factor[rows],
+        )  # fmt: skip
         return part.on(part.windows.select(rows)), here, self._caps[rows]
 
     def _beats(self, better: Refit, worse: Refit) -> bool:
@@ -297,6 +319,8 @@ class Search:
 
     def _is_done(self, current: Refit, base: Refit) -> bool:
         """Whether what is left is noise, or too small a part of the gap to tell anything."""
+        if self.evidence.robust and clears(base, current):
+            return True
         return not significant(current.cost, self.rules) or (current.cost.excess < self.rules.least * base.cost.excess)
 
     @property
@@ -312,7 +336,7 @@ class Search:
         fewer, here, caps = self._fewer_of(current, self._fewer)
         total = len(self.candidates)
         return screen(
-            fewer, here, self.candidates, caps=caps,
+            fewer, here, self.candidates, caps=caps * here.factor,
             on_progress=lambda done: self._report(f"screening {total} candidates", done / total),
         )  # fmt: skip
 
@@ -332,7 +356,8 @@ class Search:
             tried = self._refits(current, pairs, "refitting pairs")
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
                 best = tried[0]
-            families = promising_families(*self._fewer_of(current, self._fewer)[1:], alive)
+            _, here, caps = self._fewer_of(current, self._fewer)
+            families = promising_families(here, caps * here.factor, alive)
             tried = self._refits(current, families, "refitting families")
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
                 best = tried[0]
@@ -346,6 +371,7 @@ class Search:
     def _aligned(self, current: Refit, candidates: Sequence[Candidate]) -> tuple[Refit, list[Candidate], np.ndarray]:
         """Promising candidates screened again from where they promise the most, on more windows."""
         fewer, here, caps = self._fewer_of(current, 2 * self._fewer)
+        caps = caps * here.factor
         return here, screen(fewer, here, [c.placed for c in candidates], caps=caps), caps
 
     def _refits(
@@ -357,7 +383,7 @@ class Search:
         begin from ``origin``, by default the current hypothesis.
         """
         fewer, here, caps = self._fewer_of(current, 2 * self._fewer)
-        before = cost_of(here.residual, here.starts, fewer.degrees(here.starts), caps).excess
+        before = cost_of(here.residual, here.starts, fewer.degrees(here.starts), caps, fewer.tail(here.starts)).excess
         rough: list[Refit] = []
         for number, group in enumerate(groups):
             self._report(stage, number / (len(groups) + 2))
@@ -415,6 +441,22 @@ class Search:
                     break
         return current
 
+    def _everywhere(self, current: Refit) -> Refit:
+        """Put the last accepted effect at all its other targets, too, where that explains more."""
+        own = current.hypothesis.placed[-1]
+        if len(own.values) != 1:
+            return current
+        setting, taken = self.evidence.twin.setting, {p.key for p in current.hypothesis.placed}
+        idle = {*taken, *self.silent}
+        hypothesis = current.hypothesis
+        for target in own.effect.targets(setting):
+            if (own.effect.name, target) not in idle:
+                neutral = own.effect.quantities(setting, target)[0].neutral
+                hypothesis = hypothesis.with_effect(Placed(own.effect, target, (neutral,)))
+        self._report("refitting families", 0.5)
+        whole = refit(self._part(self._few), hypothesis, caps=self._caps)
+        return whole if self._beats(whole, current) else current
+
     def _better(self, without: Refit, current: Refit) -> list[Candidate]:
         """Candidates that promise to explain more than the effect that was left out does, the best first."""
         ranked = [c for c in self._screened(without) if not c.dead]
@@ -456,7 +498,8 @@ class Search:
             close = fitted.cost.excess - current.cost.excess < max(
                 0.3 * max(current.cost.excess, 0.0), 4 * np.sqrt(2 * current.cost.degrees)
             )
-            if close and paired(fitted.cost, current.cost, self.blocks) < self.rules.tie:
+            as_clear = not self.evidence.robust or clears(base, fitted) or not clears(base, current)
+            if close and as_clear and paired(fitted.cost, current.cost, self.blocks) < self.rules.tie:
                 found.append(other)
         return tuple(found), without.cost.excess - current.cost.excess
 

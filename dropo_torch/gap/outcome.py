@@ -13,7 +13,7 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.intervals import deviations, step_errors
 from dropo_torch.gap.locate import dof_names, guilty, places, regime, residual_pictures
-from dropo_torch.gap.naming import Naming, Search
+from dropo_torch.gap.naming import FAR, Naming, Search
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Gap, NamedEffect, Place, Ranked, Strength
@@ -69,7 +69,10 @@ def make_result(scene: Scene, search: Search, naming: Naming, started: float) ->
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
-        notes=_notes(scene, evidence, held, final.hypothesis),
+        notes=(
+            *_rest(naming, final, dof_names(scene.setting.model)[guilty(after)]),
+            *_notes(scene, evidence, held, final.hypothesis),
+        ),
         symbolic=describe(scene.setting, before, guilty(before)) if naming.gap and not naming.named else "",
     )
 
@@ -96,6 +99,18 @@ def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> tuple[Refit, Eviden
         evidence = evidence.with_model_error(smooth.ravel())
         final = refit(evidence, final.hypothesis, iterations=6)
     return final, evidence
+
+
+def _rest(naming: Naming, final: Refit, where: str) -> tuple[str, ...]:
+    """What a partial explanation leaves."""
+    if not naming.partial:
+        return ()
+    chi2 = (final.residual**2).sum(-1) * len(final.residual) / final.cost.degrees
+    share = float(np.mean(chi2 > FAR))
+    return (
+        f"This leaves no more than noise in most of the log; in {100 * share:.0f} % of the windows something else "
+        f"remains, which none of the known effects explains, mostly at {where}.",
+    )
 
 
 def _notes(scene: Scene, evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.twin import Variant
-from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of
+from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of, robust_factors
 from dropo_torch.parameters import ParameterSpace
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.
@@ -94,6 +94,7 @@ class Refit:
         starts: the linearisation by the starts.
         scale: the numbers' scales, ``(q,)``.
         converged: whether the moves became small.
+        factor: factors of the windows' residuals that the fit ended with, ``(W,)``.
     """
 
     hypothesis: Hypothesis
@@ -103,6 +104,7 @@ class Refit:
     starts: Starts
     scale: np.ndarray
     converged: bool
+    factor: np.ndarray
 
 
 def slopes(
@@ -144,13 +146,13 @@ def refit(
     columns = np.arange(len(limits.scale))
     relinearise = starts is None
     starts = evidence.linearise(hypothesis.variant) if starts is None else starts
-    factor = np.ones(len(evidence.windows)) if caps is None else caps
+    fixed, tail = np.ones(len(evidence.windows)) if caps is None else caps, evidence.tail(starts)
     damping, converged = 1e-3, False
     current = hypothesis.at(np.clip(hypothesis.vector, limits.low, limits.high))
     begin = current.vector
     raw, change = slopes(evidence, current, limits, columns)
     residual, slope = evidence.project(raw, starts), evidence.project_slope(change, starts)
-    value = float(((residual * factor[:, None]) ** 2).sum())
+    value, factor = _loss(residual, fixed, tail)
     for _ in range(iterations):
         move = _step(residual * factor[:, None], slope * factor[:, None], current.vector, limits, damping)
         trial = current.at(np.clip(current.vector + move * limits.scale, limits.low, limits.high))
@@ -160,9 +162,9 @@ def refit(
             break
         raw, change = slopes(evidence, trial, limits, columns)
         found = evidence.project(raw, starts)
-        after = float(((found * factor[:, None]) ** 2).sum())
+        after, following = _loss(found, fixed, tail)
         if after < value:
-            gain, current, residual = value - after, trial, found
+            gain, current, residual, factor = value - after, trial, found, following
             slope, value = evidence.project_slope(change, starts), after
             damping = max(damping / 8, 1e-9)
             if gain < 1e-6 * value + 0.01:
@@ -176,8 +178,15 @@ def refit(
     if relinearise and far:
         return refit(evidence, current, starts=evidence.linearise(current.variant), caps=caps, iterations=4)
     degrees = evidence.degrees(starts) - len(columns)
-    cost = cost_of(residual, starts, degrees, caps)
-    return Refit(current, cost, residual, slope, starts, limits.scale, converged)
+    cost = cost_of(residual, starts, degrees, caps, tail)
+    return Refit(current, cost, residual, slope, starts, limits.scale, converged, factor / fixed)
+
+
+def _loss(residual: np.ndarray, fixed: np.ndarray, tail: float | None) -> tuple[float, np.ndarray]:
+    """The cost that is minimised, and the factors ``(W,)`` of its least squares."""
+    chi2 = ((residual * fixed[:, None]) ** 2).sum(-1)
+    value = float((chi2 if tail is None else tail * np.log1p(chi2 / tail)).sum())
+    return value, fixed * robust_factors(chi2, tail)
 
 
 def _step(residual: np.ndarray, slope: np.ndarray, vector: np.ndarray, limits: Limits, damping: float) -> np.ndarray:

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dropo_torch.effects import VOCABULARY, Effect
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.naming import Naming, Report, Rules, Search, significant
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import found_places, make_result
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
-from dropo_torch.gap.scene import Scene, prepare, short_windows, shorter_windows
+from dropo_torch.gap.scene import Scene, contact_windows, prepare, short_windows, shorter_windows
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
 
@@ -97,22 +98,25 @@ def find_gap(
 def _name(
     scene: Scene, vocabulary: list[Effect], rules: Rules, checkpoint: Path | None, resume: bool, report: Report
 ) -> tuple[Search, Naming]:
-    """Search; where nothing has a name, once more over shorter windows."""
+    """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly."""
     known = f"{scene.problem.fingerprint} {rules} {[e.name for e in vocabulary]}"
-    search = Search(
-        scene.evidence, vocabulary, rules=rules, report=report, checkpoint=checkpoint, resume=resume, fingerprint=known
-    )
-    naming = search.run(scene.begin)
-    shorter = shorter_windows(scene)
-    if naming.gap and not naming.named and shorter is not None:
-        again = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}-shorter")
-        second = Search(
-            shorter, vocabulary, rules=rules, report=report, checkpoint=again, resume=resume, fingerprint=known
+
+    def look(evidence: Evidence, suffix: str) -> tuple[Search, Naming]:
+        store = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
+        search = Search(
+            evidence, vocabulary, rules=rules, report=report, checkpoint=store, resume=resume, fingerprint=known
         )
-        found = second.run(scene.begin)
-        if found.named:
-            return second, found
-    return search, naming
+        return search, search.run(scene.begin)
+
+    first = look(scene.evidence, "")
+    for suffix, make in (("-shorter", shorter_windows), ("-contact", contact_windows)):
+        if first[1].named or not first[1].gap:
+            break
+        evidence = make(scene)
+        again = None if evidence is None else look(evidence, suffix)
+        if again is not None and again[1].named:
+            return again
+    return first
 
 
 def _quiet(stage: str, share: float) -> None:

@@ -126,6 +126,14 @@ def shorter_windows(scene: Scene) -> Evidence | None:
     return Evidence(scene.twin, windows, scene.noise, rough=scene.evidence.rough)
 
 
+def contact_windows(scene: Scene) -> Evidence | None:
+    """The shortest windows with a robust cost, for logs in which contacts part the windows into right and far off."""
+    if not scene.setting.signals.contacts.any():
+        return None
+    windows = spread(cut_windows(scene.train, scene.problem.observation, LENGTHS[-1]), MOST)
+    return Evidence(scene.twin, windows, scene.noise, rough=True, robust=True)
+
+
 def _choose_window(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray) -> tuple[int, bool]:
     """The longest window over which the simulation is still nearly linear in its start, and whether it is rough."""
     longest = int(np.diff(np.append(-1, np.flatnonzero(train.terminals))).max())
