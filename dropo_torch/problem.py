@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.bundled import BundledSim, bundled_sim
-from dropo_torch.config import Config
+from dropo_torch.config import TRAINING_KEYS, Config
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
@@ -373,7 +373,7 @@ def _observation(
 
 
 def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> str:
-    digest = hashlib.sha256(config.fingerprint().encode())
+    digest = hashlib.sha256(config.fingerprint(*TRAINING_KEYS).encode())
     for array in (
         trajectories.observations,
         trajectories.next_observations,
