@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
@@ -24,8 +23,6 @@ from dropo_torch.rl.sac import SAC
 from dropo_torch.rl.settings import PPOSettings, SACSettings
 
 SCHEMA = "dropo-torch/train/1"
-#: Threads that small networks can use; more only wait for each other.
-MAX_THREADS = 4
 #: History entries that are kept: a run of many short iterations keeps some of them.
 MAX_ENTRIES = 1000
 
@@ -141,7 +138,7 @@ def train(
 ) -> Training:
     """Train a policy under the problem's distribution.
 
-    The same seed gives the same weights on the same machine with the same number of threads, interrupted or not.
+    The same seed gives the same weights on the same machine at any number of threads, interrupted or not.
 
     Args:
         problem: of :func:`~dropo_torch.rl.problem.make_training`.
@@ -152,7 +149,7 @@ def train(
     Raises:
         InputError: a checkpoint of another training; losses that stay infinite.
     """
-    with _own_random_numbers(problem.config.seed, problem.device), _few_threads(problem.config.threads):
+    with _own_random_numbers(problem.config.seed, problem.device), _one_thread():
         run = _Run(problem, checkpoint)
         if resume:
             run.restore()
@@ -330,10 +327,10 @@ def _own_random_numbers(seed: int, device: str) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _few_threads(threads: int) -> Iterator[None]:
-    """Let torch use a few threads for a while."""
+def _one_thread() -> Iterator[None]:
+    """Let torch use one thread for a while: small networks gain little by more, and sums do not depend on how many."""
     before = torch.get_num_threads()
-    torch.set_num_threads(min(threads or len(os.sched_getaffinity(0)), MAX_THREADS))
+    torch.set_num_threads(1)
     try:
         yield
     finally:
