@@ -95,7 +95,7 @@ class Collector:
         """Return everything that the next steps depend on, the environments' state too."""
         now = self._now
         return {
-            "now": None if now is None else {k: now.get(k).clone() for k in now.keys()},
+            "now": None if now is None else {k: v.clone() for k, v in now.items()},
             "return": self._return.clone(),
             "length": self._length.clone(),
             "returns": list(self.returns),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Sequence
 from typing import Literal
@@ -108,7 +109,7 @@ def mlp(inputs: int, outputs: int, hidden: Sequence[int], activation: str, gain:
     """Return a multilayer perceptron with orthogonal weights; ``gain`` scales those of the last layer."""
     layers: list[nn.Module] = []
     widths = [inputs, *hidden]
-    for before, after in zip(widths[:-1], widths[1:], strict=True):
+    for before, after in itertools.pairwise(widths):
         layers += [_linear(before, after, math.sqrt(2)), ACTIVATIONS[activation]()]
     return nn.Sequential(*layers, _linear(widths[-1], outputs, gain))
 

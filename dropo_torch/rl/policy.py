@@ -119,9 +119,7 @@ def load_policy(path: str | Path) -> Policy:
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
         schema = content["schema"]
-        policy = make_policy(
-            content["architecture"], config=content["config"], distribution=content["distribution"]
-        )
+        policy = make_policy(content["architecture"], config=content["config"], distribution=content["distribution"])
         policy.load_state_dict(content["weights"])
     except Exception as error:  # whatever torch raises on a file that is not its own
         first = str(error).partition("\n")[0][:200]

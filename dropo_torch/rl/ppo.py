@@ -107,8 +107,9 @@ class PPO(Learner):
 
     def _epochs(self, data: TensorDict) -> dict[str, float]:
         """Pass over the data in minibatches until the policy has moved enough."""
-        settings, sums, updates, epoch = self.settings, torch.zeros(4, dtype=torch.float64), 0, 0
-        for epoch in range(1, settings.epochs + 1):
+        settings, sums, updates, epochs = self.settings, torch.zeros(4, dtype=torch.float64), 0, 0
+        while epochs < settings.epochs:
+            epochs += 1
             divergence, batches = 0.0, 0
             for rows in torch.randperm(len(data), device=data["action"].device).split(settings.minibatch):
                 losses = self._loss(data[rows])
@@ -123,12 +124,12 @@ class PPO(Learner):
                 break
         names = ("loss_policy", "loss_critic", "kl", "clip_fraction")
         means = (sums / max(updates, 1)).tolist()
-        return {**dict(zip(names, means, strict=True)), "epochs": float(epoch)}
+        return {**dict(zip(names, means, strict=True)), "epochs": float(epochs)}
 
     def _step(self, losses: TensorDict) -> bool:
         """Follow a gradient, unless the loss is not finite."""
         loss = losses["loss_objective"] + losses["loss_critic"]
-        if "loss_entropy" in losses.keys():
+        if self.settings.entropy > 0:
             loss = loss + losses["loss_entropy"]
         if not self._is_sound(loss):
             return False

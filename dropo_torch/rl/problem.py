@@ -27,6 +27,9 @@ from dropo_torch.rl.sampling import ParameterSource, PointSource, load_source
 from dropo_torch.rl.settings import TrainSettings, train_settings
 from dropo_torch.rl.task import Task, load_task
 
+#: Distributions that need no file.
+KEYWORDS = ("uniform", "nominal")
+
 
 @dataclass(frozen=True)
 class World:
@@ -83,9 +86,7 @@ class TrainingProblem:
     def env(self, world: World, num_envs: int, seed: int) -> RandomizedEnv:
         """Return environments of one of the worlds, on the config's backend."""
         config = self.config
-        return world.env(
-            num_envs, seed=seed, backend=config.backend, num_threads=config.threads, device=self.device
-        )
+        return world.env(num_envs, seed=seed, backend=config.backend, num_threads=config.threads, device=self.device)
 
     @property
     def device(self) -> str:
@@ -143,26 +144,26 @@ def _has_effects(config: Config) -> bool:
     return bool(config.effects) or any("effect" in p for p in (config.parameters or {}).values())
 
 
-def _given_distribution(config: Config, varies: bool) -> tuple[Any, Path | None]:
-    """What the config says of the distribution: a keyword, a mapping, or a file."""
+def _given_distribution(config: Config, varies: bool) -> tuple[str | dict[str, float], Path | None]:
+    """What the config says of the distribution (a keyword, values, or a file), and the file."""
     given = config.distribution
-    if given is None:
-        beside = config.base / "fit.json"
-        given = str(beside.resolve()) if beside.is_file() and varies else ("uniform" if varies else "nominal")
-    elif isinstance(given, str) and given not in ("uniform", "nominal"):
-        given = str(config.path(given))
-    if not varies and given != "nominal":
+    if not varies and given not in (None, "nominal"):
         raise InputError(
             "distribution: no parameters are given that it could be of; give parameters, or distribution: nominal"
         )
-    is_path = isinstance(given, str) and given not in ("uniform", "nominal")
-    if is_path and not Path(given).is_file():
-        raise InputError(
-            f"distribution: no file {given}; expected a fit.json, uniform, nominal, or name: value of every parameter"
-        )
     if isinstance(given, dict):
-        given = _numbers("distribution", given)
-    return given, Path(given) if is_path else None
+        return _numbers("distribution", given), None
+    if given in KEYWORDS:
+        return given, None
+    beside = config.base / "fit.json"
+    if given is None and not (varies and beside.is_file()):
+        return "uniform" if varies else "nominal", None
+    path = (beside if given is None else config.path(given)).resolve()
+    if not path.is_file():
+        raise InputError(
+            f"distribution: no file {path}; expected a fit.json, uniform, nominal, or name: value of every parameter"
+        )
+    return str(path), path
 
 
 def _numbers(key: str, given: Mapping[str, Any]) -> dict[str, float]:
@@ -190,9 +191,7 @@ def _space_and_effects(
         raise InputError("effects: they need parameters; give one of the model's, such as a mass")
     entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
     observation = parse_observation(task.model, entries)
-    effects = place_effects(
-        config.effects, space, plain_setting(task.model, observation, task.frame_skip), find_effect
-    )
+    effects = place_effects(config.effects, space, plain_setting(task.model, observation, task.frame_skip), find_effect)
     return space.with_limits(lowest(effects, space)), effects
 
 
@@ -206,16 +205,15 @@ def _nominal_world(training: World) -> World | None:
     return World(training.task, space, PointSource(space.named(space.nominal)), training.effects)
 
 
-def _target_world(
-    config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]
-) -> World:
+def _target_world(config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]) -> World:
     """The world of the config's ``target``: the model's own values but for those given."""
     known = {**(dict(sim.parameters) if sim else {}), **specs}
-    wanted, values = dict(specs), {}
+    wanted = dict(specs)
+    values: dict[str, float] = {}
     for name, entry in config.target.items():
         if isinstance(entry, dict):
             spec = {k: v for k, v in entry.items() if k != "value"}
-            values |= _numbers(f"target.{name}", {"value": entry.get("value")}) and {name: float(entry["value"])}
+            values[name] = _numbers(f"target.{name}", {"value": entry.get("value")})["value"]
             wanted[name] = {"bounds": _around(values[name]), **spec}
         elif name in known:
             values |= _numbers("target", {name: entry})
@@ -282,5 +280,3 @@ def _fingerprint(
     mujoco.mj_saveModel(task.model, None, buffer)
     digest.update(buffer.tobytes())
     return digest.hexdigest()[:32]
-
-

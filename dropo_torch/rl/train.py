@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -135,6 +135,7 @@ def train(
     checkpoint: Path | None = None,
     resume: bool = False,
     on_progress: Callable[[TrainEntry, Progress | None], None] | None = None,
+    on_start: Callable[[Sequence[TrainEntry], Sequence[Progress]], None] | None = None,
 ) -> Training:
     """Train a policy under the problem's distribution.
 
@@ -145,6 +146,7 @@ def train(
         checkpoint: file in which the state is kept between iterations.
         resume: go on from it.
         on_progress: called after every iteration, with the evaluation that followed it, if one did.
+        on_start: called once before the first, with what an interrupted run had done.
 
     Raises:
         InputError: a checkpoint of another training; losses that stay infinite.
@@ -153,6 +155,8 @@ def train(
         run = _Run(problem, checkpoint)
         if resume:
             run.restore()
+        if on_start is not None:
+            on_start(run.history, run.evaluations)
         while not run.done:
             entry, evaluation = run.iterate()
             if on_progress is not None:
@@ -271,7 +275,7 @@ class _Run:
     def _episodes(self, world: World, number: int) -> Evaluation:
         """Episodes of the policy as it is; the same starts and parameters for the same number."""
         seed = (self.problem.config.seed * 4 + number) * 1_000_003 + 17
-        with torch.random.fork_rng():
+        with _own_random_numbers(seed, self.problem.device):
             return evaluate(self.policy, self.problem.env(world, self.problem.settings.episodes, seed % 2**31))
 
     def _entry(self, scalars: dict[str, float]) -> TrainEntry:
