@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -35,6 +36,7 @@ def run_train(config: Config, out: Path, *, console: Console, resume: bool = Fal
         resume: continue an interrupted run in ``out``.
         log: ``"tensorboard"`` writes the learning curves as TensorBoard events too, while it trains.
     """
+    logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells every storage it allocates
     check_log_option(log)
     problem = make_training(config)
     checkpoint = out / "train-progress.pt"

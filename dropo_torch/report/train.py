@@ -192,7 +192,7 @@ def _parameters(distribution: Mapping[str, Any]) -> list[dict[str, str]]:
     rows = []
     for name, entry in distribution.get("parameters", {}).items():
         numbers = {k: float(v) for k, v in entry.items() if isinstance(v, int | float)}
-        shown = {k: words.number(v) for k, v in numbers.items() if k in ("value", "mean", "std", "low", "high")}
+        shown = {k: figures.plain(v) for k, v in numbers.items() if k in ("value", "mean", "std", "low", "high")}
         rows.append({"name": name, "unit": str(entry.get("unit") or "–"), **shown})
     return rows
 

@@ -38,8 +38,8 @@ class Normalizer(nn.Module):
     @torch.no_grad()
     def update(self, values: torch.Tensor) -> None:
         """Take in inputs ``(..., n)`` (Chan et al. 1979, parallel variance)."""
-        rows = values.reshape(-1, len(self.mean)).double()
-        if not len(rows):
+        rows = values.flatten(0, -2).double()
+        if not rows.numel():
             return
         total = self.count + len(rows)
         mean = rows.mean(0)
@@ -50,8 +50,8 @@ class Normalizer(nn.Module):
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
         """Return normalised inputs ``(..., n)``, float32, cut off at ±:data:`CLIP`."""
-        variance = torch.where(self.count > 0, self.square / self.count.clamp(min=1), 1.0)
-        scaled = (values.double() - self.mean) / torch.sqrt(variance + 1e-8)
+        variance = torch.where(self.count > 0, self.square / self.count.clamp(min=1) + 1e-8, 1.0)
+        scaled = (values.double() - self.mean) / torch.sqrt(variance)
         return scaled.clamp(-CLIP, CLIP).float()
 
 

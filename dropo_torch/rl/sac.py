@@ -72,7 +72,7 @@ class SAC(Learner):
         self._owed -= updates
         scalars: dict[str, float] = {}
         for number in range(updates):
-            losses = self._gradient()
+            losses = self._gradient().detach()
             if number == updates - 1:
                 scalars = {
                     "loss_policy": float(losses["loss_actor"]), "loss_critic": float(losses["loss_qvalue"]),
