@@ -9,6 +9,7 @@ from typing import Any
 
 import gymnasium
 import mujoco
+import mujoco.batch
 import numpy as np
 import pytest
 import torch
@@ -128,34 +129,78 @@ def test_the_hopper_starts_as_gymnasiums() -> None:
     assert task.timestep == pytest.approx(0.008)
 
 
+def test_the_hopper_observes_and_ends_as_gymnasiums() -> None:
+    reference = gymnasium.make("Hopper-v5", xml_file=str(SIM.model), frame_skip=4).unwrapped
+    reference.reset(seed=0)
+    task = HopperTask()
+    states = random_states(task.model, 200, 0.4, 5)
+    states[::3, 6:] *= 100.0  # beyond the clip
+    states[:, 1] -= 0.3
+    states[5::20, [1, 2, 4]] = [1.2, 0.0, 120.0]  # upright, and beyond all health
+    observed, ended = task.observe(torch.from_numpy(states)), task.terminated(torch.from_numpy(states))
+    for state, observation, end in zip(states, observed, ended, strict=True):
+        reference.data.qpos[:], reference.data.qvel[:] = np.split(state, 2)
+        np.testing.assert_array_equal(observation.numpy(), reference._get_obs())
+        assert bool(end) == (not reference.is_healthy)
+    assert 20 < ended.sum() < 180
+    assert ended[5::20].all()
+    assert (observed[:, 5:].abs() == 10).any()
+
+
+LAGGED = CART_POLE.replace(
+    '<motor name="push" joint="slide" gear="10" ctrlrange="-1 1"/>',
+    '<general name="push" joint="slide" gear="10" ctrlrange="-1 1" dyntype="filterexact" dynprm="0.05"/>',
+)
+
+
+def lagged() -> Task:
+    """The cart and pole with an actuator that has a state of its own."""
+    return CartPole().on(mujoco.MjModel.from_xml_string(LAGGED))
+
+
 @pytest.mark.parametrize("threads", [1, 2])
-def test_every_row_is_one_simulation_of_its_own_model(threads: int) -> None:
+@pytest.mark.parametrize("task", [HopperTask(), lagged()], ids=["hopper", "lagged"])
+def test_every_row_is_one_simulation_of_its_own_model(task: Task, threads: int) -> None:
     num, steps = 9, 40
-    rng = np.random.default_rng(1)
-    table = rng.uniform(MASSES.low, MASSES.high, (400, 4))
-    env = RandomizedEnv("hopper", num, space=MASSES, source=Rows(MASSES.names, table), num_threads=threads)
-    actions = actions_of(env, steps)
-    td, begun = env.reset(), num
-    sims = []
-    for row in range(num):
-        model = MASSES.apply(table[row])
-        sims.append((model, mujoco.MjData(model)))
-        sims[row][1].qpos[:], sims[row][1].qvel[:] = np.split(env.states[row].numpy(), 2)
-    resets = 0
-    for action in actions:
-        after, td = env.step_and_maybe_reset(td.set("action", action))
-        done = after["next", "done"][:, 0]
+    space = ParameterSpace(task.model, SIM.parameters if task.name == "hopper" else CART)
+    table = np.random.default_rng(1).uniform(space.low, space.high, (400, len(space)))
+    env = RandomizedEnv(task, num, space=space, source=Rows(space.names, table), num_threads=threads)
+    td, begun, resets = env.reset(), 0, -num
+    sims = [(task.model, mujoco.MjData(task.model)) for _ in range(num)]
+    begin = torch.ones(num, dtype=torch.bool)
+    for action in actions_of(env, steps):
+        for row in begin.nonzero()[:, 0].tolist():
+            model = space.apply(table[begun])
+            sims[row] = model, mujoco.MjData(model)
+            sims[row][1].qpos[:], sims[row][1].qvel[:] = np.split(env.states[row].numpy(), 2)
+            begun, resets = begun + 1, resets + 1
+        after = env.step(td.set("action", action))
         for row, (model, data) in enumerate(sims):
             data.ctrl[:] = action[row].double().numpy()
-            mujoco.mj_step(model, data, nstep=4)
-            expected = np.concatenate([data.qpos[1:], np.clip(data.qvel, -10, 10)]).astype(np.float32)
-            np.testing.assert_array_equal(after["next", "observation"][row].numpy(), expected)
-            if done[row]:
-                model = MASSES.apply(table[begun])
-                sims[row], begun, resets = (model, mujoco.MjData(model)), begun + 1, resets + 1
-                sims[row][1].qpos[:], sims[row][1].qvel[:] = np.split(env.states[row].numpy(), 2)
+            mujoco.mj_step(model, data, nstep=task.frame_skip)
+            np.testing.assert_array_equal(env.states[row].numpy(), np.concatenate([data.qpos, data.qvel]))
+        observed = task.observe(env.states).float()
+        assert torch.equal(after["next", "observation"], observed)
+        begin = after["next", "done"][:, 0]
+        td = env.maybe_reset(env.step_mdp(after))
     assert resets > 5
     np.testing.assert_array_equal(td["parameters"].numpy(), env.values.float().numpy())
+
+
+def test_a_simulation_that_mujoco_gives_up_is_a_divergence(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = RandomizedEnv(CartPole(), 4)
+    batch, td = env._stepper._batch, env.reset()  # type: ignore[attr-defined]
+
+    def step(*args: Any, **kwargs: Any) -> None:
+        raise mujoco.batch.SimulationError(np.array([2]), "arena is full")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(batch, "step", step)
+        after, td = env.step_and_maybe_reset(td.set("action", torch.zeros(4, 1)))
+    assert after["next", "diverged"][:, 0].tolist() == [False, False, True, False]
+    assert env.num_diverged == 1
+    after, _ = env.step_and_maybe_reset(td.set("action", torch.zeros(4, 1)))
+    assert not after["next", "diverged"].any()
 
 
 def test_threads_and_company_do_not_matter() -> None:
