@@ -47,13 +47,13 @@ def target_masses() -> dict[str, float]:
     return {**masses, "torso_mass": masses["torso_mass"] - LIGHTER}
 
 
-def fit_log(folder: Path, seed: int) -> Path:
+def fit_log(folder: Path, seed: int, given: argparse.Namespace) -> Path:
     """Record a log of the target and fit three masses to it; return the path of the fit."""
     path = folder / "fit.json"
     if path.exists():
         return path
     folder.mkdir(parents=True, exist_ok=True)
-    record(variant="unmodeled", seed=seed).save(folder / "log.npz")
+    record(variant="unmodeled", seed=seed, steps=given.log_steps).save(folder / "log.npz")
     document = {"sim": "hopper", "data": "log.npz", "parameters": {n: dict(SIM.parameters[n]) for n in FITTED}}
     problem = dropo.make_problem(dropo.make_config(document, {"seed": seed}, base=folder))
     dropo.fit(problem.objective, seed=seed).save(path)
@@ -83,7 +83,7 @@ def run(method: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     """Train one policy, or go on with it, or take the result that is there."""
     folder = given.out / f"{method}-{seed}"
     result = folder / "train.json"
-    fit = fit_log(given.out / f"fit-{seed}", seed)
+    fit = fit_log(given.out / f"fit-{seed}", seed, given)
     if not result.exists():
         problem = make_training(training_config(method, fit, seed, given))
         found = train(problem, checkpoint=folder / "train-progress.pt", resume=True)
@@ -159,6 +159,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, help="environment steps of each training; the algorithm's by default")
     parser.add_argument("--algorithm", choices=["ppo", "sac"], default="ppo")
     parser.add_argument("--episodes", type=int, default=50, help="of each evaluation")
+    parser.add_argument("--log-steps", type=int, default=500, help="transitions of each of the log's two episodes")
     parser.add_argument("--threads", type=int, default=0, help="of the simulator")
     parser.add_argument(
         "--train", nargs=2, action="append", default=[], metavar=("KEY", "VALUE"), help="a setting of the training"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
 
@@ -54,12 +54,12 @@ class Policy(nn.Module):
     @overload
     def forward(self, observation: torch.Tensor) -> torch.Tensor: ...
     @overload
-    def forward(self, observation: np.ndarray) -> np.ndarray: ...
+    def forward(self, observation: np.ndarray | Sequence[float]) -> np.ndarray: ...
     @torch.no_grad()
-    def forward(self, observation: torch.Tensor | np.ndarray) -> torch.Tensor | np.ndarray:
+    def forward(self, observation: torch.Tensor | np.ndarray | Sequence[float]) -> torch.Tensor | np.ndarray:
         """Return the action ``(..., m)`` at an observation ``(..., n)``, in the environment's units.
 
-        Arrays give arrays, tensors give tensors.
+        Tensors give tensors, arrays and lists give arrays.
 
         Raises:
             InputError: an observation of another width.
@@ -70,7 +70,7 @@ class Policy(nn.Module):
                 f"policy: observation of shape {tuple(given.shape)} given; expected (..., {self.num_observations})"
             )
         action = self.to_action(self.actor.deterministic(self.normalizer(given)))
-        return action.cpu().numpy() if isinstance(observation, np.ndarray) else action
+        return action if isinstance(observation, torch.Tensor) else action.cpu().numpy()
 
     def to_action(self, unit: torch.Tensor) -> torch.Tensor:
         """Return actions in the environment's units of actions in [-1, 1]; what lies outside is cut off."""
