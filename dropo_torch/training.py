@@ -74,9 +74,12 @@ def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
     env = problem.env(world, 1, problem.config.seed)
     states = record(result.policy, env)
     strip, note = draw(env.space.model, states[chosen_frames(len(states), env.task.timestep)])
+    notes = [note] if note else []
+    if problem.nominal is None:
+        notes.append("Not evaluated in a nominal model: a number of an effect has no value of its own in the model.")
     write_train_report(
         out / "report.html", result, config=problem.config.document(), versions=versions(),
-        title=f"Policy for {env.task.name}", strip=strip, notes=[note] if note else [],
+        title=f"Policy for {env.task.name}", strip=strip, notes=notes,
     )  # fmt: skip
     write_atomically(out / "train.json", document.encode() + b"\n")
 

@@ -38,6 +38,8 @@ LABELS = {"true": "target's own masses", "fitted": "fitted distribution", "point
 FITTED = ("thigh_mass", "leg_mass", "foot_mass")
 #: How much lighter the target's torso is than the model's, kg.
 LIGHTER = 1.0
+#: ε of the fit: about the variance of what no value of the three masses explains.
+EPSILON = 1e-3
 CONFIDENCE = 0.9
 
 
@@ -55,7 +57,8 @@ def fit_log(folder: Path, seed: int, given: argparse.Namespace) -> Path:
     folder.mkdir(parents=True, exist_ok=True)
     record(variant="unmodeled", seed=seed, steps=given.log_steps).save(folder / "log.npz")
     document = {"sim": "hopper", "data": "log.npz", "parameters": {n: dict(SIM.parameters[n]) for n in FITTED}}
-    problem = dropo.make_problem(dropo.make_config(document, {"seed": seed}, base=folder))
+    settings = {"seed": seed, "epsilon": given.epsilon, "threads": given.threads}
+    problem = dropo.make_problem(dropo.make_config(document, settings, base=folder))
     dropo.fit(problem.objective, seed=seed).save(path)
     return path
 
@@ -159,6 +162,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--steps", type=int, help="environment steps of each training; the algorithm's by default")
     parser.add_argument("--algorithm", choices=["ppo", "sac"], default="ppo")
     parser.add_argument("--episodes", type=int, default=50, help="of each evaluation")
+    parser.add_argument("--epsilon", type=float, default=EPSILON, help="of the fit")
     parser.add_argument("--log-steps", type=int, default=500, help="transitions of each of the log's two episodes")
     parser.add_argument("--threads", type=int, default=0, help="of the simulator")
     parser.add_argument(

@@ -267,19 +267,8 @@ def test_transfer_hopper(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     small = {"num_envs": 2, "horizon": 8, "minibatch": 16, "epochs": 1, "evaluations": 1}
     options = [word for k, v in small.items() for word in ("--train", k, str(v))]
     example = load_example(ROOT / "examples" / "transfer_hopper.py")
-    arguments = [
-        "--out",
-        str(tmp_path),
-        "--seeds",
-        "2",
-        "--steps",
-        "16",
-        "--episodes",
-        "2",
-        "--log-steps",
-        "30",
-        *options,
-    ]
+    arguments = ["--out", str(tmp_path), "--seeds", "2", "--steps", "16", "--episodes", "2", "--log-steps", "30"]
+    arguments += options
     example.main(arguments)
     found = json.loads((tmp_path / "transfer.json").read_text())
     assert {(r["method"], r["seed"]) for r in found["runs"]} == {(m, s) for m in example.METHODS for s in (0, 1)}

@@ -37,13 +37,13 @@ class World:
 
     Attributes:
         task: what is to be done, on its model.
-        space: what varies, or ``None``.
-        source: where an episode's parameters come from, or ``None``: the model's own.
+        space: what varies; may be empty.
+        source: where an episode's parameters come from, or ``None`` where nothing varies.
         effects: the physical effects of the config, or ``None``.
     """
 
     task: Task
-    space: ParameterSpace | None
+    space: ParameterSpace
     source: ParameterSource | None
     effects: EffectSet | None
 
@@ -178,17 +178,15 @@ def _world(
 ) -> World:
     """The world of parameters ``specs`` that come from what was given."""
     space, effects = _space_and_effects(config, sim, task, specs)
-    return World(task, space, None if space is None else load_source(given, space), effects)
+    return World(task, space, load_source(given, space) if len(space) else None, effects)
 
 
 def _space_and_effects(
     config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]
-) -> tuple[ParameterSpace | None, EffectSet | None]:
-    space = ParameterSpace(task.model, specs) if specs else None
+) -> tuple[ParameterSpace, EffectSet | None]:
+    space = ParameterSpace(task.model, specs) if specs else ParameterSpace.empty(task.model)
     if not config.effects and not any("effect" in p for p in specs.values()):
         return space, None
-    if space is None:
-        raise InputError("effects: they need parameters; give one of the model's, such as a mass")
     entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
     observation = parse_observation(task.model, entries)
     effects = place_effects(config.effects, space, plain_setting(task.model, observation, task.frame_skip), find_effect)
@@ -198,7 +196,7 @@ def _space_and_effects(
 def _nominal_world(training: World) -> World | None:
     """The same with the model's own values."""
     space = training.space
-    if space is None:
+    if not len(space):
         return training
     if not np.isfinite(space.nominal).all():
         return None
@@ -224,7 +222,6 @@ def _target_world(config: Config, sim: BundledSim | None, task: Task, specs: Map
                 + f"; any other is given as {name}: {{field: body_mass, name: BODY, value: 1.0}}"
             )  # fmt: skip
     space, effects = _space_and_effects(config, sim, task, wanted)
-    assert space is not None
     vector = space.nominal.copy()
     for name, value in values.items():
         column = space.names.index(name)
@@ -246,7 +243,7 @@ def _around(value: float) -> list[float]:
 def describe(world: World, given: Any) -> dict[str, Any]:
     """Return where a world's parameters come from, as plain data."""
     space, source = world.space, world.source
-    if space is None or source is None:
+    if source is None:
         return {"kind": "nominal", "parameters": {}}
     units = {p.name: p.unit for p in space.parameters}
     if given == "uniform":

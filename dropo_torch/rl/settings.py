@@ -63,10 +63,10 @@ class PPOSettings(TrainSettings):
     """
 
     steps: Count = 4_000_000
-    num_envs: Count = 128
-    horizon: Count = 128
+    num_envs: Count = 64
+    horizon: Count = 64
     epochs: Count = 10
-    minibatch: Count = 2048
+    minibatch: Count = 512
     anneal: bool = True
     lambda_: Share = pydantic.Field(0.95, alias="lambda")
     clip: Positive = 0.2

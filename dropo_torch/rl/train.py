@@ -314,8 +314,7 @@ def _fresh_policy(problem: TrainingProblem) -> Policy:
 
 
 def _make_learner(problem: TrainingProblem, policy: Policy) -> Learner:
-    settings, space = problem.settings, problem.training.space
-    width = 0 if space is None else len(space)
+    settings, width = problem.settings, len(problem.training.space)
     if isinstance(settings, SACSettings):
         return SAC(policy, width, num_envs=settings.num_envs, settings=settings)
     assert isinstance(settings, PPOSettings)
