@@ -101,6 +101,15 @@ def run(method: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def same_settings(given: argparse.Namespace) -> bool:
+    """Whether the folder is new, or was begun with the same settings."""
+    path = given.out / "settings.json"
+    settings = {k: getattr(given, k) for k in ("steps", "algorithm", "episodes", "log_steps", "epsilon", "train")}
+    if not path.exists():
+        write_atomically(path, json.dumps(settings).encode())
+    return json.loads(path.read_text()) == settings
+
+
 def interval(values: Sequence[float]) -> tuple[float, float, float]:
     """Mean of values over seeds, and the ends of its interval (Student's t)."""
     mean = float(np.mean(values))
@@ -169,6 +178,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "--train", nargs=2, action="append", default=[], metavar=("KEY", "VALUE"), help="a setting of the training"
     )
     given = parser.parse_args(arguments)
+    if not same_settings(given):
+        parser.error(f"{given.out} holds a study with other settings; name another folder")
     runs = []
     for seed in range(given.seeds):
         for method in METHODS:
