@@ -453,6 +453,25 @@ def test_tasks_that_cannot_be(name: str, message: str, tmp_path: Path) -> None:
         load_task(name, base=tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("method", "wrong", "message"),
+    [
+        ("initial_states", lambda n, g: torch.zeros(n, 3), r"initial_states\(1\) returns shape \(1, 3\).*\(1, 4\)"),
+        ("observe", lambda s: s[:, :2], r"observe returns shape \(1, 2\) for one environment; expected \(1, 4\)"),
+        ("reward", lambda s, a, n: s[:, :1], r"reward returns shape \(1, 1\) for one environment; expected \(1,\)"),
+        ("reward", lambda s, a, n: 1.0, r"reward returns a float; expected a tensor"),
+        ("terminated", lambda s: s[:, 0], r"terminated returns torch.float64; expected torch.bool"),
+        ("controls", lambda a: a.repeat(1, 2), r"controls returns shape \(1, 2\)"),
+        ("observe", lambda s: s / s.nowhere, r"task: cartpole fails, .*test_rl_env.py line \d+: AttributeError"),
+    ],
+)
+def test_what_a_task_returns_is_checked_at_once(method: str, wrong: Any, message: str) -> None:
+    task = CartPole()
+    setattr(task, method, wrong)
+    with pytest.raises(InputError, match=message):
+        RandomizedEnv(task, 2)
+
+
 def test_controls_without_a_range_need_one() -> None:
     task = CartPole()
     task.model = mujoco.MjModel.from_xml_string(CART_POLE.replace('ctrlrange="-1 1"', ""))

@@ -17,7 +17,7 @@ from dropo_torch.rl.commands import Commands
 from dropo_torch.rl.sampling import ParameterSource, UniformSource
 from dropo_torch.rl.sensors import Sensors
 from dropo_torch.rl.stepper import make_stepper
-from dropo_torch.rl.task import Task, load_task
+from dropo_torch.rl.task import Task, check_task, load_task
 from dropo_torch.simulators.base import DIVERGED
 
 
@@ -70,6 +70,7 @@ class RandomizedEnv(EnvBase):
             raise InputError(f"num_envs: {num_envs} given; expected 1 or more")
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.task = load_task(task)
+        check_task(self.task)
         self.num_envs, self.num_diverged = num_envs, 0
         self.space = _checked_space(self.task, space, source, effects)
         self.source = (UniformSource(self.space) if source is None else source).over(self.space)
@@ -126,7 +127,7 @@ class RandomizedEnv(EnvBase):
         return self._states.clone()
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        actions = tensordict.get("action").to(torch.float64)
+        actions = tensordict.get("action").detach().to(torch.float64)
         controls = self.task.controls(actions)
         if not torch.isfinite(controls).all():
             row = int((~torch.isfinite(controls)).any(1).nonzero()[0])
@@ -176,12 +177,12 @@ class RandomizedEnv(EnvBase):
         entries["observation"], entries["step_count"] = self._observation, self._count
         if self._exposed:
             entries["parameters"] = self._shared
-        return TensorDict._new_unsafe(entries, batch_size=self.batch_size, device=self.device)
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
     def _restart(self, rows: torch.Tensor) -> None:
         """Begin new episodes in environments ``rows``; what was handed out before is not written to."""
         values = self.source.sample(len(rows), self._generator)
-        start = self.task.initial_states(len(rows), self._generator).to(self.device)
+        start = self.task.initial_states(len(rows), self._generator).to(self.device, torch.float64)
         self._values[rows] = values
         self._stepper.reset(rows, start, values)
         at = rows.to(self.device)

@@ -122,3 +122,28 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
     if missing:
         raise InputError(f"task: {name} has no {missing[0]}; a task has {', '.join(_NEEDED)}")
     return made
+
+
+def check_task(task: Task) -> None:
+    """Raise an :class:`InputError` for a task whose methods fail, or return other shapes than they should."""
+    width, where = task.model.nq + task.model.nv, f"task: {task.name}"
+    with user_code("task", task.name):
+        middle = torch.from_numpy(0.5 * (np.asarray(task.action_low) + np.asarray(task.action_high)))[None]
+        states = task.initial_states(1, torch.Generator().manual_seed(0))
+        _expect(f"{where}: initial_states(1)", states, (1, width))
+        states = states.to(torch.float64)
+        _expect(f"{where}: controls", task.controls(middle), (1, task.model.nu))
+        _expect(f"{where}: observe", task.observe(states), (1, task.num_observations))
+        _expect(f"{where}: reward", task.reward(states, middle, states), (1,))
+        ends = task.terminated(states)
+        _expect(f"{where}: terminated", ends, (1,))
+    if ends.dtype != torch.bool:
+        raise InputError(f"{where}: terminated returns {ends.dtype}; expected torch.bool")
+
+
+def _expect(what: str, given: object, shape: tuple[int, ...]) -> None:
+    """Raise unless a method has returned a tensor of one environment's shape."""
+    if not isinstance(given, torch.Tensor):
+        raise InputError(f"{what} returns a {type(given).__name__}; expected a tensor")
+    if tuple(given.shape) != shape:
+        raise InputError(f"{what} returns shape {tuple(given.shape)} for one environment; expected {shape}")
