@@ -6,6 +6,8 @@
 >>> result.distribution.save("distribution.json")
 """
 
+from typing import TYPE_CHECKING, Any
+
 from dropo_torch import gap
 from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.diagnostics import Diagnostics, diagnose
@@ -24,6 +26,19 @@ from dropo_torch.readers import read_recording, read_trajectories
 from dropo_torch.recording import Recording
 from dropo_torch.simulators import Simulator, make_simulator
 from dropo_torch.trajectory import Trajectories, Transitions, make_transitions
+
+if TYPE_CHECKING:
+    from dropo_torch.rl.policy import load_policy
+
+
+def __getattr__(name: str) -> Any:
+    """Import what needs TorchRL, which takes seconds, when it is asked for."""
+    if name == "load_policy":
+        from dropo_torch.rl.policy import load_policy
+
+        return load_policy
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
 
 __all__ = [
     "Config",
@@ -49,6 +64,7 @@ __all__ = [
     "fit",
     "gap",
     "load_config",
+    "load_policy",
     "log_likelihood",
     "make_config",
     "make_problem",

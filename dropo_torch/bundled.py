@@ -28,6 +28,7 @@ class BundledSim:
         parameters: what may vary, as in a config.
         log: path of a small log, for the demo.
         truth: the values that the log was recorded with.
+        task: the class of its task as ``module:Class``, or ``None``.
     """
 
     name: str
@@ -37,18 +38,19 @@ class BundledSim:
     parameters: Mapping[str, Mapping[str, Any]]
     log: Path
     truth: Mapping[str, float] = field(default_factory=dict)
+    task: str | None = None
 
 
-def bundled_sim(name: str) -> BundledSim:
-    """Return a bundled simulation.
+def bundled_sim(name: str, *, key: str = "sim") -> BundledSim:
+    """Return a bundled simulation; ``key`` is the config's key that names it.
 
     Raises:
         InputError: an unknown name.
     """
     found = {e.name: e for e in entry_points(group=GROUP)}
     if name not in found:
-        raise InputError(f"sim: no bundled simulation {name!r}" + choices(name, sorted(found)))
+        raise InputError(f"{key}: no bundled simulation {name!r}" + choices(name, sorted(found)))
     sim = found[name].load()
     if not isinstance(sim, BundledSim):
-        raise InputError(f"sim: {found[name].value} is no BundledSim")
+        raise InputError(f"{key}: {found[name].value} is no BundledSim")
     return sim

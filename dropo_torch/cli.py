@@ -1,4 +1,4 @@
-"""The command line: ``dropo fit``, ``gap``, ``sweep-epsilon``, ``certify``, ``compare`` and ``demo``."""
+"""The command line: ``dropo fit``, ``gap``, ``train``, ``sweep-epsilon``, ``certify``, ``compare`` and ``demo``."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from dropo_torch.errors import InputError, choices
 
-COMMANDS = ("fit", "gap", "sweep-epsilon", "certify", "compare", "demo")
+COMMANDS = ("fit", "gap", "train", "sweep-epsilon", "certify", "compare", "demo")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -86,6 +86,10 @@ def _dispatch(given: list[str]) -> int:
         runs.run_fit(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
     elif parsed.command == "gap":
         runs.run_gap(config, parsed.out, console=console, source=parsed.config, resume=parsed.resume)
+    elif parsed.command == "train":
+        from dropo_torch.training import run_train  # TorchRL takes seconds to import
+
+        run_train(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
     elif parsed.command == "certify":
         runs.run_certify(config, parsed.out, console=console)
     elif parsed.command == "compare":
@@ -110,6 +114,8 @@ def _parser() -> argparse.ArgumentParser:
     fit = _command(commands, "fit", "fit the distribution to the log")
     fit.add_argument("--log", metavar="tensorboard", help="write the history as TensorBoard events, too")
     _command(commands, "gap", "find where simulation and log disagree, and name the physical effect that is missing")
+    train = _command(commands, "train", "train a policy over the distribution")
+    train.add_argument("--log", metavar="tensorboard", help="write the learning curves as TensorBoard events, too")
     sweep = _command(commands, "sweep-epsilon", "fit at several ε and choose one by the elbow")
     sweep.add_argument("--epsilons", metavar="1e-6,1e-5,...", help="the values to try")
     _command(commands, "certify", "compare the gradients of the warp backend with MuJoCo's own differences")

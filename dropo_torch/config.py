@@ -58,6 +58,23 @@ class Config(pydantic.BaseModel):
         {}, description="with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers"
     )
     device: str = pydantic.Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
+    task: str | None = pydantic.Field(
+        None, description="what a policy learns: a bundled task, or file.py:Class (module:Class); the sim's by default"
+    )
+    algorithm: Literal["ppo", "sac"] | None = pydantic.Field(
+        None, description="how a policy is trained: ppo (the default) or sac"
+    )
+    distribution: str | dict[str, Any] | None = pydantic.Field(
+        None,
+        description="of the parameters in training: path of a fit.json, uniform, nominal, or name: value; "
+        "fit.json beside the config by default, uniform where there is none",
+    )
+    train: dict[str, Any] = pydantic.Field(
+        {}, description="how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md"
+    )
+    target: dict[str, Any] = pydantic.Field(
+        {}, description="name: value, the model on which a trained policy is evaluated beside the nominal one"
+    )
     threads: int = pydantic.Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")
     chunk_size: int = pydantic.Field(10_000, ge=1, description="simulations held in memory at once")
 
@@ -100,6 +117,8 @@ class Config(pydantic.BaseModel):
 
 
 KEYS = tuple(k for k in Config.model_fields if k != "base")
+#: Keys that only training reads.
+TRAINING_KEYS = ("task", "algorithm", "distribution", "train", "target")
 
 
 def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:
@@ -144,11 +163,11 @@ def make_config(
     try:
         return Config(**merged, base=base)
     except pydantic.ValidationError as error:
-        raise InputError(f"{source}: {_explained(error, merged)}") from None
+        raise InputError(f"{source}: {explained(error, merged)}") from None
 
 
-def _explained(error: pydantic.ValidationError, document: Mapping[str, Any]) -> str:
-    """Which entry is wrong, what it is, and what it should be."""
+def explained(error: pydantic.ValidationError, document: Mapping[str, Any]) -> str:
+    """Return which entry is wrong, what it is, and what it should be."""
     found = error.errors()
     deepest = max(len(e["loc"]) for e in found)  # of a union's alternatives, the one that fits furthest
     first = next(e for e in found if len(e["loc"]) == deepest)
@@ -174,6 +193,8 @@ def _expectation(error: Any) -> str:
         return f"{error['ctx']['ge']} or more"
     if error["type"] == "less_than_equal":
         return f"{error['ctx']['le']} or less"
+    if error["type"] == "greater_than":
+        return f"more than {error['ctx']['gt']:g}"
     text = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
     text = {"a integer": "a whole number", "a dictionary": "keys and values"}.get(
         text.split(",")[0], text.split(",")[0]
@@ -238,7 +259,9 @@ def _override(document: dict[str, Any], dotted: str, value: Any) -> None:
     """Set a nested entry in place."""
     *parents, last = dotted.split(".")
     place = document
-    for parent in parents:
+    for depth, parent in enumerate(parents):
+        if depth == 0 and parent in Config.model_fields and Config.model_fields[parent].default == {}:
+            place.setdefault(parent, {})
         if parent not in place:
             raise InputError(f"--{dotted}: the config has no {parent!r} to change" + choices(parent, place))
         if not isinstance(place[parent], dict):

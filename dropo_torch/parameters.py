@@ -125,6 +125,13 @@ class ParameterSpace:
         if self.model is not None:
             _refuse_derived(self)
 
+    @classmethod
+    def empty(cls, model: mujoco.MjModel) -> ParameterSpace:
+        """Return a space over a model in which nothing varies."""
+        space = cls.__new__(cls)
+        space.model, space.parameters = model, ()
+        return space
+
     def __len__(self) -> int:
         """Return the number of parameters d."""
         return len(self.parameters)
@@ -150,7 +157,7 @@ class ParameterSpace:
     @cached_property
     def limits(self) -> np.ndarray:
         """Physical limits, ``(d, 2)``."""
-        return np.array([p.limits for p in self.parameters])
+        return np.array([p.limits for p in self.parameters]).reshape(-1, 2)
 
     @cached_property
     def is_log(self) -> np.ndarray:

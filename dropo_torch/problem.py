@@ -3,14 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import importlib
-import importlib.util
 import re
-import sys
-import traceback
 import warnings
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -20,11 +16,11 @@ import mujoco
 import numpy as np
 
 from dropo_torch.bundled import BundledSim, bundled_sim
-from dropo_torch.config import Config
+from dropo_torch.config import TRAINING_KEYS, Config
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
-from dropo_torch.errors import InputError, choices
+from dropo_torch.errors import InputError
 from dropo_torch.model import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.observation import Observation, generic_observation, parse_observation
@@ -32,6 +28,7 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.readers import read_trajectories
 from dropo_torch.simulators import Adapter, MujocoEnvAdapter, Simulator, make_simulator
 from dropo_torch.trajectory import Trajectories, make_transitions
+from dropo_torch.usercode import load_callable, user_code
 
 #: Relative difference between the log's time step and the simulator's that is still called equal.
 TIME_TOLERANCE = 1e-3
@@ -201,7 +198,10 @@ def _gymnasium_source(config: Config, sim: BundledSim | None) -> tuple[Path | No
             raise InputError(f"environment: Gymnasium cannot make {name!r}: {error}") from None
         space = _space(getattr(environment.unwrapped, "model", None), config, sim)
         return None, space, MujocoEnvAdapter(environment, space)
-    maker = _load_function(config, name)
+    maker = load_callable(
+        "environment", name, path=config.path, what="function {} that makes an adapter",
+        example="an id such as Hopper-v5, or file.py:function of an adapter",
+    )  # fmt: skip
     path = None if config.model is None else config.path(config.model)
     space = _space(None if path is None else load_model(path), config, sim if path is not None else None)
     with _user_code(name):
@@ -254,46 +254,9 @@ class _CheckedAdapter:
         return after
 
 
-@contextmanager
-def _user_code(name: str) -> Iterator[None]:
-    """Turn what the user's own code raises into an :class:`InputError` that says where."""
-    try:
-        yield
-    except InputError:
-        raise
-    except (Exception, SystemExit) as error:
-        ours = str(Path(__file__).parent)
-        frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith((ours, "<"))]
-        place = f", {frames[-1].filename} line {frames[-1].lineno}" if frames else ""
-        raise InputError(f"environment: {name} fails{place}: {type(error).__name__}: {error}") from error
-
-
-def _load_function(config: Config, name: str) -> Callable[..., Any]:
-    """Load ``file.py:function`` or ``module:function``."""
-    where, _, function = name.rpartition(":")
-    if not where:
-        raise InputError(f"environment: {name!r} given; expected an id such as Hopper-v5, or file.py:function")
-    with _user_code(name):
-        if where.endswith(".py"):
-            path = config.path(where).resolve()
-            if not path.is_file():
-                raise InputError(f"environment: no file {path}; expected file.py:function of an adapter")
-            if str(path.parent) not in sys.path:
-                sys.path.append(str(path.parent))  # as for a script: it may import what lies beside it
-            spec = importlib.util.spec_from_file_location(f"dropo_adapter_{path.stem}", path)
-            assert spec is not None
-            assert spec.loader is not None
-            module = importlib.util.module_from_spec(spec)
-            sys.modules[spec.name] = module
-            spec.loader.exec_module(module)
-        else:
-            module = importlib.import_module(where)
-    if not callable(getattr(module, function, None)):
-        functions = [n for n, v in vars(module).items() if callable(v) and not n.startswith("_")]
-        raise InputError(
-            f"environment: {where} has no function {function!r} that makes an adapter" + choices(function, functions)
-        )
-    return getattr(module, function)
+def _user_code(name: str) -> AbstractContextManager[None]:
+    """Turn what an adapter raises into an :class:`InputError` that says where."""
+    return user_code("environment", name)
 
 
 def _log(config: Config, sim: BundledSim | None, model: mujoco.MjModel | None) -> Trajectories:
@@ -373,7 +336,7 @@ def _observation(
 
 
 def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> str:
-    digest = hashlib.sha256(config.fingerprint().encode())
+    digest = hashlib.sha256(config.fingerprint(*TRAINING_KEYS).encode())
     for array in (
         trajectories.observations,
         trajectories.next_observations,

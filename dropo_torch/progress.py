@@ -87,5 +87,40 @@ class StageProgress:
         self._stage = stage
 
 
+class TrainProgress:
+    """A progress line of a training: steps, return of late, steps a second, time left."""
+
+    def __init__(self, console: Console, steps: int) -> None:
+        self._console, self._steps, self._last = console, steps, time.monotonic()
+        self._bar = Progress(
+            SpinnerColumn(), TextColumn("train"), BarColumn(bar_width=20), TextColumn("{task.fields[status]}"),
+            TimeElapsedColumn(), console=console, transient=True, disable=not console.is_terminal,
+        )  # fmt: skip
+        self._task = self._bar.add_task("train", total=1.0, status="simulating")
+        self._from: tuple[int, float] | None = None
+
+    def __enter__(self) -> TrainProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def update(self, steps: int, mean_return: float) -> None:
+        """Show how many steps are done, and the return of the episodes that ended last."""
+        now = time.monotonic()
+        first_steps, first_time = self._from = self._from or (steps, now)
+        rate = (steps - first_steps) / max(now - first_time, 1e-9)
+        left = f", about {_duration((self._steps - steps) / rate)} left" if rate > 0 else ""
+        late = "" if math.isnan(mean_return) else f", return {mean_return:.4g}"
+        status = f"{steps:,} of {self._steps:,} steps{late}{left}"
+        self._bar.update(self._task, completed=steps / self._steps, status=status)
+        if not self._console.is_terminal and now - self._last > INTERVAL:
+            self._last = now
+            self._console.print(f"train: {status}", soft_wrap=True, highlight=False)
+
+
 def _duration(seconds: float) -> str:
     return f"{seconds:.0f} s" if seconds < 90 else f"{seconds / 60:.0f} min"

@@ -38,13 +38,13 @@ from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
-    "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "checkpoint.pkl", "gap-progress.pkl",
-    "sweep-progress.json", "compare-progress.json", "distribution.yaml", "fitted_config.yaml", "config.yaml",
-    "model.xml", "report.html", "tensorboard", "gap-progress-shorter.pkl",
-    "gap-progress-contact.pkl",
+    "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.pkl",
+    "gap-progress.pkl", "sweep-progress.json", "compare-progress.json", "train-progress.pt", "policy.pt",
+    "gap-progress-shorter.pkl", "gap-progress-contact.pkl", "distribution.yaml", "fitted_config.yaml", "config.yaml",
+    "model.xml", "report.html", "tensorboard",
 )  # fmt: skip
 #: The first of them: a folder with none of these holds no run.
-_MARKS = _RESULTS[:9]
+_MARKS = _RESULTS[:11]
 _PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")
 
 
@@ -58,12 +58,12 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         resume: continue an interrupted run in ``out``.
         log: ``"tensorboard"`` writes the history as TensorBoard events too.
     """
-    _check_log_option(log)
+    check_log_option(log)
     problem = make_problem(config)
     continued = resume and (out / "checkpoint.pkl").exists()
     if not continued:
         refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
-    _prepare(out, problem, resume=continued)
+    prepare_folder(out, problem.model_path, resume=continued)
     result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
     _refuse_lost(problem, result)
     _write_fit(problem, result, out)
@@ -101,7 +101,7 @@ def run_sweep(
 
     problem = make_problem(config)
     store = out / "sweep-progress.json"
-    _prepare(out, problem, resume=resume and store.exists())
+    prepare_folder(out, problem.model_path, resume=resume and store.exists())
     values = default_epsilons(problem.objective.measured.numpy()) if epsilons is None else list(epsilons)
 
     def fit_at(epsilon: float) -> Fit:
@@ -138,7 +138,7 @@ def run_certify(config: Config, out: Path, *, console: Console) -> Certificate:
         InputError: a gradient that is dead or wrong; the certificate is written all the same.
     """
     problem = make_problem(config.model_copy(update={"backend": "warp"}))
-    _prepare(out, problem, resume=False)
+    prepare_folder(out, problem.model_path, resume=False)
     found = certify(problem.objective, seed=config.seed)
     write_atomically(out / "certificate.json", json.dumps(found.document(), indent=2).encode() + b"\n")
     table = Table("parameter", "derivative", "median error", "99 %", "active set moved", "verdict")
@@ -167,7 +167,7 @@ def run_compare(
 
     problem = make_problem(config)
     store = out / "compare-progress.json"
-    _prepare(out, problem, resume=resume and store.exists())
+    prepare_folder(out, problem.model_path, resume=resume and store.exists())
 
     def fit_with(optimizer: str, backend: str, seed: int) -> tuple[Fit, Objective]:
         part = make_problem(config.model_copy(update={"optimizer": optimizer, "backend": backend, "seed": seed}))
@@ -219,7 +219,7 @@ def run_gap(config: Config, out: Path, *, console: Console, source: Path | None 
     with StageProgress(console, "gap") as progress:
         progress.update("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside
-        _prepare(out, problem, resume=resume and store.exists())
+        prepare_folder(out, problem.model_path, resume=resume and store.exists())
         gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update, scene=scene)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
@@ -300,8 +300,12 @@ def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Co
         )
 
 
-def _prepare(out: Path, problem: Problem, *, resume: bool) -> None:
-    """Make the folder; move an earlier run's files aside unless it is to be continued. Nothing else is touched."""
+def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:
+    """Make the folder; move an earlier run's files aside unless it is to be continued. Nothing else is touched.
+
+    Raises:
+        InputError: a folder that cannot be written, or in which a result would replace one of the user's files.
+    """
     try:
         if out.exists() and not out.is_dir():
             raise InputError(f"--out: {out} is a file; expected a folder")
@@ -315,7 +319,7 @@ def _prepare(out: Path, problem: Problem, *, resume: bool) -> None:
     present = [name for name in _RESULTS if (out / name).exists()]
     if not (out / "gap.json").exists() and "config.yaml" in present:
         present.remove("config.yaml")  # one of the user's own
-    source = problem.model_path
+    source = model_path
     if source is not None and source.name in present and source.resolve() == (out / source.name).resolve():
         raise InputError(
             f"--out: {out / source.name} is the model of this run, which would replace it; name another folder"
@@ -399,7 +403,8 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
 
 
-def _check_log_option(log: str | None) -> None:
+def check_log_option(log: str | None) -> None:
+    """Raise an :class:`InputError` for an option ``--log`` that is not known or not installed."""
     if log not in (None, "tensorboard"):
         raise InputError(f"--log: unknown {log!r}; expected tensorboard")
     if log is not None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import json
 import os
 import re
 import shlex
@@ -25,6 +26,7 @@ from dropo_torch import cli
 from dropo_torch.config import _Loader, make_config, parse_overrides
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
+from dropo_torch.rl.policy import make_policy
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -112,6 +114,9 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     shutil.copy(ROOT / "sims" / "hopper" / "log.npz", folder / "hopper.npz")
     (folder / "cart.py").write_text(blocks(ROOT / "docs" / "adapters.md", "python")[0])
     (folder / "robot.yaml").write_text(blocks(ROOT / "README.md", "yaml")[0])
+    (folder / "out" / "policy").mkdir(parents=True)
+    network = {"num_observations": 4, "num_actions": 2, "hidden": [4], "head": "tanh", "activation": "relu"}
+    make_policy(network).save(folder / "out" / "policy" / "policy.pt")
     return folder
 
 
@@ -256,6 +261,22 @@ def test_links_and_files_exist(page: Path) -> None:
 def test_recover_hopper(capsys: pytest.CaptureFixture) -> None:
     load_example(ROOT / "examples" / "recover_hopper.py").main(["point", "--steps", "30", "--seeds", "1"])
     assert "torso_mass" in capsys.readouterr().out
+
+
+def test_transfer_hopper(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    small = {"num_envs": 2, "horizon": 8, "minibatch": 16, "epochs": 1, "evaluations": 1}
+    options = [word for k, v in small.items() for word in ("--train", k, str(v))]
+    example = load_example(ROOT / "examples" / "transfer_hopper.py")
+    arguments = ["--out", str(tmp_path), "--seeds", "2", "--steps", "16", "--episodes", "2", "--log-steps", "30"]
+    arguments += options
+    example.main(arguments)
+    found = json.loads((tmp_path / "transfer.json").read_text())
+    assert {(r["method"], r["seed"]) for r in found["runs"]} == {(m, s) for m in example.METHODS for s in (0, 1)}
+    assert (tmp_path / "transfer.png").stat().st_size > 0
+    assert "target's own masses" in capsys.readouterr().out
+    before = (tmp_path / "true-1" / "train.json").stat().st_mtime_ns
+    example.main(arguments)
+    assert (tmp_path / "true-1" / "train.json").stat().st_mtime_ns == before
 
 
 def test_gradient_vs_gradient_free(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -44,6 +44,14 @@ class Entry:
         """What it is called in messages, such as ``actuator_delay at elbow``."""
         return self.effect.name + (f" at {self.target}" if self.target else "")
 
+    def values(self, vectors: np.ndarray) -> np.ndarray:
+        """Return its numbers ``(K, p)`` under parameter vectors ``(K, d)``."""
+        out = np.tile(np.asarray(self.fixed, dtype=np.float64), (len(vectors), 1))
+        for number, column in enumerate(self.columns):
+            if column >= 0:
+                out[:, number] = vectors[:, column]
+        return out
+
     def at(self, vector: np.ndarray) -> Placed:
         """Return the effect under a parameter vector ``(d,)``."""
         numbers = (f if c < 0 else float(vector[c]) for f, c in zip(self.fixed, self.columns, strict=True))

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import TypeVar
 
 import numpy as np
+import torch
 
 from dropo_torch.effects.base import Effect, Path, Quantity, Setting
+
+Numbers = TypeVar("Numbers", np.ndarray, torch.Tensor)
 
 
 class SensorEffect(Effect):
@@ -101,7 +105,7 @@ class SensorDelay(SensorEffect):
         if rate >= 0:
             h = path.step
             slopes = fine[:, whole, rate] * h, fine[:, whole + 1, rate] * h
-            value = _hermite(left, right, *slopes, part)
+            value = hermite(left, right, *slopes, part)
         else:
             value = (1 - part) * left + part * right
         columns, valid = path.columns.copy(), path.valid.copy()
@@ -115,10 +119,8 @@ class SensorDelay(SensorEffect):
         return out
 
 
-def _hermite(
-    left: np.ndarray, right: np.ndarray, slope: np.ndarray, next_slope: np.ndarray, part: np.ndarray
-) -> np.ndarray:
-    """Cubic interpolation between two values with their slopes a step."""
+def hermite(left: Numbers, right: Numbers, slope: Numbers, next_slope: Numbers, part: Numbers) -> Numbers:
+    """Return the cubic interpolation between two values with their slopes a step, at a part of the step."""
     t2, t3 = part**2, part**3
     ends = (2 * t3 - 3 * t2 + 1) * left + (3 * t2 - 2 * t3) * right
     return ends + (t3 - 2 * t2 + part) * slope + (t3 - t2) * next_slope

@@ -322,14 +322,9 @@ def effect_simulator(
         InputError: effects that the backend cannot have.
     """
     setting = effects.setting
-    native = effects.matching(is_native)
-    fixed = not any(e.varies for e in native.entries)
-    shared = overlap(native, space) if fixed else None
-    outer = effects.matching(is_outer)
-    inside = len(native) + len(outer) < len(effects)
-    if inside or not fixed or shared is not None:
-        if backend != "mujoco":
-            _refuse(backend, effects, native, shared)
+    native, outer = effects.matching(is_native), effects.matching(is_outer)
+    if needs_mujoco(effects, space):
+        check_backend(backend, effects, space)
         simulator: Engine = TwinEngine(setting, space, num_threads)
         make(setting.model, setting.frame_skip, space)  # for what it refuses
         wrapped, kept = simulator, effects
@@ -341,7 +336,7 @@ def effect_simulator(
                 "let the adapter do it"
             )
         model = apply_native(setting.model, native)
-        finer = _finer(setting.model, model, native)
+        finer = finer_steps(setting.model, model, native)
         if backend == "gymnasium" and finer > 1:
             raise InputError(
                 f"effects: {native.entries[0].place} changes the step, which an environment has for itself"
@@ -372,19 +367,30 @@ def _is_force(effect: Effect) -> bool:
     return effect.has_force or type(effect).wrench is not Effect.wrench
 
 
-def _refuse(backend: str, effects: EffectSet, native: EffectSet, shared: tuple[Entry, str] | None) -> None:
-    """Say which effect a backend cannot have, and what would."""
+def needs_mujoco(effects: EffectSet, space: ParameterSpace) -> bool:
+    """Whether effects are forces in the simulation or change its model from one parameter vector to another."""
+    native = effects.matching(is_native)
+    inside = len(native) + len(effects.matching(is_outer)) < len(effects)
+    return inside or any(e.varies for e in native.entries) or overlap(native, space) is not None
+
+
+def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> None:
+    """Raise an :class:`InputError` for an effect that a backend cannot have; it says what could."""
+    if backend == "mujoco":
+        return
     for entry in effects.entries:
         if not is_native(entry.effect) and not is_outer(entry.effect):
             raise InputError(
                 f"effects: backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
             )
+    native = effects.matching(is_native)
     for entry in native.entries:
         if entry.varies:
             raise InputError(
                 f"effects: {entry.place} has a number that varies, which backend {backend} cannot; "
                 "vary a field of the model instead, or use backend: mujoco"
             )
+    shared = overlap(native, space)
     if shared is not None:
         raise InputError(
             f"effects: {shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
@@ -392,8 +398,12 @@ def _refuse(backend: str, effects: EffectSet, native: EffectSet, shared: tuple[E
         )
 
 
-def _finer(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSet) -> int:
-    """How many steps of the changed model make one of the model."""
+def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSet) -> int:
+    """Return how many steps of the changed model make one of the model.
+
+    Raises:
+        InputError: no whole number.
+    """
     ratio = model.opt.timestep / changed.opt.timestep
     if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
         entry = next((e for e in native.entries if e.effect.name == "integration"), native.entries[0])
@@ -411,7 +421,7 @@ def _check_timestep(setting: Setting, effects: EffectSet, space: ParameterSpace)
         changed = copy.copy(setting.model)
         for placed in native.at(vector):
             placed.effect.apply(changed, placed.target, np.asarray(placed.values))
-        _finer(setting.model, changed, native)
+        finer_steps(setting.model, changed, native)
 
 
 def _parts(total: int, size: int) -> Iterator[slice]:

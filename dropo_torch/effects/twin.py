@@ -297,13 +297,17 @@ class Twin:
         out = np.empty((rows, total // every, flat.shape[1]))
         failed = np.zeros(rows, dtype=bool)
         force = batch.bind("qfrc_applied") if forced or pushes is not None else None
-        middle = _Middle(self._base, self._base.opt.timestep / finer) if forced else None
+        middle, before = (Middle(self._base), qvel.copy()) if forced else (None, qvel)
         single = forced or _varies(control, every)
         for step in range(0, total, 1 if single else every):
             ctrl[:] = control[:, step]
             for _ in range(finer if forced else 1):
                 if force is not None:
-                    force[:] = 0.0 if middle is None else self._forces(variants, *middle(qpos, qvel), num_w)
+                    force[:] = 0.0
+                    if middle is not None:
+                        ahead = middle.ahead(qpos, qvel, before, self._base.opt.timestep / finer)
+                        before = qvel.copy()
+                        force[:] = self._forces(variants, *ahead, num_w)
                     if pushes is not None:
                         force[:] += np.repeat(pushes[:, step // self.setting.frame_skip], num_w, axis=0)
                 try:
@@ -371,23 +375,26 @@ class Twin:
         return self._batches[rows]
 
 
-class _Middle:
+class Middle:
     """States half a physics step ahead: a force that is held over the step is then right to second order."""
 
-    def __init__(self, model: mujoco.MjModel, step: float) -> None:
-        self._step = step
+    def __init__(self, model: mujoco.MjModel) -> None:
         simple = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)))
         self._position, self._velocity = model.jnt_qposadr[simple], model.jnt_dofadr[simple]
-        self._before: np.ndarray | None = None
 
-    def __call__(self, position: np.ndarray, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return positions ``(R, nq)`` and velocities ``(R, nv)`` ahead; free and ball joints stay where they are."""
-        q, v = position.copy(), velocity.copy()
-        q[:, self._position] += 0.5 * self._step * velocity[:, self._velocity]
-        if self._before is not None:
-            v += 0.5 * (velocity - self._before)
-        self._before = velocity.copy()
-        return q, v
+    def ahead(
+        self, position: np.ndarray, velocity: np.ndarray, before: np.ndarray, step: float
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return positions ``(R, nq)`` and velocities ``(R, nv)`` ahead; free and ball joints stay where they are.
+
+        Args:
+            position, velocity: the states.
+            before: velocities a physics step ago, ``(R, nv)``; those of the states at an episode's start.
+            step: seconds of a physics step.
+        """
+        q = position.copy()
+        q[:, self._position] += 0.5 * step * velocity[:, self._velocity]
+        return q, velocity + 0.5 * (velocity - before)
 
 
 def _warp_variants(space: ParameterSpace, num_threads: int) -> Any:

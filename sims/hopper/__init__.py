@@ -18,4 +18,5 @@ SIM = BundledSim(
     },
     log=_HERE / "log.npz",
     truth={"torso_mass": 3.0, "thigh_mass": 4.7, "leg_mass": 2.4, "foot_mass": 4.9},
+    task="sims.hopper.task:HopperTask",
 )

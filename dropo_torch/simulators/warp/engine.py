@@ -22,17 +22,26 @@ KEEP_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class Problem:
-    """One call: how many transitions, parameter vectors, logged steps and physics steps of each."""
+    """One call: how many transitions, parameter vectors, logged steps and physics steps of each.
+
+    Paired, each transition has a parameter vector of its own; otherwise each is simulated under all of them.
+    """
 
     transitions: int
     parameters: int
     lag: int
     skip: int
+    paired: bool = False
+
+    @property
+    def each(self) -> int:
+        """Number of simulations of a transition."""
+        return 1 if self.paired else self.parameters
 
     @property
     def worlds(self) -> int:
         """Number of simulations."""
-        return self.transitions * self.parameters
+        return self.transitions * self.each
 
 
 @dataclass(frozen=True)
@@ -157,7 +166,7 @@ class Engine:
 
     def _forward(self, problem: Problem, inputs: list[Any], out: Any, first: int, count: int, keep: bool) -> Trace:
         self._load(kernel_forward)
-        period = problem.lag * self.skip + 1 if keep else 2
+        period = problem.lag * problem.skip + 1 if keep else 2
         slots = self._slots(count)
         rows = self._rows((count if keep else slots) * period * self.tables.nstage)
         alive = wp.empty(count, dtype=wp.int32, device=self.device)
@@ -167,7 +176,7 @@ class Engine:
             wp.launch(
                 kernel_forward.simulate_kernel, dim=number, device=self.device,
                 inputs=[self.tables, scratch, rows, *inputs, out, alive, first + local, local, problem.parameters,
-                        problem.lag, self.skip, period, slot, int(not self.is_cpu), int(keep)],
+                        problem.each, problem.lag, problem.skip, period, slot, int(not self.is_cpu), int(keep)],
             )  # fmt: skip
 
         self._spread(launch, count)

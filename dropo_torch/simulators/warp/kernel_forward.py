@@ -27,6 +27,7 @@ def simulate_kernel(
     first: int,
     local: int,
     nparam: int,
+    each: int,
     lag: int,
     skip: int,
     period: int,
@@ -34,14 +35,14 @@ def simulate_kernel(
     slot_stride: int,
     keep: int,
 ):
-    """Simulate world ``first + tid``: transition ``world // nparam`` under parameter vector ``world % nparam``.
+    """Simulate world ``first + tid``: transition ``world // each`` under parameter vector ``world % nparam``.
 
     ``out`` has a row per logged step; ``rows`` keeps every stage (``keep`` 1) or the last two steps.
     """
     tid = wp.tid()
     world = first + tid
     i = local + tid
-    tr = world // nparam
+    tr = world // each
     th = theta[world % nparam]
     t = slot + tid * slot_stride
     base = t * period * m.nstage

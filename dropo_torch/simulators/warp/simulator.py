@@ -64,24 +64,12 @@ class WarpSimulator(Simulator):
                 raise InputError(f"{option}: {value} given; expected 1 or more")
         model = copy.copy(model)
         mujoco.mj_setConst(model, mujoco.MjData(model))
-        pairs = candidate_pairs(model)
-        check_support(model, parameters, pairs)
         self.parameters, self.frame_skip = parameters, frame_skip
         self.num_states, self.num_controls = model.nq + model.nv, model.nu
         self.timestep = model.opt.timestep * frame_skip
-        self._fields = Fields(model, parameters, pairs)
-        start_warp()
-        with LOADING:
-            try:
-                wp.get_device(device)
-            except Exception:
-                names = ", ".join(str(d) for d in wp.get_devices())
-                raise InputError(f"device: Warp has no {device!r}; there are: {names}") from None
-            layout = self._fields.layout
-            self._engine = Engine(
-                build_tables(model, parameters, pairs, layout, device), layout.size, self._fields.wanted,
-                skip=frame_skip, chunk_size=chunk_size, num_threads=threads, device=device,
-            )  # fmt: skip
+        self._engine, self._fields = make_engine(
+            model, parameters, skip=frame_skip, chunk_size=chunk_size, num_threads=threads, device=device
+        )
         self._device = wp.device_to_torch(device)
 
     def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -133,3 +121,33 @@ class WarpSimulator(Simulator):
         shape = (len(states), num_values)
         by_values = torch.einsum("tkjw,kwd->tkjd", by_theta.cpu().unflatten(0, shape), slope)
         return after.cpu().unflatten(0, shape), by_values, by_state.cpu().unflatten(0, shape)
+
+
+def make_engine(
+    model: mujoco.MjModel, parameters: ParameterSpace, *, skip: int, chunk_size: int, num_threads: int, device: str
+) -> tuple[Engine, Fields]:
+    """Return what simulates a model, and what maps parameter vectors to its numbers.
+
+    Args:
+        model: the model, with everything ``mj_setConst`` derives up to date.
+        parameters: what varies.
+        skip, chunk_size, num_threads, device: as for :class:`WarpSimulator`.
+
+    Raises:
+        InputError: a model or a parameter outside the subset, or an unknown device.
+    """
+    pairs = candidate_pairs(model)
+    check_support(model, parameters, pairs)
+    fields = Fields(model, parameters, pairs)
+    start_warp()
+    with LOADING:
+        try:
+            wp.get_device(device)
+        except Exception:
+            names = ", ".join(str(d) for d in wp.get_devices())
+            raise InputError(f"device: Warp has no {device!r}; there are: {names}") from None
+        engine = Engine(
+            build_tables(model, parameters, pairs, fields.layout, device), fields.layout.size, fields.wanted,
+            skip=skip, chunk_size=chunk_size, num_threads=num_threads, device=device,
+        )  # fmt: skip
+    return engine, fields

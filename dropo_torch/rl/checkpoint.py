@@ -1,0 +1,71 @@
+"""Keeping a training between two iterations, so that it goes on exactly after whatever ended it."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from dropo_torch.errors import InputError
+from dropo_torch.fit import write_atomically
+
+SCHEMA = "dropo-torch/training/1"
+#: A checkpoint may take this share of the time since the last.
+SHARE = 0.05
+
+
+class Checkpoints:
+    """Writes a training's state now and then, whole or not at all.
+
+    Args:
+        path: the file, or ``None`` to keep nothing.
+        fingerprint: identifies the training.
+        seconds: least time between two; more where writing takes long.
+    """
+
+    def __init__(self, path: Path | None, fingerprint: str, seconds: float) -> None:
+        self._path, self._fingerprint, self._seconds = path, fingerprint, seconds
+        self._next = 0.0
+
+    def due(self) -> bool:
+        """Whether it is time for the next."""
+        return self._path is not None and time.monotonic() >= self._next
+
+    def save(self, state: Mapping[str, Any]) -> None:
+        """Write a state: tensors, numbers and text in mappings and lists."""
+        if self._path is None:
+            return
+        begun = time.monotonic()
+        buffer = io.BytesIO()
+        torch.save({"schema": SCHEMA, "fingerprint": self._fingerprint, "state": dict(state)}, buffer)
+        write_atomically(self._path, buffer.getvalue())
+        ended = time.monotonic()
+        self._next = ended + max(self._seconds, (ended - begun) / SHARE)
+
+    def load(self) -> dict[str, Any] | None:
+        """Return the state that was kept last; ``None`` where there is none. No code in the file is run.
+
+        Raises:
+            InputError: a file that is no checkpoint, or that of another training.
+        """
+        if self._path is None or not self._path.is_file():
+            return None
+        try:
+            content = torch.load(self._path, map_location="cpu", weights_only=True)
+            schema, owner, state = content["schema"], content["fingerprint"], content["state"]
+        except Exception as error:  # whatever torch raises on a file that is not its own
+            first = str(error).partition("\n")[0][:200]
+            raise InputError(
+                f"resume: {self._path} is no checkpoint of a training ({type(error).__name__}: {first}); "
+                "start again without --resume"
+            ) from None
+        if schema != SCHEMA or owner != self._fingerprint:
+            raise InputError(
+                f"resume: {self._path} belongs to another task, config, distribution or algorithm; restore those, "
+                "or start again without --resume"
+            )
+        return state

@@ -1,0 +1,265 @@
+"""Environments with parameters of their own, as one TorchRL environment."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+from tensordict import TensorDict, TensorDictBase
+from torchrl.data import Binary, Bounded, Composite, Unbounded
+from torchrl.envs import EnvBase
+
+from dropo_torch.effects.placing import EffectSet
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.rl.commands import Commands
+from dropo_torch.rl.sampling import ParameterSource, UniformSource
+from dropo_torch.rl.sensors import Sensors
+from dropo_torch.rl.stepper import make_stepper
+from dropo_torch.rl.task import Task, check_task, load_task
+from dropo_torch.simulators.base import DIVERGED
+
+
+class RandomizedEnv(EnvBase):
+    """N environments of one task that step as one batch; each episode has parameters of its own.
+
+    Keys: ``observation`` float32 ``(N, n)``, ``parameters`` float32 ``(N, d)`` (in their units; for critics and
+    analysis, not for a policy that is to run on the robot), ``step_count`` int64 ``(N, 1)``, ``diverged`` bool
+    ``(N, 1)``, ``action`` float32, ``reward`` float32, ``done``, ``terminated`` and ``truncated``, ``(N, 1)``.
+
+    The model that is simulated is the one that ``space`` (or ``effects``) belongs to, and the task's where there is
+    neither. A simulation that diverges ends its episode: it is terminated with reward 0 and its last good observation,
+    and counted in ``num_diverged``. A time limit truncates.
+
+    Args:
+        task: the task, or what :func:`~dropo_torch.rl.task.load_task` understands.
+        num_envs: environments N.
+        space: what varies; nothing by default.
+        source: where an episode's parameters come from; by default the bounds of ``space``, uniformly.
+        effects: physical effects, understood over ``space``. Those of sensors change what is observed; reward and
+            termination see the true states.
+        backend: ``"mujoco"`` or ``"warp"``.
+        seed: of start states and parameters.
+        num_threads: threads of a CPU, 0 for all processors; results do not depend on it.
+        device: of the tensors; with ``backend="warp"`` also of the simulation.
+        expose_parameters: whether ``parameters`` is among the keys.
+
+    Attributes:
+        num_diverged: simulations that have diverged so far.
+
+    Raises:
+        InputError: a task, parameters, effects and a backend that do not fit each other.
+    """
+
+    def __init__(
+        self,
+        task: Task | str,
+        num_envs: int,
+        *,
+        space: ParameterSpace | None = None,
+        source: ParameterSource | None = None,
+        effects: EffectSet | None = None,
+        backend: str = "mujoco",
+        seed: int = 0,
+        num_threads: int = 0,
+        device: str | torch.device = "cpu",
+        expose_parameters: bool = True,
+    ) -> None:
+        if num_envs < 1:
+            raise InputError(f"num_envs: {num_envs} given; expected 1 or more")
+        super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
+        self.task = load_task(task)
+        check_task(self.task)
+        self.num_envs, self.num_diverged = num_envs, 0
+        self.space = _checked_space(self.task, space, source, effects)
+        self.source = (UniformSource(self.space) if source is None else source).over(self.space)
+        self._stepper = make_stepper(
+            backend, self.space, num_envs, frame_skip=self.task.frame_skip, effects=effects, num_threads=num_threads,
+            device=str(device),
+        )  # fmt: skip
+        self._commands, self._sensors = None, None
+        if effects is not None:
+            model, skip = effects.setting.model, self.task.frame_skip
+            commands = Commands(effects, num_envs, model=model, skip=skip, device=self.device)
+            sensors = Sensors(effects, num_envs, space=self.space, device=self.device)
+            self._commands, self._sensors = commands or None, sensors or None
+        self._exposed = expose_parameters and len(self.space) > 0
+        self._generator = torch.Generator()
+        self._values = torch.zeros(num_envs, len(self.space), dtype=torch.float64)
+        self._shared = torch.zeros(num_envs, len(self.space), device=self.device)
+        self._states = torch.zeros(num_envs, self._stepper.num_states, dtype=torch.float64, device=self.device)
+        self._observation = torch.zeros(num_envs, self.task.num_observations, device=self.device)
+        self._count = torch.zeros(num_envs, 1, dtype=torch.int64, device=self.device)
+        self._make_specs()
+        self.set_seed(seed)
+
+    def _make_specs(self) -> None:
+        num, device = self.num_envs, self.device
+        entries = {
+            "observation": Unbounded((num, self.task.num_observations), device=device),
+            "step_count": Unbounded((num, 1), dtype=torch.int64, device=device),
+            "diverged": Binary(1, shape=(num, 1), dtype=torch.bool, device=device),
+        }
+        if self._exposed:
+            entries["parameters"] = Unbounded((num, len(self.space)), device=device)
+        self.observation_spec = Composite(entries, shape=(num,), device=device)
+        low, high = (
+            torch.as_tensor(np.asarray(x, dtype=np.float32), device=device).expand(num, -1).clone()
+            for x in (self.task.action_low, self.task.action_high)
+        )
+        self.action_spec = Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device)
+        self.reward_spec = Unbounded((num, 1), device=device)
+        ends = ("done", "terminated", "truncated")
+        self.full_done_spec = Composite(
+            {key: Binary(1, shape=(num, 1), dtype=torch.bool, device=device) for key in ends}, shape=(num,),
+            device=device,
+        )  # fmt: skip
+
+    @property
+    def values(self) -> torch.Tensor:
+        """The parameters of each environment's episode, in their units, ``(N, d)`` float64."""
+        return self._values.clone()
+
+    @property
+    def states(self) -> torch.Tensor:
+        """The true states ``[qpos, qvel]``, ``(N, nq + nv)`` float64; the last good ones where one diverged."""
+        return self._states.clone()
+
+    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
+        actions = tensordict.get("action").detach().to(torch.float64)
+        controls = self.task.controls(actions)
+        if not torch.isfinite(controls).all():
+            row = int((~torch.isfinite(controls)).any(1).nonzero()[0])
+            raise InputError(f"action: {tensordict.get('action')[row].tolist()} in environment {row} is not finite")
+        signals = controls[:, None] if self._commands is None else self._commands(controls)
+        if self._commands is None and self._sensors is not None:
+            signals = signals.expand(-1, self.task.frame_skip, -1)
+        path = self._stepper.step(signals).to(self.device)
+        good = (path.abs() < DIVERGED).flatten(1).all(1)
+        all_good = bool(good.all())
+        if not all_good:
+            path = torch.where(good[:, None, None], path, self._states[:, None])
+            self.num_diverged += int((~good).sum())
+        before, self._states = self._states, path[:, -1]
+        shown = self._states
+        if self._sensors is not None:
+            self._sensors.record(path)
+            shown = self._sensors.show(shown)
+        observation = self.task.observe(shown).to(torch.float32)
+        reward = self.task.reward(before, actions, self._states).to(torch.float32)
+        terminated = self.task.terminated(self._states)
+        if not all_good:
+            observation = torch.where(good[:, None], observation, self._observation)
+            reward, terminated = torch.where(good, reward, 0.0), terminated | ~good
+        self._observation, self._count = observation, self._count + 1
+        truncated = self._count >= self.task.max_episode_steps
+        terminated = terminated[:, None]
+        return self._tensordict(
+            {
+                "reward": reward[:, None],
+                "terminated": terminated,
+                "truncated": truncated,
+                "done": terminated | truncated,
+                "diverged": ~good[:, None],
+            }
+        )
+
+    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero()[:, 0].cpu()
+        if len(rows):
+            self._restart(rows)
+        flags = ("terminated", "truncated", "done", "diverged")
+        return self._tensordict({key: torch.zeros_like(self._count, dtype=torch.bool) for key in flags})
+
+    def _tensordict(self, entries: dict[str, torch.Tensor]) -> TensorDictBase:
+        entries["observation"], entries["step_count"] = self._observation, self._count
+        if self._exposed:
+            entries["parameters"] = self._shared
+        return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _restart(self, rows: torch.Tensor) -> None:
+        """Begin new episodes in environments ``rows``; what was handed out before is not written to."""
+        values = self.source.sample(len(rows), self._generator)
+        start = self.task.initial_states(len(rows), self._generator).to(self.device, torch.float64)
+        self._values[rows] = values
+        self._stepper.reset(rows, start, values)
+        at = rows.to(self.device)
+        self._states = self._states.index_copy(0, at, start)
+        self._count = self._count.index_fill(0, at, 0)
+        if self._exposed:
+            self._shared = self._shared.index_copy(0, at, values.to(self.device, torch.float32))
+        if self._commands is not None:
+            self._commands.reset(at, values.numpy())
+        shown = start
+        if self._sensors is not None:
+            self._sensors.reset(at, start, values.numpy())
+            shown = self._sensors.show(self._states)[at]
+        self._observation = self._observation.index_copy(0, at, self.task.observe(shown).to(torch.float32))
+
+    def _set_seed(self, seed: int | None) -> None:
+        if seed is not None:
+            self._generator.manual_seed(seed)
+
+    def get_extra_state(self) -> dict[str, Any]:
+        """Return all that the next steps depend on; it is what ``state_dict`` holds."""
+        state: dict[str, Any] = {
+            "stepper": self._stepper.state_dict(), "generator": self._generator.get_state(), "values": self._values,
+            "states": self._states, "observation": self._observation, "count": self._count,
+            "num_diverged": self.num_diverged,
+        }  # fmt: skip
+        if self._commands is not None:
+            state["commands"] = self._commands.state_dict()
+        if self._sensors is not None:
+            state["sensors"] = self._sensors.state_dict()
+        return state
+
+    def set_extra_state(self, state: dict[str, Any]) -> None:
+        """Go on from a state of :meth:`get_extra_state`."""
+        if state["states"].shape != self._states.shape or state["values"].shape != self._values.shape:
+            raise InputError(
+                f"environments: the saved state is of {len(state['states'])} environments with "
+                f"{state['values'].shape[1]} parameters; these are {self.num_envs} with {len(self.space)}"
+            )
+        self._values = state["values"].clone()
+        self._generator.set_state(state["generator"])
+        self._shared = self._values.to(self.device, torch.float32)
+        self._states, self._observation, self._count = (
+            state[k].to(self.device) for k in ("states", "observation", "count")
+        )
+        self.num_diverged = int(state["num_diverged"])
+        self._stepper.load_state_dict(state["stepper"], self._values)
+        every = torch.arange(self.num_envs, device=self.device)
+        if self._commands is not None:
+            self._commands.reset(every, self._values.numpy())
+            self._commands.load_state_dict(state["commands"])
+        if self._sensors is not None:
+            self._sensors.reset(every, self._states, self._values.numpy())
+            self._sensors.load_state_dict(state["sensors"])
+
+
+def _checked_space(
+    task: Task, space: ParameterSpace | None, source: ParameterSource | None, effects: EffectSet | None
+) -> ParameterSpace:
+    """The parameters over the model that is simulated."""
+    if space is None:
+        if source is not None:
+            raise InputError("source: given without a space; give the parameters that it draws, too")
+        space = ParameterSpace.empty(task.model if effects is None else effects.setting.model)
+    model = space.model
+    if model is None:
+        raise InputError("space: these parameters belong to no MuJoCo model")
+    for size in ("nq", "nv", "nu"):
+        ours, theirs = getattr(task.model, size), getattr(model, size)
+        if ours != theirs:
+            raise InputError(f"task: {task.name} is for a model with {size} {ours}; this one has {theirs}")
+    if effects is None:
+        named = [p.name for p in space.parameters if p.effect]
+        if named:
+            raise InputError(f"parameters.{named[0]}: a number of an effect, but no effects are given")
+    elif effects.setting.frame_skip != task.frame_skip:
+        raise InputError(
+            f"effects: understood with frame_skip {effects.setting.frame_skip}; task {task.name} has {task.frame_skip}"
+        )
+    return space

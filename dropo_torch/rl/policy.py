@@ -1,0 +1,129 @@
+"""A trained policy: what maps an observation to an action, and the file that holds it."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, overload
+
+import numpy as np
+import torch
+from torch import nn
+
+from dropo_torch.errors import InputError
+from dropo_torch.fit import write_atomically
+from dropo_torch.rl.networks import Actor, Normalizer
+
+SCHEMA = "dropo-torch/policy/1"
+
+
+class Policy(nn.Module):
+    """A deterministic policy with its observation statistics.
+
+    Args:
+        actor: the network.
+        normalizer: statistics of the observations.
+        low, high: bounds of the actions, ``(m,)`` each; where one is infinite, [-1, 1] is not scaled.
+        architecture: what :func:`make_policy` needs to build the network again.
+        config: the training's config, as plain data.
+        distribution: where the episodes' parameters came from, as plain data.
+    """
+
+    low: torch.Tensor
+    high: torch.Tensor
+
+    def __init__(
+        self, actor: Actor, normalizer: Normalizer, low: torch.Tensor, high: torch.Tensor, *,
+        architecture: Mapping[str, Any], config: Mapping[str, Any] | None = None,
+        distribution: Mapping[str, Any] | None = None,
+    ) -> None:  # fmt: skip
+        super().__init__()
+        self.actor, self.normalizer = actor, normalizer
+        self.register_buffer("low", low.float().clone())
+        self.register_buffer("high", high.float().clone())
+        self.architecture = dict(architecture)
+        self.config = dict(config or {})
+        self.distribution = dict(distribution or {})
+
+    @property
+    def num_observations(self) -> int:
+        """Width n of an observation."""
+        return len(self.normalizer.mean)
+
+    @overload
+    def forward(self, observation: torch.Tensor) -> torch.Tensor: ...
+    @overload
+    def forward(self, observation: np.ndarray | Sequence[float]) -> np.ndarray: ...
+    @torch.no_grad()
+    def forward(self, observation: torch.Tensor | np.ndarray | Sequence[float]) -> torch.Tensor | np.ndarray:
+        """Return the action ``(..., m)`` at an observation ``(..., n)``, in the environment's units.
+
+        Tensors give tensors, arrays and lists give arrays.
+
+        Raises:
+            InputError: an observation of another width.
+        """
+        given = torch.as_tensor(observation, device=self.low.device)
+        if given.ndim < 1 or given.shape[-1] != self.num_observations:
+            raise InputError(
+                f"policy: observation of shape {tuple(given.shape)} given; expected (..., {self.num_observations})"
+            )
+        action = self.to_action(self.actor.deterministic(self.normalizer(given)))
+        return action if isinstance(observation, torch.Tensor) else action.cpu().numpy()
+
+    def to_action(self, unit: torch.Tensor) -> torch.Tensor:
+        """Return actions in the environment's units of actions in [-1, 1]; what lies outside is cut off."""
+        bounded = torch.isfinite(self.low) & torch.isfinite(self.high)
+        low, high = torch.where(bounded, self.low, -1.0), torch.where(bounded, self.high, 1.0)
+        return low + (unit.clamp(-1, 1) + 1) * 0.5 * (high - low)
+
+    def save(self, path: str | Path) -> None:
+        """Write the policy with its config and distribution, whole or not at all."""
+        content = {
+            "schema": SCHEMA,
+            "architecture": self.architecture,
+            "weights": self.state_dict(),
+            "config": self.config,
+            "distribution": self.distribution,
+        }
+        buffer = io.BytesIO()
+        torch.save(content, buffer)
+        write_atomically(Path(path), buffer.getvalue())
+
+
+def make_policy(architecture: Mapping[str, Any], **about: Any) -> Policy:
+    """Return a fresh policy of an architecture: num_observations, num_actions, hidden, head and activation."""
+    actor = Actor(
+        architecture["num_observations"], architecture["num_actions"], hidden=architecture["hidden"],
+        head=architecture["head"], activation=architecture["activation"],
+        initial_std=architecture.get("initial_std", 0.6),
+    )  # fmt: skip
+    num_actions = architecture["num_actions"]
+    bounds = (torch.full((num_actions,), -1.0), torch.full((num_actions,), 1.0))
+    return Policy(actor, Normalizer(architecture["num_observations"]), *bounds, architecture=architecture, **about)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read a ``policy.pt``; no code in the file is run.
+
+    >>> policy = load_policy("policy.pt")
+    >>> action = policy(observation)
+
+    Raises:
+        InputError: a missing file, or one that holds no policy.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"policy: no file {path}; expected a policy.pt that dropo train has written")
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+        schema = content["schema"]
+        policy = make_policy(content["architecture"], config=content["config"], distribution=content["distribution"])
+        policy.load_state_dict(content["weights"])
+    except Exception as error:  # whatever torch raises on a file that is not its own
+        first = str(error).partition("\n")[0][:200]
+        raise InputError(f"policy: {path} holds no policy ({type(error).__name__}: {first})") from None
+    if schema != SCHEMA:
+        raise InputError(f"policy: {path} is of schema {schema!r}; expected {SCHEMA!r}")
+    return policy.eval()

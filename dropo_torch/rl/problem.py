@@ -1,0 +1,279 @@
+"""From a config to what training needs: task, parameters, their distribution, effects, and a target."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+from dropo_torch.bundled import BundledSim, bundled_sim
+from dropo_torch.config import Config
+from dropo_torch.distribution import Distribution
+from dropo_torch.effects import find_effect
+from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
+from dropo_torch.errors import InputError, choices
+from dropo_torch.model import load_model
+from dropo_torch.observation import parse_observation
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.rl.env import RandomizedEnv
+from dropo_torch.rl.sampling import ParameterSource, PointSource, load_source
+from dropo_torch.rl.settings import TrainSettings, train_settings
+from dropo_torch.rl.task import Task, load_task
+
+#: Distributions that need no file.
+KEYWORDS = ("uniform", "nominal")
+
+
+@dataclass(frozen=True)
+class World:
+    """A model of the robot with parameters that come from somewhere.
+
+    Attributes:
+        task: what is to be done, on its model.
+        space: what varies; may be empty.
+        source: where an episode's parameters come from, or ``None`` where nothing varies.
+        effects: the physical effects of the config, or ``None``.
+    """
+
+    task: Task
+    space: ParameterSpace
+    source: ParameterSource | None
+    effects: EffectSet | None
+
+    def env(self, num_envs: int, *, seed: int, backend: str, num_threads: int, device: str) -> RandomizedEnv:
+        """Return ``num_envs`` environments in this world."""
+        return RandomizedEnv(
+            self.task, num_envs, space=self.space, source=self.source, effects=self.effects, backend=backend,
+            seed=seed, num_threads=num_threads, device=device,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class TrainingProblem:
+    """Everything that a config says about training.
+
+    Attributes:
+        config: the config.
+        algorithm: ppo or sac.
+        settings: how it learns.
+        model_path: path of the model, where it has one.
+        training: the world in which the policy learns.
+        nominal: the model as it is; ``None`` where a number of an effect has no value of its own.
+        target: the world of the config's ``target``, or ``None``.
+        distribution: where parameters come from, as plain data.
+        distribution_path: its file, or ``None``.
+        fingerprint: identifies all of it; an interrupted run goes on only with the same.
+    """
+
+    config: Config
+    algorithm: str
+    settings: TrainSettings
+    model_path: Path | None
+    training: World
+    nominal: World | None
+    target: World | None
+    distribution: dict[str, Any]
+    distribution_path: Path | None
+    fingerprint: str
+
+    def env(self, world: World, num_envs: int, seed: int) -> RandomizedEnv:
+        """Return environments of one of the worlds, on the config's backend."""
+        config = self.config
+        return world.env(num_envs, seed=seed, backend=config.backend, num_threads=config.threads, device=self.device)
+
+    @property
+    def device(self) -> str:
+        """Where environments and networks live."""
+        return self.config.device if self.config.backend == "warp" else "cpu"
+
+
+def make_training(config: Config) -> TrainingProblem:
+    """Read, build and check everything that a config names for training; no log is needed.
+
+    Raises:
+        InputError: anything that does not fit, by key.
+    """
+    if config.backend == "gymnasium":
+        raise InputError("backend: gymnasium steps one environment at a time; train with backend mujoco or warp")
+    algorithm = config.algorithm or "ppo"
+    settings = train_settings(algorithm, config.train)
+    sim = None if config.sim is None else bundled_sim(config.sim)
+    task, model_path = _task(config, sim)
+    specs = config.parameters if config.parameters is not None else (dict(sim.parameters) if sim else {})
+    given, distribution_path = _given_distribution(config, bool(specs))
+    training = _world(config, sim, task, specs, given)
+    described = describe(training, given)
+    nominal = _nominal_world(training)
+    target = _target_world(config, sim, task, specs) if config.target else None
+    return TrainingProblem(
+        config=config, algorithm=algorithm, settings=settings, model_path=model_path, training=training,
+        nominal=nominal, target=target, distribution=described, distribution_path=distribution_path,
+        fingerprint=_fingerprint(config, algorithm, settings, task, described),
+    )  # fmt: skip
+
+
+def _task(config: Config, sim: BundledSim | None) -> tuple[Task, Path | None]:
+    """The task on the config's model, and that model's path."""
+    if config.model is not None and sim is not None:
+        raise InputError("config: both model and sim are given; expected one: model: robot.xml, or sim: hopper")
+    name = config.task if config.task is not None else config.sim
+    if name is None:
+        raise InputError("config: no task given; expected task: file.py:Class of a Task, or sim: hopper")
+    task = load_task(name, base=config.base)
+    path = sim.model if sim is not None else (None if config.model is None else config.path(config.model))
+    if path is None:
+        return task, None
+    model = load_model(path, general=_has_effects(config))
+    for size in ("nq", "nv", "nu"):
+        if getattr(model, size) != getattr(task.model, size):
+            raise InputError(
+                f"task: {task.name} was made for a model of {size} {getattr(task.model, size)}; "
+                f"{path} has {getattr(model, size)}"
+            )
+    return task.on(model), path
+
+
+def _has_effects(config: Config) -> bool:
+    return bool(config.effects) or any("effect" in p for p in (config.parameters or {}).values())
+
+
+def _given_distribution(config: Config, varies: bool) -> tuple[str | dict[str, float], Path | None]:
+    """What the config says of the distribution (a keyword, values, or a file), and the file."""
+    given = config.distribution
+    if not varies and given not in (None, "nominal"):
+        raise InputError(
+            "distribution: no parameters are given that it could be of; give parameters, or distribution: nominal"
+        )
+    if isinstance(given, dict):
+        return _numbers("distribution", given), None
+    if given in KEYWORDS:
+        return given, None
+    beside = config.base / "fit.json"
+    if given is None and not (varies and beside.is_file()):
+        return "uniform" if varies else "nominal", None
+    path = (beside if given is None else config.path(given)).resolve()
+    if not path.is_file():
+        raise InputError(
+            f"distribution: no file {path}; expected a fit.json, uniform, nominal, or name: value of every parameter"
+        )
+    return str(path), path
+
+
+def _numbers(key: str, given: Mapping[str, Any]) -> dict[str, float]:
+    for name, value in given.items():
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
+            raise InputError(f"{key}.{name} is {value!r}; expected a number")
+    return {name: float(value) for name, value in given.items()}
+
+
+def _world(
+    config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]], given: Any
+) -> World:
+    """The world of parameters ``specs`` that come from what was given."""
+    space, effects = _space_and_effects(config, sim, task, specs)
+    return World(task, space, load_source(given, space) if len(space) else None, effects)
+
+
+def _space_and_effects(
+    config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]
+) -> tuple[ParameterSpace, EffectSet | None]:
+    space = ParameterSpace(task.model, specs) if specs else ParameterSpace.empty(task.model)
+    if not config.effects and not any("effect" in p for p in specs.values()):
+        return space, None
+    entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
+    observation = parse_observation(task.model, entries)
+    effects = place_effects(config.effects, space, plain_setting(task.model, observation, task.frame_skip), find_effect)
+    return space.with_limits(lowest(effects, space)), effects
+
+
+def _nominal_world(training: World) -> World | None:
+    """The same with the model's own values."""
+    space = training.space
+    if not len(space):
+        return training
+    if not np.isfinite(space.nominal).all():
+        return None
+    return World(training.task, space, PointSource(space.named(space.nominal)), training.effects)
+
+
+def _target_world(config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]) -> World:
+    """The world of the config's ``target``: the model's own values but for those given."""
+    known = {**(dict(sim.parameters) if sim else {}), **specs}
+    wanted = dict(specs)
+    values: dict[str, float] = {}
+    for name, entry in config.target.items():
+        if isinstance(entry, dict):
+            spec = {k: v for k, v in entry.items() if k != "value"}
+            values[name] = _numbers(f"target.{name}", {"value": entry.get("value")})["value"]
+            wanted[name] = {"bounds": _around(values[name]), **spec}
+        elif name in known:
+            values |= _numbers("target", {name: entry})
+            wanted[name] = known[name]
+        else:
+            raise InputError(
+                f"target: unknown parameter {name!r}" + choices(name, known)
+                + f"; any other is given as {name}: {{field: body_mass, name: BODY, value: 1.0}}"
+            )  # fmt: skip
+    space, effects = _space_and_effects(config, sim, task, wanted)
+    vector = space.nominal.copy()
+    for name, value in values.items():
+        column = space.names.index(name)
+        low, high = space.limits[column]
+        if not low <= value <= high:
+            raise InputError(f"target.{name} is {value:g}; the model allows {low:g} to {high:g}")
+        vector[column] = value
+    if not np.isfinite(vector).all():
+        missing = space.names[int(np.flatnonzero(~np.isfinite(vector))[0])]
+        raise InputError(f"target: no value given for {missing!r}, which the model has none of")
+    return World(task, space, PointSource(space.named(vector)), effects)
+
+
+def _around(value: float) -> list[float]:
+    """Bounds that hold a value, for a parameter that is only set."""
+    return sorted([0.5 * value, 2 * value]) if value else [0.0, 1.0]
+
+
+def describe(world: World, given: Any) -> dict[str, Any]:
+    """Return where a world's parameters come from, as plain data."""
+    space, source = world.space, world.source
+    if source is None:
+        return {"kind": "nominal", "parameters": {}}
+    units = {p.name: p.unit for p in space.parameters}
+    if given == "uniform":
+        entries = {
+            p.name: {"low": float(p.low), "high": float(p.high), "unit": p.unit, "scale": p.scale}
+            for p in space.parameters
+        }
+        return {"kind": "uniform", "parameters": entries}
+    if given == "nominal" or isinstance(given, Mapping):
+        vector = source.sample(1, torch.Generator())[0].tolist()
+        values = {n: {"value": v, "unit": units[n]} for n, v in zip(source.names, vector, strict=True)}
+        return {"kind": "nominal" if given == "nominal" else "point", "parameters": values}
+    distribution = given if isinstance(given, Distribution) else Distribution.load(given)
+    return {"kind": "fitted", "parameters": distribution.summary()}
+
+
+def _fingerprint(
+    config: Config, algorithm: str, settings: TrainSettings, task: Task, distribution: Mapping[str, Any]
+) -> str:
+    """A digest of what decides a training's course."""
+    ignored = ("data", "trajectories", "optimizer", "budget", "population", "adam", "samples", "epsilon", "noise",
+               "mask", "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm")  # fmt: skip
+    learning = settings.model_dump(mode="json", exclude={"checkpoint_seconds"})
+    text = json.dumps([config.fingerprint(*ignored), algorithm, learning, dict(distribution)], sort_keys=True)
+    digest = hashlib.sha256(text.encode())
+    digest.update(f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}".encode())
+    where, _, _ = (config.task or "").rpartition(":")
+    if where.endswith(".py"):
+        digest.update(config.path(where).read_bytes())
+    buffer = np.empty(mujoco.mj_sizeModel(task.model), np.uint8)
+    mujoco.mj_saveModel(task.model, None, buffer)
+    digest.update(buffer.tobytes())
+    return digest.hexdigest()[:32]

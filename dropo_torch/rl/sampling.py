@@ -1,0 +1,134 @@
+"""Where an episode's parameters come from: one point, the bounds, or a fitted distribution."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from dropo_torch.distribution import Distribution, to_coordinates, to_values
+from dropo_torch.errors import InputError, choices
+from dropo_torch.parameters import ParameterSpace
+
+
+class ParameterSource(abc.ABC):
+    """Draws parameter vectors.
+
+    Attributes:
+        names: the parameters, d of them.
+    """
+
+    names: tuple[str, ...]
+
+    @abc.abstractmethod
+    def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Return parameter values ``(count, d)``, in their units, float64."""
+
+    def over(self, space: ParameterSpace) -> ParameterSource:
+        """Return the same source with its columns in a space's order.
+
+        Raises:
+            InputError: names that are not the space's.
+        """
+        for name in self.names:
+            if name not in space.names:
+                raise InputError(f"distribution: parameter {name!r} is not in the model" + choices(name, space.names))
+        missing = [n for n in space.names if n not in self.names]
+        if missing:
+            raise InputError(f"distribution: it says nothing about parameter {missing[0]!r}; it has {self.names}")
+        return self if self.names == space.names else _Ordered(self, space.names)
+
+
+class _Ordered(ParameterSource):
+    """Another source's columns in another order."""
+
+    def __init__(self, source: ParameterSource, names: tuple[str, ...]) -> None:
+        self.names = names
+        self._source, self._columns = source, [source.names.index(n) for n in names]
+
+    def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        return self._source.sample(count, generator)[:, self._columns]
+
+
+class PointSource(ParameterSource):
+    """The same values in every episode.
+
+    Args:
+        values: name → value.
+    """
+
+    def __init__(self, values: Mapping[str, float]) -> None:
+        self.names = tuple(values)
+        self._values = torch.tensor([float(v) for v in values.values()], dtype=torch.float64)
+
+    def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Return the values ``(count, d)``."""
+        return self._values.repeat(count, 1)
+
+
+class UniformSource(ParameterSource):
+    """Values spread evenly over the search bounds, in the logarithm for log-scaled parameters.
+
+    Args:
+        space: the parameters.
+    """
+
+    def __init__(self, space: ParameterSpace) -> None:
+        self.names = space.names
+        self._is_log = space.is_log
+        self._low, high = (to_coordinates(x, space.is_log) for x in (space.low, space.high))
+        self._width = high - self._low
+
+    def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Return values ``(count, d)`` inside the bounds."""
+        uniforms = torch.rand(count, len(self.names), generator=generator, dtype=torch.float64).numpy()
+        return torch.from_numpy(to_values(self._low + uniforms * self._width, self._is_log))
+
+
+class DistributionSource(ParameterSource):
+    """A fitted distribution.
+
+    Args:
+        distribution: the distribution.
+    """
+
+    def __init__(self, distribution: Distribution) -> None:
+        self.names = distribution.names
+        self.distribution = distribution
+
+    def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Return independent values ``(count, d)``."""
+        return self.distribution.sample(count, generator)
+
+
+def load_source(
+    given: str | Path | Mapping[str, float] | Distribution | ParameterSource, space: ParameterSpace
+) -> ParameterSource:
+    """Return where an episode's parameters come from, in the order of a space.
+
+    Args:
+        given: ``"uniform"``, ``"nominal"`` (the model's own values), name → value, a distribution or the path of one
+            (a ``fit.json`` or a saved distribution), or a source.
+        space: the parameters.
+
+    Raises:
+        InputError: a missing file, or names that are not the space's.
+    """
+    if isinstance(given, ParameterSource):
+        return given.over(space)
+    if isinstance(given, Distribution):
+        return DistributionSource(given).over(space)
+    if isinstance(given, Mapping):
+        space.vector(given)
+        return PointSource(given).over(space)
+    if given == "uniform":
+        return UniformSource(space)
+    if given == "nominal":
+        unknown = [n for n, v in zip(space.names, space.nominal, strict=True) if not np.isfinite(v)]
+        if unknown:
+            raise InputError(f"distribution: the model has no nominal value of {unknown[0]!r}; give name: value of all")
+        return PointSource(space.named(space.nominal))
+    return DistributionSource(Distribution.load(given)).over(space)

@@ -1,0 +1,149 @@
+"""What a policy is to do: observation, reward and end of an episode, of many environments at once."""
+
+from __future__ import annotations
+
+import abc
+import copy
+from functools import cached_property
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import torch
+
+from dropo_torch.bundled import bundled_sim
+from dropo_torch.errors import InputError
+from dropo_torch.usercode import load_callable, user_code
+
+
+class Task(abc.ABC):
+    """A task on a MuJoCo model. It holds no state: every method is a function of N environments' states.
+
+    States are ``[qpos, qvel]``, ``(N, nq + nv)`` float64, on the environments' device.
+
+    Attributes:
+        name: what it is called.
+        model: the model as the task knows it.
+        frame_skip: physics steps of an environment step.
+        max_episode_steps: environment steps after which an episode is cut off.
+        num_observations: width of an observation.
+    """
+
+    name: str
+    model: mujoco.MjModel
+    frame_skip: int
+    max_episode_steps: int
+    num_observations: int
+
+    @abc.abstractmethod
+    def initial_states(self, count: int, generator: torch.Generator) -> torch.Tensor:
+        """Draw start states ``(count, nq + nv)``, float64, on the CPU."""
+
+    @abc.abstractmethod
+    def observe(self, states: torch.Tensor) -> torch.Tensor:
+        """Return observations ``(N, num_observations)`` of states as the sensors show them."""
+
+    @abc.abstractmethod
+    def reward(self, states: torch.Tensor, actions: torch.Tensor, next_states: torch.Tensor) -> torch.Tensor:
+        """Return the rewards ``(N,)`` of transitions; actions are the policy's, ``(N, num_actions)``."""
+
+    @abc.abstractmethod
+    def terminated(self, next_states: torch.Tensor) -> torch.Tensor:
+        """Return which episodes end in these states, ``(N,)`` bool."""
+
+    def controls(self, actions: torch.Tensor) -> torch.Tensor:
+        """Return the model's controls ``(N, nu)`` of actions; the actions themselves by default."""
+        return actions
+
+    @cached_property
+    def action_low(self) -> np.ndarray:
+        """Lowest actions, ``(num_actions,)``; by default the model's ``ctrlrange``."""
+        return self._control_range()[0]
+
+    @cached_property
+    def action_high(self) -> np.ndarray:
+        """Highest actions, ``(num_actions,)``; by default the model's ``ctrlrange``."""
+        return self._control_range()[1]
+
+    @property
+    def timestep(self) -> float:
+        """Seconds of an environment step."""
+        return float(self.model.opt.timestep) * self.frame_skip
+
+    def on(self, model: mujoco.MjModel) -> Task:
+        """Return the same task on another model of the same robot."""
+        other = copy.copy(self)
+        other.model = model
+        return other
+
+    def _control_range(self) -> tuple[np.ndarray, np.ndarray]:
+        limited = self.model.actuator_ctrllimited.astype(bool)
+        if not limited.all():
+            name = self.model.actuator(int(np.flatnonzero(~limited)[0])).name
+            raise InputError(
+                f"task: {self.name}: actuator {name!r} has no ctrlrange; give it one in the model, or give the task "
+                "action_low and action_high"
+            )
+        low, high = self.model.actuator_ctrlrange.T
+        return low.copy(), high.copy()
+
+
+#: What a task must have, for errors.
+_NEEDED = ("name", "model", "frame_skip", "max_episode_steps", "num_observations")
+
+
+def load_task(task: str | Task, *, base: Path | None = None) -> Task:
+    """Return a task: itself, a bundled simulation's by name, or the user's own.
+
+    Args:
+        task: a task, ``"hopper"``, ``"file.py:Class"`` or ``"module:Class"``; the class takes no arguments.
+        base: folder against which a file's path counts, by default the current one.
+
+    Raises:
+        InputError: a name that leads to no task, or a class that fails or lacks something.
+    """
+    if isinstance(task, Task):
+        return task
+    name = task
+    if ":" not in task:
+        sim = bundled_sim(task, key="task")
+        if sim.task is None:
+            raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
+        name = sim.task
+    maker = load_callable(
+        "task", name, path=lambda p: (base or Path()) / p, what="class {} that is a Task",
+        example="a bundled simulation such as hopper, or file.py:Class of a Task",
+    )  # fmt: skip
+    with user_code("task", name):
+        made = maker()
+    if not isinstance(made, Task):
+        raise InputError(f"task: {name} makes a {type(made).__name__}; expected a subclass of dropo_torch.rl.Task")
+    missing = [a for a in _NEEDED if not hasattr(made, a)]
+    if missing:
+        raise InputError(f"task: {name} has no {missing[0]}; a task has {', '.join(_NEEDED)}")
+    return made
+
+
+def check_task(task: Task) -> None:
+    """Raise an :class:`InputError` for a task whose methods fail, or return other shapes than they should."""
+    width, where = task.model.nq + task.model.nv, f"task: {task.name}"
+    with user_code("task", task.name):
+        middle = torch.from_numpy(0.5 * (np.asarray(task.action_low) + np.asarray(task.action_high)))[None]
+        states = task.initial_states(1, torch.Generator().manual_seed(0))
+        _expect(f"{where}: initial_states(1)", states, (1, width))
+        states = states.to(torch.float64)
+        _expect(f"{where}: controls", task.controls(middle), (1, task.model.nu))
+        _expect(f"{where}: observe", task.observe(states), (1, task.num_observations))
+        _expect(f"{where}: reward", task.reward(states, middle, states), (1,))
+        ends = task.terminated(states)
+        _expect(f"{where}: terminated", ends, (1,))
+    if ends.dtype != torch.bool:
+        raise InputError(f"{where}: terminated returns {ends.dtype}; expected torch.bool")
+
+
+def _expect(what: str, given: object, shape: tuple[int, ...]) -> None:
+    """Raise unless a method has returned a tensor of one environment's shape."""
+    if not isinstance(given, torch.Tensor):
+        raise InputError(f"{what} returns a {type(given).__name__}; expected a tensor")
+    if tuple(given.shape) != shape:
+        raise InputError(f"{what} returns shape {tuple(given.shape)} for one environment; expected {shape}")
