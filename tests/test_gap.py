@@ -35,6 +35,7 @@ from dropo_torch.gap.log import Chart, cut_windows
 from dropo_torch.gap.naming import Rules, allowance
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
+from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
@@ -722,6 +723,22 @@ def test_functions_are_where_they_are_looked_for() -> None:
 def test_add_writes_nothing_where_nothing_is_named(tmp_path: Path) -> None:
     assert add(load(hidden()), found(()), tmp_path) == []
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_family_is_added_member_by_member(tmp_path: Path) -> None:
+    numbers = {"rail": Strength(0.7, 0.6, 0.8, "N·s/m"), "hinge": Strength(0.02, 0.01, 0.03, "N·m·s/rad")}
+    family = NamedEffect("joint_damping", "*", numbers, 1.0, (), "")
+    problem = make_problem(load_config(hidden("joint_damping").write(tmp_path)), general=True)
+    out = tmp_path / "out"
+    out.mkdir()
+    assert add(problem, dataclasses.replace(found(("joint_damping",)), effects=(family,)), out) == []
+    model, plain = mujoco.MjModel.from_xml_path(str(out / "model.xml")), problem.space.model
+    assert plain is not None
+    for joint, strength in numbers.items():
+        (more,) = model.joint(joint).damping[:1] - plain.joint(joint).damping[:1]
+        assert more == pytest.approx(strength.value)
+    written = yaml.safe_load((out / "config.yaml").read_text())["parameters"]
+    assert sum("damping" in str(entry) for entry in written.values()) >= 2
 
 
 def test_the_steps_one_by_one_say_what_the_whole_says() -> None:

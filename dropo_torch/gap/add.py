@@ -5,21 +5,37 @@ from __future__ import annotations
 from pathlib import Path
 
 from dropo_torch.effects import find_effect
-from dropo_torch.effects.base import Placed
+from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.export import write_config, write_model
 from dropo_torch.errors import InputError
 from dropo_torch.gap.log import make_setting
-from dropo_torch.gap.result import Gap
+from dropo_torch.gap.result import FAMILY, Gap
 from dropo_torch.problem import Problem
 
 
 def named(gap: Gap) -> list[Placed]:
-    """Return the named effects with their values; what has no name is left out."""
-    return [
-        Placed(find_effect(e.effect), e.target, tuple(s.value for s in e.parameters.values()))
-        for e in gap.effects
-        if e.effect != "unnamed"
-    ]
+    """Return the named effects with their values, a family's one by one; what has no name is left out."""
+    found = []
+    for e in gap.effects:
+        values = [s.value for s in e.parameters.values()]
+        if e.target == FAMILY:
+            found += [Placed(find_effect(e.effect), t, (v,)) for t, v in zip(e.parameters, values, strict=True)]
+        elif e.effect != "unnamed":
+            found.append(Placed(find_effect(e.effect), e.target, tuple(values)))
+    return found
+
+
+def intervals(gap: Gap, setting: Setting) -> dict[tuple[str, str | None], dict[str, tuple[float, float]]]:
+    """Return the intervals of the numbers of :func:`named`, by effect and target."""
+    found: dict[tuple[str, str | None], dict[str, tuple[float, float]]] = {}
+    for e in gap.effects:
+        for name, s in e.parameters.items():
+            if e.target == FAMILY:
+                (quantity,) = find_effect(e.effect).quantities(setting, name)
+                found[e.effect, name] = {quantity.name: (s.low, s.high)}
+            else:
+                found.setdefault((e.effect, e.target), {})[name] = (s.low, s.high)
+    return found
 
 
 def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
@@ -49,11 +65,7 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
             notes.append(f"MJCF cannot express {names}: model.xml lacks it, config.yaml has it.")
     except InputError as error:
         notes.append(f"No model.xml was written: {error}.")
-    intervals = {
-        (e.effect, e.target): {n: (s.low, s.high) for n, s in e.parameters.items()}
-        for e in gap.effects
-        if e.effect != "unnamed"
-    }
     setting = make_setting(problem, problem.trajectories)
-    write_config(problem.config, problem.space, setting, placed, intervals, model, folder / "config.yaml")
+    known = intervals(gap, setting)
+    write_config(problem.config, problem.space, setting, placed, known, model, folder / "config.yaml")
     return notes

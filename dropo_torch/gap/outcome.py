@@ -16,7 +16,7 @@ from dropo_torch.gap.locate import dof_names, guilty, places, regime, residual_p
 from dropo_torch.gap.naming import FAR, Naming, Search
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Ranked, Strength
+from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Ranked, Strength
 from dropo_torch.gap.scene import Scene, short_windows
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
@@ -184,7 +184,7 @@ def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[
         numbers = {str(e.target): next(iter(e.parameters.values())) for e in members}
         share = min(1.0, sum(e.share_of_gap for e in members))
         where = effect.kind + "s"
-        whole = NamedEffect(name, "*", numbers, share, (), effect.sentence.format(target=f"all {where}"))
+        whole = NamedEffect(name, FAMILY, numbers, share, (), effect.sentence.format(target=f"all {where}"))
         kept = [whole if e is members[0] else e for e in kept if e not in members[1:]]
     return tuple(kept)
 

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 
 SCHEMA = "dropo-torch/gap/1"
+#: Target of an effect that sits at all places of its kind.
+FAMILY = "*"
 
 
 @dataclass(frozen=True)
