@@ -236,8 +236,10 @@ class Search:
         found = self._next(stage.current, base, stage.number)
         if found is None:
             return replace(stage, done=True)
-        if not self._is_done(found, base):
-            found = self._everywhere(found) if self.evidence.robust else self._extended(found, base)
+        if self.evidence.robust and not self._is_done(found, base):
+            found = self._everywhere(found)
+        elif significant(found.cost, self.rules):
+            found = self._extended(found, base)
         if not self._is_done(found, base) and len(found.hypothesis.placed) > 1:
             found = self._swap(found, base)
         number = stage.number + 1
@@ -436,7 +438,8 @@ class Search:
             origin = current.hypothesis.without(index)
             for found in self._refits(without, groups, "refining", origin)[:1]:
                 gained = current.cost.excess - found.cost.excess
-                if gained >= self.rules.least * base.cost.excess and self._beats(found, current):
+                much = gained >= self.rules.least * base.cost.excess or gained >= self.rules.most * current.cost.excess
+                if much and self._beats(found, current):
                     current = found
                     break
         return current
