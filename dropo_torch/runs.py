@@ -19,6 +19,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from dropo_torch.baselines import make_search
 from dropo_torch.bundled import bundled_sim
 from dropo_torch.certify import Certificate, certify
 from dropo_torch.compare import Comparison, Run, compare
@@ -60,8 +61,9 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     _check_log_option(log)
     problem = make_problem(config)
     continued = resume and (out / "checkpoint.pkl").exists()
+    make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not continued:
-        refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
+        refuse_dead_parameters(problem.objective)
     _prepare(out, problem, resume=continued)
     result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
     _refuse_lost(problem, result)
@@ -296,6 +298,7 @@ def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Co
             resume=resume,
             fingerprint=problem.fingerprint,
             on_progress=progress.update,
+            search=make_search(problem),
         )
 
 

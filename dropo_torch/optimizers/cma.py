@@ -15,7 +15,7 @@ from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 
 
-class _Normals:
+class Normals:
     """Standard normals for pycma from a generator of their own, which travels with a checkpoint."""
 
     def __init__(self, seed: int) -> None:
@@ -57,7 +57,7 @@ class CMAOptimizer(Optimizer):
         self._noisy = objective.noise is not None
         options = {
             "bounds": [0, SearchBox.WIDTH],
-            "randn": _Normals(seed),
+            "randn": Normals(seed),
             "seed": np.nan,  # the generator above is the only source of randomness
             "verbose": -9,
             "verb_log": 0,

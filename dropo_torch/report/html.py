@@ -418,6 +418,7 @@ def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
         ("Log-likelihood", f"{nats(fit.log_likelihood)} nats, on samples that the optimizer has not seen"),
         ("Mean squared difference", f"{words.number(fit.mse)}, measured against mean simulated next state"),
         ("Simulator", fit.backend),
+        ("Method", fit.method),
         ("Optimizer", fit.optimizer),
         ("Stopped because", fit.stop_reason or "not recorded"),
         ("Evaluations of the objective", f"{fit.evaluations:,}"),

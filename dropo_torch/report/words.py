@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
@@ -143,13 +144,15 @@ def density_curve(distribution: Distribution, index: int, points: int = 121) -> 
     if not (np.isfinite(mean) and np.isfinite(std) and std > 0):
         return np.zeros(0), np.zeros(0)
     z = np.linspace(*support(distribution, index), points)
-    density = np.exp(-0.5 * z**2)
+    density = np.ones_like(z) if distribution.is_uniform else np.exp(-0.5 * z**2)
     x = mean + std * np.concatenate([z[:1], z, z[-1:]])
     return to_values(x, np.full(x.shape, distribution.is_log[index])), np.concatenate([[0], density, [0]])
 
 
 def support(distribution: Distribution, index: int) -> tuple[float, float]:
     """Return the ends of one parameter's support, in deviations from its mean."""
+    if distribution.is_uniform:
+        return -math.sqrt(3), math.sqrt(3)
     low, high = (float(limit[index]) for limit in coordinate_limits(distribution.limits, distribution.is_log))
     mean, std = float(distribution.mean[index]), float(distribution.std[index])
     a, b = max(-2.0, (low - mean) / std), min(2.0, (high - mean) / std)
