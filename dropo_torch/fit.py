@@ -20,6 +20,7 @@ from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError, choices
 from dropo_torch.objective import Objective, draw_uniforms, no_effect
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer, Progress
+from dropo_torch.optimizers.correlated import CorrelatedOptimizer
 
 SCHEMA = "dropo-torch/fit/1"
 OPTIMIZERS = ("fisher", "cma", "adam")
@@ -124,6 +125,8 @@ def fit(
     population: int | None = None,
     common_random_numbers: bool = False,
     adam: AdamSettings | None = None,
+    entropy: float = 0.0,
+    covariance: str = "diagonal",
     checkpoint: str | Path | None = None,
     resume: bool = False,
     fingerprint: str = "",
@@ -139,6 +142,8 @@ def fit(
         seed: seeds every random number.
         budget, population, common_random_numbers: options of CMA-ES; see :class:`CMAOptimizer`.
         adam: how Adam steps.
+        entropy: weight β of Σ log σ, the entropy of p_φ, beside the log-likelihood.
+        covariance: ``"full"`` lets parameters vary together; with ``"fisher"``.
         checkpoint: file in which the fit's state is kept after every batch.
         resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
         fingerprint: identifies the config and log; a checkpoint of another one is refused.
@@ -161,6 +166,8 @@ def fit(
         population=population,
         common_random_numbers=common_random_numbers,
         adam=adam,
+        entropy=entropy,
+        covariance=covariance,
     )
     path = None if checkpoint is None else Path(checkpoint)
     history = _restore(path, fingerprint, search, objective) if resume and path is not None else None
@@ -183,8 +190,16 @@ def _optimizer(
     population: int | None,
     common_random_numbers: bool,
     adam: AdamSettings | None,
+    entropy: float,
+    covariance: str,
 ) -> Optimizer:
     """The optimizer of a name."""
+    if covariance not in ("diagonal", "full"):
+        raise InputError(f"covariance: {covariance!r} given; expected diagonal or full")
+    if covariance == "full" and optimizer != "fisher":
+        raise InputError(f"covariance: full needs optimizer: fisher; {optimizer} has independent parameters only")
+    if entropy and optimizer == "adam":
+        raise InputError("entropy: adam has no entropy bonus; use optimizer: fisher or cma")
     if optimizer == "cma":
         return CMAOptimizer(
             objective,
@@ -193,15 +208,18 @@ def _optimizer(
             budget=budget,
             population=population,
             common_random_numbers=common_random_numbers,
+            entropy=entropy,
         )
     if optimizer == "adam":
         return AdamOptimizer(objective, settings=adam or AdamSettings(), seed=seed)
-    return FisherOptimizer(
+    kind = CorrelatedOptimizer if covariance == "full" else FisherOptimizer
+    return kind(
         objective.simulator.parameters,
         samples=samples,
         seed=seed,
         noisy=objective.noise is not None,
         differentiable=objective.simulator.differentiable,
+        entropy=entropy,
     )
 
 

@@ -294,6 +294,8 @@ def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Co
             population=config.population,
             common_random_numbers=config.common_random_numbers,
             adam=adam_settings(config.adam),
+            entropy=config.entropy,
+            covariance=config.covariance,
             checkpoint=checkpoint,
             resume=resume,
             fingerprint=problem.fingerprint,

@@ -37,7 +37,7 @@ def summary_sums(features: torch.Tensor, measured: torch.Tensor, controls: torch
 
 
 def summaries(sums: np.ndarray, columns: int, count: int) -> np.ndarray:
-    """Return mean, variance and control correlation of the changes, ``(P, q)``, of their sums ``(P, q)`` over ``count``."""
+    """Return mean, variance and control correlation of ``count`` changes, ``(P, q)``, from their sums ``(P, q)``."""
     first, second, crossed = np.split(sums / count, [columns, 2 * columns], axis=1)
     return np.concatenate([first, second - first**2, crossed], axis=1)
 
@@ -46,10 +46,11 @@ class BayesSimOptimizer(Optimizer):
     """Simulation-based inference from a uniform prior over the search box.
 
     The log is cut into windows of ``horizon`` steps, which are replayed *open loop* from their logged starts with the
-    logged actions, under parameter vectors of the prior. A replay is summarised by mean and variance of the columns' changes per
-    step and their correlation with the controls, over all windows together. A network learns the parameters' distribution given
-    the summary, a mixture of Gaussians; put to the log's own summary it gives the posterior. The result is the normal with
-    the posterior's mean and covariance inside the box, its correlation included; the mixture is kept beside it.
+    logged actions, under parameter vectors of the prior. A replay is summarised by mean and variance of the columns'
+    changes per step and their correlation with the controls, over all windows together. A network learns the
+    parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
+    posterior. The result is the normal with the posterior's mean and covariance inside the box, its correlation
+    included; the mixture is kept beside it.
 
     Args:
         space: what varies.

@@ -147,10 +147,9 @@ def _network(x: np.ndarray, outputs: int, settings: BayesSimSettings, seed: int)
         lengthscale = float(np.median(scipy.spatial.distance.pdist(x[:500]))) or 1.0
         body: nn.Module = FourierFeatures(inputs, hidden, lengthscale, seed)
         return MixtureDensityNetwork(body, 2 * hidden, settings.components, outputs)
-    layers = [
-        nn.Linear(inputs, hidden, dtype=torch.float64), nn.Tanh(), nn.Linear(hidden, hidden, dtype=torch.float64), nn.Tanh(),
-    ]  # fmt: skip
-    return MixtureDensityNetwork(nn.Sequential(*layers), hidden, settings.components, outputs)
+    first, second = (nn.Linear(n, hidden, dtype=torch.float64) for n in (inputs, hidden))
+    body = nn.Sequential(first, nn.Tanh(), second, nn.Tanh())
+    return MixtureDensityNetwork(body, hidden, settings.components, outputs)
 
 
 def _train(network: MixtureDensityNetwork, x: torch.Tensor, targets: torch.Tensor, epochs: int) -> None:

@@ -28,9 +28,9 @@ def squared_errors(features: torch.Tensor, measured: torch.Tensor, covariance: t
 class DroidOptimizer(Optimizer):
     """CMA-ES over parameter vectors, scaled to [0, 4], first step 1, start in the middle.
 
-    Each logged transition (window of λ steps) is replayed from its logged start; the error is the squared L2 distance in
-    the compared columns, summed. The distribution is the normal from which the last generation was drawn: it says how far the
-    search had contracted when it stopped, and nothing about the log.
+    Each logged transition (window of λ steps) is replayed from its logged start; the error is the squared L2 distance
+    in the compared columns, summed. The distribution is the normal from which the last generation was drawn: it says
+    how far the search had contracted when it stopped, and nothing about the log.
 
     Args:
         space: what varies.

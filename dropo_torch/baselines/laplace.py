@@ -20,8 +20,8 @@ class LaplaceOptimizer(Optimizer):
     """Gauss-Newton on the means, and the normal of the likelihood's curvature there.
 
     The transitions of the log are simulated one by one from their logged starts, as for DROPO. The covariance is
-    s² (ΣJᵀC⁻¹J)⁻¹ with C of ε and the noise, and s² the reduced χ² of the residuals: ε only weighs the columns, the size of
-    the residuals is the log's own. It says how uncertain a fixed vector is, not how much parameters vary.
+    s² (ΣJᵀC⁻¹J)⁻¹ with C of ε and the noise, and s² the reduced χ² of the residuals: ε only weighs the columns, the
+    size of the residuals is the log's own. It says how uncertain a fixed vector is, not how much parameters vary.
 
     Args:
         objective: gives the reduction and the size of the log; it is not evaluated here.

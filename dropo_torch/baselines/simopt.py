@@ -1,4 +1,4 @@
-"""SimOpt (Chebotar et al. 2019), offline: relative-entropy policy search on the discrepancy of replayed trajectories."""
+"""SimOpt (Chebotar et al. 2019), offline: relative-entropy policy search on the error of replayed trajectories."""
 
 from __future__ import annotations
 
@@ -60,10 +60,11 @@ class SimOptOptimizer(Optimizer):
     """Moves a normal with full covariance, in coordinates, towards replays that look like the log.
 
     The log is cut into windows of ``horizon`` steps. Each is replayed *open loop* from its logged start with its
-    logged actions, so errors add up along it. The discrepancy is the sum of the L1 and squared L2 errors over all steps, in
-    columns scaled by their deviation over the log. (SimOpt also filters the error in time, for robots whose clock drifts against
-    the simulation's; a log and its replay share theirs.) The first distribution is the search box's middle with a quarter of its
-    width. Each iteration fits the normal to its samples, weighted by :func:`reps_weights`.
+    logged actions, so errors add up along it. The discrepancy is the sum of the L1 and squared L2 errors over all
+    steps, in columns scaled by their deviation over the log. (SimOpt also filters the error in time, for robots whose
+    clock drifts against the simulation's; a log and its replay share theirs.) The first distribution is the search
+    box's middle with a quarter of its width. Each iteration fits the normal to its samples, weighted by
+    :func:`reps_weights`.
 
     Args:
         space: what varies.
