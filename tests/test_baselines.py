@@ -15,6 +15,7 @@ from conftest import LinearSimulator, linear_objective, space_of
 from dropo_torch.baselines import Mixture, fit_method, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
 from dropo_torch.baselines.density import fit_mixture
+from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.cli import main
@@ -22,8 +23,7 @@ from dropo_torch.config import make_config
 from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
-from dropo_torch.objective import Objective, draw_uniforms
-from dropo_torch.observation import generic_observation
+from dropo_torch.objective import draw_uniforms
 from dropo_torch.optimizers.correlated import random_effects
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.trajectory import Trajectories, make_replay
@@ -111,8 +111,6 @@ def test_laplace_is_the_normal_of_least_squares(folder: Path) -> None:
     simulator = LinearSimulator(space, np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]]))
     measured = np.array([1.0, -2.0]) @ simulator.effect.numpy().T + 0.1 * rng.standard_normal((40, 3))
     objective = linear_objective(simulator, measured, epsilon=[1e-2, 1e-2, 4e-2])
-    from dropo_torch.baselines.laplace import LaplaceOptimizer
-
     found = fit(objective, search=LaplaceOptimizer(objective), samples=10).distribution
     weight = np.diag(1 / np.array([1e-2, 1e-2, 4e-2]))
     design = simulator.effect.numpy()
@@ -444,14 +442,6 @@ def test_options_of_the_fit_that_do_not_go_together_are_refused(folder: Path) ->
         fit(objective, optimizer="adam", entropy=1.0)
     with pytest.raises(InputError, match=r"fitted by dropo_torch\.fit"):
         fit_method(problem(folder, "dropo"))
-
-
-def _linear(simulator: LinearSimulator, measured: np.ndarray, **options: Any) -> Objective:
-    number = len(measured)
-    states = torch.zeros(number, simulator.num_states, dtype=torch.float64)
-    controls = torch.zeros(number, 1, simulator.num_controls, dtype=torch.float64)
-    observation = generic_observation(simulator.num_states)
-    return Objective(simulator, windows(states, controls, measured), observation, **options)
 
 
 def test_a_log_of_single_transitions_has_nothing_for_bayessim(folder: Path) -> None:
