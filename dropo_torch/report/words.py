@@ -138,6 +138,22 @@ def at_largest_deviation(distribution: Distribution) -> np.ndarray:
     return np.asarray(distribution.std >= search_box(distribution).max_std / AT_DEVIATION_BOUND)
 
 
+def law(fit: Fit) -> str:
+    """Return what the distribution is, and what its standard deviation says, by the method that found it."""
+    normal = "Each parameter follows a normal distribution cut off two standard deviations from its mean"
+    if fit.distribution.correlation is not None:
+        normal += ", and parameters vary together (correlation in fit.json)"
+    meaning = {
+        "droid": "how far the search had contracted when it stopped; it says nothing about the log",
+        "simopt": "how far the search had contracted when it stopped",
+        "bayessim": "how uncertain the network is about one fixed value",
+        "laplace": "how uncertain the log leaves one fixed value; not how much the parameter varies",
+        "udr": "the width of a box that was drawn at random",
+    }.get(fit.method, "how much the parameter must vary for the simulator to cover the log")
+    first = "Each parameter is uniform over a random interval" if fit.distribution.is_uniform else normal
+    return f"{first}. The standard deviation says {meaning}"
+
+
 def density_curve(distribution: Distribution, index: int, points: int = 121) -> tuple[np.ndarray, np.ndarray]:
     """Return values, in units, and density in coordinates, of one parameter over its support."""
     mean, std = float(distribution.mean[index]), float(distribution.std[index])
