@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,8 +13,9 @@ import pytest
 import torch
 from conftest import LinearSimulator, linear_objective, space_of
 
-from dropo_torch.baselines import Mixture, fit_method, make_search
+from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
+from dropo_torch.baselines.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
 from dropo_torch.baselines.density import fit_mixture
 from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
@@ -27,6 +29,7 @@ from dropo_torch.objective import draw_uniforms
 from dropo_torch.optimizers.correlated import random_effects
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.trajectory import Trajectories, make_replay
+from sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
 #: A driven pendulum; the rod has no mass, the bob's is to be found.
 PENDULUM_XML = """
@@ -99,7 +102,7 @@ TRUTH = np.array([MASS, DAMPING])
 
 def test_droid_finds_the_parameters_and_its_deviations_collapse(folder: Path) -> None:
     for data, tolerance in (("exact", 1e-5), ("noisy", 3e-2)):
-        found = fit_method(problem(folder, "droid", data)).distribution
+        found = fit_problem(problem(folder, "droid", data)).distribution
         assert found.mean == pytest.approx(TRUTH, rel=tolerance)
         assert (found.std < 1e-3 * (found.high - found.low)).all()  # whatever the noise
 
@@ -126,7 +129,7 @@ def test_laplace_is_the_normal_of_least_squares(folder: Path) -> None:
 
 
 def test_laplace_covers_the_truth_of_a_noisy_log(folder: Path) -> None:
-    found = fit_method(problem(folder, "laplace", "noisy")).distribution
+    found = fit_problem(problem(folder, "laplace", "noisy")).distribution
     z = (TRUTH - found.mean) / found.std
     assert (np.abs(z) < 3.5).all()
     assert (found.std < 0.1 * TRUTH).all()
@@ -134,7 +137,7 @@ def test_laplace_covers_the_truth_of_a_noisy_log(folder: Path) -> None:
 
 def test_simopt_moves_to_the_parameters_and_shrinks(folder: Path) -> None:
     options = {"samples": 60, "iterations": 15, "horizon": 20}
-    found = fit_method(problem(folder, "simopt", method_options=options))
+    found = fit_problem(problem(folder, "simopt", method_options=options))
     spread = found.distribution.std / (found.distribution.high - found.distribution.low)
     assert found.distribution.mean == pytest.approx(TRUTH, rel=0.05)
     assert (spread < 0.05).all()
@@ -150,7 +153,7 @@ def test_bayessim_contains_the_truth_and_is_narrower_than_the_prior(folder: Path
     model = Path(given["model"])
     light = model.with_name("damped.xml")
     light.write_text(PENDULUM_XML.replace('damping="0.05"', f'damping="{DAMPING}"'))
-    result = fit_method(make_problem(make_config({**given, "model": str(light)})))
+    result = fit_problem(make_problem(make_config({**given, "model": str(light)})))
     mixture = Mixture.of(result.document()["mixture"])
     draws = mixture.sample(2000, seed=1)[:, 0]
     low, high = np.quantile(draws, [0.01, 0.99])
@@ -246,13 +249,13 @@ def test_replays_follow_the_log_where_the_parameters_are_right(folder: Path) -> 
 
 
 def test_uniform_boxes_lie_inside_the_search_box(folder: Path) -> None:
-    first = fit_method(problem(folder, "udr"))
+    first = fit_problem(problem(folder, "udr"))
     document = first.document()
     assert len(document["boxes"]) == 10
     for box in document["boxes"]:
         assert 0.5 <= box["mass"][0] < box["mass"][1] <= 3.0
         assert 0.01 <= box["damping"][0] < box["damping"][1] <= 0.5
-    third = fit_method(problem(folder, "udr", method_options={"box": 3}))
+    third = fit_problem(problem(folder, "udr", method_options={"box": 3}))
     draws = third.distribution.sample(20_000, torch.Generator().manual_seed(0)).numpy()
     low, high = np.array([document["boxes"][3][name] for name in ("mass", "damping")]).T
     assert (draws.min(0) >= low - 1e-12).all()
@@ -440,8 +443,6 @@ def test_options_of_the_fit_that_do_not_go_together_are_refused(folder: Path) ->
         fit(objective, covariance="round")
     with pytest.raises(InputError, match="no entropy bonus"):
         fit(objective, optimizer="adam", entropy=1.0)
-    with pytest.raises(InputError, match=r"fitted by dropo_torch\.fit"):
-        fit_method(problem(folder, "dropo"))
 
 
 def test_a_log_of_single_transitions_has_nothing_for_bayessim(folder: Path) -> None:
@@ -450,3 +451,84 @@ def test_a_log_of_single_transitions_has_nothing_for_bayessim(folder: Path) -> N
     single = Trajectories(log.observations, log.next_observations, log.actions, np.ones(len(log), dtype=bool))
     with pytest.raises(InputError, match="two transitions"):
         make_search(Problem(**{**vars(ours), "trajectories": single}))
+
+
+TINY = Plan(
+    seeds=1, steps=12, samples=8, droid_budget=40, simulations=20, horizon=6, epsilons=(1e-8, 1e-5, 1e-2),
+    noise_variances=(1e-5,), sizes=(12,), resamples=2, cma_steps=8, cma_budget=24, cma_samples=4,
+)  # fmt: skip
+
+
+def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    found = run_study(out, plan=TINY)
+    assert len(found) == 6
+    assert all(line.startswith(("holds", "DOES NOT HOLD")) for line in found)
+    document = json.loads((out / "study.json").read_text())
+    cases = {(r["case"], r["method"]) for r in document["tables"]["table"]}
+    assert cases >= {(c, m) for c in ("noiseless", "unmodeled torso") for m in ("dropo", "droid", "bayessim")}
+    assert cases >= {("noisy", m) for m in ("dropo", "dropo (noise given)", "droid", "bayessim")}
+    torso = {r["case"] for r in document["tables"]["table"] if r["parameter"] == "torso_mass"}
+    assert torso == {"noiseless", "noisy"}
+    point = [r for r in document["tables"]["table"] if (r["case"], r["method"]) == ("noiseless", "dropo")]
+    assert max(r["largest_error_percent"] for r in point) < 0.1
+    text = (out / "tables.md").read_text()
+    assert "| noiseless | torso_mass |" in text
+    for figure in ("recovery.png", "sweep.png", "noise.png", "size.png"):
+        assert (out / figure).stat().st_size > 5000
+    cells = sorted((out / "cells").iterdir())
+    assert len(cells) == len(all_cells(TINY))
+    before = {p.name: p.stat().st_mtime_ns for p in cells}
+    cells[0].unlink()
+    with pytest.raises(InputError, match="add --resume"):
+        run_study(out, plan=TINY)
+    with pytest.raises(InputError, match="another size"):
+        run_study(out, plan=replace(TINY, seeds=2), resume=True)
+    assert [line.split("(")[0] for line in run_study(out, plan=TINY, resume=True)] == [f.split("(")[0] for f in found]
+    after = {p.name: p.stat().st_mtime_ns for p in (out / "cells").iterdir()}
+    assert {n for n in before if after[n] != before[n]} == {cells[0].name}
+
+
+def test_cells_of_a_study_have_names_of_their_own() -> None:
+    for plan in (Plan(), REDUCED, TINY):
+        names = [cell.name for cell in all_cells(plan)]
+        assert len(set(names)) == len(names)
+
+
+def test_an_unknown_study_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reproduce", "hoper", "--out", str(tmp_path / "x")]) == 2
+    assert "did you mean 'hopper'" in capsys.readouterr().err
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["reproduce", "hopper", "--out", str(tmp_path)]) == 2
+    assert "not an empty folder" in capsys.readouterr().err
+
+
+def test_intervals_hold_their_share_of_draws() -> None:
+    for uniform in (False, True):
+        made = Distribution.over(space_of(a=[0, 10]), np.array([4.0]), np.array([0.5]), is_uniform=uniform)
+        low, high = interval(made, 0.9)
+        draws = made.sample(20_000, torch.Generator().manual_seed(0)).numpy()
+        assert np.mean((draws >= low) & (draws <= high)) == pytest.approx(0.9, abs=0.01)
+    assert wilson(0.9, 100) == pytest.approx((0.826, 0.945), abs=2e-3)
+
+
+def test_a_synthetic_log_is_explained_by_its_truth(folder: Path) -> None:
+    ours = problem(folder, "laplace")
+    truths = draw_truths(ours, "fixed", 3)
+    assert (truths == truths[0]).all()
+    made = synthesise(ours, truths, np.zeros(2), seed=0)
+    found = fit_problem(made).distribution
+    assert found.mean == pytest.approx(truths[0], rel=1e-6)
+    varying = draw_truths(ours, "varying", 3)
+    assert varying.std(0) == pytest.approx(0.88 * 0.05 * np.array([2.5, 0.49]), rel=0.25)
+
+
+def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(folder: Path) -> None:
+    noise = np.array([1e-3, 1e-2])
+    trials = calibrate(lambda method: problem(folder, method), ["laplace", "dropo"], logs=12, noise=noise)
+    found = {(c.kind, c.method): c.covered for c in coverages(trials) if c.level == 0.9}
+    assert found["fixed", "laplace"] > 0.7
+    assert found["varying", "dropo"] == pytest.approx(0.9, abs=0.12)
+    assert found["varying", "laplace"] < 0.6
+    again = calibrate(lambda method: problem(folder, method), ["laplace"], logs=12, noise=noise, done=trials)
+    assert again == trials

@@ -5,6 +5,9 @@ Each is an :class:`~dropo_torch.optimizers.Optimizer`, so that one loop runs, re
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 from dropo_torch.baselines.bayessim import BayesSimOptimizer
 from dropo_torch.baselines.droid import DroidOptimizer
 from dropo_torch.baselines.laplace import LaplaceOptimizer
@@ -20,12 +23,13 @@ from dropo_torch.baselines.settings import (
 from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
 from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.errors import InputError
-from dropo_torch.fit import Fit, fit
-from dropo_torch.optimizers import Optimizer
+from dropo_torch.fit import Fit, HistoryEntry, fit
+from dropo_torch.optimizers import Optimizer, Progress
+from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import make_replay
 
-__all__ = ["METHODS", "Mixture", "fit_method", "make_search"]
+__all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
 
 
 def make_search(problem: Problem) -> Optimizer | None:
@@ -54,13 +58,29 @@ def make_search(problem: Problem) -> Optimizer | None:
     return None
 
 
-def fit_method(problem: Problem) -> Fit:
-    """Fit by a method of this module, without progress or checkpoint.
-
-    Raises:
-        InputError: ``method: dropo``, which is :func:`dropo_torch.fit`, and what :func:`make_search` raises.
-    """
-    search = make_search(problem)
-    if search is None:
-        raise InputError("method: dropo is fitted by dropo_torch.fit; expected one of " + ", ".join(METHODS[1:]))
-    return fit(problem.objective, search=search, samples=problem.config.samples, seed=problem.config.seed)
+def fit_problem(
+    problem: Problem,
+    *,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
+) -> Fit:
+    """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`."""
+    config = problem.config
+    return fit(
+        problem.objective,
+        optimizer=config.optimizer,
+        samples=config.samples,
+        seed=config.seed,
+        budget=config.budget,
+        population=config.population,
+        common_random_numbers=config.common_random_numbers,
+        adam=adam_settings(config.adam),
+        entropy=config.entropy,
+        covariance=config.covariance,
+        checkpoint=checkpoint,
+        resume=resume,
+        fingerprint=problem.fingerprint,
+        on_progress=on_progress,
+        search=make_search(problem),
+    )
