@@ -5,7 +5,8 @@ Logs are simulated under known parameters, with the starts and actions of a give
 ``fixed``    one vector of parameters holds throughout, drawn from the search box: is it inside the interval?
 ``varying``  every transition has parameters of its own, drawn around such a vector: which share is inside?
 
-A method that says how uncertain a fixed value is should pass the first, one that says how much a value varies the second.
+A method that says how uncertain a fixed value is should pass the first, one that says how much a value varies the
+second.
 """
 
 from __future__ import annotations
