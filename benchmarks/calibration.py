@@ -3,7 +3,8 @@
     python benchmarks/calibration.py --logs 100 --out out/calibration     # --resume goes on
 
 Writes ``trials.jsonl``, a line a fit, and ``calibration.md``. Mass and damping are searched for; the log has 60
-transitions and noise on their ends, whose variance is ε. See :mod:`dropo_torch.baselines.calibration` for the two kinds of log.
+transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.baselines.calibration` has the two kinds of
+log.
 """
 
 from __future__ import annotations
