@@ -22,7 +22,7 @@ from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.cli import main
 from dropo_torch.config import make_config
-from dropo_torch.distribution import Distribution
+from dropo_torch.distribution import Distribution, truncated_moments
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
 from dropo_torch.objective import draw_uniforms
@@ -101,9 +101,9 @@ TRUTH = np.array([MASS, DAMPING])
 
 
 def test_droid_finds_the_parameters_and_its_deviations_collapse(folder: Path) -> None:
-    for data, tolerance in (("exact", 1e-5), ("noisy", 3e-2)):
+    for data, tolerance in (("exact", [1e-5, 1e-5]), ("noisy", [0.05, 0.1])):
         found = fit_problem(problem(folder, "droid", data)).distribution
-        assert found.mean == pytest.approx(TRUTH, rel=tolerance)
+        assert (np.abs(found.mean - TRUTH) < tolerance).all()
         assert (found.std < 1e-3 * (found.high - found.low)).all()  # whatever the noise
 
 
@@ -132,7 +132,7 @@ def test_laplace_covers_the_truth_of_a_noisy_log(folder: Path) -> None:
     found = fit_problem(problem(folder, "laplace", "noisy")).distribution
     z = (TRUTH - found.mean) / found.std
     assert (np.abs(z) < 3.5).all()
-    assert (found.std < 0.1 * TRUTH).all()
+    assert (found.std < [0.03, 0.07]).all()
 
 
 def test_simopt_moves_to_the_parameters_and_shrinks(folder: Path) -> None:
@@ -340,12 +340,20 @@ def test_full_covariance_is_found_where_parameters_vary_together() -> None:
 
 
 def test_entropy_keeps_deviations_open(folder: Path) -> None:
-    closed = fit(problem(folder, "dropo", "noisy").objective, samples=20)
-    opened = fit(problem(folder, "dropo", "noisy").objective, samples=20, entropy=2.0)
-    assert (opened.distribution.std > 3 * closed.distribution.std).all()
+    closed = fit(problem(folder, "dropo", "exact").objective, samples=20)
+    opened = fit(problem(folder, "dropo", "exact").objective, samples=20, entropy=2.0)
+    assert (opened.distribution.std > 100 * closed.distribution.std).all()
     assert opened.log_likelihood < closed.log_likelihood
     assert opened.document()["entropy"] == 2.0
-    assert opened.distribution.mean == pytest.approx(TRUTH, rel=0.1)
+    assert opened.distribution.mean[0] == pytest.approx(MASS, rel=0.05)
+
+
+def test_the_entropy_bonus_is_balanced_by_the_likelihood() -> None:
+    """With one parameter and A = 1, Σ log N(0; 0, vσ² + ε) + β log σ is largest at vσ² = βε / (T − β)."""
+    simulator = LinearSimulator(space_of(a=[-5, 5]), np.eye(1))
+    found = fit(linear_objective(simulator, np.zeros((50, 1)), epsilon=1e-2), entropy=5.0, samples=50)
+    variance = float(truncated_moments(torch.tensor(-2.0), torch.tensor(2.0))[1])
+    assert variance * found.distribution.std[0] ** 2 == pytest.approx(5 * 1e-2 / (50 - 5), rel=0.02)
 
 
 @pytest.mark.parametrize("method", ["droid", "simopt", "bayessim", "laplace"])
@@ -520,15 +528,19 @@ def test_a_synthetic_log_is_explained_by_its_truth(folder: Path) -> None:
     found = fit_problem(made).distribution
     assert found.mean == pytest.approx(truths[0], rel=1e-6)
     varying = draw_truths(ours, "varying", 3)
-    assert varying.std(0) == pytest.approx(0.88 * 0.05 * np.array([2.5, 0.49]), rel=0.25)
+    assert varying.std(0) == pytest.approx(0.1 * np.array([2.5, 0.49]), rel=0.25)
 
 
 def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(folder: Path) -> None:
-    noise = np.array([1e-3, 1e-2])
-    trials = calibrate(lambda method: problem(folder, method), ["laplace", "dropo"], logs=12, noise=noise)
+    noise = np.array([1e-4, 5e-4])
+
+    def ours(method: str) -> Problem:
+        return problem(folder, method, epsilon=(noise**2).tolist())
+
+    trials = calibrate(ours, ["laplace", "dropo"], logs=12, noise=noise)
     found = {(c.kind, c.method): c.covered for c in coverages(trials) if c.level == 0.9}
     assert found["fixed", "laplace"] > 0.7
     assert found["varying", "dropo"] == pytest.approx(0.9, abs=0.12)
     assert found["varying", "laplace"] < 0.6
-    again = calibrate(lambda method: problem(folder, method), ["laplace"], logs=12, noise=noise, done=trials)
+    again = calibrate(ours, ["laplace"], logs=12, noise=noise, done=trials)
     assert again == trials

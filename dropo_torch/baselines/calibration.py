@@ -30,7 +30,7 @@ LEVELS = (0.5, 0.9)
 #: Truths are drawn from this inner share of the search box.
 _INNER = 0.6
 #: Deviation of the parameters of ``varying`` logs, as a share of the search width.
-SPREAD = 0.05
+SPREAD = 0.1
 
 
 @dataclass(frozen=True)

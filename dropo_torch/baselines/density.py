@@ -61,7 +61,7 @@ class MixtureDensityNetwork(nn.Module):
                 rows,
                 columns,
             ),
-            lower.reshape(len(inputs), m, -1) * 0.3,
+            lower.reshape(len(inputs), m, len(rows)) * 0.3,
         )
         return torch.log_softmax(logits, -1), means.reshape(-1, m, d), factor
 
@@ -73,6 +73,7 @@ class FourierFeatures(nn.Module):
         super().__init__()
         halton = scipy.stats.qmc.Halton(inputs, seed=seed).random(frequencies)
         normal = scipy.stats.norm.ppf(np.clip(halton, 1e-6, 1 - 1e-6))
+        self.omega: torch.Tensor
         self.register_buffer("omega", torch.from_numpy(normal.T / lengthscale))
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
