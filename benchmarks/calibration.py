@@ -76,11 +76,13 @@ def problem_of(folder: Path, name: str, transitions: int) -> dropo.Problem:
 
 
 def markdown(rows: Sequence[Coverage]) -> str:
-    lines = ["| log | method | level | covered [95 %] | width of the interval, share of the box | logs |"]
-    lines.append("|---|---|---|---|---|---|")
+    lines = ["| log | method | parameter | level | covered [95 %] | width of the interval, share of the box | logs |"]
+    lines.append("|---|---|---|---|---|---|---|")
     for r in rows:
         covered = f"{100 * r.covered:.0f} % [{100 * r.low:.0f}, {100 * r.high:.0f}]"
-        lines.append(f"| {r.kind} | {r.method} | {100 * r.level:.0f} % | {covered} | {r.width:.2g} | {r.logs} |")
+        lines.append(
+            f"| {r.kind} | {r.method} | {r.parameter} | {100 * r.level:.0f} % | {covered} | {r.width:.2g} | {r.logs} |"
+        )
     return "\n".join(lines) + "\n"
 
 

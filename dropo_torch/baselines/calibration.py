@@ -56,12 +56,13 @@ class Trial:
 
 @dataclass(frozen=True)
 class Coverage:
-    """All trials of a method on one kind of log.
+    """All trials of a method on one kind of log, for one parameter.
 
     Attributes:
         kind, method: as of the trials.
+        parameter: name.
         level: of the intervals.
-        covered: mean share inside, over logs and parameters.
+        covered: mean share inside, over logs.
         low, high: 95 % interval of ``covered``, the logs taken as independent.
         width: mean width of the intervals, as a share of the search box.
         logs: number of logs.
@@ -69,6 +70,7 @@ class Coverage:
 
     kind: str
     method: str
+    parameter: str
     level: float
     covered: float
     low: float
@@ -187,15 +189,16 @@ def calibrate(
 
 
 def coverages(trials: Sequence[Trial]) -> list[Coverage]:
-    """Return how much each method covered, by kind of log and level."""
+    """Return how much each method covered, by kind of log, parameter and level."""
     rows = []
     for kind, method in dict.fromkeys((t.kind, t.method) for t in trials):
         own = [t for t in trials if (t.kind, t.method) == (kind, method)]
-        for level in (f"{level:g}" for level in LEVELS):
-            shares = np.array([np.mean(list(t.inside[level].values())) for t in own])
-            width = float(np.mean([list(t.width[level].values()) for t in own]))
-            low, high = wilson(float(shares.mean()), len(own))
-            rows.append(Coverage(kind, method, float(level), float(shares.mean()), low, high, width, len(own)))
+        for parameter in own[0].error:
+            for level in (f"{level:g}" for level in LEVELS):
+                share = float(np.mean([t.inside[level][parameter] for t in own]))
+                width = float(np.mean([t.width[level][parameter] for t in own]))
+                low, high = wilson(share, len(own))
+                rows.append(Coverage(kind, method, parameter, float(level), share, low, high, width, len(own)))
     return rows
 
 

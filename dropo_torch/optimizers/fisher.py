@@ -298,13 +298,18 @@ class FisherOptimizer(Optimizer):
         return {"entropy": self._entropy} if self._entropy else {}
 
     def _with_entropy(self, stage: ScoringStage | SampledStage, sums: torch.Tensor) -> torch.Tensor:
-        """Add the bonus to a stage's objective and to its scores of log σ."""
+        """Add the bonus to a stage's objective and to its scores of log σ.
+
+        Where it holds a deviation open, residuals are smaller than their covariance, and the likelihood bends by 2β
+        where its Fisher information is next to nothing: that is added too, or steps overshoot.
+        """
         if not self._entropy:
             return sums
         std = (stage.candidate or (stage.mean, stage.std))[1]
         d, added = len(std), sums.clone()
         added[0] += self._entropy * float(np.log(std).sum())
         added[1 + d : 1 + 2 * d] += self._entropy
+        added[1 + 2 * d + d * d : 1 + 2 * d + 2 * d * d].view(d, d).diagonal().add_(2 * self._entropy)
         return added
 
     def _after_means(self) -> None:
