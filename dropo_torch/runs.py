@@ -206,7 +206,9 @@ def run_reproduce(
         found = study(out, reduced=reduced, resume=resume, report=progress.update)
     for line in found:
         console.print(f"  - {line}", highlight=False, markup=False, soft_wrap=True)
-    console.print(f"tables: {out / 'tables.md'}", highlight=False, markup=False, soft_wrap=True)
+    console.print(
+        f"tables: {out / 'tables.md'}; report: {out / 'report.html'}", highlight=False, markup=False, soft_wrap=True
+    )
     return found
 
 

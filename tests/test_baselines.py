@@ -482,6 +482,9 @@ def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None
     assert max(r["largest_error_percent"] for r in point) < 0.1
     text = (out / "tables.md").read_text()
     assert "| noiseless | torso_mass |" in text
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 4
+    assert "DROPO widens under the unmodeled torso" in page
     for figure in ("recovery.png", "sweep.png", "noise.png", "size.png"):
         assert (out / figure).stat().st_size > 5000
     cells = sorted((out / "cells").iterdir())

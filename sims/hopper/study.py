@@ -126,7 +126,8 @@ def run_study(
     """Run every cell that is not there yet, then write tables and figures.
 
     Args:
-        out: the folder: ``cells/`` and ``logs/``, and at the end ``study.json``, ``tables.md`` and figures.
+        out: the folder: ``cells/`` and ``logs/``, and at the end ``study.json``, ``tables.md``,
+            ``report.html`` and figures.
         reduced: the plan :data:`REDUCED`.
         resume: keep finished cells of the same plan.
         report: called with what is being done and the share that is.

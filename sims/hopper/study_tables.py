@@ -11,7 +11,9 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.fit import write_atomically
-from dropo_torch.runs import plain_numbers
+from dropo_torch.report import write_study_report
+from dropo_torch.report.figures import to_svg
+from dropo_torch.runs import plain_numbers, versions
 from dropo_torch.sweep import elbow
 from sims.hopper.study_figures import draw_all
 
@@ -19,6 +21,11 @@ SCHEMA = "dropo-torch/study/1"
 #: A deviation below this share of the search box has collapsed to a point; one above the other is wide.
 COLLAPSED, WIDE = 1e-3, 1e-2
 CASES = {"point": "noiseless", "noisy": "noisy", "unmodeled": "unmodeled torso", "distribution": "masses redrawn"}
+
+INTRODUCTION = (
+    "Written by `dropo reproduce hopper`. The logs are recorded by this project, from slow random torques: "
+    "compare with the paper in kind, not digit by digit."
+)
 
 Result = dict[str, Any]
 
@@ -32,8 +39,17 @@ class Finding:
     measured: str
 
 
+@dataclass(frozen=True)
+class Section:
+    """A table with its title, in words."""
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+
+
 def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) -> list[str]:
-    """Write ``study.json``, ``tables.md`` and the figures; return the findings as sentences."""
+    """Write ``study.json``, ``tables.md``, ``report.html`` and the figures; return the findings as sentences."""
     findings = all_findings(results)
     tables = {
         "table": table_rows(results, "table"),
@@ -45,8 +61,18 @@ def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) ->
     }
     document = {"schema": SCHEMA, "plan": plan, "findings": [asdict(f) for f in findings], "tables": tables}
     write_atomically(out / "study.json", json.dumps(plain_numbers(document), indent=1).encode() + b"\n")
-    figures = draw_all(out, results, tables)
-    write_atomically(out / "tables.md", markdown(tables, findings, figures).encode())
+    page, figures = sections(tables, findings), draw_all(results, tables)
+    for name, figure in figures.items():
+        figure.savefig(out / name, dpi=110, facecolor="white", metadata={"Software": None})
+    write_atomically(out / "tables.md", markdown(page, figures).encode())
+    write_study_report(
+        out / "report.html",
+        title="The paper's simulated Hopper",
+        lead=INTRODUCTION,
+        tables=[(section.title, section.head, section.rows) for section in page],
+        figures={name.removesuffix(".png"): to_svg(figure, name) for name, figure in figures.items()},
+        versions=versions(),
+    )
     return [f"{'holds' if f.holds else 'DOES NOT HOLD'}: {f.finding} ({f.measured})" for f in findings]
 
 
@@ -201,38 +227,53 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
     return found
 
 
-def markdown(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding], figures: Sequence[str]) -> str:
-    """Return the page of the study."""
-    parts = ["# The paper's simulated Hopper\n", "`dropo reproduce hopper --out DIR` wrote this page.\n"]
-    parts.append("The logs are this project's own, so compare with the paper in kind, not digit by digit.\n")
-    parts.append("## Findings\n")
-    parts.append(_table(["finding", "holds", "measured"], [[f.finding, _yes(f.holds), f.measured] for f in findings]))
-    for name, title in (
-        ("table", "Table 1: mean ± std, averaged over seeds"),
-        ("recovery", "Recovery of a distribution"),
-    ):
-        parts += [f"## {title}\n", _method_table(tables[name])]
-    for name, title in (("sweep", "Sweeps over ε"), ("noise", "ε against the noise")):
-        rows = [
+def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding]) -> list[Section]:
+    """Return the tables as people read them."""
+    found = [[f.finding, "yes" if f.holds else "no", f.measured] for f in findings]
+    sweeps = {
+        name: [
             [r["case"], _number(r["noise_variance"]), r["noise_on"] or "–", _number(r["chosen"]), _number(r["ratio"])]
             for r in tables[name]
         ]
-        parts += [f"## {title}\n", _table(["case", "noise variance", "noise on", "ε at the elbow", "ratio"], rows)]
-    rows = [
+        for name in ("sweep", "noise")
+    }
+    sizes = [
         [r["case"], str(r["transitions"]), r["parameter"], _number(r["truth"])]
         + [f"{_number(r[k])} [{_number(r[k + '_low'])}, {_number(r[k + '_high'])}]" for k in ("mean", "std")]
         for r in tables["size"]
     ]
-    head = ["case", "transitions", "parameter", "truth", "mean [90 % of bootstrap]", "std [90 %]"]
-    parts += ["## Number of transitions\n", _table(head, rows)]
-    rows = [[_number(v) if not isinstance(v, str) else v for v in r.values()] for r in tables["cma"]]
-    head = ["optimizer", "log-likelihood", "largest error (%)", "simulated per logged", "s"]
-    parts += ["## CMA-ES on a part\n", _table(head, rows)]
+    cma = [[v if isinstance(v, str) else _number(v) for v in r.values()] for r in tables["cma"]]
+    swept = ["case", "noise variance", "noise on", "ε at the elbow", "ratio"]
+    return [
+        Section("Findings", ["finding", "holds", "measured"], found),
+        _methods("Table 1: mean ± std, averaged over seeds", tables["table"]),
+        _methods("Recovery of a distribution: mean ± std", tables["recovery"]),
+        Section("Sweeps over ε", swept, sweeps["sweep"]),
+        Section("ε against the noise", swept, sweeps["noise"]),
+        Section(
+            "Number of transitions",
+            ["case", "transitions", "parameter", "truth", "mean [90 % of bootstrap]", "std [90 %]"],
+            sizes,
+        ),
+        Section(
+            "CMA-ES on a part",
+            ["optimizer", "log-likelihood", "largest error (%)", "simulated per logged", "s"],
+            cma,
+        ),
+    ]
+
+
+def markdown(page: Sequence[Section], figures: Iterable[str]) -> str:
+    """Return the study's page as Markdown, with its figures at the end."""
+    parts = ["# The paper's simulated Hopper\n", INTRODUCTION + "\n"]
+    for section in page:
+        lines = [section.head, ["---"] * len(section.head), *section.rows]
+        parts += [f"## {section.title}\n", "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"]
     parts += [f"![{name.removesuffix('.png')}]({name})\n" for name in figures]
     return "\n".join(parts)
 
 
-def _method_table(rows: Sequence[dict[str, Any]]) -> str:
+def _methods(title: str, rows: Sequence[dict[str, Any]]) -> Section:
     """Cases and parameters down, methods across."""
     methods = list(dict.fromkeys(r["method"] for r in rows))
     lines = []
@@ -241,20 +282,11 @@ def _method_table(rows: Sequence[dict[str, Any]]) -> str:
         first = next(iter(own.values()))
         cells = [f"{own[m]['mean']:.3f} ± {own[m]['std']:.2g}" if m in own else "–" for m in methods]
         lines.append([case, parameter, f"{first['truth']:.3f} ± {first['true_std']:.2g}", *cells])
-    return _table(["case", "parameter", "truth", *methods], lines)
-
-
-def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
-    lines = [head, ["---"] * len(head), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
+    return Section(title, ["case", "parameter", "truth", *methods], lines)
 
 
 def _number(value: float | None) -> str:
     return "–" if value is None else f"{value:.3g}"
-
-
-def _yes(value: bool) -> str:
-    return "yes" if value else "**no**"
 
 
 def _largest_error(result: Result) -> float:
