@@ -6,7 +6,7 @@
 >>> result.distribution.save("distribution.json")
 """
 
-from dropo_torch import gap
+from dropo_torch import baselines, gap
 from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.diagnostics import Diagnostics, diagnose
 from dropo_torch.distribution import Distribution
@@ -44,6 +44,7 @@ __all__ = [
     "Simulator",
     "Trajectories",
     "Transitions",
+    "baselines",
     "diagnose",
     "export_model",
     "fit",

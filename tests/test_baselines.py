@@ -405,7 +405,10 @@ def test_dropo_fit_writes_what_training_reads(folder: Path, tmp_path: Path, meth
     loaded = Distribution.load(tmp_path / "out" / "fit.json")
     draws = loaded.sample(50, torch.Generator().manual_seed(0))
     assert torch.isfinite(draws).all()
-    assert method in (tmp_path / "out" / "report.html").read_text()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "What the standard deviations are" in page
+    assert "Standard deviation at its floor" not in page
+    assert ("The posterior, pair by pair" in page) == (method == "bayessim")
 
 
 @pytest.mark.parametrize(

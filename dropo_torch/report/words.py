@@ -52,7 +52,7 @@ def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
     """Return what needs attention first, then what is good to know."""
     found = [
         *_at_bounds(fit.distribution),
-        *_deviations(fit.distribution),
+        *(_deviations(fit.distribution) if fit.method == "dropo" else _of_method(fit)),
         *_residuals(diagnostics),
         *_confounded(diagnostics),
         *_vague(fit.distribution, diagnostics),
@@ -92,7 +92,7 @@ def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
         bad = int(np.sum(standardised > limit))
         where = "" if len(standardised) == 1 else f" in {bad} of {len(standardised)} columns"
         return False, f"The simulator does not explain the log{where}. {scale}; {at_worst}."
-    if at_largest_deviation(fit.distribution).any():
+    if fit.method == "dropo" and at_largest_deviation(fit.distribution).any():
         return False, (
             "The simulator explains the log only with parameters that vary as widely as they may (see below). "
             f"{scale}; {at_worst}."
@@ -315,6 +315,35 @@ def _deviations(distribution: Distribution) -> list[Finding]:
                 "Standard deviation at its floor",
                 f"{joined(_chosen(distribution, floor))}. One fixed value explains the log as well as any "
                 "distribution: this is a point estimate. For training a policy you may want to add spread.",
+            )
+        )
+    return found
+
+
+def _of_method(fit: Fit) -> list[Finding]:
+    """What to know about the deviations of a method other than DROPO."""
+    box = search_box(fit.distribution)
+    share = fit.distribution.std / box.width
+    texts = {
+        "droid": (
+            "attention",
+            "They shrink with every generation, noise or not. Take the means, and spread of your own.",
+        ),
+        "simopt": ("note", "Other iterations or another bound on their steps give others."),
+        "laplace": ("note", "The model lacking something does not widen them; a longer log narrows them."),
+        "udr": ("note", "The log has no part in them."),
+        "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior pair by pair."),
+    }
+    level, text = texts.get(fit.method, ("note", ""))
+    found = [Finding(cast(Level, level), "What the standard deviations are", f"{law(fit).split('. ')[1]}. {text}")]
+    vague = [name for name, s in zip(fit.distribution.names, share, strict=True) if s > 0.8 / math.sqrt(12)]
+    if fit.method == "bayessim" and vague:
+        found.append(
+            Finding(
+                "attention",
+                "Hardly narrower than the search box",
+                f"{joined(vague)}. The network has learned next to nothing about it: more simulations, or a horizon "
+                "over which the parameter shows, may help.",
             )
         )
     return found
