@@ -5,8 +5,6 @@ from __future__ import annotations
 import copy
 
 import numpy as np
-import scipy.spatial.distance
-import scipy.stats
 import torch
 from torch import nn
 
@@ -71,10 +69,12 @@ class FourierFeatures(nn.Module):
 
     def __init__(self, inputs: int, frequencies: int, lengthscale: float, seed: int) -> None:
         super().__init__()
-        halton = scipy.stats.qmc.Halton(inputs, seed=seed).random(frequencies)
-        normal = scipy.stats.norm.ppf(np.clip(halton, 1e-6, 1 - 1e-6))
+        from scipy.stats import qmc  # takes a while to import
+
+        halton = torch.from_numpy(qmc.Halton(inputs, seed=seed).random(frequencies))
+        normal = torch.special.ndtri(halton.clamp(1e-6, 1 - 1e-6))
         self.omega: torch.Tensor
-        self.register_buffer("omega", torch.from_numpy(normal.T / lengthscale))
+        self.register_buffer("omega", normal.T / lengthscale)
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Return the features."""
@@ -145,7 +145,7 @@ def _network(x: np.ndarray, outputs: int, settings: BayesSimSettings, seed: int)
     """An untrained network with the features of the settings."""
     inputs, hidden = x.shape[1], settings.hidden
     if settings.features == "mdrff":
-        lengthscale = float(np.median(scipy.spatial.distance.pdist(x[:500]))) or 1.0
+        lengthscale = float(torch.pdist(torch.from_numpy(x[:500])).median()) or 1.0
         body: nn.Module = FourierFeatures(inputs, hidden, lengthscale, seed)
         return MixtureDensityNetwork(body, 2 * hidden, settings.components, outputs)
     first, second = (nn.Linear(n, hidden, dtype=torch.float64) for n in (inputs, hidden))
