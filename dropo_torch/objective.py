@@ -370,6 +370,11 @@ class Objective:
             moved[..., target] = moved[..., target] / moved[..., target].norm(dim=-1, keepdim=True)
         return moved.reshape(-1, states.shape[1])
 
+    @property
+    def noise_deviation(self) -> torch.Tensor | None:
+        """Standard deviation of the measurement in each feature, ``(m,)``; ``None`` without noise."""
+        return None if self.noise is None else self._end_variance().sqrt()
+
     def _end_variance(self) -> torch.Tensor:
         """Variance of the measured features, ``(m,)``; a quaternion's noise ν turns by 2ν."""
         assert self.noise is not None

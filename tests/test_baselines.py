@@ -221,6 +221,21 @@ def test_summaries_are_moments_of_changes() -> None:
     assert found[2, :4] == pytest.approx(np.diff(logged.numpy(), axis=1).reshape(-1, 4).mean(0))
 
 
+def test_bayessim_measures_its_replays_as_the_log_was(folder: Path) -> None:
+    """Noise of variance ν adds 2ν to the mean square of a step's change."""
+    options = {"simulations": 200, "horizon": 20}
+    sums = []
+    for noise in (None, [0.05, 0.3]):
+        ours = problem(folder, "bayessim", method_options=options, noise=noise)
+        search = make_search(ours)
+        assert search is not None
+        request = search.ask()
+        assert request.replay is not None
+        table = ours.objective.map_replay(request.replay, request.values, request.reduce).reshape(101, -1)
+        sums.append(table[:-1, 2:4].mean(0) / (4 * 19))
+    assert (sums[1] - sums[0]).numpy() == pytest.approx([2 * 0.05**2, 2 * 0.3**2], rel=0.1)
+
+
 def test_reps_weights_keep_within_the_bound_and_prefer_low_costs() -> None:
     costs = np.random.default_rng(0).uniform(size=500)
     for kl in (0.1, 0.5, 1.0):
@@ -501,6 +516,12 @@ def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None
     assert [line.split("(")[0] for line in run_study(out, plan=TINY, resume=True)] == [f.split("(")[0] for f in found]
     after = {p.name: p.stat().st_mtime_ns for p in (out / "cells").iterdir()}
     assert {n for n in before if after[n] != before[n]} == {cells[0].name}
+
+
+@pytest.mark.slow
+def test_the_reduced_study_finds_the_point_dynamics(tmp_path: Path) -> None:
+    found = run_study(tmp_path / "study", reduced=True)
+    assert found[0].startswith("holds: DROPO and DROID find the point dynamics")
 
 
 def test_cells_of_a_study_have_names_of_their_own() -> None:

@@ -54,7 +54,14 @@ def make_search(problem: Problem) -> Optimizer | None:
             return SimOptOptimizer(space, replay, column_scales(objective), settings=settings, seed=seed)
         if replay.horizon < 2:
             raise InputError("method: bayessim needs an episode of two transitions or more; this log has none")
-        return BayesSimOptimizer(space, replay, objective.num_features, settings=settings, seed=seed)
+        return BayesSimOptimizer(
+            space,
+            replay,
+            objective.num_features,
+            settings=settings,
+            seed=seed,
+            noise=objective.noise_deviation,
+        )
     return None
 
 

@@ -11,7 +11,7 @@ from dropo_torch.baselines.density import fit_mixture
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.distribution import Distribution, SearchBox, to_values
-from dropo_torch.objective import draw_uniforms
+from dropo_torch.objective import ReplayReduce, draw_uniforms
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.trajectory import Replay
@@ -50,12 +50,13 @@ class BayesSimOptimizer(Optimizer):
     changes per step and their correlation with the controls, over all windows together. A network learns the
     parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
     posterior. The result is the normal with the posterior's mean and covariance inside the box, its correlation
-    included; the mixture is kept beside it.
+    included; the mixture is kept beside it. With ``noise``, replays are measured as the log was.
 
     Args:
         space: what varies.
         replay: the windows.
         num_columns: compared columns m.
+        noise: standard deviation of the measurement in each of them, ``(m,)``, or ``None``.
         settings: features, simulations and size of the network.
         seed: seeds simulations and network.
     """
@@ -64,8 +65,16 @@ class BayesSimOptimizer(Optimizer):
     method = "bayessim"
 
     def __init__(
-        self, space: ParameterSpace, replay: Replay, num_columns: int, *, settings: BayesSimSettings, seed: int
+        self,
+        space: ParameterSpace,
+        replay: Replay,
+        num_columns: int,
+        *,
+        settings: BayesSimSettings,
+        seed: int,
+        noise: torch.Tensor | None = None,
     ) -> None:
+        self._noise = noise
         self._space, self._replay, self._settings, self._seed = space, replay, settings, seed
         self._num_columns = num_columns
         self._box = SearchBox.of(space)
@@ -78,7 +87,7 @@ class BayesSimOptimizer(Optimizer):
         points = self._box.low + self._shares(len(self._sums)) * self._box.width
         return Request(
             values=to_values(points, self._space.is_log),
-            reduce=summary_sums,
+            reduce=self._measured(len(self._sums)),
             evaluations=len(points),
             replay=self._replay,
         )
@@ -134,6 +143,18 @@ class BayesSimOptimizer(Optimizer):
         """Go on from a saved state."""
         self._sums, self._logged = list(state["sums"]), state["logged"]
         self._mixture = None if state["mixture"] is None else Mixture.of(state["mixture"])
+
+    def _measured(self, batch: int) -> ReplayReduce:
+        """The sums of a batch's summaries, noise added to what is simulated."""
+        if self._noise is None:
+            return summary_sums
+        noise, generator = self._noise, torch.Generator().manual_seed(self._seed * 1_000_003 + batch)
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
+            drawn = noise * torch.randn(features.shape, generator=generator, dtype=features.dtype)
+            return summary_sums(features + drawn, measured, controls)
+
+        return reduce
 
     def _shares(self, batch: int) -> np.ndarray:
         """A batch of the prior, as shares of the search box, ``(n, d)``."""
