@@ -8,7 +8,7 @@
 
 from typing import TYPE_CHECKING, Any
 
-from dropo_torch import gap
+from dropo_torch import baselines, gap
 from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.diagnostics import Diagnostics, diagnose
 from dropo_torch.distribution import Distribution
@@ -59,6 +59,7 @@ __all__ = [
     "Simulator",
     "Trajectories",
     "Transitions",
+    "baselines",
     "diagnose",
     "export_model",
     "fit",

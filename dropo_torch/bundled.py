@@ -5,11 +5,12 @@ A package offers one by an entry point of the group ``dropo_torch.sims`` that is
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import importlib
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol, cast
 
 from dropo_torch.errors import InputError, choices
 
@@ -29,6 +30,7 @@ class BundledSim:
         log: path of a small log, for the demo.
         truth: the values that the log was recorded with.
         task: the class of its task as ``module:Class``, or ``None``.
+        study: what ``dropo reproduce`` runs, as ``module:function``, or ``None``.
     """
 
     name: str
@@ -39,6 +41,32 @@ class BundledSim:
     log: Path
     truth: Mapping[str, float] = field(default_factory=dict)
     task: str | None = None
+    study: str | None = None
+
+
+class Study(Protocol):
+    """A published study, redone: results into a folder, finished parts kept where it resumes."""
+
+    def __call__(
+        self, out: Path, *, reduced: bool, resume: bool, report: Callable[[str, float], None]
+    ) -> Sequence[str]:
+        """Run it; return what it found, in sentences."""
+
+
+def bundled_study(name: str) -> Study:
+    """Return the study of a bundled simulation.
+
+    Raises:
+        InputError: an unknown name, or a simulation without a study.
+    """
+    found = {e.name: e for e in entry_points(group=GROUP)}
+    if name not in found:
+        raise InputError(f"reproduce: no study {name!r}" + choices(name, sorted(found)))
+    given = bundled_sim(name).study
+    if given is None:
+        raise InputError(f"reproduce: {name} has no study")
+    module, _, function = given.partition(":")
+    return cast(Study, getattr(importlib.import_module(module), function))
 
 
 def bundled_sim(name: str, *, key: str = "sim") -> BundledSim:

@@ -1,4 +1,4 @@
-"""The command line: ``dropo fit``, ``gap``, ``train``, ``sweep-epsilon``, ``certify``, ``compare`` and ``demo``."""
+"""The command line: ``dropo fit``, ``gap``, ``train``, ``sweep-epsilon``, ``compare``, ``reproduce`` and others."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import NoReturn
 
 from dropo_torch.errors import InputError, choices
 
-COMMANDS = ("fit", "gap", "train", "sweep-epsilon", "certify", "compare", "demo")
+COMMANDS = ("fit", "gap", "train", "sweep-epsilon", "certify", "compare", "reproduce", "demo")
 
 
 class _Parser(argparse.ArgumentParser):
@@ -81,6 +81,11 @@ def _dispatch(given: list[str]) -> int:
     if parsed.command == "demo":
         runs.run_demo(parsed.out, console=console, overrides=overrides, resume=parsed.resume)
         return 0
+    if parsed.command == "reproduce":
+        if rest:
+            raise InputError(f"reproduce: {rest[0]} is not understood; it takes --out, --resume and --reduced")
+        runs.run_reproduce(parsed.study, parsed.out, console=console, reduced=parsed.reduced, resume=parsed.resume)
+        return 0
     config = load_config(parsed.config, overrides)
     if parsed.command == "fit":
         runs.run_fit(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
@@ -122,6 +127,11 @@ def _parser() -> argparse.ArgumentParser:
     comparison = _command(commands, "compare", "fit by several optimizers and backends, side by side")
     comparison.add_argument("--methods", metavar="fisher-warp,...", help="optimizer-backend pairs, all by default")
     comparison.add_argument("--seeds", metavar="N", default="3", help="seeds of each (default 3)")
+    study = commands.add_parser("reproduce", help="redo a published study: hopper", allow_abbrev=False)
+    study.add_argument("study", metavar="STUDY", help="hopper, the simulated experiments of the DROPO paper")
+    study.add_argument("--out", type=_folder, required=True, metavar="DIR", help="folder of the results")
+    study.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
+    study.add_argument("--reduced", action="store_true", help="short logs and few seeds: minutes instead of hours")
     demo = commands.add_parser("demo", help="fit the bundled Hopper's masses", allow_abbrev=False)
     demo.add_argument("--out", type=_folder, default=Path("out/demo"), metavar="DIR", help="folder of the results")
     demo.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")

@@ -41,7 +41,13 @@ class Config(pydantic.BaseModel):
         [], description="physical effects that the model lacks: effect, target and its numbers"
     )
     backend: Literal["mujoco", "warp", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
+    method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = pydantic.Field(
+        "dropo", description="what finds the distribution"
+    )
+    method_options: dict[str, Any] = pydantic.Field({}, description="of a method other than dropo; see docs/methods.md")
     optimizer: Literal["fisher", "cma", "adam"] = pydantic.Field("fisher", description="how φ is searched")
+    entropy: float = pydantic.Field(0.0, ge=0, description="weight of the entropy of the distribution in the fit")
+    covariance: Literal["diagonal", "full"] = pydantic.Field("diagonal", description="whether parameters vary together")
     epsilon: float | list[float] = pydantic.Field(1e-5, description="ε, variance added to every column, or one each")
     noise: float | list[float] | None = pydantic.Field(
         None, description="standard deviation of the measurement, or one per column; starts are then uncertain"

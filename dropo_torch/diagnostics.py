@@ -86,7 +86,7 @@ def diagnose(
     mean, variance, center, jacobian, lost = _simulate(objective, values, stencil, steps)
     covariance = torch.cat([objective.base_covariance(slice(i, i + 1)) for i in range(len(objective))])
     information = torch.einsum("tdm,tmn,ten->de", jacobian, torch.linalg.inv(covariance), jacobian).numpy()
-    error, correlation = _estimates(information)
+    error, correlation = estimates(information)
     width = objective.box.width[:, None]
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
@@ -142,7 +142,7 @@ def _simulate(
     return mean, variance, center, jacobian, lost
 
 
-def _estimates(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def estimates(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Standard errors ``(d,)`` and correlations ``(d, d)`` from an information matrix, however singular."""
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     inverse = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)

@@ -81,6 +81,8 @@ class Distribution:
         limits: physical limits in the parameters' units, ``(d, 2)``.
         is_log: whether each parameter's law is that of its logarithm, ``(d,)`` bool.
         units: the parameters' units.
+        correlation: of the underlying normals (a Gaussian copula), ``(d, d)``; ``None`` where they are independent.
+        is_uniform: each law is uniform over μ ± √3 σ instead, so that μ and σ are still its mean and deviation.
     """
 
     names: tuple[str, ...]
@@ -91,13 +93,23 @@ class Distribution:
     limits: np.ndarray
     is_log: np.ndarray
     units: tuple[str, ...]
+    correlation: np.ndarray | None = None
+    is_uniform: bool = False
 
     def __len__(self) -> int:
         """Return the number of parameters d."""
         return len(self.names)
 
     @classmethod
-    def over(cls, space: ParameterSpace, mean: np.ndarray, std: np.ndarray) -> Distribution:
+    def over(
+        cls,
+        space: ParameterSpace,
+        mean: np.ndarray,
+        std: np.ndarray,
+        *,
+        correlation: np.ndarray | None = None,
+        is_uniform: bool = False,
+    ) -> Distribution:
         """Return the distribution over ``space`` with μ and σ in coordinates, ``(d,)`` each."""
         return cls(
             names=space.names,
@@ -108,6 +120,8 @@ class Distribution:
             limits=space.limits,
             is_log=space.is_log,
             units=tuple(p.unit for p in space.parameters),
+            correlation=None if correlation is None else np.asarray(correlation, dtype=np.float64).copy(),
+            is_uniform=is_uniform,
         )
 
     @property
@@ -122,9 +136,24 @@ class Distribution:
 
     def rsample(self, uniforms: torch.Tensor) -> torch.Tensor:
         """Return parameter values ``(K, d)``, in units, for base uniforms ``(K, d)`` in (0, 1)."""
+        if self.correlation is not None:
+            uniforms = correlate(uniforms, torch.as_tensor(self.correlation))
+        if self.is_uniform:
+            low, high = (torch.as_tensor(x) for x in self.ends)
+            x = low + uniforms * (high - low)
+            return torch.where(torch.as_tensor(self.is_log), torch.exp(x), x) if self.is_log.any() else x
         return values_from_uniforms(
             uniforms, torch.as_tensor(self.mean), torch.as_tensor(self.std), self.limits, self.is_log
         )
+
+    @property
+    def ends(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest value that occurs, in coordinates, ``(d,)`` each."""
+        if self.is_uniform:
+            return self.mean - math.sqrt(3) * self.std, self.mean + math.sqrt(3) * self.std
+        low, high = (torch.as_tensor(x) for x in coordinate_limits(self.limits, self.is_log))
+        a, b = truncated_interval(torch.as_tensor(self.mean), torch.as_tensor(self.std), low, high)
+        return self.mean + self.std * a.numpy(), self.mean + self.std * b.numpy()
 
     def sample(self, num_samples: int, generator: torch.Generator) -> torch.Tensor:
         """Return ``num_samples`` independent parameter vectors ``(num_samples, d)``, in units."""
@@ -136,13 +165,22 @@ class Distribution:
         mean, std = torch.as_tensor(self.mean), torch.as_tensor(self.std)
         low, high = (torch.as_tensor(x) for x in coordinate_limits(self.limits, self.is_log))
         x = torch.where(is_log, torch.log(values), values)
+        if self.is_uniform:
+            low, high = (torch.as_tensor(e) for e in self.ends)
+            density = -torch.log(high - low) - torch.where(is_log, x, torch.zeros_like(x))
+            return torch.where((x >= low) & (x <= high), density, torch.full_like(x, -torch.inf)).sum(-1)
         a, b = truncated_interval(mean, std, low, high)
         z = (x - mean) / std
         mass = torch.special.ndtr(b) - torch.special.ndtr(a)
         density = -0.5 * z * z - _LOG_SQRT_2PI - torch.log(std) - torch.log(mass)
         density = density - torch.where(is_log, x, torch.zeros_like(x))  # d(log v)/dv = 1/v
         inside = (z >= a) & (z <= b)
-        return torch.where(inside, density, torch.full_like(density, -torch.inf)).sum(-1)
+        total = torch.where(inside, density, torch.full_like(density, -torch.inf)).sum(-1)
+        if self.correlation is None:
+            return total
+        below = torch.special.ndtr(a)
+        share = ((torch.special.ndtr(z) - below) / mass).clamp(1e-12, 1 - 1e-12)
+        return total + copula_log_density(torch.special.ndtri(share), torch.as_tensor(self.correlation))
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return name → mean, std, low, high, unit, limits (and ``log_mean``, ``log_std`` where log-scaled)."""
@@ -156,6 +194,8 @@ class Distribution:
                 "unit": self.units[i],
                 "limits": [None if math.isinf(x) else float(x) for x in self.limits[i]],
             }
+            if self.is_uniform:
+                entries[name]["law"] = "uniform"
             if self.is_log[i]:
                 entries[name] |= {"scale": "log", "log_mean": float(self.mean[i]), "log_std": float(self.std[i])}
         return entries
@@ -163,6 +203,8 @@ class Distribution:
     def save(self, path: str | Path) -> None:
         """Write the distribution as JSON, or as YAML where the path ends in ``.yaml`` or ``.yml``."""
         document: dict[str, Any] = {"schema": SCHEMA, "parameters": self.summary()}
+        if self.correlation is not None:
+            document["correlation"] = self.correlation.tolist()
         path = Path(path)
         if path.suffix in (".yaml", ".yml"):
             path.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
@@ -187,10 +229,12 @@ class Distribution:
         entries = document.get("parameters") if isinstance(document, Mapping) else None
         if not isinstance(entries, Mapping) or not entries:
             raise InputError(f"distribution: {path} has no 'parameters'; expected name → mean, std, low, high, unit")
-        return cls._from_entries(entries, path)
+        return cls._from_entries(entries, path, _correlation(document.get("correlation"), len(entries), path))
 
     @classmethod
-    def _from_entries(cls, entries: Mapping[str, Mapping[str, Any]], path: Path) -> Distribution:
+    def _from_entries(
+        cls, entries: Mapping[str, Mapping[str, Any]], path: Path, correlation: np.ndarray | None
+    ) -> Distribution:
         for name, entry in entries.items():
             for key in ("mean", "std", "low", "high"):
                 if not isinstance(entry, Mapping) or not isinstance(entry.get(key), (int, float)):
@@ -198,6 +242,9 @@ class Distribution:
                     raise InputError(
                         f"distribution: {path}: parameters.{name} has no number {key!r}" + choices(key, have)
                     )
+        laws = {str(entry.get("law", "normal")) for entry in entries.values()}
+        if laws not in ({"normal"}, {"uniform"}):
+            raise InputError(f"distribution: {path}: law {', '.join(sorted(laws))}; expected all normal or all uniform")
         is_log = np.array([entry.get("scale") == "log" for entry in entries.values()])
         pick = [("log_mean", "log_std") if log else ("mean", "std") for log in is_log]
         limits = [entry.get("limits") or [None, None] for entry in entries.values()]
@@ -212,7 +259,37 @@ class Distribution:
             ),
             is_log=is_log,
             units=tuple(str(e.get("unit", "")) for e in entries.values()),
+            correlation=correlation,
+            is_uniform=laws == {"uniform"},
         )
+
+
+def _correlation(given: Any, size: int, path: Path) -> np.ndarray | None:
+    """A document's correlation matrix, checked."""
+    if given is None:
+        return None
+    try:
+        matrix = np.asarray(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        matrix = np.empty(0)
+    fits = matrix.shape == (size, size) and np.allclose(matrix, matrix.T) and np.allclose(np.diag(matrix), 1)
+    if not fits or np.linalg.eigvalsh(matrix).min() < -1e-9:
+        raise InputError(f"distribution: {path}: correlation is no correlation matrix of {size} parameters")
+    return matrix
+
+
+def correlate(uniforms: torch.Tensor, correlation: torch.Tensor) -> torch.Tensor:
+    """Return uniforms ``(..., d)`` whose normal scores have the given correlation, of independent ones."""
+    values, vectors = torch.linalg.eigh(correlation)
+    root = vectors * values.clamp(min=0).sqrt() @ vectors.T  # semidefinite is enough
+    return torch.special.ndtr(torch.special.ndtri(uniforms) @ root).clamp(1e-15, 1 - 1e-15)
+
+
+def copula_log_density(scores: torch.Tensor, correlation: torch.Tensor) -> torch.Tensor:
+    """Return the log-density of a Gaussian copula at normal scores ``(..., d)``, ``(...)``."""
+    inverse, log_det = torch.linalg.inv(correlation), torch.linalg.slogdet(correlation)[1]
+    pull = inverse - torch.eye(len(correlation), dtype=correlation.dtype)
+    return -0.5 * log_det - 0.5 * torch.einsum("...i,ij,...j->...", scores, pull, scores)
 
 
 def base_uniforms(num_samples: int, num_parameters: int, generator: torch.Generator) -> torch.Tensor:

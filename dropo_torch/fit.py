@@ -8,8 +8,8 @@ import math
 import os
 import pickle
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError, choices
 from dropo_torch.objective import Objective, draw_uniforms, no_effect
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer, Progress
+from dropo_torch.optimizers.correlated import CorrelatedOptimizer
 
 SCHEMA = "dropo-torch/fit/1"
 OPTIMIZERS = ("fisher", "cma", "adam")
@@ -64,6 +65,8 @@ class Fit:
         seconds: time spent, over all sessions of the fit.
         stop_reason: why the optimizer stopped, in words.
         history: one entry a batch.
+        method: how the distribution was found.
+        extras: what that method found beside it, as plain data.
     """
 
     distribution: Distribution
@@ -80,13 +83,18 @@ class Fit:
     seconds: float
     stop_reason: str
     history: tuple[HistoryEntry, ...]
+    method: str = "dropo"
+    extras: Mapping[str, Any] = field(default_factory=dict)
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
         same = len(set(self.epsilon)) == 1
+        correlation = self.distribution.correlation
         return {
             "schema": SCHEMA,
+            "method": self.method,
             "parameters": self.distribution.summary(),
+            **({} if correlation is None else {"correlation": correlation.tolist()}),
             "log_likelihood": self.log_likelihood,
             "mse": self.mse,
             "epsilon": self.epsilon[0] if same else list(self.epsilon),
@@ -99,6 +107,7 @@ class Fit:
             "seconds": round(self.seconds, 3),
             "seed": self.seed,
             "stop_reason": self.stop_reason,
+            **self.extras,
         }
 
     def save(self, path: str | Path) -> None:
@@ -116,10 +125,13 @@ def fit(
     population: int | None = None,
     common_random_numbers: bool = False,
     adam: AdamSettings | None = None,
+    entropy: float = 0.0,
+    covariance: str = "diagonal",
     checkpoint: str | Path | None = None,
     resume: bool = False,
     fingerprint: str = "",
     on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
+    search: Optimizer | None = None,
 ) -> Fit:
     """Fit the distribution of a simulator's parameters to a log.
 
@@ -130,10 +142,14 @@ def fit(
         seed: seeds every random number.
         budget, population, common_random_numbers: options of CMA-ES; see :class:`CMAOptimizer`.
         adam: how Adam steps.
+        entropy: weight β of Σ log σ, the entropy of p_φ, beside the log-likelihood.
+        covariance: ``"full"`` lets parameters vary together; with ``"fisher"``.
         checkpoint: file in which the fit's state is kept after every batch.
         resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
         fingerprint: identifies the config and log; a checkpoint of another one is refused.
         on_progress: called after every batch.
+        search: what finds the distribution in place of ``optimizer``, such as a method of
+            :mod:`dropo_torch.baselines`.
 
     Raises:
         InputError: a parameter without effect on this log, an unknown optimizer, a checkpoint that does not fit;
@@ -141,35 +157,70 @@ def fit(
     """
     if optimizer not in OPTIMIZERS:
         raise InputError(f"optimizer: unknown {optimizer!r}" + choices(optimizer, OPTIMIZERS))
-    search: Optimizer
+    search = search or _optimizer(
+        objective,
+        optimizer,
+        samples=samples,
+        seed=seed,
+        budget=budget,
+        population=population,
+        common_random_numbers=common_random_numbers,
+        adam=adam,
+        entropy=entropy,
+        covariance=covariance,
+    )
+    path = None if checkpoint is None else Path(checkpoint)
+    history = _restore(path, fingerprint, search, objective) if resume and path is not None else None
+    if history is None:
+        history = []
+        refuse_dead_parameters(objective)
+        if search.name == "adam" and has_reference(objective):
+            certify(objective, max_transitions=20, points=1, seed=seed).check()
+    history = _run(search, objective, history, path, fingerprint, on_progress)
+    return _conclude(search, objective, history, samples, seed)
+
+
+def _optimizer(
+    objective: Objective,
+    optimizer: str,
+    *,
+    samples: int,
+    seed: int,
+    budget: int,
+    population: int | None,
+    common_random_numbers: bool,
+    adam: AdamSettings | None,
+    entropy: float,
+    covariance: str,
+) -> Optimizer:
+    """The optimizer of a name."""
+    if covariance not in ("diagonal", "full"):
+        raise InputError(f"covariance: {covariance!r} given; expected diagonal or full")
+    if covariance == "full" and optimizer != "fisher":
+        raise InputError(f"covariance: full needs optimizer: fisher; {optimizer} has independent parameters only")
+    if entropy and optimizer == "adam":
+        raise InputError("entropy: adam has no entropy bonus; use optimizer: fisher or cma")
     if optimizer == "cma":
-        search = CMAOptimizer(
+        return CMAOptimizer(
             objective,
             samples=samples,
             seed=seed,
             budget=budget,
             population=population,
             common_random_numbers=common_random_numbers,
+            entropy=entropy,
         )
-    elif optimizer == "adam":
-        search = AdamOptimizer(objective, settings=adam or AdamSettings(), seed=seed)
-    else:
-        search = FisherOptimizer(
-            objective.simulator.parameters,
-            samples=samples,
-            seed=seed,
-            noisy=objective.noise is not None,
-            differentiable=objective.simulator.differentiable,
-        )
-    path = None if checkpoint is None else Path(checkpoint)
-    history = _restore(path, fingerprint, search, objective) if resume and path is not None else None
-    if history is None:
-        history = []
-        refuse_dead_parameters(objective)
-        if optimizer == "adam" and has_reference(objective):
-            certify(objective, max_transitions=20, points=1, seed=seed).check()
-    history = _run(search, objective, history, path, fingerprint, on_progress)
-    return _conclude(search, objective, history, samples, seed)
+    if optimizer == "adam":
+        return AdamOptimizer(objective, settings=adam or AdamSettings(), seed=seed)
+    kind = CorrelatedOptimizer if covariance == "full" else FisherOptimizer
+    return kind(
+        objective.simulator.parameters,
+        samples=samples,
+        seed=seed,
+        noisy=objective.noise is not None,
+        differentiable=objective.simulator.differentiable,
+        entropy=entropy,
+    )
 
 
 def refuse_dead_parameters(objective: Objective) -> None:
@@ -201,7 +252,9 @@ def _run(
         at = request.linearise_at
         if at is not None and (objective.linearised_at is None or not np.array_equal(at, objective.linearised_at)):
             objective.linearise(at)
-        if request.gradient:
+        if request.replay is not None:
+            search.tell(objective.map_replay(request.replay, request.values, request.reduce))
+        elif request.gradient:
             search.tell(*objective.gradient(request.values, request.reduce, request.rows))
         elif request.is_stencil and request.rows is None and objective.has_cheaper_jacobian:
             search.tell(objective.map_linear(request.values, request.reduce))
@@ -234,14 +287,14 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
     space = objective.simulator.parameters
     uniforms = draw_uniforms(samples, len(space), seed, 0)
     results = []
-    for mean, std in search.candidates():
-        objective.linearise(mean)
-        evaluation = objective.evaluate(mean[None], std[None], uniforms)[0]
-        results.append((evaluation.log_likelihood, mean, std, evaluation))
-    _, mean, std, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
-    objective.linearise(mean)
+    for candidate in search.distributions(space):
+        objective.linearise(candidate.mean)
+        evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None])[0]
+        results.append((evaluation.log_likelihood, candidate, evaluation))
+    _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
+    objective.linearise(distribution.mean)
     return Fit(
-        distribution=Distribution.over(space, mean, std),
+        distribution=distribution,
         log_likelihood=best.log_likelihood,
         mse=best.mse,
         epsilon=tuple(objective.epsilon.tolist()),
@@ -255,6 +308,8 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
         seconds=spent + time.monotonic() - begun,
         stop_reason=search.stop_reason or "",
         history=tuple(history),
+        method=search.method,
+        extras=search.extras(),
     )
 
 

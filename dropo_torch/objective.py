@@ -19,7 +19,7 @@ from dropo_torch.errors import InputError, choices
 from dropo_torch.likelihood import likelihood_with_losses, propagate, rotation_vector, widen
 from dropo_torch.observation import Observation
 from dropo_torch.simulators.base import Simulator
-from dropo_torch.trajectory import Transitions
+from dropo_torch.trajectory import Replay, Transitions
 
 #: Antithetic pairs of start noise per noisy column, and their seed.
 NOISE_DRAWS = 2
@@ -27,6 +27,8 @@ NOISE_SEED = 4
 
 #: ``reduce(features (t, P, m), measured (t, m), covariance (t, m, m)) -> (r,)``, summed over chunks.
 Reduce = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
+#: ``reduce(features (w, P, H, m), measured (w, H, m), controls (w, H, nu)) -> (r,)``, summed over replayed windows.
+ReplayReduce = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 @dataclass(frozen=True)
@@ -167,6 +169,28 @@ class Objective:
         assert total is not None
         return total
 
+    def map_replay(self, replay: Replay, values: np.ndarray | torch.Tensor, reduce: ReplayReduce) -> torch.Tensor:
+        """Replay windows open loop under parameter values ``(P, d)`` and sum ``reduce`` over them.
+
+        Args:
+            replay: the windows: W of H logged steps each.
+            values: parameter values in their units, ``(P, d)``.
+            reduce: what to sum; a replay that diverges is NaN throughout.
+        """
+        values = torch.as_tensor(np.asarray(values), dtype=torch.float64)
+        states, controls, measured = (torch.from_numpy(x) for x in (replay.states, replay.controls, replay.measured))
+        total: torch.Tensor | None = None
+        for block in _blocks(len(states), max(1, self._chunk_size // max(1, len(values) * replay.horizon))):
+            after = self.simulator.rollout(states[block], controls[block], values)[..., self.observation.index]
+            with single_thread():
+                logged = measured[block][:, None].expand_as(after)
+                compared = self.features(measured[block], measured[block])
+                part = reduce(self.features(after, logged), compared, controls[block][:, replay.history :])
+                total = part if total is None else total + part
+        self.simulated_transitions += len(states) * len(values) * replay.horizon
+        assert total is not None
+        return total
+
     @property
     def has_cheaper_jacobian(self) -> bool:
         """Whether one backward pass a column costs less than one simulation a parameter (a pass costs about 1.5)."""
@@ -228,10 +252,13 @@ class Objective:
             mean, std: μ and σ in coordinates, ``(P, d)`` each.
             uniforms: base uniforms, ``(K, d)`` common to all or ``(P, K, d)``.
         """
-        num_phi, num_samples = len(mean), uniforms.shape[-2]
-        values = self.values(mean, std, uniforms).reshape(num_phi * num_samples, -1)
+        return self.evaluate_values(self.values(mean, std, uniforms))
+
+    def evaluate_values(self, values: torch.Tensor) -> list[Evaluation]:
+        """Evaluate the sampled objective of P distributions given by their samples ``(P, K, d)``, in units."""
+        num_phi = len(values)
         before = self.simulated_transitions
-        sums = self.map(values, self.likelihood_reduction(num_phi)).reshape(4, num_phi)
+        sums = self.map(values.reshape(-1, values.shape[-1]), self.likelihood_reduction(num_phi)).reshape(4, num_phi)
         cost = (self.simulated_transitions - before) // num_phi
         found = zip(*sums.tolist(), strict=True)
         return [
@@ -342,6 +369,11 @@ class Objective:
             target = self.observation.index[list(q)]
             moved[..., target] = moved[..., target] / moved[..., target].norm(dim=-1, keepdim=True)
         return moved.reshape(-1, states.shape[1])
+
+    @property
+    def noise_deviation(self) -> torch.Tensor | None:
+        """Standard deviation of the measurement in each feature, ``(m,)``; ``None`` without noise."""
+        return None if self.noise is None else self._end_variance().sqrt()
 
     def _end_variance(self) -> torch.Tensor:
         """Variance of the measured features, ``(m,)``; a quaternion's noise ν turns by 2ν."""

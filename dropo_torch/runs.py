@@ -19,7 +19,8 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from dropo_torch.bundled import bundled_sim
+from dropo_torch.baselines import fit_problem, make_search
+from dropo_torch.bundled import bundled_sim, bundled_study
 from dropo_torch.certify import Certificate, certify
 from dropo_torch.compare import Comparison, Run, compare
 from dropo_torch.config import Config, make_config
@@ -27,10 +28,9 @@ from dropo_torch.diagnostics import diagnose
 from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
-from dropo_torch.fit import Fit, fit, refuse_dead_parameters, write_atomically
+from dropo_torch.fit import Fit, refuse_dead_parameters, write_atomically
 from dropo_torch.gap import Gap, add, find_gap, prepare
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.progress import FitProgress, StageProgress
 from dropo_torch.report.gap_words import answer
@@ -61,8 +61,9 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     check_log_option(log)
     problem = make_problem(config)
     continued = resume and (out / "checkpoint.pkl").exists()
+    make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not continued:
-        refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
+        refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
     result = _fit(problem, out / "checkpoint.pkl", resume=resume, console=console)
     _refuse_lost(problem, result)
@@ -197,6 +198,21 @@ def run_compare(
     return comparison
 
 
+def run_reproduce(
+    name: str, out: Path, *, console: Console, reduced: bool = False, resume: bool = False
+) -> Sequence[str]:
+    """Redo the published study of a bundled simulation in ``out``, and print what it found."""
+    study = bundled_study(name)
+    with StageProgress(console, f"reproduce {name}") as progress:
+        found = study(out, reduced=reduced, resume=resume, report=progress.update)
+    for line in found:
+        console.print(f"  - {line}", highlight=False, markup=False, soft_wrap=True)
+    console.print(
+        f"tables: {out / 'tables.md'}; report: {out / 'report.html'}", highlight=False, markup=False, soft_wrap=True
+    )
+    return found
+
+
 def run_gap(config: Config, out: Path, *, console: Console, source: Path | None = None, resume: bool = False) -> Gap:
     """Find what the model lacks, and write ``gap.json``, ``report.html``, ``model.xml`` and ``config.yaml`` to ``out``.
 
@@ -282,22 +298,8 @@ def versions() -> dict[str, str]:
 
 
 def _fit(problem: Problem, checkpoint: Path | None, *, resume: bool, console: Console, label: str = "fit") -> Fit:
-    config = problem.config
     with FitProgress(console, label) as progress:
-        return fit(
-            problem.objective,
-            optimizer=config.optimizer,
-            samples=config.samples,
-            seed=config.seed,
-            budget=config.budget,
-            population=config.population,
-            common_random_numbers=config.common_random_numbers,
-            adam=adam_settings(config.adam),
-            checkpoint=checkpoint,
-            resume=resume,
-            fingerprint=problem.fingerprint,
-            on_progress=progress.update,
-        )
+        return fit_problem(problem, checkpoint=checkpoint, resume=resume, on_progress=progress.update)
 
 
 def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:

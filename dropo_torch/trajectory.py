@@ -215,6 +215,49 @@ def make_transitions(
     )
 
 
+@dataclass(frozen=True)
+class Replay:
+    """Windows of a log that are replayed open loop: from a logged state, through the logged controls.
+
+    Attributes:
+        states: simulator states at the windows' starts, ``(W, nq + nv)``.
+        controls: the controls applied, after those of ``history`` steps before, ``(W, history + H, nu)``.
+        measured: observed columns after each of the H steps, ``(W, H, n)``.
+        history: logged steps before a window whose controls come with it.
+    """
+
+    states: np.ndarray
+    controls: np.ndarray
+    measured: np.ndarray
+    history: int = 0
+
+    @property
+    def horizon(self) -> int:
+        """Number of logged steps H of a window."""
+        return int(self.measured.shape[1])
+
+
+def make_replay(trajectories: Trajectories, observation: Observation, horizon: int, *, history: int = 0) -> Replay:
+    """Cut a log into consecutive windows of ``horizon`` transitions, or of the longest episode's where that is shorter.
+
+    Raises:
+        InputError: a horizon below 1.
+    """
+    if horizon < 1:
+        raise InputError(f"horizon: {horizon} given; expected a whole number of logged steps, 1 or more")
+    longest = int(np.bincount(trajectories.episodes).max())
+    steps = min(horizon, longest)
+    windows = make_transitions(trajectories, observation, lag=steps, history=history)
+    rows = (windows.rows[:, None] + np.arange(steps)).reshape(-1)
+    measured = observation.observed(trajectories.next_observations[rows])
+    return Replay(
+        states=np.ascontiguousarray(windows.states, dtype=np.float64),
+        controls=np.ascontiguousarray(windows.controls, dtype=np.float64),
+        measured=np.ascontiguousarray(measured.reshape(len(windows), steps, -1)),
+        history=history,
+    )
+
+
 def _matrix(array: object, name: str, source: str) -> np.ndarray:
     """``array`` as a read-only float64 ``(T, columns)`` matrix of finite values."""
     try:

@@ -9,7 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from dropo_torch.objective import Reduce
+from dropo_torch.distribution import Distribution
+from dropo_torch.objective import Reduce, ReplayReduce
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.trajectory import Replay
 
 
 @dataclass(frozen=True)
@@ -22,17 +25,20 @@ class Request:
         evaluations: how many evaluations of the objective this counts as.
         linearise_at: μ in coordinates at which the start noise is propagated first, or ``None``.
         rows: the transitions to simulate, ascending; ``None`` for all of them.
+        replay: windows that are replayed open loop in place of the log's transitions; ``reduce`` is then a
+            :data:`~dropo_torch.objective.ReplayReduce`.
         is_stencil: whether all vectors lie so close to the first that the simulation is linear between them.
         gradient: whether ``tell`` wants the gradient of the first sum in ``values``.
     """
 
     values: np.ndarray
-    reduce: Reduce
+    reduce: Reduce | ReplayReduce
     evaluations: int
     linearise_at: np.ndarray | None = None
     rows: np.ndarray | None = None
     gradient: bool = False
     is_stencil: bool = False
+    replay: Replay | None = None
 
 
 @dataclass(frozen=True)
@@ -58,6 +64,8 @@ class Optimizer(abc.ABC):
     """
 
     name: ClassVar[str]
+    #: What stands as ``method`` in ``fit.json``.
+    method: ClassVar[str] = "dropo"
 
     @abc.abstractmethod
     def ask(self) -> Request:
@@ -80,6 +88,14 @@ class Optimizer(abc.ABC):
     @abc.abstractmethod
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the final φ to choose from, each μ and σ in coordinates, ``(d,)`` each."""
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the final distributions to choose from: normals of the candidates unless the method has others."""
+        return [Distribution.over(space, mean, std) for mean, std in self.candidates()]
+
+    def extras(self) -> dict[str, Any]:
+        """Return what the method found beside a distribution, as plain data for ``fit.json``."""
+        return {}
 
     @abc.abstractmethod
     def state(self) -> dict[str, Any]:

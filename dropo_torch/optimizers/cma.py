@@ -15,13 +15,14 @@ from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 
 
-class _Normals:
+class Normals:
     """Standard normals for pycma from a generator of their own, which travels with a checkpoint."""
 
     def __init__(self, seed: int) -> None:
         self.generator = np.random.default_rng(seed)
 
     def __call__(self, *shape: int) -> np.ndarray:
+        """Return standard normals of a shape."""
         return self.generator.standard_normal(shape)
 
 
@@ -35,6 +36,7 @@ class CMAOptimizer(Optimizer):
         budget: evaluations of the objective after which it stops.
         population: φ per generation; ``None`` for pycma's choice.
         common_random_numbers: the same base uniforms in every generation instead of fresh ones.
+        entropy: weight of Σ log σ, which is added to the log-likelihood.
     """
 
     name = "cma"
@@ -48,7 +50,9 @@ class CMAOptimizer(Optimizer):
         budget: int,
         population: int | None = None,
         common_random_numbers: bool = False,
+        entropy: float = 0.0,
     ) -> None:
+        self._entropy = entropy
         self._objective = objective
         self._space: ParameterSpace = objective.simulator.parameters
         self._box = SearchBox.of(self._space)
@@ -57,7 +61,7 @@ class CMAOptimizer(Optimizer):
         self._noisy = objective.noise is not None
         options = {
             "bounds": [0, SearchBox.WIDTH],
-            "randn": _Normals(seed),
+            "randn": Normals(seed),
             "seed": np.nan,  # the generator above is the only source of randomness
             "verbose": -9,
             "verb_log": 0,
@@ -94,7 +98,8 @@ class CMAOptimizer(Optimizer):
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its log-likelihoods."""
         assert self._asked is not None
-        values = sums[: len(self._asked)].numpy()
+        std = self._box.denormalise(np.array(self._asked))[1]
+        values = sums[: len(self._asked)].numpy() + self._entropy * np.log(std).sum(-1)
         best = int(np.argmax(values))
         if values[best] > self._best:
             self._best, self._best_phi = float(values[best]), np.array(self._asked[best])
@@ -129,6 +134,10 @@ class CMAOptimizer(Optimizer):
         if self._best_phi is not None:
             found.append(self._best_phi)
         return [self._box.denormalise(phi) for phi in found]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the weight of the entropy, where there is one."""
+        return {"entropy": self._entropy} if self._entropy else {}
 
     def state(self) -> dict[str, Any]:
         """Return pycma's own pickle and what stands beside it."""

@@ -183,6 +183,9 @@ class FisherOptimizer(Optimizer):
     refitted until they rest; the scoring then works on that covariance. Where the
     simulation bends within the distribution, the scoring goes on over ``samples`` samples; with exact
     gradients of their likelihood where the simulator is ``differentiable``.
+
+    With ``entropy`` β, the scoring maximises the log-likelihood plus β Σ log σ: the entropy of p_φ but for a
+    constant, as in E-DROPO (arXiv 2506.10133). It keeps deviations open that the log alone would close.
     """
 
     name = "fisher"
@@ -195,9 +198,11 @@ class FisherOptimizer(Optimizer):
         seed: int = 0,
         noisy: bool = False,
         differentiable: bool = False,
+        entropy: float = 0.0,
     ) -> None:
         self._space = space
-        self._differentiable = differentiable
+        self._entropy = entropy
+        self._differentiable = differentiable and not entropy  # the exact scores know nothing of the bonus
         self._noisy = noisy
         self._box = SearchBox.of(space)
         self._limits = coordinate_limits(space.limits, space.is_log)
@@ -223,9 +228,9 @@ class FisherOptimizer(Optimizer):
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Hand the sums to the stage at work, and change stages when it has finished."""
         if self._sampled is not None:
-            self._sampled.tell(sums, gradient)
+            self._sampled.tell(self._with_entropy(self._sampled, sums), gradient)
         elif self._scoring is not None:
-            self._scoring.tell(sums)
+            self._scoring.tell(self._with_entropy(self._scoring, sums))
             if self._scoring.reason is not None and self._misleads(self._scoring):
                 self._sampled = SampledStage(
                     self._box,
@@ -287,6 +292,25 @@ class FisherOptimizer(Optimizer):
                 self._box, self._limits, self._uniforms, is_log=self._space.is_log, **state["sampled"]
             )
         self._round, self._linearised = state["round"], state["linearised"]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the weight of the entropy, where there is one."""
+        return {"entropy": self._entropy} if self._entropy else {}
+
+    def _with_entropy(self, stage: ScoringStage | SampledStage, sums: torch.Tensor) -> torch.Tensor:
+        """Add the bonus to a stage's objective and to its scores of log σ.
+
+        Where it holds a deviation open, residuals are smaller than their covariance, and the likelihood bends by 2β
+        where its Fisher information is next to nothing: that is added too, or steps overshoot.
+        """
+        if not self._entropy:
+            return sums
+        std = (stage.candidate or (stage.mean, stage.std))[1]
+        d, added = len(std), sums.clone()
+        added[0] += self._entropy * float(np.log(std).sum())
+        added[1 + d : 1 + 2 * d] += self._entropy
+        added[1 + 2 * d + d * d : 1 + 2 * d + 2 * d * d].view(d, d).diagonal().add_(2 * self._entropy)
+        return added
 
     def _after_means(self) -> None:
         """Refit the means around the noise propagated at them until they rest, then go on to the deviations."""

@@ -69,6 +69,26 @@ def distribution_row(axis: Axis, values: np.ndarray, density: np.ndarray, center
     return to_svg(figure, "density over the search box")
 
 
+def pair_panel(x_axis: Axis, y_axis: Axis, x: np.ndarray, y: np.ndarray) -> str:
+    """Draw draws of two parameters over their search boxes.
+
+    Args:
+        x_axis, y_axis: the search boxes, in the parameters' units.
+        x, y: the draws, ``(n,)`` each.
+    """
+    figure = new_figure(300, 240)
+    axes = new_axes(figure, (46, 26, 12, 8))
+    for scale, is_log in ((axes.set_xscale, x_axis.is_log), (axes.set_yscale, y_axis.is_log)):
+        scale("log" if is_log else "linear")
+    axes.minorticks_off()
+    _dots(axes, x, y, BLUE)
+    axes.set_xlim(x_axis.low, x_axis.high)
+    axes.set_ylim(y_axis.low, y_axis.high)
+    _few_ticks(axes.xaxis, 5, x_axis.is_log)
+    _few_ticks(axes.yaxis, 5, y_axis.is_log)
+    return to_svg(figure, "draws of two parameters")
+
+
 def trace_panel(
     position: np.ndarray, measured: np.ndarray, simulated: np.ndarray, expected: np.ndarray, breaks: np.ndarray
 ) -> str:

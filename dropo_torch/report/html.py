@@ -12,8 +12,9 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
+from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
-from dropo_torch.distribution import Distribution
+from dropo_torch.distribution import Distribution, to_values
 from dropo_torch.fit import Fit, HistoryEntry, write_atomically
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report import figures, words
@@ -24,6 +25,9 @@ MAX_COLUMNS = 24
 TRACE_LENGTH = 100
 #: Pairs of inseparable parameters that are spelt out.
 MAX_PAIRS = 10
+#: Draws of a mixture in each pair's panel, and panels.
+PAIR_DRAWS = 300
+MAX_DRAWN_PAIRS = 15
 
 
 def write_fit_report(
@@ -62,6 +66,8 @@ def write_fit_report(
         "tiles": _tiles(fit, diagnostics),
         "parameters": _parameter_rows(fit.distribution, diagnostics, config, space, nominal),
         "densities": _densities(fit.distribution, nominal),
+        "law": words.law(fit),
+        "pairs_drawn": _drawn_pairs(fit),
         "has_nominal": bool(np.isfinite(nominal).any()),
         **_column_content(diagnostics, shown),
         **_convergence(fit),
@@ -245,6 +251,26 @@ def _densities(distribution: Distribution, nominal: np.ndarray) -> list[dict[str
     return panels
 
 
+def _drawn_pairs(fit: Fit) -> list[dict[str, Any]]:
+    """Panels of every pair of parameters' draws, of a posterior that is more than a normal."""
+    if "mixture" not in fit.extras:
+        return []
+    distribution, mixture = fit.distribution, Mixture.of(fit.extras["mixture"])
+    draws = to_values(mixture.sample(PAIR_DRAWS, seed=0), distribution.is_log)
+    axes = [
+        figures.Axis(float(distribution.low[i]), float(distribution.high[i]), bool(distribution.is_log[i]))
+        for i in range(len(distribution))
+    ]
+    pairs = [(i, j) for i in range(len(distribution)) for j in range(i)][:MAX_DRAWN_PAIRS]
+    return [
+        {
+            "name": f"{distribution.names[i]} over {distribution.names[j]}",
+            "svg": Markup(figures.pair_panel(axes[j], axes[i], draws[:, j], draws[:, i])),
+        }
+        for i, j in pairs
+    ]
+
+
 def _column_content(diagnostics: Diagnostics, shown: Sequence[int]) -> dict[str, Any]:
     """Traces, residual panels and the table of all columns."""
     z = words.standardised_residual(diagnostics)
@@ -418,6 +444,7 @@ def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
         ("Log-likelihood", f"{nats(fit.log_likelihood)} nats, on samples that the optimizer has not seen"),
         ("Mean squared difference", f"{words.number(fit.mse)}, measured against mean simulated next state"),
         ("Simulator", fit.backend),
+        ("Method", fit.method),
         ("Optimizer", fit.optimizer),
         ("Stopped because", fit.stop_reason or "not recorded"),
         ("Evaluations of the objective", f"{fit.evaluations:,}"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, cast
@@ -51,7 +52,7 @@ def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
     """Return what needs attention first, then what is good to know."""
     found = [
         *_at_bounds(fit.distribution),
-        *_deviations(fit.distribution),
+        *(_deviations(fit.distribution) if fit.method == "dropo" else _of_method(fit)),
         *_residuals(diagnostics),
         *_confounded(diagnostics),
         *_vague(fit.distribution, diagnostics),
@@ -91,7 +92,7 @@ def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
         bad = int(np.sum(standardised > limit))
         where = "" if len(standardised) == 1 else f" in {bad} of {len(standardised)} columns"
         return False, f"The simulator does not explain the log{where}. {scale}; {at_worst}."
-    if at_largest_deviation(fit.distribution).any():
+    if fit.method == "dropo" and at_largest_deviation(fit.distribution).any():
         return False, (
             "The simulator explains the log only with parameters that vary as widely as they may (see below). "
             f"{scale}; {at_worst}."
@@ -137,19 +138,37 @@ def at_largest_deviation(distribution: Distribution) -> np.ndarray:
     return np.asarray(distribution.std >= search_box(distribution).max_std / AT_DEVIATION_BOUND)
 
 
+def law(fit: Fit) -> str:
+    """Return what the distribution is, and what its standard deviation says, by the method that found it."""
+    normal = "Each parameter follows a normal distribution cut off two standard deviations from its mean"
+    if fit.distribution.correlation is not None:
+        normal += ", and parameters vary together (correlation in fit.json)"
+    meaning = {
+        "droid": "how far the search had contracted when it stopped; it says nothing about the log",
+        "simopt": "how far the search had contracted when it stopped",
+        "bayessim": "how uncertain the network is about one fixed value",
+        "laplace": "how uncertain the log leaves one fixed value; not how much the parameter varies",
+        "udr": "the width of a box that was drawn at random",
+    }.get(fit.method, "how much the parameter must vary for the simulator to cover the log")
+    first = "Each parameter is uniform over a random interval" if fit.distribution.is_uniform else normal
+    return f"{first}. The standard deviation says {meaning}"
+
+
 def density_curve(distribution: Distribution, index: int, points: int = 121) -> tuple[np.ndarray, np.ndarray]:
     """Return values, in units, and density in coordinates, of one parameter over its support."""
     mean, std = float(distribution.mean[index]), float(distribution.std[index])
     if not (np.isfinite(mean) and np.isfinite(std) and std > 0):
         return np.zeros(0), np.zeros(0)
     z = np.linspace(*support(distribution, index), points)
-    density = np.exp(-0.5 * z**2)
+    density = np.ones_like(z) if distribution.is_uniform else np.exp(-0.5 * z**2)
     x = mean + std * np.concatenate([z[:1], z, z[-1:]])
     return to_values(x, np.full(x.shape, distribution.is_log[index])), np.concatenate([[0], density, [0]])
 
 
 def support(distribution: Distribution, index: int) -> tuple[float, float]:
     """Return the ends of one parameter's support, in deviations from its mean."""
+    if distribution.is_uniform:
+        return -math.sqrt(3), math.sqrt(3)
     low, high = (float(limit[index]) for limit in coordinate_limits(distribution.limits, distribution.is_log))
     mean, std = float(distribution.mean[index]), float(distribution.std[index])
     a, b = max(-2.0, (low - mean) / std), min(2.0, (high - mean) / std)
@@ -296,6 +315,35 @@ def _deviations(distribution: Distribution) -> list[Finding]:
                 "Standard deviation at its floor",
                 f"{joined(_chosen(distribution, floor))}. One fixed value explains the log as well as any "
                 "distribution: this is a point estimate. For training a policy you may want to add spread.",
+            )
+        )
+    return found
+
+
+def _of_method(fit: Fit) -> list[Finding]:
+    """What to know about the deviations of a method other than DROPO."""
+    box = search_box(fit.distribution)
+    share = fit.distribution.std / box.width
+    texts = {
+        "droid": (
+            "attention",
+            "They shrink with every generation, noise or not. Take the means, and spread of your own.",
+        ),
+        "simopt": ("note", "Other iterations or another bound on their steps give others."),
+        "laplace": ("note", "The model lacking something does not widen them; a longer log narrows them."),
+        "udr": ("note", "The log has no part in them."),
+        "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior pair by pair."),
+    }
+    level, text = texts.get(fit.method, ("note", ""))
+    found = [Finding(cast(Level, level), "What the standard deviations are", f"{law(fit).split('. ')[1]}. {text}")]
+    vague = [name for name, s in zip(fit.distribution.names, share, strict=True) if s > 0.8 / math.sqrt(12)]
+    if fit.method == "bayessim" and vague:
+        found.append(
+            Finding(
+                "attention",
+                "Hardly narrower than the search box",
+                f"{joined(vague)}. The network has learned next to nothing about it: more simulations, or a horizon "
+                "over which the parameter shows, may help.",
             )
         )
     return found

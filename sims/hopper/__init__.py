@@ -17,6 +17,7 @@ SIM = BundledSim(
         for link in LINKS
     },
     log=_HERE / "log.npz",
+    study="sims.hopper.study:run_study",
     truth={"torso_mass": 3.0, "thigh_mass": 4.7, "leg_mass": 2.4, "foot_mass": 4.9},
     task="sims.hopper.task:HopperTask",
 )

@@ -1,0 +1,126 @@
+"""How often the intervals of each method hold the truth, over simulated logs of a driven pendulum.
+
+    python benchmarks/calibration.py --logs 100 --out out/calibration     # --resume goes on
+
+Writes ``trials.jsonl``, a line a fit, and ``calibration.md``. Mass and damping are searched for; the log has 60
+transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.baselines.calibration` has the two kinds of
+log.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import dropo_torch as dropo
+from dropo_torch.baselines.calibration import LEVELS, Coverage, Trial, calibrate, coverages, plain
+
+MODEL = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="bob" pos="0 0 1">
+      <joint name="pivot" type="hinge" axis="0 1 0" damping="0.1"/>
+      <inertial pos="0 0 -.5" mass="1" diaginertia=".002 .002 .002"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="pivot"/></actuator>
+</mujoco>"""
+#: Deviations of the noise, rad and rad/s.
+NOISE = np.array([1e-4, 5e-4])
+#: Name → what the config of the method has beside the common keys.
+METHODS: dict[str, dict[str, Any]] = {
+    "dropo": {},
+    "dropo, full covariance": {"covariance": "full"},
+    "dropo, entropy 1": {"entropy": 1.0},
+    "laplace": {"method": "laplace"},
+    "droid": {"method": "droid", "method_options": {"budget": 600}},
+    "simopt": {"method": "simopt", "method_options": {"samples": 60, "iterations": 15, "horizon": 20}},
+    "bayessim, mdnn": {"method": "bayessim", "method_options": {"simulations": 500, "horizon": 20}},
+    "bayessim, mdrff": {
+        "method": "bayessim", "method_options": {"simulations": 500, "horizon": 20, "features": "mdrff"},
+    },
+    "udr": {"method": "udr"},
+}  # fmt: skip
+
+
+def problem_of(folder: Path, name: str, transitions: int) -> dropo.Problem:
+    """The pendulum fitted by a method; the log gives actions and a start."""
+    (folder / "pendulum.xml").write_text(MODEL)
+    torque = 3 * np.sin(0.31 * np.arange(transitions)) + np.sin(1.1 * np.arange(transitions))
+    still = np.zeros((transitions, 2))
+    np.savez(
+        folder / "log.npz", observations=still, next_observations=still, actions=torque[:, None],
+        terminals=np.arange(transitions) == transitions - 1,
+    )  # fmt: skip
+    document = {
+        "model": "pendulum.xml",
+        "data": "log.npz",
+        "frame_skip": 4,
+        "parameters": {
+            "mass": {"field": "body_mass", "name": "bob", "bounds": [0.5, 2.5], "unit": "kg"},
+            "damping": {"field": "dof_damping", "name": "pivot", "bounds": [0.02, 0.5], "limits": [0, 1]},
+        },
+        "epsilon": (NOISE**2).tolist(),
+        "samples": 50,
+        "threads": 1,
+        **METHODS[name],
+    }
+    return dropo.make_problem(dropo.make_config(document, base=folder))
+
+
+def markdown(rows: Sequence[Coverage]) -> str:
+    lines = ["| log | method | parameter | level | covered [95 %] | width of the interval, share of the box | logs |"]
+    lines.append("|---|---|---|---|---|---|---|")
+    for r in rows:
+        covered = f"{100 * r.covered:.0f} % [{100 * r.low:.0f}, {100 * r.high:.0f}]"
+        lines.append(
+            f"| {r.kind} | {r.method} | {r.parameter} | {100 * r.level:.0f} % | {covered} | {r.width:.2g} | {r.logs} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--logs", type=int, default=100, help="of each kind")
+    parser.add_argument("--transitions", type=int, default=60)
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    store = given.out / "trials.jsonl"
+    if store.exists() and not given.resume:
+        parser.error(f"{store} exists; add --resume, or name another folder")
+    done = []
+    if store.exists():
+        whole = store.read_text().rpartition("\n")[0]  # a line that was cut short is done again
+        store.write_text(whole + "\n" if whole else "")
+        done = [Trial(**json.loads(line)) for line in whole.splitlines()]
+    with tempfile.TemporaryDirectory() as folder, store.open("a") as stream:
+
+        def keep(trial: Trial) -> None:
+            stream.write(json.dumps(plain(trial)) + "\n")
+            stream.flush()
+            inside = "  ".join(
+                f"{level:g}: {np.mean(list(trial.inside[f'{level:g}'].values())):.2f}" for level in LEVELS
+            )
+            print(f"log {trial.log:<4} {trial.kind:<8} {trial.method:<24} inside {inside}", flush=True)
+
+        trials = calibrate(
+            lambda name: problem_of(Path(folder), name, given.transitions),
+            given.methods, logs=given.logs, noise=NOISE, done=done, on_trial=keep,
+        )  # fmt: skip
+    table = markdown(coverages(trials))
+    (given.out / "calibration.md").write_text(table)
+    print(table)
+
+
+if __name__ == "__main__":
+    main()

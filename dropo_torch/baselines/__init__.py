@@ -1,0 +1,93 @@
+"""Other ways from a log to a distribution: DROID, BayesSim, SimOpt, uniform boxes and the Laplace posterior.
+
+Each is an :class:`~dropo_torch.optimizers.Optimizer`, so that one loop runs, reports and resumes them all.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from dropo_torch.baselines.bayessim import BayesSimOptimizer
+from dropo_torch.baselines.droid import DroidOptimizer
+from dropo_torch.baselines.laplace import LaplaceOptimizer
+from dropo_torch.baselines.mixture import Mixture
+from dropo_torch.baselines.settings import (
+    METHODS,
+    BayesSimSettings,
+    DroidSettings,
+    SimOptSettings,
+    UdrSettings,
+    method_settings,
+)
+from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
+from dropo_torch.baselines.udr import UdrOptimizer
+from dropo_torch.errors import InputError
+from dropo_torch.fit import Fit, HistoryEntry, fit
+from dropo_torch.optimizers import Optimizer, Progress
+from dropo_torch.optimizers.adam import adam_settings
+from dropo_torch.problem import Problem
+from dropo_torch.trajectory import make_replay
+
+__all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
+
+
+def make_search(problem: Problem) -> Optimizer | None:
+    """Return what finds the distribution by the config's ``method``; ``None`` for DROPO's own optimizers.
+
+    Raises:
+        InputError: options that the method does not have.
+    """
+    config, objective = problem.config, problem.objective
+    settings = method_settings(config.method, config.method_options)
+    space, seed = problem.space, config.seed
+    if isinstance(settings, UdrSettings):
+        return UdrOptimizer(space, settings=settings, seed=seed)
+    if isinstance(settings, DroidSettings):
+        return DroidOptimizer(space, settings=settings, seed=seed)
+    if config.method == "laplace":
+        return LaplaceOptimizer(objective)
+    if isinstance(settings, SimOptSettings | BayesSimSettings):
+        history = objective.transitions.history
+        replay = make_replay(problem.trajectories, problem.observation, settings.horizon, history=history)
+        if isinstance(settings, SimOptSettings):
+            return SimOptOptimizer(space, replay, column_scales(objective), settings=settings, seed=seed)
+        if replay.horizon < 2:
+            raise InputError("method: bayessim needs an episode of two transitions or more; this log has none")
+        return BayesSimOptimizer(
+            space,
+            replay,
+            objective.num_features,
+            settings=settings,
+            seed=seed,
+            noise=objective.noise_deviation,
+        )
+    return None
+
+
+def fit_problem(
+    problem: Problem,
+    *,
+    checkpoint: Path | None = None,
+    resume: bool = False,
+    on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
+) -> Fit:
+    """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`."""
+    config = problem.config
+    return fit(
+        problem.objective,
+        optimizer=config.optimizer,
+        samples=config.samples,
+        seed=config.seed,
+        budget=config.budget,
+        population=config.population,
+        common_random_numbers=config.common_random_numbers,
+        adam=adam_settings(config.adam),
+        entropy=config.entropy,
+        covariance=config.covariance,
+        checkpoint=checkpoint,
+        resume=resume,
+        fingerprint=problem.fingerprint,
+        on_progress=on_progress,
+        search=make_search(problem),
+    )

@@ -1,0 +1,177 @@
+"""BayesSim (Ramos, Possas, Fox 2019): a mixture-density network from summaries of replays to parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.baselines.density import fit_mixture
+from dropo_torch.baselines.mixture import Mixture
+from dropo_torch.baselines.settings import BayesSimSettings
+from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.objective import ReplayReduce, draw_uniforms
+from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.trajectory import Replay
+
+#: Simulations of a batch.
+_BATCH = 100
+
+
+def summary_sums(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
+    """Return the sums behind the summary statistics, of each replay and last of the log, ``((P + 1) · q,)``.
+
+    With Δ the change of the m columns over a step and u its n controls: ΣΔ, ΣΔ² and ΣΔuᵀ, so q = 2m + mn.
+
+    Args:
+        features: replayed, ``(w, P, H, m)``.
+        measured: ``(w, H, m)``.
+        controls: ``(w, H, n)``.
+    """
+    paths = torch.cat([features, measured[:, None]], 1)
+    change = paths.diff(dim=2)
+    crossed = torch.einsum("wphm,whn->pmn", change, controls[:, 1:])
+    return torch.cat([change.sum((0, 2)), change.square().sum((0, 2)), crossed.flatten(1)], 1).flatten()
+
+
+def summaries(sums: np.ndarray, columns: int, count: int) -> np.ndarray:
+    """Return mean, variance and control correlation of ``count`` changes, ``(P, q)``, from their sums ``(P, q)``."""
+    first, second, crossed = np.split(sums / count, [columns, 2 * columns], axis=1)
+    return np.concatenate([first, second - first**2, crossed], axis=1)
+
+
+class BayesSimOptimizer(Optimizer):
+    """Simulation-based inference from a uniform prior over the search box.
+
+    The log is cut into windows of ``horizon`` steps, which are replayed *open loop* from their logged starts with the
+    logged actions, under parameter vectors of the prior. A replay is summarised by mean and variance of the columns'
+    changes per step and their correlation with the controls, over all windows together. A network learns the
+    parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
+    posterior. The result is the normal with the posterior's mean and covariance inside the box, its correlation
+    included; the mixture is kept beside it. With ``noise``, replays are measured as the log was.
+
+    Args:
+        space: what varies.
+        replay: the windows.
+        num_columns: compared columns m.
+        noise: standard deviation of the measurement in each of them, ``(m,)``, or ``None``.
+        settings: features, simulations and size of the network.
+        seed: seeds simulations and network.
+    """
+
+    name = "mixture-density network"
+    method = "bayessim"
+
+    def __init__(
+        self,
+        space: ParameterSpace,
+        replay: Replay,
+        num_columns: int,
+        *,
+        settings: BayesSimSettings,
+        seed: int,
+        noise: torch.Tensor | None = None,
+    ) -> None:
+        self._noise = noise
+        self._space, self._replay, self._settings, self._seed = space, replay, settings, seed
+        self._num_columns = num_columns
+        self._box = SearchBox.of(space)
+        self._sums: list[np.ndarray] = []  # of each batch, (n, q)
+        self._logged = np.zeros(0)
+        self._mixture: Mixture | None = None
+
+    def ask(self) -> Request:
+        """Return the next batch of the prior, ``(n, d)``."""
+        points = self._box.low + self._shares(len(self._sums)) * self._box.width
+        return Request(
+            values=to_values(points, self._space.is_log),
+            reduce=self._measured(len(self._sums)),
+            evaluations=len(points),
+            replay=self._replay,
+        )
+
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Keep the summaries; train the network on the last batch's."""
+        table = sums.numpy().reshape(len(self._shares(len(self._sums))) + 1, -1)
+        self._sums.append(table[:-1].copy())
+        self._logged = table[-1].copy()
+        if len(self._sums) * _BATCH >= self._settings.simulations:
+            self._mixture = self._infer()
+
+    @property
+    def stop_reason(self) -> str | None:
+        """The network is trained."""
+        return None if self._mixture is None else f"{self._settings.simulations} simulations of the prior are used"
+
+    @property
+    def progress(self) -> Progress:
+        """The share of the prior's simulations that is done."""
+        return Progress("BayesSim", float("nan"), min(1.0, len(self._sums) * _BATCH / self._settings.simulations))
+
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return mean and deviations of the posterior, before it is known the prior's."""
+        if self._mixture is None:
+            return [(self._box.middle, self._box.width / np.sqrt(12))]
+        mean, covariance = self._mixture.moments_inside
+        return [(mean, np.maximum(np.sqrt(np.diag(covariance)), self._box.min_std))]
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the normal with the posterior's moments."""
+        assert self._mixture is not None
+        (mean, std), (_, covariance) = self.candidates()[0], self._mixture.moments_inside
+        spread = np.sqrt(np.diag(covariance))
+        return [Distribution.over(space, mean, std, correlation=covariance / np.outer(spread, spread))]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the whole mixture, in coordinates, and what it was learned from."""
+        assert self._mixture is not None
+        return {
+            "mixture": {"parameters": list(self._space.names), **self._mixture.document()},
+            "features": self._settings.features,
+            "horizon": self._replay.horizon,
+            "simulations": self._settings.simulations,
+        }
+
+    def state(self) -> dict[str, Any]:
+        """Return the summaries so far, and the mixture."""
+        mixture = None if self._mixture is None else self._mixture.document()
+        return {"sums": self._sums, "logged": self._logged, "mixture": mixture}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._sums, self._logged = list(state["sums"]), state["logged"]
+        self._mixture = None if state["mixture"] is None else Mixture.of(state["mixture"])
+
+    def _measured(self, batch: int) -> ReplayReduce:
+        """The sums of a batch's summaries, noise added to what is simulated."""
+        if self._noise is None:
+            return summary_sums
+        noise, generator = self._noise, torch.Generator().manual_seed(self._seed * 1_000_003 + batch)
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
+            drawn = noise * torch.randn(features.shape, generator=generator, dtype=features.dtype)
+            return summary_sums(features + drawn, measured, controls)
+
+        return reduce
+
+    def _shares(self, batch: int) -> np.ndarray:
+        """A batch of the prior, as shares of the search box, ``(n, d)``."""
+        count = min(_BATCH, self._settings.simulations - batch * _BATCH)
+        return draw_uniforms(count, len(self._space), self._seed, 13, batch).numpy()
+
+    def _infer(self) -> Mixture:
+        """The posterior at the log's summary."""
+        shares = np.concatenate([self._shares(i) for i in range(len(self._sums))])
+        count = len(self._replay.states) * (self._replay.horizon - 1)
+        found = summaries(np.concatenate([*self._sums, self._logged[None]]), self._num_columns, count)
+        return fit_mixture(
+            found[:-1],
+            shares,
+            found[-1],
+            settings=self._settings,
+            seed=self._seed,
+            low=self._box.low,
+            width=self._box.width,
+        )

@@ -1,0 +1,128 @@
+"""DROID (Tsai et al. 2021): CMA-ES on the error of replayed transitions; the distribution is its last generation's."""
+
+from __future__ import annotations
+
+import pickle
+from typing import Any
+
+import cma
+import numpy as np
+import torch
+
+from dropo_torch.baselines.settings import DroidSettings
+from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.optimizers.cma import Normals
+from dropo_torch.parameters import ParameterSpace
+
+#: Squared error that a diverged transition counts as, per column.
+_LOST = 1e6
+
+
+def squared_errors(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Return Σ‖s − s'‖² of each parameter vector, ``(P,)``; a diverged column counts a million."""
+    error = (features - measured[:, None]).square()
+    return torch.nan_to_num(error, nan=_LOST).sum((0, 2))
+
+
+class DroidOptimizer(Optimizer):
+    """CMA-ES over parameter vectors, scaled to [0, 4], first step 1, start in the middle.
+
+    Each logged transition (window of λ steps) is replayed from its logged start; the error is the squared L2 distance
+    in the compared columns, summed. The distribution is the normal from which the last generation was drawn: it says
+    how far the search had contracted when it stopped, and nothing about the log.
+
+    Args:
+        space: what varies.
+        settings: budget and population.
+        seed: seeds the search.
+    """
+
+    name = "cma"
+    method = "droid"
+
+    def __init__(self, space: ParameterSpace, *, settings: DroidSettings, seed: int) -> None:
+        self._space, self._box, self._settings = space, SearchBox.of(space), settings
+        options: dict[str, Any] = {
+            "bounds": [0, SearchBox.WIDTH],
+            "randn": Normals(seed),
+            "seed": np.nan,  # the generator above is the only source of randomness
+            "verbose": -9,
+            "verb_log": 0,
+            "verb_disp": 0,
+            "maxfevals": settings.budget,
+            "tolfun": 1e-12,
+            "tolfunhist": 1e-13,
+        }
+        if settings.population:
+            options["popsize"] = max(2, settings.population)
+        start = np.full(max(2, len(space)), SearchBox.WIDTH / 2)  # pycma needs two dimensions; the second is idle
+        self._search = cma.CMAEvolutionStrategy(start, 1.0, options)
+        self._asked: list[np.ndarray] | None = None
+        self._best = np.inf
+
+    def ask(self) -> Request:
+        """Return a generation, ``(population, d)``."""
+        if self._asked is None:
+            self._asked = self._search.ask()
+        points = self._coordinates(np.array(self._asked))
+        return Request(
+            values=to_values(points, self._space.is_log), reduce=squared_errors, evaluations=len(self._asked)
+        )
+
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Rank the generation by its errors."""
+        assert self._asked is not None
+        self._best = min(self._best, float(sums.min()))
+        self._search.tell(self._asked, sums.tolist())
+        self._asked = None
+
+    @property
+    def stop_reason(self) -> str | None:
+        """Pycma's termination conditions, in words."""
+        met = self._search.stop()
+        words = {
+            "maxfevals": f"the budget of {self._settings.budget} simulations of the log is spent",
+            "tolfun": "the error no longer differs within a generation",
+            "tolfunhist": "the best error no longer changes",
+            "tolx": "the search distribution has shrunk to a point",
+            "tolflatfitness": "the error is flat",
+        }
+        return "; ".join(words.get(k, f"pycma stopped: {k}") for k in met) if met else None
+
+    @property
+    def progress(self) -> Progress:
+        """The share of the budget that is spent."""
+        return Progress("DROID", float("nan"), min(1.0, self._search.countevals / self._settings.budget))
+
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return mean and deviations of the search distribution."""
+        d, scale = len(self._space), self._box.width / SearchBox.WIDTH
+        mean = self._coordinates(np.asarray(self._search.result.xfavorite)[None])[0]
+        std = np.asarray(self._search.result.stds)[:d] * scale
+        return [(mean, np.clip(std, self._box.min_std, self._box.width))]
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the search distribution with its correlation."""
+        mean, std = self.candidates()[0]
+        d = len(space)
+        correlation = np.asarray(self._search.sm.correlation_matrix)[:d, :d]
+        return [Distribution.over(space, mean, std, correlation=correlation)]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the best squared error, summed over the log."""
+        return {"squared_error": self._best}
+
+    def state(self) -> dict[str, Any]:
+        """Return pycma's own pickle and what stands beside it."""
+        return {"search": self._search.pickle_dumps(), "asked": self._asked, "best": self._best}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._search = pickle.loads(state["search"])
+        self._asked, self._best = state["asked"], state["best"]
+
+    def _coordinates(self, points: np.ndarray) -> np.ndarray:
+        """Parameter vectors in coordinates of points in [0, 4], ``(P, d)``."""
+        share = np.clip(points[:, : len(self._space)] / SearchBox.WIDTH, 0, 1)
+        return self._box.low + share * self._box.width

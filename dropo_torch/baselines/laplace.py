@@ -1,0 +1,107 @@
+"""The Laplace posterior of the point estimate: how well the log pins down *one* vector of parameters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.diagnostics import estimates
+from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.objective import Objective
+from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.optimizers.fisher import AT_REST, NOISY_ROUNDS
+from dropo_torch.optimizers.gauss_newton import MeansStage
+from dropo_torch.parameters import ParameterSpace
+
+
+class LaplaceOptimizer(Optimizer):
+    """Gauss-Newton on the means, and the normal of the likelihood's curvature there.
+
+    The transitions of the log are simulated one by one from their logged starts, as for DROPO. The covariance is
+    s² (ΣJᵀC⁻¹J)⁻¹ with C of ε and the noise, and s² the reduced χ² of the residuals: ε only weighs the columns, the
+    size of the residuals is the log's own. It says how uncertain a fixed vector is, not how much parameters vary.
+
+    Args:
+        objective: gives the reduction and the size of the log; it is not evaluated here.
+    """
+
+    name = "gauss-newton"
+    method = "laplace"
+
+    def __init__(self, objective: Objective) -> None:
+        self._space: ParameterSpace = objective.simulator.parameters
+        self._box = SearchBox.of(self._space)
+        self._num_residuals = len(objective) * objective.num_features
+        self._means = MeansStage(self._box.low, self._box.high, self._box.middle)
+        self._linearised: np.ndarray | None = None if objective.noise is None else self._means.point
+        self._round = 0
+
+    def ask(self) -> Request:
+        """Return the stencil of the means."""
+        return Request(
+            values=to_values(self._means.points(), self._space.is_log),
+            reduce=self._means.reduction(),
+            evaluations=1,
+            linearise_at=self._linearised,
+            is_stencil=True,
+        )
+
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Hand the sums to the means; start anew around noise propagated at them until they rest."""
+        self._means.tell(sums)
+        before = self._linearised
+        if self._means.reason is None or before is None or self._round >= NOISY_ROUNDS:
+            return
+        point = self._means.point
+        if bool((np.abs(point - before) > AT_REST * self._box.width).any()):
+            self._round, self._linearised = self._round + 1, point
+            self._means = MeansStage(self._box.low, self._box.high, point)
+
+    @property
+    def stop_reason(self) -> str | None:
+        """Why the means stopped."""
+        return self._means.reason
+
+    @property
+    def progress(self) -> Progress:
+        """How far the means may be."""
+        done = self._round / (NOISY_ROUNDS + 1) if self._linearised is not None else 0.0
+        share = done + (1 - done) * min(1.0, self._means.iterations / 10)
+        return Progress("Gauss-Newton on the means", float("nan"), share)
+
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return the point estimate and its standard errors."""
+        error, _ = self._posterior()
+        return [(self._means.point, np.clip(error, self._box.min_std, self._box.width))]
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the posterior with its correlation."""
+        (mean, std), (_, correlation) = self.candidates()[0], self._posterior()
+        return [Distribution.over(space, mean, std, correlation=correlation)]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the reduced χ², 1 where ε (and the noise) are as large as the residuals."""
+        return {"reduced_chi2": self._scale()}
+
+    def state(self) -> dict[str, Any]:
+        """Return the stage as plain data."""
+        return {"means": dict(vars(self._means)), "round": self._round, "linearised": self._linearised}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._means = MeansStage(**state["means"])
+        self._round, self._linearised = state["round"], state["linearised"]
+
+    def _posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        """Standard errors ``(d,)`` and correlations ``(d, d)``."""
+        d = len(self._space)
+        if self._means.hessian.shape != (d, d):  # nothing has been simulated yet, or nothing survived
+            return self._box.width.copy(), np.eye(d)
+        error, correlation = estimates(self._means.hessian)
+        return np.sqrt(self._scale()) * error, correlation
+
+    def _scale(self) -> float:
+        freedom = max(1, self._num_residuals - len(self._space))
+        return float(2 * self._means.cost / freedom)

@@ -1,0 +1,97 @@
+"""Mixtures of Gaussians in coordinates, cut off at the search box: what BayesSim's posterior is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.errors import InputError
+
+#: Draws of the truncated mixture from which its moments are taken.
+_MOMENT_DRAWS = 20_000
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """A mixture of M Gaussians over d coordinates, cut off at a box.
+
+    Attributes:
+        weights: ``(M,)``, summing to 1.
+        means: ``(M, d)``.
+        covariances: ``(M, d, d)``.
+        low, high: the box, ``(d,)`` each; infinite where there is none.
+    """
+
+    weights: np.ndarray
+    means: np.ndarray
+    covariances: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def sample(self, count: int, seed: int) -> np.ndarray:
+        """Return draws inside the box, ``(count, d)``.
+
+        A mixture with next to no mass in its box is drawn from at the box's nearest points.
+        """
+        generator = np.random.default_rng(seed)
+        roots = np.linalg.cholesky(self.covariances)
+        kept: list[np.ndarray] = []
+        found = 0
+        draws = np.zeros((0, self.means.shape[1]))
+        for _ in range(50):
+            which = generator.choice(len(self.weights), size=2 * count, p=self.weights)
+            normal = generator.standard_normal((2 * count, self.means.shape[1]))
+            draws = self.means[which] + np.einsum("nij,nj->ni", roots[which], normal)
+            inside = draws[((draws >= self.low) & (draws <= self.high)).all(1)]
+            kept.append(inside)
+            found += len(inside)
+            if found >= count:
+                break
+        else:
+            kept.append(np.clip(draws, self.low, self.high))
+        return np.concatenate(kept)[:count]
+
+    def log_density(self, points: np.ndarray) -> np.ndarray:
+        """Return the log-density of the mixture without its box at points ``(n, d)``, ``(n,)``."""
+        d = self.means.shape[1]
+        parts = []
+        for weight, mean, covariance in zip(self.weights, self.means, self.covariances, strict=True):
+            root = np.linalg.cholesky(covariance)
+            white = np.linalg.solve(root, (points - mean).T)
+            log_det = np.log(np.diag(root)).sum()
+            parts.append(np.log(weight + 1e-300) - 0.5 * (white**2).sum(0) - log_det - 0.5 * d * np.log(2 * np.pi))
+        return np.asarray(np.logaddexp.reduce(parts, axis=0))
+
+    @property
+    def moments(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean ``(d,)`` and covariance ``(d, d)`` of the mixture without its box, exact."""
+        mean = self.weights @ self.means
+        centred = self.means - mean
+        between = np.einsum("m,mi,mj->ij", self.weights, centred, centred)
+        return mean, np.einsum("m,mij->ij", self.weights, self.covariances) + between
+
+    @property
+    def moments_inside(self) -> tuple[np.ndarray, np.ndarray]:
+        """Mean ``(d,)`` and covariance ``(d, d)`` of the mixture inside its box, from draws."""
+        draws = self.sample(_MOMENT_DRAWS, seed=0)
+        return draws.mean(0), np.atleast_2d(np.cov(draws.T))
+
+    def document(self) -> dict[str, Any]:
+        """Return the mixture as plain data."""
+        return {name: getattr(self, name).tolist() for name in ("weights", "means", "covariances", "low", "high")}
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> Mixture:
+        """Return the mixture of a ``fit.json``'s ``mixture``.
+
+        Raises:
+            InputError: no such entry.
+        """
+        names: Sequence[str] = ("weights", "means", "covariances", "low", "high")
+        try:
+            return cls(*(np.asarray(document[name], dtype=np.float64) for name in names))
+        except (KeyError, TypeError, ValueError):
+            raise InputError(f"mixture: expected {', '.join(names)}, as in the fit.json of method: bayessim") from None

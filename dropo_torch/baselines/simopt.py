@@ -1,0 +1,171 @@
+"""SimOpt (Chebotar et al. 2019), offline: relative-entropy policy search on the error of replayed trajectories."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.optimize
+import torch
+
+from dropo_torch.baselines.settings import SimOptSettings
+from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.objective import Objective
+from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.trajectory import Replay
+
+
+def discrepancy(features: torch.Tensor, measured: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """Return Σ (|e|₁ + |e|₂²) of each parameter vector, ``(P,)``, with e = (s − s')/scale; NaN where one diverged.
+
+    Args:
+        features: replayed, ``(w, P, H, m)``.
+        measured: ``(w, H, m)``.
+        scale: of each column, ``(m,)``.
+    """
+    error = (features - measured[:, None]) / scale
+    return (error.abs() + error.square()).sum((0, 2, 3))
+
+
+def reps_weights(costs: np.ndarray, kl: float) -> np.ndarray:
+    """Return the weights of relative-entropy policy search, ``(N,)``, summing to 1.
+
+    They minimise the expected cost among all reweightings of the samples whose relative entropy to the samples is
+    at most ``kl``: w ∝ exp(−cost / η), with η the minimiser of the dual η kl + η log mean exp(−cost / η).
+
+    Args:
+        costs: of the samples, ``(N,)``; one that is not finite gets no weight.
+        kl: in nats.
+    """
+    finite = np.isfinite(costs)
+    if not finite.any():
+        return np.full(len(costs), 1 / len(costs))
+    low = costs[finite].min()
+    spread = costs[finite].std()
+    if spread == 0:
+        return finite / finite.sum()
+    gain = np.where(finite, (costs - low) / spread, np.inf)
+
+    def dual(log_eta: float) -> float:
+        eta = float(np.exp(log_eta))
+        return eta * kl + eta * float(np.log(np.mean(np.exp(-gain / eta))))
+
+    best = scipy.optimize.minimize_scalar(dual, bounds=(np.log(1e-3), np.log(1e3)), method="bounded")
+    weights = np.exp(-gain / np.exp(best.x))
+    return weights / weights.sum()
+
+
+class SimOptOptimizer(Optimizer):
+    """Moves a normal with full covariance, in coordinates, towards replays that look like the log.
+
+    The log is cut into windows of ``horizon`` steps. Each is replayed *open loop* from its logged start with its
+    logged actions, so errors add up along it. The discrepancy is the sum of the L1 and squared L2 errors over all
+    steps, in columns scaled by their deviation over the log. (SimOpt also filters the error in time, for robots whose
+    clock drifts against the simulation's; a log and its replay share theirs.) The first distribution is the search
+    box's middle with a quarter of its width. Each iteration fits the normal to its samples, weighted by
+    :func:`reps_weights`.
+
+    Args:
+        space: what varies.
+        replay: the windows.
+        scale: of each compared column, ``(m,)``.
+        settings: samples, iterations and bounds.
+        seed: seeds the samples.
+    """
+
+    name = "reps"
+    method = "simopt"
+
+    def __init__(
+        self, space: ParameterSpace, replay: Replay, scale: torch.Tensor, *, settings: SimOptSettings, seed: int
+    ) -> None:
+        self._space, self._replay, self._scale, self._settings, self._seed = space, replay, scale, settings, seed
+        self._box = SearchBox.of(space)
+        self._mean = np.full(len(space), 0.5)  # as shares of the search box
+        self._covariance = np.diag(np.full(len(space), 0.25**2))
+        self._iteration = 0
+        self._cost = float("nan")
+
+    def ask(self) -> Request:
+        """Return the samples of the current distribution, ``(N, d)``."""
+        points = self._box.low + self._draws() * self._box.width
+        scale = self._scale
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
+            return discrepancy(features, measured, scale)
+
+        return Request(
+            values=to_values(points, self._space.is_log), reduce=reduce, evaluations=len(points), replay=self._replay
+        )
+
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Fit the distribution to the weighted samples."""
+        draws, costs = self._draws(), sums.numpy()
+        weights = reps_weights(costs, self._settings.kl)
+        self._mean = weights @ draws
+        centred = draws - self._mean
+        covariance = (weights[:, None] * centred).T @ centred
+        lost = float(weights @ weights)  # a weighted covariance is too small by the inverse of the effective number
+        covariance /= max(1 - lost, 0.1)
+        floor = (self._box.min_std / self._box.width) ** 2
+        self._covariance = covariance + np.diag(np.maximum(floor - np.diag(covariance), 0))
+        self._cost = float(weights @ np.nan_to_num(costs))
+        self._iteration += 1
+
+    @property
+    def stop_reason(self) -> str | None:
+        """Iterations spent, or nothing left to shrink."""
+        if self._iteration and (np.sqrt(np.diag(self._covariance)) < self._settings.tolerance).all():
+            return f"every deviation is below {self._settings.tolerance:g} of the search width"
+        if self._iteration >= self._settings.iterations:
+            return f"{self._settings.iterations} iterations of relative-entropy policy search"
+        return None
+
+    @property
+    def progress(self) -> Progress:
+        """The share of iterations done."""
+        return Progress("SimOpt", float("nan"), self._iteration / self._settings.iterations)
+
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return mean and deviations of the current distribution."""
+        mean = np.clip(self._box.low + self._mean * self._box.width, self._box.low, self._box.high)
+        return [(mean, np.maximum(np.sqrt(np.diag(self._covariance)) * self._box.width, self._box.min_std))]
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the current distribution with its correlation."""
+        mean, std = self.candidates()[0]
+        spread = np.sqrt(np.diag(self._covariance))
+        correlation = self._covariance / np.outer(spread, spread)
+        return [Distribution.over(space, mean, std, correlation=correlation)]
+
+    def extras(self) -> dict[str, Any]:
+        """Return the weighted discrepancy of the last iteration, and the windows' length."""
+        return {"discrepancy": self._cost, "horizon": self._replay.horizon}
+
+    def state(self) -> dict[str, Any]:
+        """Return the distribution and the iteration."""
+        return {
+            "mean": self._mean,
+            "covariance": self._covariance,
+            "iteration": self._iteration,
+            "cost": self._cost,
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._mean, self._covariance = state["mean"], state["covariance"]
+        self._iteration, self._cost = state["iteration"], state["cost"]
+
+    def _draws(self) -> np.ndarray:
+        """The iteration's samples, as shares of the search box, ``(N, d)``; a function of seed and iteration."""
+        generator = np.random.default_rng([self._seed, 11, self._iteration])
+        normal = generator.standard_normal((self._settings.samples, len(self._mean)))
+        values, vectors = np.linalg.eigh(self._covariance)
+        return np.clip(self._mean + normal * np.sqrt(np.maximum(values, 0)) @ vectors.T, 0.0, 1.0)
+
+
+def column_scales(objective: Objective) -> torch.Tensor:
+    """Return the deviation of each compared column over the log, 1 where it never moves, ``(m,)``."""
+    deviation = objective.measured.std(0, unbiased=False)
+    return torch.where(deviation > 1e-12, deviation, torch.ones_like(deviation))

@@ -1,0 +1,79 @@
+"""Uniform domain randomization: random boxes inside the search space, without a look at the log."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.baselines.settings import UdrSettings
+from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.parameters import ParameterSpace
+
+
+class UdrOptimizer(Optimizer):
+    """Draws boxes whose ends are uniform in the search box, and returns one of them; nothing is simulated.
+
+    A policy is usually trained on each of the boxes and their results are averaged: the same config with
+    ``method_options.box`` from 0 to ``boxes`` − 1 gives them all.
+
+    Args:
+        space: what varies.
+        settings: how many boxes, and which.
+        seed: seeds the boxes.
+    """
+
+    name = "udr"
+    method = "udr"
+
+    def __init__(self, space: ParameterSpace, *, settings: UdrSettings, seed: int) -> None:
+        box = SearchBox.of(space)
+        ends = np.random.default_rng(seed).uniform(size=(settings.boxes, 2, len(space)))
+        self._ends = box.low + np.sort(ends, axis=1) * box.width  # (boxes, 2, d), coordinates
+        self._space, self._chosen = space, settings.box
+
+    def ask(self) -> Request:
+        """Nothing is asked."""
+        raise RuntimeError("uniform domain randomization simulates nothing")
+
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Nothing is told."""
+        raise RuntimeError("uniform domain randomization simulates nothing")
+
+    @property
+    def stop_reason(self) -> str | None:
+        """It is done before it begins."""
+        return "the boxes are random: nothing is searched"
+
+    @property
+    def progress(self) -> Progress:
+        """All is done."""
+        return Progress("drawing boxes", float("nan"), 1.0)
+
+    def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Return mean and deviation of the chosen box."""
+        low, high = self._ends[self._chosen]
+        return [(0.5 * (low + high), (high - low) / np.sqrt(12))]
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the chosen box."""
+        mean, std = self.candidates()[0]
+        return [Distribution.over(space, mean, std, is_uniform=True)]
+
+    def extras(self) -> dict[str, Any]:
+        """Return all boxes, in the parameters' units."""
+        values = to_values(self._ends, self._space.is_log)
+        boxes = [
+            {name: [float(a), float(b)] for name, a, b in zip(self._space.names, low, high, strict=True)}
+            for low, high in values
+        ]
+        return {"boxes": boxes, "box": self._chosen}
+
+    def state(self) -> dict[str, Any]:
+        """Return nothing: the seed says it all."""
+        return {}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Do nothing."""

@@ -1,0 +1,155 @@
+"""A full covariance of p_φ: expectation-maximisation after Fisher scoring.
+
+With the next state linear in the parameters around μ, the parameters of each transition are a random effect:
+r_t = A_t (ξ_t − μ) + noise, ξ_t ~ N(μ, C). The likelihood depends on the log through G_t = A_tᵀΣ_t⁻¹A_t and
+g_t = A_tᵀΣ_t⁻¹r_t alone, which one stencil gives for every transition.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.distribution import TRUNCATION, Distribution, to_values, truncated_moments
+from dropo_torch.objective import Reduce
+from dropo_torch.optimizers.base import Progress, Request
+from dropo_torch.optimizers.fisher import FisherOptimizer
+from dropo_torch.optimizers.gauss_newton import MeansStage
+from dropo_torch.parameters import ParameterSpace
+
+#: Times that the simulation is linearised anew, at most.
+_ROUNDS = 5
+_ITERATIONS = 500
+#: The means rest when no round moves them by more than this share of their box.
+_AT_REST = 1e-4
+
+
+def random_effects(gram: torch.Tensor, force: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the covariance C ``(d, d)`` and the shift of μ ``(d,)`` that make the residuals most likely.
+
+    Args:
+        gram: G_t, ``(T, d, d)``.
+        force: g_t, ``(T, d)``.
+        start: first guess of C, positive definite, ``(d, d)``.
+    """
+    eye = torch.eye(len(start), dtype=start.dtype)
+    covariance, total = start, torch.zeros(len(start), dtype=start.dtype)
+    for _ in range(_ITERATIONS):
+        # (C⁻¹ + G)⁻¹ = (I + CG)⁻¹ C, which needs no inverse of C
+        inner = torch.linalg.solve(eye + covariance @ gram, covariance.expand(len(gram), -1, -1))
+        inner = 0.5 * (inner + inner.mT)
+        means = (inner @ (force - gram @ total)[..., None])[..., 0]
+        shift = means.mean(0)
+        centred = means - shift
+        updated = inner.mean(0) + centred.T @ centred / len(means)
+        change = (updated - covariance).abs().max() / covariance.diagonal().max().clamp(min=1e-300)
+        covariance, total = 0.5 * (updated + updated.T), total + shift
+        if float(change) < 1e-6:
+            break
+    return covariance, total
+
+
+class CorrelatedOptimizer(FisherOptimizer):
+    """Fisher scoring with independent parameters, then their full covariance; the likelier of both is the result."""
+
+    def __init__(self, space: ParameterSpace, **options: Any) -> None:
+        super().__init__(space, **options)
+        self._center: np.ndarray | None = None
+        self._covariance: np.ndarray | None = None
+        self._rounds = 0
+        self._gathered: list[tuple[torch.Tensor, torch.Tensor]] = []
+
+    def ask(self) -> Request:
+        """Return the points of the stage at work, or the stencil that linearises the simulation."""
+        if super().stop_reason is None:
+            return super().ask()
+        stage = MeansStage(self._box.low, self._box.high, self._at)
+        self._gathered = []
+        return Request(
+            values=to_values(stage.points(), self._space.is_log),
+            reduce=self._gather(stage.points()),
+            evaluations=1,
+            linearise_at=self._linearised,
+            is_stencil=True,
+        )
+
+    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
+        """Hand the sums to the stage at work, or maximise over μ and C."""
+        if super().stop_reason is None:
+            super().tell(sums, gradient)
+            return
+        gram, force = (torch.cat(parts) for parts in zip(*self._gathered, strict=True))
+        scale = torch.from_numpy(self._box.width)  # parameters of very different size, as shares of their boxes
+        start = self._covariance if self._covariance is not None else self._first_guess()
+        found, shift = random_effects(
+            gram * torch.outer(scale, scale),
+            force * scale,
+            torch.from_numpy(start) / torch.outer(scale, scale),
+        )
+        self._covariance = (found * torch.outer(scale, scale)).numpy()
+        moved = np.clip(self._at + (shift * scale).numpy(), self._box.low, self._box.high)
+        rests = bool((np.abs(moved - self._at) <= _AT_REST * self._box.width).all())
+        self._center, self._rounds = moved, (_ROUNDS if rests else self._rounds + 1)
+
+    @property
+    def stop_reason(self) -> str | None:
+        """The reason of the scoring, when the covariance is found too."""
+        reason = super().stop_reason
+        return None if reason is None or self._rounds < _ROUNDS else f"{reason}; the covariance is found"
+
+    @property
+    def progress(self) -> Progress:
+        """The stage at work."""
+        if super().stop_reason is None:
+            return super().progress
+        return Progress("full covariance", float("nan"), 0.9)
+
+    def distributions(self, space: ParameterSpace) -> list[Distribution]:
+        """Return the independent distribution and the correlated one."""
+        independent = super().distributions(space)
+        if self._covariance is None:
+            return independent
+        deviation = np.sqrt(np.maximum(np.diag(self._covariance), 1e-300))
+        wide = torch.tensor(TRUNCATION, dtype=torch.float64)
+        std = deviation / np.sqrt(float(truncated_moments(-wide, wide)[1]))  # the cut takes its share again
+        correlation = self._covariance / np.outer(deviation, deviation)
+        bounded = np.clip(std, self._box.min_std, self._box.max_std)
+        return [*independent, Distribution.over(space, self._at, bounded, correlation=correlation)]
+
+    def state(self) -> dict[str, Any]:
+        """Return all stages as plain data."""
+        own = {"center": self._center, "covariance": self._covariance, "rounds": self._rounds}
+        return {**super().state(), "correlated": own}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        super().restore(state)
+        own = state["correlated"]
+        self._center, self._covariance, self._rounds = own["center"], own["covariance"], own["rounds"]
+
+    @property
+    def _at(self) -> np.ndarray:
+        """Where the simulation is linearised, in coordinates, ``(d,)``."""
+        return self.candidates()[0][0] if self._center is None else self._center
+
+    def _first_guess(self) -> np.ndarray:
+        """A diagonal covariance wider than the scoring's: from a point, expectation-maximisation never leaves."""
+        return np.diag(np.maximum(1.5 * self.candidates()[0][1], self._box.width / 200) ** 2)
+
+    def _gather(self, points: np.ndarray) -> Reduce:
+        """A reduction that keeps G and g of every transition whose simulations survive."""
+        steps = torch.from_numpy(np.diag(points[1:] - points[0]).copy())
+        gathered = self._gathered
+
+        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+            alive = torch.isfinite(features).flatten(1).all(-1)
+            base, moved = features[alive, 0], features[alive, 1:]
+            jacobian = (moved - base[:, None]) / steps[:, None]
+            residual = (measured[alive] - base)[:, None]
+            solved = torch.linalg.solve(covariance[alive], torch.cat([residual, jacobian], 1).mT)
+            gathered.append((jacobian @ solved[..., 1:], (jacobian @ solved[..., :1])[..., 0]))
+            return torch.zeros(1, dtype=features.dtype)
+
+        return reduce

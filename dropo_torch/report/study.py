@@ -1,0 +1,41 @@
+"""The page of a study: its tables and figures, one below the other."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from markupsafe import Markup
+
+from dropo_torch.fit import write_atomically
+from dropo_torch.report.html import render
+
+
+def write_study_report(
+    path: str | Path,
+    *,
+    title: str,
+    lead: str,
+    tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]],
+    figures: Mapping[str, str],
+    versions: Mapping[str, str] | None = None,
+) -> None:
+    """Write the report of a study as one self-contained file, whole or not at all.
+
+    Args:
+        path: the HTML file.
+        title: of the page.
+        lead: what the study is.
+        tables: each a heading, the columns' names and the rows.
+        figures: name → SVG.
+        versions: name → version of what the results depend on.
+    """
+    content = {
+        "title": title,
+        "lead": lead,
+        "tables": list(tables),
+        "figures": {name: Markup(svg) for name, svg in figures.items()},
+        "config": "",
+        "versions": dict(versions or {}),
+    }
+    write_atomically(Path(path), render("study.html", content))

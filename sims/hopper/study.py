@@ -1,0 +1,261 @@
+"""The simulated Hopper experiments of the DROPO paper, redone: ``dropo reproduce hopper``.
+
+Every fit is a *cell* with a file of its own, so that an interrupted study loses at most one of them. The logs are
+recorded here (:mod:`sims.hopper.record`): compare numbers with the paper's in kind, not digit by digit.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.baselines import fit_problem
+from dropo_torch.config import make_config
+from dropo_torch.errors import InputError
+from dropo_torch.fit import write_atomically
+from dropo_torch.problem import make_problem
+from sims.hopper import SIM
+from sims.hopper.record import HopperLog, record
+from sims.hopper.study_tables import write_results
+
+SCHEMA = "dropo-torch/study/1"
+METHODS = ("dropo", "droid", "bayessim")
+#: What the torso's mass is not among in the ``unmodeled`` variant.
+UNMODELED = "torso_mass"
+#: Variance of the noise that ``record`` puts on the ``noisy`` variant.
+NOISE_VARIANCE = 1e-5
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How large a study is.
+
+    Attributes:
+        seeds: logs of each kind.
+        episodes, steps: of a log.
+        samples: K.
+        droid_budget: simulations of the log by DROID.
+        simulations: of BayesSim.
+        horizon: logged steps that BayesSim replays.
+        epsilons: values of the sweeps.
+        noise_variances: of the sweeps against noise.
+        sizes: numbers of transitions whose estimates are compared.
+        resamples: bootstrap samples of each size.
+        cma_steps, cma_budget, cma_samples: length of the log's episodes, evaluations and K of the CMA-ES run.
+    """
+
+    seeds: int = 3
+    episodes: int = 2
+    steps: int = 500
+    samples: int = 100
+    droid_budget: int = 2000
+    simulations: int = 1000
+    horizon: int = 50
+    epsilons: tuple[float, ...] = tuple(10.0**k for k in range(-9, 0))
+    noise_variances: tuple[float, ...] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+    sizes: tuple[int, ...] = (10, 30, 100, 300, 1000, 3000)
+    resamples: int = 10
+    cma_steps: int = 100
+    cma_budget: int = 800
+    cma_samples: int = 50
+
+
+#: Minutes instead of hours: short logs, one seed, coarse sweeps.
+REDUCED = Plan(
+    seeds=1, steps=60, samples=40, droid_budget=400, simulations=200, horizon=20,
+    epsilons=(1e-8, 1e-6, 1e-4, 1e-2), noise_variances=(1e-5, 1e-4), sizes=(10, 30, 100), resamples=4,
+    cma_steps=20, cma_budget=60, cma_samples=10,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One fit of the study.
+
+    Attributes:
+        block: what it is part of: ``table``, ``recovery``, ``sweep``, ``noise``, ``size`` or ``cma``.
+        variant: of the log.
+        method: of the fit.
+        seed: of the log and the fit.
+        epsilon: ε.
+        knows_noise: whether the fit is given the deviation of the noise.
+        noise: variance of noise put on a noiseless log, ``None`` for the variant's own.
+        ends_only: whether that noise is on the ends of transitions alone, not on their starts.
+        size: transitions of a bootstrap sample; ``None`` for the whole log.
+        resample: number of the bootstrap sample.
+        optimizer: of DROPO.
+    """
+
+    block: str
+    variant: str
+    method: str = "dropo"
+    seed: int = 0
+    epsilon: float = 1e-5
+    knows_noise: bool = False
+    noise: float | None = None
+    ends_only: bool = False
+    size: int | None = None
+    resample: int = 0
+    optimizer: str = "fisher"
+
+    @property
+    def name(self) -> str:
+        """The cell's file, without suffix."""
+        parts = [self.block, self.variant, self.method, f"seed{self.seed}", f"eps{self.epsilon:g}"]
+        parts += ["known"] * self.knows_noise
+        parts += [] if self.noise is None else [f"noise{self.noise:g}", "ends" if self.ends_only else "all"]
+        parts += [] if self.size is None else [f"n{self.size}", f"b{self.resample}"]
+        parts += [] if self.optimizer == "fisher" else [self.optimizer]
+        return "-".join(parts)
+
+
+def run_study(
+    out: Path,
+    *,
+    reduced: bool = False,
+    resume: bool = False,
+    report: Callable[[str, float], None] = lambda stage, share: None,
+    plan: Plan | None = None,
+) -> Sequence[str]:
+    """Run every cell that is not there yet, then write tables and figures.
+
+    Args:
+        out: the folder: ``cells/`` and ``logs/``, and at the end ``study.json``, ``tables.md``,
+            ``report.html`` and figures.
+        reduced: the plan :data:`REDUCED`.
+        resume: keep finished cells of the same plan.
+        report: called with what is being done and the share that is.
+        plan: a size of one's own.
+
+    Raises:
+        InputError: a folder with another study, or with one that is not to be resumed.
+    """
+    plan = plan or (REDUCED if reduced else Plan())
+    _claim(out, plan, resume=resume)
+    cells = all_cells(plan)
+    results = []
+    for number, cell in enumerate(cells):
+        path = out / "cells" / f"{cell.name}.json"
+        if not path.exists():
+            report(f"{number + 1} of {len(cells)}: {cell.name}", number / len(cells))
+            write_atomically(path, json.dumps(run_cell(cell, plan, out / "logs"), indent=1).encode() + b"\n")
+        results.append(json.loads(path.read_text()))
+    report("tables and figures", 1.0)
+    return write_results(out, results, asdict(plan))
+
+
+def all_cells(plan: Plan) -> list[Cell]:
+    """Return the study's cells, in the order in which they run."""
+    cells: list[Cell] = []
+    for seed in range(plan.seeds):
+        for method in METHODS:
+            cells += [
+                Cell("table", "point", method, seed),
+                Cell("table", "noisy", method, seed, 1e-8 if method == "dropo" else 1e-5, method == "dropo"),
+                Cell("table", "unmodeled", method, seed, 1e-3),
+                Cell("recovery", "distribution", method, seed, 1e-7),
+            ]
+        cells.append(Cell("table", "noisy", "dropo", seed, NOISE_VARIANCE))  # as in the paper: ε alone
+    cells += [Cell("sweep", variant, epsilon=e) for variant in ("point", "noisy", "unmodeled") for e in plan.epsilons]
+    cells += [
+        Cell("noise", "point", epsilon=e, noise=noise, ends_only=ends)
+        for noise in plan.noise_variances
+        for ends in (True, False)
+        for e in plan.epsilons
+    ]
+    cells += [
+        Cell("size", variant, epsilon=epsilon, knows_noise=variant == "noisy", size=size, resample=b)
+        for variant, epsilon in (("noisy", 1e-8), ("distribution", 1e-7))
+        for size in plan.sizes
+        for b in range(plan.resamples)
+    ]
+    return [*cells, Cell("cma", "point"), Cell("cma", "point", optimizer="cma")]
+
+
+def run_cell(cell: Cell, plan: Plan, logs: Path) -> dict[str, Any]:
+    """Record the cell's log, fit it, and return what was found beside what is true."""
+    sized = plan
+    if cell.block == "cma":
+        sized = replace(plan, steps=plan.cma_steps, samples=plan.cma_samples)
+    if cell.size is not None:
+        sized = replace(plan, steps=-(-max(plan.sizes) // plan.episodes))
+    log = _log(cell, sized)
+    path = logs / f"{cell.name}.npz"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    log.save(path)
+    options = {
+        "droid": {"budget": plan.droid_budget},
+        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon},
+    }
+    parameters = {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED}
+    begun = time.monotonic()
+    fit = fit_problem(
+        make_problem(
+            make_config(
+                {
+                    "sim": "hopper",
+                    "data": str(path.resolve()),
+                    "parameters": parameters,
+                    "method": cell.method,
+                    "method_options": options.get(cell.method, {}),
+                    "optimizer": cell.optimizer,
+                    "budget": plan.cma_budget,
+                    "samples": sized.samples,
+                    "seed": cell.seed,
+                    "epsilon": cell.epsilon,
+                    **({"noise": NOISE_VARIANCE**0.5} if cell.knows_noise else {}),
+                }
+            )
+        )
+    )
+    path.unlink()
+    document = fit.document()
+    realised = {f"{link}_mass": log.masses[:, i] for i, link in enumerate(("torso", "thigh", "leg", "foot"))}
+    return {
+        "cell": asdict(cell),
+        "truth": {n: {"mean": float(m.mean()), "std": float(m.std())} for n, m in realised.items()},
+        "transitions": len(log.actions),
+        "wall_seconds": round(time.monotonic() - begun, 3),
+        "fit": document,
+    }
+
+
+def _log(cell: Cell, plan: Plan) -> HopperLog:
+    """The log of a cell."""
+    log = record(variant=cell.variant, episodes=plan.episodes, steps=plan.steps, seed=cell.seed)
+    generator = np.random.default_rng([cell.seed, cell.resample, 17])
+    if cell.noise is not None:
+        deviation, shape = np.sqrt(cell.noise), log.observations.shape
+        ends = log.next_observations + deviation * generator.standard_normal(shape)
+        starts = log.observations + (0.0 if cell.ends_only else deviation) * generator.standard_normal(shape)
+        log = replace(log, observations=starts, next_observations=ends)
+    if cell.size is not None:
+        rows = generator.integers(0, len(log.actions), cell.size)  # a bootstrap sample: with replacement
+        log = HopperLog(
+            observations=log.observations[rows],
+            next_observations=log.next_observations[rows],
+            actions=log.actions[rows],
+            terminals=np.ones(cell.size, dtype=bool),
+            masses=log.masses,
+        )
+    return log
+
+
+def _claim(out: Path, plan: Plan, *, resume: bool) -> None:
+    """Mark the folder as this study's; refuse one that holds another's results."""
+    mark = out / "plan.json"
+    wanted = json.loads(json.dumps({"schema": SCHEMA, "plan": asdict(plan)}))
+    if mark.exists():
+        if not resume:
+            raise InputError(f"--out: {out} holds a study; add --resume to go on with it, or name another folder")
+        if json.loads(mark.read_text()) != wanted:
+            raise InputError(f"resume: {out} holds a study of another size; name another folder, or drop --reduced")
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out: {out} is not an empty folder; name another one")
+    write_atomically(mark, json.dumps(wanted, indent=2).encode() + b"\n")

@@ -1,0 +1,105 @@
+"""Figures of the Hopper study."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.report import figures
+
+_COLOURS = {"dropo": "#0072b2", "dropo (noise given)": "#56b4e9", "droid": "#d55e00", "bayessim": "#009e73"}
+_LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31", "#7b8794", "#999933")
+
+Result = dict[str, Any]
+
+
+def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
+    """Return the study's figures by the names of their files."""
+    return {
+        "recovery.png": recovery(results),
+        "sweep.png": sweeps(tables["sweep"]),
+        "noise.png": sweeps(tables["noise"]),
+        "size.png": sizes(tables["size"]),
+    }
+
+
+def recovery(results: Sequence[Result]) -> Any:
+    """Draw the fitted normals of the redrawn masses over the realised ones, first seed."""
+    chosen = [r for r in results if r["cell"]["block"] == "recovery" and r["cell"]["seed"] == 0]
+    names = list(chosen[0]["fit"]["parameters"])
+    figure = figures.new_figure(230 * len(names), 230)
+    for i, name in enumerate(names):
+        axes = _part(figure, i, len(names))
+        truth = chosen[0]["truth"][name]
+        box = chosen[0]["fit"]["parameters"][name]
+        grid = np.linspace(box["low"], box["high"], 2000)
+        curves = {"realised": (truth["mean"], max(truth["std"], 1e-3))} | {
+            str(r["cell"]["method"]): (
+                r["fit"]["parameters"][name]["mean"],
+                max(r["fit"]["parameters"][name]["std"], 1e-3),
+            )
+            for r in chosen
+        }
+        for method, (mean, std) in curves.items():
+            density = np.exp(-0.5 * ((grid - mean) / std) ** 2)  # of equal height: some are points
+            colour = _COLOURS.get(method, "#1f2933")
+            axes.plot(grid, density, color=colour, linewidth=1.4, label=method if i == 0 else None,
+                      linestyle="--" if method == "realised" else "-")  # fmt: skip
+        axes.set_yticks([])
+        axes.set_xlabel(f"{name} (kg)")
+    figure.legend(loc="upper center", ncol=4, frameon=False, fontsize=9)
+    return figure
+
+
+def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
+    """Draw error and mean deviation against ε, a line a case, the elbow marked."""
+    figure = figures.new_figure(920, 320)
+    for i, (key, title) in enumerate((("mse", "mean squared error"), ("mean_std", "mean deviation (kg)"))):
+        axes = _part(figure, i, 2)
+        for colour, row in zip(_LINES, rows, strict=False):
+            noise = "" if row["noise_variance"] is None else f", {row['noise_variance']:g} on {row['noise_on']}"
+            axes.loglog(
+                row["epsilons"], row[key], color=colour, marker=".", linewidth=1.2,
+                label=row["case"] + noise if i == 0 else None,
+            )  # fmt: skip
+            at = row["epsilons"].index(row["chosen"])
+            axes.plot(row["chosen"], row[key][at], marker="o", markersize=8, markerfacecolor="none", color=colour)
+        axes.set_xlabel("ε")
+        axes.set_ylabel(title)
+    figure.legend(loc="upper center", ncol=3, frameon=False, fontsize=7)
+    return figure
+
+
+def sizes(rows: Sequence[dict[str, Any]]) -> Any:
+    """Draw relative mean and deviation against the number of transitions, with bootstrap intervals."""
+    cases = list(dict.fromkeys(r["case"] for r in rows))
+    names = list(dict.fromkeys(r["parameter"] for r in rows))
+    figure = figures.new_figure(460 * len(cases), 320)
+    for i, case in enumerate(cases):
+        axes = _part(figure, i, len(cases))
+        for shift, (colour, name) in enumerate(zip(_LINES, names, strict=False)):
+            own = [r for r in rows if (r["case"], r["parameter"]) == (case, name)]
+            x = np.array([r["transitions"] for r in own]) * 1.06**shift
+            y, low, high = (
+                100 * np.array([r[k] / r["truth"] - 1 for r in own]) for k in ("mean", "mean_low", "mean_high")
+            )
+            axes.errorbar(
+                x, y, np.maximum([y - low, high - y], 0), color=colour, marker=".", linewidth=1.1, capsize=2,
+                label=name if i == 0 else None,
+            )  # fmt: skip
+        axes.set_xscale("log")
+        axes.set_yscale("symlog", linthresh=0.1)
+        axes.set_xlabel(f"transitions, {case}")
+        axes.set_ylabel("error of the mean (%)")
+    figure.legend(loc="upper center", ncol=4, frameon=False, fontsize=9)
+    return figure
+
+
+def _part(figure: Any, index: int, count: int) -> Any:
+    """Axes of one of several panels side by side."""
+    width = float(figure.get_size_inches()[0]) * 72 / count
+    left = index * width + 52
+    total = float(figure.get_size_inches()[0]) * 72
+    return figures.new_axes(figure, (left, 40, total - left - width + 66, 44))

@@ -1,0 +1,299 @@
+"""What the cells of the Hopper study say together: tables, findings, figures."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.fit import write_atomically
+from dropo_torch.report import write_study_report
+from dropo_torch.report.figures import to_svg
+from dropo_torch.runs import plain_numbers, versions
+from dropo_torch.sweep import elbow
+from sims.hopper.study_figures import draw_all
+
+SCHEMA = "dropo-torch/study/1"
+#: A deviation below this share of the search box has collapsed to a point; one above the other is wide.
+COLLAPSED, WIDE = 1e-3, 1e-2
+CASES = {"point": "noiseless", "noisy": "noisy", "unmodeled": "unmodeled torso", "distribution": "masses redrawn"}
+
+INTRODUCTION = (
+    "Written by `dropo reproduce hopper`. The logs are recorded by this project, from slow random torques: "
+    "compare with the paper in kind, not digit by digit."
+)
+
+Result = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A qualitative finding of the paper, and what was measured about it."""
+
+    finding: str
+    holds: bool
+    measured: str
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table with its title, in words."""
+
+    title: str
+    head: list[str]
+    rows: list[list[str]]
+
+
+def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) -> list[str]:
+    """Write ``study.json``, ``tables.md``, ``report.html`` and the figures; return the findings as sentences."""
+    findings = all_findings(results)
+    tables = {
+        "table": table_rows(results, "table"),
+        "recovery": table_rows(results, "recovery"),
+        "sweep": sweep_rows(pick(results, "sweep")),
+        "noise": sweep_rows(pick(results, "noise")),
+        "size": size_rows(results),
+        "cma": cma_rows(results),
+    }
+    document = {"schema": SCHEMA, "plan": plan, "findings": [asdict(f) for f in findings], "tables": tables}
+    write_atomically(out / "study.json", json.dumps(plain_numbers(document), indent=1).encode() + b"\n")
+    page, figures = sections(tables, findings), draw_all(results, tables)
+    for name, figure in figures.items():
+        figure.savefig(out / name, dpi=110, facecolor="white", metadata={"Software": None})
+    write_atomically(out / "tables.md", markdown(page, figures).encode())
+    write_study_report(
+        out / "report.html",
+        title="The paper's simulated Hopper",
+        lead=INTRODUCTION,
+        tables=[(section.title, section.head, section.rows) for section in page],
+        figures={name.removesuffix(".png"): to_svg(figure, name) for name, figure in figures.items()},
+        versions=versions(),
+    )
+    return [f"{'holds' if f.holds else 'DOES NOT HOLD'}: {f.finding} ({f.measured})" for f in findings]
+
+
+def pick(results: Iterable[Result], block: str, **wanted: Any) -> list[Result]:
+    """Return the results of a block whose cells have the wanted entries."""
+    return [r for r in results if r["cell"]["block"] == block and all(r["cell"][key] == v for key, v in wanted.items())]
+
+
+def label(result: Result) -> str:
+    """Return the name of a result's method, with how it treats noise."""
+    cell = result["cell"]
+    return str(cell["method"]) + (" (noise given)" if cell["knows_noise"] else "")
+
+
+def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
+    """Return one row for each case, parameter and method: means over the seeds, and the range of the means."""
+    rows = []
+    chosen = pick(results, block)
+    for variant in dict.fromkeys(r["cell"]["variant"] for r in chosen):
+        case = [r for r in chosen if r["cell"]["variant"] == variant]
+        for parameter in case[0]["fit"]["parameters"]:
+            for method in dict.fromkeys(label(r) for r in case):
+                own = [r for r in case if label(r) == method]
+                means = np.array([r["fit"]["parameters"][parameter]["mean"] for r in own])
+                stds = np.array([r["fit"]["parameters"][parameter]["std"] for r in own])
+                truths = np.array([r["truth"][parameter]["mean"] for r in own])
+                rows.append(
+                    {
+                        "case": CASES[variant],
+                        "parameter": parameter,
+                        "method": method,
+                        "truth": float(truths.mean()),
+                        "true_std": float(np.mean([r["truth"][parameter]["std"] for r in own])),
+                        "mean": float(means.mean()),
+                        "std": float(stds.mean()),
+                        "largest_error_percent": float(100 * np.max(np.abs(means / truths - 1))),
+                        "mse": float(np.mean([r["fit"]["mse"] for r in own])),
+                        "seeds": len(own),
+                    }
+                )
+    return rows
+
+
+def sweep_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Return one row for each sweep over ε, with the elbow and, where there is noise, its variance."""
+    groups: dict[tuple[Any, ...], list[Result]] = {}
+    for r in results:
+        cell = r["cell"]
+        groups.setdefault((cell["variant"], cell["noise"], cell["ends_only"]), []).append(r)
+    rows = []
+    for (variant, noise, ends_only), group in groups.items():
+        ordered = sorted(group, key=lambda r: r["cell"]["epsilon"])
+        epsilons = [r["cell"]["epsilon"] for r in ordered]
+        errors = [r["fit"]["mse"] for r in ordered]
+        chosen, reason = elbow(epsilons, errors)
+        true = noise if noise is not None else {"noisy": 1e-5}.get(variant)
+        rows.append(
+            {
+                "case": CASES[variant],
+                "noise_variance": true,
+                "noise_on": None if true is None else ("ends of transitions" if ends_only else "every measurement"),
+                "chosen": chosen,
+                "ratio": None if true is None else chosen / true,
+                "epsilons": epsilons,
+                "mse": errors,
+                "mean_std": [float(np.mean([p["std"] for p in r["fit"]["parameters"].values()])) for r in ordered],
+                "reason": reason,
+            }
+        )
+    return rows
+
+
+def size_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Return one row for each case, number of transitions and parameter, with 90 % bootstrap intervals."""
+    rows = []
+    chosen = pick(results, "size")
+    for variant in dict.fromkeys(r["cell"]["variant"] for r in chosen):
+        for size in dict.fromkeys(r["cell"]["size"] for r in chosen):
+            group = [r for r in chosen if (r["cell"]["variant"], r["cell"]["size"]) == (variant, size)]
+            for parameter in group[0]["fit"]["parameters"]:
+                truth = group[0]["truth"][parameter]
+                row: dict[str, Any] = {
+                    "case": CASES[variant],
+                    "transitions": size,
+                    "parameter": parameter,
+                    "truth": truth["mean"],
+                    "true_std": truth["std"],
+                    "resamples": len(group),
+                }
+                for key in ("mean", "std"):
+                    values = [r["fit"]["parameters"][parameter][key] for r in group]
+                    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
+                    row |= {key: float(middle), f"{key}_low": float(low), f"{key}_high": float(high)}
+                rows.append(row)
+    return rows
+
+
+def cma_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
+    """Return one row for each optimizer on the same short log."""
+    return [
+        {
+            "optimizer": r["fit"]["optimizer"],
+            "log_likelihood": r["fit"]["log_likelihood"],
+            "largest_error_percent": 100 * _largest_error(r),
+            "simulated_per_logged": r["fit"]["simulated_transitions"] / r["transitions"],
+            "seconds": r["wall_seconds"],
+        }
+        for r in pick(results, "cma")
+    ]
+
+
+def all_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the paper's qualitative findings, and whether they hold here."""
+    point = {m: pick(results, "table", variant="point", method=m) for m in ("dropo", "droid", "bayessim")}
+    error = {m: 100 * max(map(_largest_error, point[m])) for m in ("dropo", "droid")}
+    droid = max(_widest(r) for r in results if r["cell"]["method"] == "droid")
+    unmodeled = pick(results, "table", variant="unmodeled", method="dropo")
+    before, after = (float(np.mean([_widest(r) for r in group])) for group in (point["dropo"], unmodeled))
+    wide = min(_widest(r) for r in pick(results, "table", method="bayessim"))
+    found = [
+        Finding(
+            "DROPO and DROID find the point dynamics",
+            max(error.values()) < 2,
+            f"largest error of a mean {error['dropo']:.2g} % and {error['droid']:.2g} %",
+        ),
+        Finding(
+            "DROID's deviations collapse in every case",
+            droid < COLLAPSED,
+            f"widest deviation {100 * droid:.2g} % of the search box",
+        ),
+        Finding(
+            "DROPO widens under the unmodeled torso",
+            after > max(10 * before, COLLAPSED),
+            f"widest deviation {100 * before:.2g} % of the search box noiseless, {100 * after:.2g} % unmodeled",
+        ),
+        Finding(
+            "BayesSim is wide in every case",
+            wide > WIDE,
+            f"its widest deviation is {100 * wide:.2g} % of the search box or more",
+        ),
+    ]
+    for ends, words in ((True, "ends of transitions"), (False, "every measurement")):
+        rows = sweep_rows(pick(results, "noise", ends_only=ends))
+        ratios = [row["ratio"] for row in rows]
+        found.append(
+            Finding(
+                f"the elbow picks ε within a factor 10 of the noise variance, noise on {words}",
+                all(0.099 <= ratio <= 10.1 for ratio in ratios),
+                f"ε over variance: {', '.join(f'{ratio:.2g}' for ratio in ratios)}",
+            )
+        )
+    return found
+
+
+def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding]) -> list[Section]:
+    """Return the tables as people read them."""
+    found = [[f.finding, "yes" if f.holds else "no", f.measured] for f in findings]
+    sweeps = {
+        name: [
+            [r["case"], _number(r["noise_variance"]), r["noise_on"] or "–", _number(r["chosen"]), _number(r["ratio"])]
+            for r in tables[name]
+        ]
+        for name in ("sweep", "noise")
+    }
+    sizes = [
+        [r["case"], str(r["transitions"]), r["parameter"], _number(r["truth"])]
+        + [f"{_number(r[k])} [{_number(r[k + '_low'])}, {_number(r[k + '_high'])}]" for k in ("mean", "std")]
+        for r in tables["size"]
+    ]
+    cma = [[v if isinstance(v, str) else _number(v) for v in r.values()] for r in tables["cma"]]
+    swept = ["case", "noise variance", "noise on", "ε at the elbow", "ratio"]
+    return [
+        Section("Findings", ["finding", "holds", "measured"], found),
+        _methods("Table 1: mean ± std, averaged over seeds", tables["table"]),
+        _methods("Recovery of a distribution: mean ± std", tables["recovery"]),
+        Section("Sweeps over ε", swept, sweeps["sweep"]),
+        Section("ε against the noise", swept, sweeps["noise"]),
+        Section(
+            "Number of transitions",
+            ["case", "transitions", "parameter", "truth", "mean [90 % of bootstrap]", "std [90 %]"],
+            sizes,
+        ),
+        Section(
+            "CMA-ES on a part",
+            ["optimizer", "log-likelihood", "largest error (%)", "simulated per logged", "s"],
+            cma,
+        ),
+    ]
+
+
+def markdown(page: Sequence[Section], figures: Iterable[str]) -> str:
+    """Return the study's page as Markdown, with its figures at the end."""
+    parts = ["# The paper's simulated Hopper\n", INTRODUCTION + "\n"]
+    for section in page:
+        lines = [section.head, ["---"] * len(section.head), *section.rows]
+        parts += [f"## {section.title}\n", "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"]
+    parts += [f"![{name.removesuffix('.png')}]({name})\n" for name in figures]
+    return "\n".join(parts)
+
+
+def _methods(title: str, rows: Sequence[dict[str, Any]]) -> Section:
+    """Cases and parameters down, methods across."""
+    methods = list(dict.fromkeys(r["method"] for r in rows))
+    lines = []
+    for case, parameter in dict.fromkeys((r["case"], r["parameter"]) for r in rows):
+        own = {r["method"]: r for r in rows if (r["case"], r["parameter"]) == (case, parameter)}
+        first = next(iter(own.values()))
+        cells = [f"{own[m]['mean']:.3f} ± {own[m]['std']:.2g}" if m in own else "–" for m in methods]
+        lines.append([case, parameter, f"{first['truth']:.3f} ± {first['true_std']:.2g}", *cells])
+    return Section(title, ["case", "parameter", "truth", *methods], lines)
+
+
+def _number(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3g}"
+
+
+def _largest_error(result: Result) -> float:
+    """Largest relative error of a mean."""
+    return max(abs(p["mean"] / result["truth"][n]["mean"] - 1) for n, p in result["fit"]["parameters"].items())
+
+
+def _widest(result: Result) -> float:
+    """Largest deviation as a share of its search box."""
+    return max(p["std"] / (p["high"] - p["low"]) for p in result["fit"]["parameters"].values())

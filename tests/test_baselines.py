@@ -1,0 +1,574 @@
+"""The methods beside DROPO: known truths at small size, their laws, and what they refuse."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+from conftest import LinearSimulator, linear_objective, space_of
+
+from dropo_torch.baselines import Mixture, fit_problem, make_search
+from dropo_torch.baselines.bayessim import summaries, summary_sums
+from dropo_torch.baselines.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
+from dropo_torch.baselines.density import fit_mixture
+from dropo_torch.baselines.laplace import LaplaceOptimizer
+from dropo_torch.baselines.settings import BayesSimSettings, method_settings
+from dropo_torch.baselines.simopt import reps_weights
+from dropo_torch.cli import main
+from dropo_torch.config import make_config
+from dropo_torch.distribution import Distribution, truncated_moments
+from dropo_torch.errors import InputError
+from dropo_torch.fit import fit
+from dropo_torch.objective import draw_uniforms
+from dropo_torch.optimizers.correlated import random_effects
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.trajectory import Trajectories, make_replay
+from sims.hopper.study import REDUCED, Plan, all_cells, run_study
+
+#: A driven pendulum; the rod has no mass, the bob's is to be found.
+PENDULUM_XML = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="bob" pos="0 0 1">
+      <joint name="pivot" type="hinge" axis="0 1 0" damping="0.05"/>
+      <inertial pos="0 0 -.5" mass="1" diaginertia=".002 .002 .002"/>
+    </body>
+  </worldbody>
+  <actuator><motor name="motor" joint="pivot"/></actuator>
+</mujoco>"""
+MASS, DAMPING = 1.4, 0.12
+STEPS = 80
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A pendulum's model, and a log of another mass and damping; without noise and with."""
+    path = tmp_path_factory.mktemp("pendulum")
+    (path / "pendulum.xml").write_text(PENDULUM_XML)
+    model = mujoco.MjModel.from_xml_string(PENDULUM_XML)
+    model.body("bob").mass[0], model.dof_damping[0] = MASS, DAMPING
+    data = mujoco.MjData(model)
+    mujoco.mj_setConst(model, data)
+    mujoco.mj_resetData(model, data)
+    torque = 3 * np.sin(0.31 * np.arange(STEPS)) + np.sin(1.1 * np.arange(STEPS))
+    states = [np.array([0.0, 0.0])]
+    for u in torque:
+        data.ctrl[0] = u
+        mujoco.mj_step(model, data, nstep=4)
+        states.append(np.array([data.qpos[0], data.qvel[0]]))
+    exact = np.array(states)
+    noisy_ends = exact[1:] + np.array([1e-3, 1e-2]) * np.random.default_rng(3).standard_normal((STEPS, 2))
+    for name, ends in (("exact", exact[1:]), ("noisy", noisy_ends)):
+        np.savez(
+            path / f"{name}.npz",
+            observations=exact[:-1],
+            next_observations=ends,
+            actions=torque[:, None],
+            terminals=np.arange(STEPS) == STEPS - 1,
+        )
+    return path
+
+
+def config(folder: Path, method: str, data: str = "exact", **keys: Any) -> dict[str, Any]:
+    return {
+        "model": str(folder / "pendulum.xml"),
+        "data": str(folder / f"{data}.npz"),
+        "frame_skip": 4,
+        "parameters": {
+            "mass": {"field": "body_mass", "name": "bob", "bounds": [0.5, 3.0], "unit": "kg"},
+            "damping": {"field": "dof_damping", "name": "pivot", "bounds": [0.01, 0.5], "limits": [0, 1]},
+        },
+        "method": method,
+        "threads": 1,
+        "samples": 20,
+        "epsilon": [1e-6, 1e-4],
+        **keys,
+    }
+
+
+def problem(folder: Path, method: str, data: str = "exact", **keys: Any) -> Problem:
+    return make_problem(make_config(config(folder, method, data, **keys)))
+
+
+TRUTH = np.array([MASS, DAMPING])
+
+
+def test_droid_finds_the_parameters_and_its_deviations_collapse(folder: Path) -> None:
+    for data, tolerance in (("exact", [1e-5, 1e-5]), ("noisy", [0.05, 0.1])):
+        found = fit_problem(problem(folder, "droid", data)).distribution
+        assert (np.abs(found.mean - TRUTH) < tolerance).all()
+        assert (found.std < 1e-3 * (found.high - found.low)).all()  # whatever the noise
+
+
+def test_laplace_is_the_normal_of_least_squares(folder: Path) -> None:
+    """Where the simulation is linear, mean and covariance are those of weighted least squares, in closed form."""
+    rng = np.random.default_rng(0)
+    space = space_of(a=[-5, 5], b=[-5, 5])
+    simulator = LinearSimulator(space, np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]]))
+    measured = np.array([1.0, -2.0]) @ simulator.effect.numpy().T + 0.1 * rng.standard_normal((40, 3))
+    objective = linear_objective(simulator, measured, epsilon=[1e-2, 1e-2, 4e-2])
+    found = fit(objective, search=LaplaceOptimizer(objective), samples=10).distribution
+    weight = np.diag(1 / np.array([1e-2, 1e-2, 4e-2]))
+    design = simulator.effect.numpy()
+    gram = 40 * design.T @ weight @ design
+    mean = np.linalg.solve(gram, design.T @ weight @ measured.sum(0))
+    residual = measured - mean @ design.T
+    scale = np.einsum("ti,ij,tj->", residual, weight, residual) / (40 * 3 - 2)
+    covariance = scale * np.linalg.inv(gram)
+    assert found.mean == pytest.approx(mean, abs=1e-6)
+    assert found.std == pytest.approx(np.sqrt(np.diag(covariance)), rel=1e-4)
+    assert found.correlation is not None
+    assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / np.sqrt(np.prod(np.diag(covariance))), rel=1e-4)
+
+
+def test_laplace_covers_the_truth_of_a_noisy_log(folder: Path) -> None:
+    found = fit_problem(problem(folder, "laplace", "noisy")).distribution
+    z = (TRUTH - found.mean) / found.std
+    assert (np.abs(z) < 3.5).all()
+    assert (found.std < [0.03, 0.07]).all()
+
+
+def test_simopt_moves_to_the_parameters_and_shrinks(folder: Path) -> None:
+    options = {"samples": 60, "iterations": 15, "horizon": 20}
+    found = fit_problem(problem(folder, "simopt", method_options=options))
+    spread = found.distribution.std / (found.distribution.high - found.distribution.low)
+    assert found.distribution.mean == pytest.approx(TRUTH, rel=0.05)
+    assert (spread < 0.05).all()
+    assert found.document()["method"] == "simopt"
+    assert found.document()["horizon"] == 20
+
+
+@pytest.mark.parametrize("features", ["mdnn", "mdrff"])
+def test_bayessim_contains_the_truth_and_is_narrower_than_the_prior(folder: Path, features: str) -> None:
+    options = {"features": features, "simulations": 300, "horizon": 20, "epochs": 250, "components": 3, "hidden": 32}
+    given = config(folder, "bayessim", method_options=options)
+    given["parameters"] = {"mass": given["parameters"]["mass"]}
+    model = Path(given["model"])
+    light = model.with_name("damped.xml")
+    light.write_text(PENDULUM_XML.replace('damping="0.05"', f'damping="{DAMPING}"'))
+    result = fit_problem(make_problem(make_config({**given, "model": str(light)})))
+    mixture = Mixture.of(result.document()["mixture"])
+    draws = mixture.sample(2000, seed=1)[:, 0]
+    low, high = np.quantile(draws, [0.01, 0.99])
+    assert low < MASS < high
+    assert draws.std() < 0.5 * (3.0 - 0.5) / np.sqrt(12)
+    assert result.distribution.mean[0] == pytest.approx(draws.mean(), abs=4 * draws.std() / np.sqrt(2000))
+
+
+def test_a_mixtures_moments_match_its_draws() -> None:
+    mixture = Mixture(
+        weights=np.array([0.3, 0.7]),
+        means=np.array([[0.0, 1.0], [2.0, -1.0]]),
+        covariances=np.array([[[1.0, 0.3], [0.3, 0.5]], [[0.4, -0.2], [-0.2, 0.9]]]),
+        low=np.full(2, -np.inf),
+        high=np.full(2, np.inf),
+    )
+    mean, covariance = mixture.moments
+    draws = mixture.sample(60_000, seed=0)
+    assert draws.mean(0) == pytest.approx(mean, abs=0.02)
+    assert np.cov(draws.T) == pytest.approx(covariance, abs=0.04)
+    inside = mixture.moments_inside
+    assert inside[0] == pytest.approx(mean, abs=0.03)
+    assert Mixture.of(json.loads(json.dumps(mixture.document()))).moments[1] == pytest.approx(covariance)
+    one = Mixture(np.ones(1), mixture.means[:1], mixture.covariances[:1], mixture.low, mixture.high)
+    points = np.array([[0.2, 0.3], [-1.0, 2.0]])
+    exact = torch.distributions.MultivariateNormal(
+        torch.from_numpy(one.means[0]), torch.from_numpy(one.covariances[0])
+    ).log_prob(torch.from_numpy(points))
+    assert one.log_density(points) == pytest.approx(exact.numpy())
+
+
+def test_a_mixture_stays_in_its_box() -> None:
+    outside = Mixture(np.ones(1), np.array([[50.0]]), np.array([[[1.0]]]), np.zeros(1), np.ones(1))
+    assert outside.sample(100, seed=0) == pytest.approx(1.0)
+    wide = Mixture(np.ones(1), np.array([[0.9]]), np.array([[[0.2]]]), np.zeros(1), np.ones(1))
+    draws = wide.sample(5000, seed=0)
+    assert draws.min() >= 0
+    assert draws.max() <= 1
+    assert wide.moments_inside[0][0] < 0.8
+
+
+@pytest.mark.parametrize("features", ["mdnn", "mdrff"])
+def test_a_mixture_density_network_learns_a_gaussian_posterior(features: str) -> None:
+    """x = θ + noise of deviation 0.1: the posterior of θ in [0, 1] is normal around x with that deviation."""
+    rng = np.random.default_rng(0)
+    shares = rng.uniform(size=(1500, 1))
+    x = shares + 0.1 * rng.standard_normal((1500, 1))
+    settings = BayesSimSettings(features=features, components=2, hidden=32, epochs=400)
+    found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
+    mean, covariance = found.moments
+    assert mean[0] == pytest.approx(0.5, abs=0.04)
+    assert np.sqrt(covariance[0, 0]) == pytest.approx(0.1, rel=0.25)
+
+
+def test_summaries_are_moments_of_changes() -> None:
+    rng = np.random.default_rng(0)
+    paths, logged = torch.from_numpy(rng.normal(size=(3, 2, 5, 4))), torch.from_numpy(rng.normal(size=(3, 5, 4)))
+    controls = torch.from_numpy(rng.normal(size=(3, 5, 2)))
+    sums = summary_sums(paths, logged, controls).numpy().reshape(3, -1)
+    found = summaries(sums, 4, 3 * 4)
+    change = np.diff(paths[:, 1].numpy(), axis=1).reshape(-1, 4)
+    u = controls[:, 1:].numpy().reshape(-1, 2)
+    expected = [change.mean(0), change.var(0), (change[:, :, None] * u[:, None]).mean(0).ravel()]
+    assert found[1] == pytest.approx(np.concatenate(expected))
+    assert found[2, :4] == pytest.approx(np.diff(logged.numpy(), axis=1).reshape(-1, 4).mean(0))
+
+
+def test_bayessim_measures_its_replays_as_the_log_was(folder: Path) -> None:
+    """Noise of variance ν adds 2ν to the mean square of a step's change."""
+    options = {"simulations": 200, "horizon": 20}
+    sums = []
+    for noise in (None, [0.05, 0.3]):
+        ours = problem(folder, "bayessim", method_options=options, noise=noise)
+        search = make_search(ours)
+        assert search is not None
+        request = search.ask()
+        assert request.replay is not None
+        table = ours.objective.map_replay(request.replay, request.values, request.reduce).reshape(101, -1)
+        sums.append(table[:-1, 2:4].mean(0) / (4 * 19))
+    assert (sums[1] - sums[0]).numpy() == pytest.approx([2 * 0.05**2, 2 * 0.3**2], rel=0.1)
+
+
+def test_reps_weights_keep_within_the_bound_and_prefer_low_costs() -> None:
+    costs = np.random.default_rng(0).uniform(size=500)
+    for kl in (0.1, 0.5, 1.0):
+        weights = reps_weights(costs, kl)
+        entropy = np.sum(weights * np.log(np.maximum(weights * len(costs), 1e-300)))
+        assert entropy == pytest.approx(kl, rel=0.02)
+        assert weights[np.argmin(costs)] == weights.max()
+    lost = reps_weights(np.array([1.0, np.nan, 2.0]), 0.5)
+    assert lost[1] == 0
+    assert lost.sum() == pytest.approx(1)
+    assert reps_weights(np.full(4, np.nan), 0.5) == pytest.approx(0.25)
+
+
+def test_replays_follow_the_log_where_the_parameters_are_right(folder: Path) -> None:
+    ours = problem(folder, "simopt")
+    replay = make_replay(ours.trajectories, ours.observation, 20)
+    assert replay.measured.shape == (4, 20, 2)
+
+    def worst(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
+        return (features - measured[:, None]).abs().amax((0, 2, 3))
+
+    error = ours.objective.map_replay(replay, np.array([[MASS, DAMPING], [1.0, 0.05]]), worst)
+    assert error[0] < 1e-9
+    assert error[1] > 0.05
+    assert make_replay(ours.trajectories, ours.observation, 10_000).horizon == STEPS
+
+
+def test_uniform_boxes_lie_inside_the_search_box(folder: Path) -> None:
+    first = fit_problem(problem(folder, "udr"))
+    document = first.document()
+    assert len(document["boxes"]) == 10
+    for box in document["boxes"]:
+        assert 0.5 <= box["mass"][0] < box["mass"][1] <= 3.0
+        assert 0.01 <= box["damping"][0] < box["damping"][1] <= 0.5
+    third = fit_problem(problem(folder, "udr", method_options={"box": 3}))
+    draws = third.distribution.sample(20_000, torch.Generator().manual_seed(0)).numpy()
+    low, high = np.array([document["boxes"][3][name] for name in ("mass", "damping")]).T
+    assert (draws.min(0) >= low - 1e-12).all()
+    assert (draws.max(0) <= high + 1e-12).all()
+    assert draws.mean(0) == pytest.approx(third.distribution.mean, rel=0.02)
+    assert draws.std(0) == pytest.approx(third.distribution.std, rel=0.03)
+
+
+@pytest.mark.parametrize("uniform", [False, True])
+def test_a_distribution_survives_its_file(tmp_path: Path, uniform: bool) -> None:
+    space = space_of(a=[0.0, 10.0], b={"bounds": [0.1, 10.0], "scale": "log"})
+    correlation = None if uniform else np.array([[1.0, 0.6], [0.6, 1.0]])
+    made = Distribution.over(
+        space, np.array([4.0, 0.3]), np.array([0.5, 0.2]), correlation=correlation, is_uniform=uniform
+    )
+    for name in ("d.json", "d.yaml"):
+        made.save(tmp_path / name)
+        back = Distribution.load(tmp_path / name)
+        uniforms = draw_uniforms(500, 2, 0)
+        assert back.rsample(uniforms).numpy() == pytest.approx(made.rsample(uniforms).numpy())
+        values = made.rsample(uniforms)
+        assert back.log_prob(values).numpy() == pytest.approx(made.log_prob(values).numpy())
+        assert torch.isfinite(made.log_prob(values)).all()
+
+
+@pytest.mark.parametrize("uniform", [False, True])
+def test_a_density_integrates_to_one(uniform: bool) -> None:
+    correlation = None if uniform else np.array([[1.0, -0.7], [-0.7, 1.0]])
+    made = Distribution.over(
+        space_of(a=[0.0, 10.0], b=[0.0, 10.0]), np.array([4.0, 5.0]), np.array([0.5, 1.0]), correlation=correlation,
+        is_uniform=uniform,
+    )  # fmt: skip
+    a, b = (torch.linspace(float(lo), float(hi), 401, dtype=torch.float64) for lo, hi in zip(*made.ends, strict=True))
+    a, b = (0.5 * (x[1:] + x[:-1]) for x in (a, b))
+    grid = torch.stack(torch.meshgrid(a, b, indexing="ij"), -1)
+    assert float(made.log_prob(grid).exp().sum() * (a[1] - a[0]) * (b[1] - b[0])) == pytest.approx(1, abs=5e-3)
+
+
+def test_correlated_draws_have_their_correlation() -> None:
+    correlation = np.array([[1.0, 0.8], [0.8, 1.0]])
+    made = Distribution.over(space_of(a=[0, 1], b=[0, 1]), np.full(2, 0.5), np.full(2, 0.01), correlation=correlation)
+    draws = made.sample(50_000, torch.Generator().manual_seed(0)).numpy()
+    assert np.corrcoef(draws.T)[0, 1] == pytest.approx(0.8, abs=0.02)
+
+
+def test_a_file_with_a_wrong_correlation_is_refused(tmp_path: Path) -> None:
+    made = Distribution.over(space_of(a=[0, 1], b=[0, 1]), np.full(2, 0.5), np.full(2, 0.1), correlation=np.eye(2))
+    made.save(tmp_path / "d.json")
+    text = json.loads((tmp_path / "d.json").read_text())
+    for wrong in ([[1.0]], [[1, 2], [2, 1]], "x", [[1, 0.5], [0.1, 1]]):
+        (tmp_path / "d.json").write_text(json.dumps({**text, "correlation": wrong}))
+        with pytest.raises(InputError, match="correlation"):
+            Distribution.load(tmp_path / "d.json")
+
+
+def test_random_effects_recovers_a_covariance() -> None:
+    rng = np.random.default_rng(0)
+    truth = np.array([[1.0, 0.6], [0.6, 0.5]])
+    design = rng.normal(size=(4000, 3, 2))
+    drawn = rng.multivariate_normal([0.2, -0.1], truth, size=4000)
+    residual = np.einsum("tij,tj->ti", design, drawn) + 0.1 * rng.standard_normal((4000, 3))
+    gram = torch.from_numpy(np.einsum("tki,tkj->tij", design, design) / 0.01)
+    force = torch.from_numpy(np.einsum("tki,tk->ti", design, residual) / 0.01)
+    covariance, shift = random_effects(gram, force, 0.1 * torch.eye(2, dtype=torch.float64))
+    assert covariance.numpy() == pytest.approx(truth, abs=0.06)
+    assert shift.numpy() == pytest.approx([0.2, -0.1], abs=0.05)
+
+
+def test_full_covariance_is_found_where_parameters_vary_together() -> None:
+    rng = np.random.default_rng(1)
+    space = space_of(a=[-4, 4], b=[-4, 4])
+    simulator = LinearSimulator(space, np.eye(2))
+    drawn = rng.multivariate_normal([0.5, -0.5], [[0.25, 0.2], [0.2, 0.25]], size=600)
+    objective = linear_objective(simulator, drawn + 0.01 * rng.standard_normal(drawn.shape), epsilon=1e-4)
+    plain = fit(objective, samples=200)
+    full = fit(objective, samples=200, covariance="full")
+    assert full.distribution.correlation is not None
+    assert full.distribution.correlation[0, 1] == pytest.approx(0.8, abs=0.08)
+    assert full.distribution.mean == pytest.approx(drawn.mean(0), abs=0.02)
+    assert full.log_likelihood > plain.log_likelihood + 50
+    assert full.document()["correlation"][0][1] == pytest.approx(full.distribution.correlation[0, 1])
+
+
+def test_entropy_keeps_deviations_open(folder: Path) -> None:
+    closed = fit(problem(folder, "dropo", "exact").objective, samples=20)
+    opened = fit(problem(folder, "dropo", "exact").objective, samples=20, entropy=2.0)
+    assert (opened.distribution.std > 100 * closed.distribution.std).all()
+    assert opened.log_likelihood < closed.log_likelihood
+    assert opened.document()["entropy"] == 2.0
+    assert opened.distribution.mean[0] == pytest.approx(MASS, rel=0.05)
+
+
+def test_the_entropy_bonus_is_balanced_by_the_likelihood() -> None:
+    """With one parameter and A = 1, Σ log N(0; 0, vσ² + ε) + β log σ is largest at vσ² = βε / (T − β)."""
+    simulator = LinearSimulator(space_of(a=[-5, 5]), np.eye(1))
+    found = fit(linear_objective(simulator, np.zeros((50, 1)), epsilon=1e-2), entropy=5.0, samples=50)
+    variance = float(truncated_moments(torch.tensor(-2.0), torch.tensor(2.0))[1])
+    assert variance * found.distribution.std[0] ** 2 == pytest.approx(5 * 1e-2 / (50 - 5), rel=0.02)
+
+
+@pytest.mark.parametrize("method", ["droid", "simopt", "bayessim", "laplace"])
+def test_an_interrupted_run_ends_as_one_never_interrupted(folder: Path, tmp_path: Path, method: str) -> None:
+    options = {
+        "droid": {"budget": 60},
+        "simopt": {"samples": 12, "iterations": 5, "horizon": 10},
+        "bayessim": {"simulations": 250, "horizon": 10, "epochs": 20, "hidden": 8, "components": 2},
+        "laplace": {},
+    }[method]
+    ours = problem(folder, method, "noisy", method_options=options)
+    whole = fit(ours.objective, search=make_search(ours), samples=10)
+
+    class Stop(Exception):
+        pass
+
+    def stop(entry: object, progress: object) -> None:
+        raise Stop
+
+    again = problem(folder, method, "noisy", method_options=options)
+    for _ in range(2):  # killed after the first batch, and again after the second
+        with pytest.raises(Stop):
+            fit(
+                again.objective, search=make_search(again), samples=10, checkpoint=tmp_path / "c.pkl", resume=True,
+                on_progress=stop,
+            )  # fmt: skip
+    last = problem(folder, method, "noisy", method_options=options)
+    resumed = fit(
+        last.objective, search=make_search(last), samples=10, checkpoint=tmp_path / "c.pkl", resume=True
+    )  # fmt: skip
+    assert resumed.distribution.mean == pytest.approx(whole.distribution.mean, rel=1e-12)
+    assert resumed.distribution.std == pytest.approx(whole.distribution.std, rel=1e-12)
+    assert resumed.evaluations == whole.evaluations
+
+
+@pytest.mark.parametrize("method", ["droid", "simopt", "bayessim", "laplace", "udr"])
+def test_dropo_fit_writes_what_training_reads(folder: Path, tmp_path: Path, method: str) -> None:
+    options = {
+        "droid": {"budget": 40},
+        "simopt": {"samples": 10, "iterations": 3, "horizon": 10},
+        "bayessim": {"simulations": 40, "horizon": 10, "epochs": 10, "hidden": 8, "components": 2},
+    }.get(method, {})
+    (tmp_path / "c.json").write_text(json.dumps(config(folder, method, "noisy", method_options=options)))
+    assert main(["fit", str(tmp_path / "c.json"), "--out", str(tmp_path / "out")]) == 0
+    document = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert document["schema"] == "dropo-torch/fit/1"
+    assert document["method"] == method
+    assert set(document["parameters"]["mass"]) >= {"mean", "std", "low", "high", "unit"}
+    loaded = Distribution.load(tmp_path / "out" / "fit.json")
+    draws = loaded.sample(50, torch.Generator().manual_seed(0))
+    assert torch.isfinite(draws).all()
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "What the standard deviations are" in page
+    assert "Standard deviation at its floor" not in page
+    assert ("The posterior, pair by pair" in page) == (method == "bayessim")
+
+
+@pytest.mark.parametrize(
+    ("method", "options", "message"),
+    [
+        ("droid", {"budge": 3}, "did you mean 'budget'"),
+        ("droid", {"budget": 0}, "1 or more"),
+        ("droid", {"budget": 1.5}, "whole number"),
+        ("simopt", {"kl": -1}, "more than 0"),
+        ("simopt", {"samples": True}, "whole number"),
+        ("bayessim", {"features": "mdn"}, "did you mean 'mdnn'"),
+        ("bayessim", {"horizon": 1}, "2 logged steps"),
+        ("udr", {"box": 10}, "one of the 10 boxes"),
+        ("laplace", {"budget": 3}, "laplace has no 'budget'"),
+        ("dropo", {"budget": 3}, "dropo has no 'budget'"),
+        ("dropi", {}, "did you mean 'dropo'"),
+    ],
+)
+def test_bad_options_are_told_in_one_line(method: str, options: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as raised:
+        method_settings(method, options)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_bad_option_ends_the_command_before_an_earlier_run_is_moved(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "c.json").write_text(json.dumps(config(folder, "udr", method_options={"boxs": 3})))
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "fit.json").write_text("{}")
+    assert main(["fit", str(tmp_path / "c.json"), "--out", str(tmp_path / "out")]) == 2
+    error = capsys.readouterr().err
+    assert "method_options" in error
+    assert error.count("\n") == 1
+    assert (tmp_path / "out" / "fit.json").read_text() == "{}"
+
+
+def test_options_of_the_fit_that_do_not_go_together_are_refused(folder: Path) -> None:
+    objective = problem(folder, "dropo").objective
+    with pytest.raises(InputError, match="needs optimizer: fisher"):
+        fit(objective, optimizer="cma", covariance="full")
+    with pytest.raises(InputError, match="diagonal or full"):
+        fit(objective, covariance="round")
+    with pytest.raises(InputError, match="no entropy bonus"):
+        fit(objective, optimizer="adam", entropy=1.0)
+
+
+def test_a_log_of_single_transitions_has_nothing_for_bayessim(folder: Path) -> None:
+    ours = problem(folder, "bayessim")
+    log = ours.trajectories
+    single = Trajectories(log.observations, log.next_observations, log.actions, np.ones(len(log), dtype=bool))
+    with pytest.raises(InputError, match="two transitions"):
+        make_search(Problem(**{**vars(ours), "trajectories": single}))
+
+
+TINY = Plan(
+    seeds=1, steps=12, samples=8, droid_budget=40, simulations=20, horizon=6, epsilons=(1e-8, 1e-5, 1e-2),
+    noise_variances=(1e-5,), sizes=(12,), resamples=2, cma_steps=8, cma_budget=24, cma_samples=4,
+)  # fmt: skip
+
+
+def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None:
+    out = tmp_path / "study"
+    found = run_study(out, plan=TINY)
+    assert len(found) == 6
+    assert all(line.startswith(("holds", "DOES NOT HOLD")) for line in found)
+    document = json.loads((out / "study.json").read_text())
+    cases = {(r["case"], r["method"]) for r in document["tables"]["table"]}
+    assert cases >= {(c, m) for c in ("noiseless", "unmodeled torso") for m in ("dropo", "droid", "bayessim")}
+    assert cases >= {("noisy", m) for m in ("dropo", "dropo (noise given)", "droid", "bayessim")}
+    torso = {r["case"] for r in document["tables"]["table"] if r["parameter"] == "torso_mass"}
+    assert torso == {"noiseless", "noisy"}
+    point = [r for r in document["tables"]["table"] if (r["case"], r["method"]) == ("noiseless", "dropo")]
+    assert max(r["largest_error_percent"] for r in point) < 0.1
+    text = (out / "tables.md").read_text()
+    assert "| noiseless | torso_mass |" in text
+    page = (out / "report.html").read_text()
+    assert page.count("<svg") == 4
+    assert "DROPO widens under the unmodeled torso" in page
+    for figure in ("recovery.png", "sweep.png", "noise.png", "size.png"):
+        assert (out / figure).stat().st_size > 5000
+    cells = sorted((out / "cells").iterdir())
+    assert len(cells) == len(all_cells(TINY))
+    before = {p.name: p.stat().st_mtime_ns for p in cells}
+    cells[0].unlink()
+    with pytest.raises(InputError, match="add --resume"):
+        run_study(out, plan=TINY)
+    with pytest.raises(InputError, match="another size"):
+        run_study(out, plan=replace(TINY, seeds=2), resume=True)
+    assert [line.split("(")[0] for line in run_study(out, plan=TINY, resume=True)] == [f.split("(")[0] for f in found]
+    after = {p.name: p.stat().st_mtime_ns for p in (out / "cells").iterdir()}
+    assert {n for n in before if after[n] != before[n]} == {cells[0].name}
+
+
+@pytest.mark.slow
+def test_the_reduced_study_finds_the_point_dynamics(tmp_path: Path) -> None:
+    found = run_study(tmp_path / "study", reduced=True)
+    assert found[0].startswith("holds: DROPO and DROID find the point dynamics")
+
+
+def test_cells_of_a_study_have_names_of_their_own() -> None:
+    for plan in (Plan(), REDUCED, TINY):
+        names = [cell.name for cell in all_cells(plan)]
+        assert len(set(names)) == len(names)
+
+
+def test_an_unknown_study_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["reproduce", "hoper", "--out", str(tmp_path / "x")]) == 2
+    assert "did you mean 'hopper'" in capsys.readouterr().err
+    (tmp_path / "notes.txt").write_text("mine")
+    assert main(["reproduce", "hopper", "--out", str(tmp_path)]) == 2
+    assert "not an empty folder" in capsys.readouterr().err
+
+
+def test_intervals_hold_their_share_of_draws() -> None:
+    for uniform in (False, True):
+        made = Distribution.over(space_of(a=[0, 10]), np.array([4.0]), np.array([0.5]), is_uniform=uniform)
+        low, high = interval(made, 0.9)
+        draws = made.sample(20_000, torch.Generator().manual_seed(0)).numpy()
+        assert np.mean((draws >= low) & (draws <= high)) == pytest.approx(0.9, abs=0.01)
+    assert wilson(0.9, 100) == pytest.approx((0.826, 0.945), abs=2e-3)
+
+
+def test_a_synthetic_log_is_explained_by_its_truth(folder: Path) -> None:
+    ours = problem(folder, "laplace")
+    truths = draw_truths(ours, "fixed", 3)
+    assert (truths == truths[0]).all()
+    made = synthesise(ours, truths, np.zeros(2), seed=0)
+    found = fit_problem(made).distribution
+    assert found.mean == pytest.approx(truths[0], rel=1e-6)
+    varying = draw_truths(ours, "varying", 3)
+    assert varying.std(0) == pytest.approx(0.1 * np.array([2.5, 0.49]), rel=0.25)
+
+
+def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(folder: Path) -> None:
+    noise = np.array([1e-4, 5e-4])
+
+    def ours(method: str) -> Problem:
+        return problem(folder, method, epsilon=(noise**2).tolist())
+
+    trials = calibrate(ours, ["laplace", "dropo"], logs=12, noise=noise)
+    found = {(c.kind, c.method, c.parameter): c.covered for c in coverages(trials) if c.level == 0.9}
+    assert found["fixed", "laplace", "mass"] > 0.7
+    assert found["fixed", "laplace", "damping"] > 0.7
+    assert found["varying", "dropo", "mass"] == pytest.approx(0.9, abs=0.08)  # damping hardly shows in one step
+    assert found["varying", "laplace", "mass"] < 0.5
+    again = calibrate(ours, ["laplace"], logs=12, noise=noise, done=trials)
+    assert again == trials
