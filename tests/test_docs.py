@@ -345,6 +345,14 @@ def test_emps(capsys: pytest.CaptureFixture) -> None:
     assert "open-loop error" in capsys.readouterr().out
 
 
+def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
+    log = str(ROOT / "sims" / "hopper" / "log.npz")
+    load_example(ROOT / "examples" / "authors_hopper.py").main([log, "--transitions", "60"])
+    told = capsys.readouterr().out
+    assert "torso: mass 3.534 kg, moment of inertia 0.893 of today's" in told
+    assert "(60 transitions)" in told or ("without contact" in told and "in contact" in told)
+
+
 def test_authors_hopper_is_a_config() -> None:
     text = (ROOT / "examples" / "authors_hopper.yaml").read_text()
     make_config({**yaml.load(text, Loader=_Loader), "data": "hopper10000"})
