@@ -3,8 +3,8 @@
     python examples/authors_hopper.py path/to/hopper10000
 
 The log was recorded with a MuJoCo that took a capsule of radius r and length h for a cylinder of length h + r. Masses
-and moments of inertia of the links come out smaller than today's. Each logged transition is simulated with the published
-masses, once with today's moments of inertia and once with the cylinder's, and compared with the logged next state.
+and moments of inertia of the links come out smaller than today's. Each logged transition is simulated with the
+published masses, once with today's moments of inertia and once with the cylinder's, and compared with the logged one.
 """
 
 from __future__ import annotations
