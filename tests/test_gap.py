@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import dataclasses
 import functools
 import json
@@ -137,6 +138,19 @@ def test_friction_that_is_larger_at_rest_is_found_from_plain_friction() -> None:
     gap = search(simulate_truth(CART_POLE, [truth], 3, **SIZE), ("joint_friction", "joint_damping", "joint_stribeck"))
     assert [e.effect for e in gap.effects] == ["joint_stribeck"]
     assert gap.effects[0].parameters["coulomb"].value == pytest.approx(0.2, rel=0.05)
+
+
+def test_a_payload_begins_where_it_shifts_the_centre_of_mass_as_far() -> None:
+    payload, setting, shift = find_effect("payload"), scene_of().setting, np.array([0.004, 0.0, -0.003])
+    moved = Placed(find_effect("center_of_mass"), "pole", tuple(shift))
+    body = setting.model.body("pole").id
+    starts = payload.extends(setting, moved)
+    assert len(starts) == 3
+    for values in starts:
+        model = copy.copy(setting.model)
+        payload.apply(model, "pole", values)
+        np.testing.assert_allclose(model.body_ipos[body] - setting.model.body_ipos[body], shift, atol=1e-9)
+    assert payload.extends(setting, placed("joint_friction", 0.3)) == []
 
 
 @pytest.mark.parametrize(

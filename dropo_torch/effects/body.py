@@ -5,7 +5,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting
 
 
 def body_number(model: mujoco.MjModel, target: str | None) -> int:
@@ -99,6 +99,18 @@ class Payload(BodyEffect):
         places[1][longest], places[2][longest] = low[longest], high[longest]
         mass = 0.05 * float(setting.model.body_mass[body])
         return [np.concatenate([[mass], p]) for p in places]
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        """Begin with masses, where they are in reach, that shift the centre of mass as far."""
+        if simpler.effect.name != CenterOfMass.name:
+            return []
+        body = body_number(setting.model, simpler.target)
+        own, center = float(setting.model.body_mass[body]), setting.model.body_ipos[body]
+        quantities = self.quantities(setting, simpler.target)[1:]
+        low, high = (np.array([getattr(q, end) for q in quantities]) for end in ("low", "high"))
+        masses = own * np.array([0.03, 0.1, 0.3])
+        places = [center + np.array(simpler.values) * (own + mass) / mass for mass in masses]
+        return [np.concatenate([[m], np.clip(p, low, high)]) for m, p in zip(masses, places, strict=True)]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] != 0:
