@@ -29,11 +29,11 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
-from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of
+from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Starts, cost_of, robust_factors
 from dropo_torch.gap.intervals import deviations
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import Chart, cut_windows
-from dropo_torch.gap.naming import Rules, allowance
+from dropo_torch.gap.naming import Rules, allowance, clears
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
 from dropo_torch.gap.result import NamedEffect, Strength
@@ -443,6 +443,41 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     ranked = screen(scene.evidence, base, candidates, caps=np.ones(len(scene.evidence.windows)))
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
+
+
+# --- outliers -------------------------------------------------------------------------------------------------
+
+
+def spoilt(size: float, share: float, windows: int = 40, rows: int = 12) -> Refit:
+    """A fit that leaves noise in its windows, and residuals of ``size`` in a share of them."""
+    residual = np.random.default_rng(0).standard_normal((windows, rows))
+    residual[: round(share * windows)] *= size
+    starts = Starts(np.zeros((windows, rows, 0)), np.ones((windows, rows)), np.zeros((windows, rows)), 0.0)
+    cost = cost_of(residual, starts, windows * rows, tail=TAIL * rows)
+    return Refit(Hypothesis(()), cost, residual, residual[None], starts, np.ones(1), True, np.ones(windows))
+
+
+def test_robust_cost_is_that_of_noise_for_noise_and_a_logarithm_far_off() -> None:
+    rows = 12
+    starts = Starts(np.zeros((1, rows, 0)), np.ones((1, rows)), np.zeros((1, rows)), 0.0)
+    costs = [cost_of(np.full((1, rows), a), starts, rows, tail=TAIL * rows).chi2 for a in (1.0, 1e4, 1e5, 1e6)]
+    assert costs[0] == pytest.approx(rows)
+    assert costs[3] - costs[2] == pytest.approx(costs[2] - costs[1], rel=1e-3)
+    assert costs[3] < 100 * costs[0]  # of a misfit 1e12 times as large
+
+
+def test_robust_factors_are_the_slope_of_the_robust_loss() -> None:
+    chi2, tail, step = np.array([0.1, 30.0, 4000.0]), 36.0, 1e-4
+    slope = tail * (np.log1p((chi2 + step) / tail) - np.log1p((chi2 - step) / tail)) / (2 * step)
+    np.testing.assert_allclose(robust_factors(chi2, tail) ** 2, slope, rtol=1e-5)
+    np.testing.assert_array_equal(robust_factors(chi2, None), 1.0)
+
+
+def test_what_is_better_everywhere_and_right_nowhere_clears_nothing() -> None:
+    base = spoilt(100.0, 1.0)
+    assert clears(base, spoilt(1000.0, 0.4))  # right in six of ten windows, worse in the others
+    assert not clears(base, spoilt(3.0, 1.0))  # imitates it everywhere
+    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0))  # was right in most windows before
 
 
 # --- intervals ------------------------------------------------------------------------------------------------

@@ -83,10 +83,6 @@ class Evidence:
         """Return the same by another simulation."""
         return self._with(twin=twin)
 
-    def robustly(self) -> Evidence:
-        """Return the same with a cost to which windows that are far off contribute by the logarithm only."""
-        return self._with(robust=True)
-
     def _with(self, **changes: object) -> Evidence:
         other = copy.copy(self)
         for name, value in changes.items():

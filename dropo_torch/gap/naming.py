@@ -87,7 +87,7 @@ class Naming:
 
 
 #: χ² per degree of freedom of the typical window that is far off, and of one that is right.
-FAR, CLEAR = 20.0, 1.5
+FAR_OFF, CLEAR = 20.0, 1.5
 
 #: ``report(stage, share)`` as the work goes on.
 Report = Callable[[str, float], None]
@@ -114,7 +114,7 @@ def clears(base: Refit, current: Refit) -> bool:
     before, after = (
         float(np.median((r.residual**2).sum(-1))) * len(r.residual) / r.cost.degrees for r in (base, current)
     )
-    return before > FAR and after < CLEAR
+    return before > FAR_OFF and after < CLEAR
 
 
 def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:

@@ -13,7 +13,7 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.intervals import deviations, step_errors
 from dropo_torch.gap.locate import dof_names, guilty, places, regime, residual_pictures
-from dropo_torch.gap.naming import FAR, Naming, Search
+from dropo_torch.gap.naming import FAR_OFF, Naming, Search
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Ranked, Strength
@@ -106,7 +106,7 @@ def _rest(naming: Naming, final: Refit, where: str) -> tuple[str, ...]:
     if not naming.partial:
         return ()
     chi2 = (final.residual**2).sum(-1) * len(final.residual) / final.cost.degrees
-    share = float(np.mean(chi2 > FAR))
+    share = float(np.mean(chi2 > FAR_OFF))
     return (
         f"This leaves no more than noise in most of the log; in {100 * share:.0f} % of the windows something else "
         f"remains, which none of the known effects explains, mostly at {where}.",
