@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import time
 from types import TracebackType
+from typing import Self
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -16,7 +17,22 @@ from dropo_torch.optimizers import Progress as OptimizerProgress
 INTERVAL = 10.0
 
 
-class FitProgress:
+class _Live:
+    """A bar that shows while it is entered."""
+
+    _bar: Progress
+
+    def __enter__(self) -> Self:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+
+class FitProgress(_Live):
     """A progress line of a fit: stage, evaluations, best log-likelihood, time spent and left.
 
     On a terminal it is redrawn in place; elsewhere a line is printed every ten seconds.
@@ -38,15 +54,6 @@ class FitProgress:
         )
         self._task = self._bar.add_task(label, total=1.0, status="simulating")
 
-    def __enter__(self) -> FitProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
-
     def update(self, entry: HistoryEntry, progress: OptimizerProgress) -> None:
         """Show the state after a batch."""
         best = "" if math.isnan(entry.log_likelihood) else f", best log-likelihood {entry.log_likelihood:.1f}"
@@ -59,7 +66,7 @@ class FitProgress:
             self._console.print(f"{self._label}: {status}", soft_wrap=True)
 
 
-class StageProgress:
+class StageProgress(_Live):
     """A progress line of a run in stages; elsewhere than on a terminal a line for every stage."""
 
     def __init__(self, console: Console, label: str) -> None:
@@ -70,15 +77,6 @@ class StageProgress:
         )  # fmt: skip
         self._task = self._bar.add_task(label, total=1.0)
 
-    def __enter__(self) -> StageProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
-
     def update(self, stage: str, share: float) -> None:
         """Show a stage and how much of it is done."""
         self._bar.update(self._task, completed=share, description=f"{self._label}: {stage}")
@@ -87,7 +85,7 @@ class StageProgress:
         self._stage = stage
 
 
-class TrainProgress:
+class TrainProgress(_Live):
     """A progress line of a training: steps, return of late, steps a second, time left."""
 
     def __init__(self, console: Console, steps: int) -> None:
@@ -98,15 +96,6 @@ class TrainProgress:
         )  # fmt: skip
         self._task = self._bar.add_task("train", total=1.0, status="simulating")
         self._from: tuple[int, float] | None = None
-
-    def __enter__(self) -> TrainProgress:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
 
     def update(self, steps: int, mean_return: float) -> None:
         """Show how many steps are done, and the return of the episodes that ended last."""

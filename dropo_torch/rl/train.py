@@ -12,6 +12,7 @@ from typing import Any
 import torch
 
 from dropo_torch.errors import InputError
+from dropo_torch.objective import single_thread
 from dropo_torch.rl.checkpoint import Checkpoints
 from dropo_torch.rl.collect import Collector
 from dropo_torch.rl.evaluate import Evaluation, evaluate
@@ -151,7 +152,7 @@ def train(
     Raises:
         InputError: a checkpoint of another training; losses that stay infinite.
     """
-    with _own_random_numbers(problem.config.seed, problem.device), _one_thread():
+    with _own_random_numbers(problem.config.seed, problem.device), single_thread():
         run = _Run(problem, checkpoint)
         if resume:
             run.restore()
@@ -327,14 +328,3 @@ def _own_random_numbers(seed: int, device: str) -> Iterator[None]:
     with torch.random.fork_rng([device] if device.startswith("cuda") else []):
         torch.manual_seed(seed)
         yield
-
-
-@contextlib.contextmanager
-def _one_thread() -> Iterator[None]:
-    """Let torch use one thread for a while: small networks gain little by more, and sums do not depend on how many."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
