@@ -208,6 +208,31 @@ def test_a_mixture_density_network_learns_a_gaussian_posterior(features: str) ->
     assert np.sqrt(covariance[0, 0]) == pytest.approx(0.1, rel=0.25)
 
 
+def test_training_the_network_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """No files in the working directory, nothing on the terminal, and the caller's random numbers as they were."""
+    monkeypatch.chdir(tmp_path)
+    x = np.random.default_rng(0).uniform(size=(60, 1))
+    settings = BayesSimSettings(components=2, hidden=8, epochs=3)
+    before = torch.random.get_rng_state()
+    found = [
+        fit_mixture(x, x, np.array([0.5]), settings=settings, seed=seed, low=np.zeros(1), width=np.ones(1))
+        for seed in (0, 0, 1)
+    ]
+    assert torch.equal(torch.random.get_rng_state(), before)
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr() == ("", "")
+    assert (found[0].means == found[1].means).all()
+    assert (found[0].means != found[2].means).any()
+
+
+def test_bayessim_without_sbi_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    with pytest.raises(InputError, match=r"pip install 'dropo_torch\[baselines\]'"):
+        make_search(problem(folder, "bayessim"))
+
+
 def test_summaries_are_moments_of_changes() -> None:
     rng = np.random.default_rng(0)
     paths, logged = torch.from_numpy(rng.normal(size=(3, 2, 5, 4))), torch.from_numpy(rng.normal(size=(3, 5, 4)))

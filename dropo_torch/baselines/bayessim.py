@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import fit_mixture
+from dropo_torch.baselines.density import fit_mixture, require_sbi
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.distribution import Distribution, SearchBox, to_values
@@ -74,6 +74,7 @@ class BayesSimOptimizer(Optimizer):
         seed: int,
         noise: torch.Tensor | None = None,
     ) -> None:
+        require_sbi()
         self._noise = noise
         self._space, self._replay, self._settings, self._seed = space, replay, settings, seed
         self._num_columns = num_columns

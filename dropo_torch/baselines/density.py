@@ -1,8 +1,12 @@
-"""Conditional mixture densities p(θ | x): learned from pairs, evaluated at one x."""
+"""Conditional mixture densities p(θ | x): learned from pairs by ``sbi``'s neural posterior estimation, put to one x."""
 
 from __future__ import annotations
 
-import copy
+import contextlib
+import importlib.util
+import io
+import warnings
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -13,55 +17,31 @@ from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.errors import InputError
 from dropo_torch.objective import single_thread
 
-_LEARNING_RATE = 5e-3
-#: Epochs without a better validation loss after which training stops.
-_PATIENCE = 60
-#: Smallest deviation of a component, as a share of the search box.
-_LEAST_DEVIATION = 1e-3
-#: Standardised inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
-_FARTHEST = 5.0
+if TYPE_CHECKING:
+    from sbi.neural_nets.estimators.mixture_density_estimator import MixtureDensityEstimator
+
+_LEARNING_RATE = 2e-3
+_BATCH = 100
+#: Epochs without a better loss on the pairs held out after which training stops.
+_PATIENCE = 40
 #: Share of the pairs by which training is stopped.
 _VALIDATION = 0.1
+#: Standardised inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
+_FARTHEST = 5.0
+#: Added to the precisions, as by the network itself: no component is wider than a hundred deviations of the prior.
+_PRECISION_FLOOR = 1e-4
+#: Deviation of a share that is uniform in [0, 1].
+_UNIFORM = 12**-0.5
 
 
-class MixtureDensityNetwork(nn.Module):
-    """Inputs ``(n, q)`` to a mixture of M Gaussians over d outputs, with full covariance.
+def require_sbi() -> None:
+    """Check that ``sbi`` is installed.
 
-    Args:
-        body: makes features of the inputs.
-        width: number of features.
-        components: M.
-        outputs: d.
+    Raises:
+        InputError: it is not.
     """
-
-    def __init__(self, body: nn.Module, width: int, components: int, outputs: int) -> None:
-        super().__init__()
-        self._shape = (components, outputs)
-        self.body = body
-        triangle = outputs * (outputs - 1) // 2
-        self.head = nn.Linear(width, components * (1 + 2 * outputs + triangle), dtype=torch.float64)
-        with torch.no_grad():
-            self.head.weight.mul_(0.1)
-            start = self.head.bias[components : components * (1 + outputs)]
-            start.uniform_(0.1, 0.9)  # components begin apart from each other
-            self.head.bias[components * (1 + outputs) : components * (1 + 2 * outputs)].fill_(-1.5)
-
-    def forward(self, inputs: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Return log weights ``(n, M)``, means ``(n, M, d)`` and Cholesky factors ``(n, M, d, d)``."""
-        m, d = self._shape
-        logits, means, logs, lower = self.head(self.body(inputs)).split([m, m * d, m * d, m * d * (d - 1) // 2], -1)
-        factor = torch.diag_embed(_LEAST_DEVIATION + torch.exp(logs.reshape(-1, m, d).clamp(max=2.0)))
-        rows, columns = torch.tril_indices(d, d, -1)
-        factor = factor.index_put(
-            (
-                torch.arange(len(inputs))[:, None, None],
-                torch.arange(m)[:, None],
-                rows,
-                columns,
-            ),
-            lower.reshape(len(inputs), m, len(rows)) * 0.3,
-        )
-        return torch.log_softmax(logits, -1), means.reshape(-1, m, d), factor
+    if importlib.util.find_spec("sbi") is None:
+        raise InputError("method: bayessim needs the package sbi: pip install 'dropo_torch[baselines]'")
 
 
 class FourierFeatures(nn.Module):
@@ -74,21 +54,12 @@ class FourierFeatures(nn.Module):
         halton = torch.from_numpy(qmc.Halton(inputs, seed=seed).random(frequencies))
         normal = torch.special.ndtri(halton.clamp(1e-6, 1 - 1e-6))
         self.omega: torch.Tensor
-        self.register_buffer("omega", normal.T / lengthscale)
+        self.register_buffer("omega", (normal.T / lengthscale).to(torch.float32))
 
     def forward(self, inputs: torch.Tensor) -> torch.Tensor:
         """Return the features."""
         phase = inputs @ self.omega
         return torch.cat([phase.cos(), phase.sin()], -1)
-
-
-def mixture_log_density(parts: tuple[torch.Tensor, torch.Tensor, torch.Tensor], targets: torch.Tensor) -> torch.Tensor:
-    """Return log p(θ | x) of targets ``(n, d)`` under the network's mixtures, ``(n,)``."""
-    weights, means, factor = parts
-    white = torch.linalg.solve_triangular(factor, (targets[:, None] - means)[..., None], upper=False)[..., 0]
-    log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
-    constant = 0.5 * targets.shape[-1] * float(np.log(2 * np.pi))
-    return torch.logsumexp(weights - 0.5 * white.square().sum(-1) - log_det - constant, -1)
 
 
 def fit_mixture(
@@ -112,8 +83,9 @@ def fit_mixture(
         low, width: the search box, in coordinates, ``(d,)`` each.
 
     Raises:
-        InputError: fewer than ten simulations that did not diverge.
+        InputError: ``sbi`` is not installed, or fewer than ten simulations did not diverge.
     """
+    require_sbi()
     alive = np.isfinite(inputs).all(1)
     if alive.sum() < 10:
         raise InputError(
@@ -123,55 +95,81 @@ def fit_mixture(
     inputs, shares = inputs[alive], shares[alive]
     center, scale = inputs.mean(0), inputs.std(0)
     moves = scale > 1e-12 * (1 + np.abs(center))
-    x = ((inputs - center) / np.where(moves, scale, 1))[:, moves].clip(-_FARTHEST, _FARTHEST)
-    here = ((at - center) / np.where(moves, scale, 1))[moves].clip(-_FARTHEST, _FARTHEST)
+    scale = np.where(moves, scale, 1)
+    x, here = (((rows - center) / scale)[..., moves].clip(-_FARTHEST, _FARTHEST) for rows in (inputs, at))
     with torch.random.fork_rng(devices=[]), single_thread():
         torch.manual_seed(seed)
-        network = _network(x, shares.shape[1], settings, seed)
-        _train(network, torch.from_numpy(x), torch.from_numpy(shares), settings.epochs)
+        estimator = _train(_float(x), _float((shares - 0.5) / _UNIFORM), settings, seed)
         with torch.no_grad():
-            weights, means, factor = (p[0] for p in network(torch.from_numpy(here)[None]))
-    root = factor.numpy() * width[:, None]
+            mixture = estimator.net(_float(here)[None])
+    factor = mixture.precision_factors[0].double().numpy()
+    precision = factor.transpose(0, 2, 1) @ factor + _PRECISION_FLOOR * np.eye(len(width))
+    covariance = np.linalg.inv(precision) * _UNIFORM**2 * np.outer(width, width)
     return Mixture(
-        weights=np.exp(weights.numpy()),
-        means=low + means.numpy() * width,
-        covariances=root @ root.transpose(0, 2, 1),
+        weights=torch.softmax(mixture.logits[0].double(), -1).numpy(),
+        means=low + (0.5 + mixture.means[0].double().numpy() * _UNIFORM) * width,
+        covariances=0.5 * (covariance + covariance.transpose(0, 2, 1)),
         low=low,
         high=low + width,
     )
 
 
-def _network(x: np.ndarray, outputs: int, settings: BayesSimSettings, seed: int) -> MixtureDensityNetwork:
+def _train(x: torch.Tensor, theta: torch.Tensor, settings: BayesSimSettings, seed: int) -> MixtureDensityEstimator:
+    """The network, trained on all pairs but those held out; the weights that are best on those are kept."""
+
+    def build(theta: torch.Tensor, x: torch.Tensor) -> MixtureDensityEstimator:
+        return _estimator(theta, x, settings, seed)
+
+    with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
+        warnings.simplefilter("ignore")  # that ``epochs`` came first, and imports of old names
+        from sbi.inference import NPE
+
+        trainer = NPE(density_estimator=build, show_progress_bars=False, tracker=_NoTracker())
+        trainer.append_simulations(theta, x)
+        return trainer.train(
+            training_batch_size=_BATCH,
+            learning_rate=_LEARNING_RATE,
+            validation_fraction=_VALIDATION,
+            stop_after_epochs=_PATIENCE,
+            max_num_epochs=settings.epochs,
+        )
+
+
+def _estimator(theta: torch.Tensor, x: torch.Tensor, settings: BayesSimSettings, seed: int) -> MixtureDensityEstimator:
     """An untrained network with the features of the settings."""
-    inputs, hidden = x.shape[1], settings.hidden
+    from sbi.neural_nets.estimators.mixture_density_estimator import MixtureDensityEstimator, MultivariateGaussianMDN
+
+    body, features = None, settings.hidden
     if settings.features == "mdrff":
-        lengthscale = float(torch.pdist(torch.from_numpy(x[:500])).median()) or 1.0
-        body: nn.Module = FourierFeatures(inputs, hidden, lengthscale, seed)
-        return MixtureDensityNetwork(body, 2 * hidden, settings.components, outputs)
-    first, second = (nn.Linear(n, hidden, dtype=torch.float64) for n in (inputs, hidden))
-    body = nn.Sequential(first, nn.Tanh(), second, nn.Tanh())
-    return MixtureDensityNetwork(body, hidden, settings.components, outputs)
+        lengthscale = float(torch.pdist(x[:500]).median()) or 1.0
+        body, features = FourierFeatures(x.shape[1], settings.hidden, lengthscale, seed), 2 * settings.hidden
+    network = MultivariateGaussianMDN(
+        features=theta.shape[1],
+        context_features=x.shape[1],
+        hidden_features=features,
+        num_components=settings.components,
+        hidden_net=body,
+        custom_initialization=True,
+    )
+    return MixtureDensityEstimator(network, input_shape=theta[0].shape, condition_shape=x[0].shape)
 
 
-def _train(network: MixtureDensityNetwork, x: torch.Tensor, targets: torch.Tensor, epochs: int) -> None:
-    """Maximise the likelihood by Adam over all pairs at once; keep the weights that are best on those held out."""
-    order = torch.randperm(len(x))
-    held = order[: max(1, int(_VALIDATION * len(x)))]
-    kept = order[len(held) :]
-    optimizer = torch.optim.Adam(network.parameters(), lr=_LEARNING_RATE, weight_decay=1e-4)
-    best, best_state, since = float("inf"), copy.deepcopy(network.state_dict()), 0
-    for _ in range(epochs):
-        optimizer.zero_grad()
-        loss = -mixture_log_density(network(x[kept]), targets[kept]).mean()
-        loss.backward()
-        nn.utils.clip_grad_norm_(network.parameters(), 5.0)
-        optimizer.step()
-        with torch.no_grad():
-            value = float(-mixture_log_density(network(x[held]), targets[held]).mean())
-        if value < best:
-            best, best_state, since = value, copy.deepcopy(network.state_dict()), 0
-        else:
-            since += 1
-        if since > _PATIENCE:
-            break
-    network.load_state_dict(best_state)
+def _float(values: np.ndarray) -> torch.Tensor:
+    """The network's single precision."""
+    return torch.from_numpy(values).to(torch.float32)
+
+
+class _NoTracker:
+    """``sbi`` would otherwise write TensorBoard files into the working directory."""
+
+    log_dir: str | None = None
+
+    def log_metric(self, name: str, value: float, step: int | None = None) -> None: ...
+
+    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None: ...
+
+    def log_params(self, params: dict[str, Any]) -> None: ...
+
+    def add_figure(self, name: str, figure: Any, step: int | None = None) -> None: ...
+
+    def flush(self) -> None: ...
