@@ -40,6 +40,9 @@ class Config(pydantic.BaseModel):
     effects: list[dict[str, Any]] = pydantic.Field(
         [], description="physical effects that the model lacks: effect, target and its numbers"
     )
+    own_effects: list[str] = pydantic.Field(
+        [], description="file.py:Class (module:Class) of effects of one's own, which join the vocabulary"
+    )
     backend: Literal["mujoco", "warp", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
     method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = pydantic.Field(
         "dropo", description="what finds the distribution"
@@ -102,10 +105,17 @@ class Config(pydantic.BaseModel):
             document["model"] = str(self.path(self.model).resolve())
         if self.data is not None:
             document["data"] = self._absolute(self.data)
-        if self.environment is not None and ".py:" in self.environment:
-            where, _, function = self.environment.rpartition(":")
-            document["environment"] = f"{self.path(where).resolve()}:{function}"
+        for key in ("environment", "task"):
+            if key in document:
+                document[key] = self._absolute_code(document[key])
+        if self.own_effects:
+            document["own_effects"] = [self._absolute_code(name) for name in self.own_effects]
         return document
+
+    def _absolute_code(self, name: str) -> str:
+        """``file.py:function`` with an absolute path; other names as they are."""
+        where, _, function = name.rpartition(":")
+        return f"{self.path(where).resolve()}:{function}" if where.endswith(".py") else name
 
     def _absolute(self, source: Any) -> Any:
         if isinstance(source, list):

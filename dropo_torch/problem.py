@@ -17,7 +17,7 @@ import numpy as np
 
 from dropo_torch.bundled import BundledSim, bundled_sim
 from dropo_torch.config import TRAINING_KEYS, Config
-from dropo_torch.effects import find_effect
+from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.errors import InputError
@@ -72,6 +72,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         InputError: anything that does not fit, by key.
     """
     sim = None if config.sim is None else bundled_sim(config.sim)
+    load_effects(config.own_effects, config.path)
     if config.backend == "gymnasium":
         model_path, space, source = _gymnasium_source(config, sim)
     else:

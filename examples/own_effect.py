@@ -1,8 +1,9 @@
-"""A physical effect of one's own, fitted: a door whose model lacks its magnetic catch.
+"""A physical effect of one's own, found and fitted: a door whose model lacks its magnetic catch.
 
-    python examples/own_effect.py       # records a log, fits it, writes out/door/fit/report.html
+    python examples/own_effect.py       # records a log; finds what is missing; fits it: out/door/*/report.html
 
-The class :class:`MagneticCatch` is all that the package has to know of the effect.
+The class :class:`MagneticCatch` is all that the package has to know of the effect; ``own_effects`` in the config
+names it, so that ``dropo gap out/door/door.yaml --out DIR`` does the same.
 """
 
 from __future__ import annotations
@@ -13,12 +14,13 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+import yaml
 from rich.console import Console
 
 import dropo_torch as dropo
-from dropo_torch.effects import Quantity, Setting, register
+from dropo_torch.effects import Quantity, Setting
 from dropo_torch.effects.joint import JointEffect
-from dropo_torch.runs import run_fit
+from dropo_torch.runs import run_fit, run_gap
 
 DOOR = """
 <mujoco>
@@ -62,9 +64,6 @@ class MagneticCatch(JointEffect):
         return out
 
 
-register(MagneticCatch())
-
-
 def record(path: Path, samples: int) -> None:
     """Write a log of the true door, whose catch is written out here by hand."""
     model = mujoco.MjModel.from_xml_string(DOOR)
@@ -90,14 +89,18 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given.out.mkdir(parents=True, exist_ok=True)
     (given.out / "door.xml").write_text(DOOR)
     record(given.out / "log.npz", given.samples)
-    catch = {"effect": "magnetic_catch", "name": "hinge"}
-    parameters = {
-        "catch_torque": {**catch, "index": "torque", "bounds": [0.0, 10.0], "unit": "N m"},
-        "catch_reach": {**catch, "index": "reach", "bounds": [0.02, 0.2], "unit": "rad"},
+    document = {
+        "model": "door.xml",
+        "data": "log.npz",
+        "frame_skip": FRAME_SKIP,
+        "own_effects": [f"{Path(__file__).resolve()}:MagneticCatch"],
+        "parameters": {"damping": {"field": "dof_damping", "name": "hinge", "bounds": [0.05, 1.0]}},
     }
-    document = {"model": "door.xml", "data": "log.npz", "frame_skip": FRAME_SKIP, "parameters": parameters}
-    config = dropo.make_config({**document, "epsilon": 1e-8}, base=given.out)
-    run_fit(config, given.out / "fit", console=Console())
+    config = given.out / "door.yaml"
+    config.write_text(yaml.safe_dump(document, sort_keys=False))
+    console = Console()
+    run_gap(dropo.load_config(config), given.out / "gap", console=console)
+    run_fit(dropo.load_config(given.out / "gap" / "config.yaml", {"epsilon": 1e-8}), given.out / "fit", console=console)
     print("recorded with:", ", ".join(f"{name} {value:g}" for name, value in TRUTH.items()))
 
 

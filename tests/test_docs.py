@@ -306,9 +306,11 @@ def test_own_simulator(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
 def test_own_effect(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     example = load_example(ROOT / "examples" / "own_effect.py")
     example.main(["--out", str(tmp_path), "--samples", "200"])
+    gap = yaml.safe_load((tmp_path / "gap" / "gap.json").read_text())
+    assert [(e["effect"], e["target"]) for e in gap["effects"]] == [("magnetic_catch", "hinge")]
     found = yaml.safe_load((tmp_path / "fit" / "fit.json").read_text())["parameters"]
-    assert found["catch_torque"]["mean"] == pytest.approx(example.TRUTH["torque"], rel=1e-3)
-    assert found["catch_reach"]["mean"] == pytest.approx(example.TRUTH["reach"], rel=1e-3)
+    assert found["hinge_torque"]["mean"] == pytest.approx(example.TRUTH["torque"], rel=1e-3)
+    assert found["hinge_reach"]["mean"] == pytest.approx(example.TRUTH["reach"], rel=1e-3)
 
 
 def test_crane(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:

@@ -651,6 +651,41 @@ def test_ones_own_effect_joins_the_vocabulary(monkeypatch: pytest.MonkeyPatch) -
     assert register(Wind()) is find_effect("wind_test")
 
 
+OWN = """
+from dropo_torch.effects.body import ExternalForce
+class Wind(ExternalForce):
+    name = "wind_of_config"
+class Taken(ExternalForce):
+    name = "payload"
+def breaks():
+    raise ValueError("no wind today")
+"""
+
+
+def test_a_config_names_effects_of_ones_own(tmp_path: Path) -> None:
+    """Once or again: a file that is read a second time takes its own place."""
+    (tmp_path / "wind.py").write_text(OWN)
+    base = {**record_arm(tmp_path, steps=20), "parameters": {"delay": DELAY}}
+    wind = {
+        "effects": [{"effect": "wind_of_config", "target": "lower", "x": 1.0, "y": 0.0, "z": 0.0}],
+        "own_effects": ["wind.py:Wind"],
+    }
+    for _ in range(2):
+        config = make_config({**base, **wind}, base=tmp_path)
+        make_problem(config)
+    assert config.portable()["own_effects"] == [f"{tmp_path.resolve()}/wind.py:Wind"]
+    for name, message in {
+        "wind.py": "expected file.py:Class of an Effect",
+        "breeze.py:Wind": "own_effects: no file .*breeze.py",
+        "wind.py:Wnd": "no class 'Wnd'.*did you mean 'Wind'",
+        "wind.py:breaks": r"own_effects: wind.py:breaks fails, .*line \d+: ValueError: no wind today",
+        "wind.py:Taken": "the name 'payload' is taken",
+        "builtins:dict": "makes a dict; expected a subclass",
+    }.items():
+        with pytest.raises(InputError, match=message):
+            make_problem(make_config({**base, "own_effects": [name]}, base=tmp_path))
+
+
 def test_history_stays_inside_its_episode() -> None:
     actions = np.arange(8.0)[:, None]
     states = np.zeros((8, 2))

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import pathlib
+from collections.abc import Callable, Sequence
+
 from dropo_torch.effects.actuator import (
     ActuatorBacklash,
     ActuatorBias,
@@ -29,6 +32,7 @@ from dropo_torch.effects.joint import (
 from dropo_torch.effects.sensor import SensorBias, SensorDelay, SensorScale
 from dropo_torch.effects.world import GravityTilt, GroundSlope, Integration
 from dropo_torch.errors import InputError, choices
+from dropo_torch.usercode import load_callable, user_code
 
 #: Every effect of the package, by name. A user's own joins with :func:`register`.
 VOCABULARY: dict[str, Effect] = {
@@ -44,15 +48,42 @@ VOCABULARY: dict[str, Effect] = {
 
 
 def register(effect: Effect) -> Effect:
-    """Add an effect of one's own to the vocabulary.
+    """Add an effect of one's own to the vocabulary; a class that is defined again takes its own place.
 
     Raises:
         InputError: a name that is taken.
     """
-    if effect.name in VOCABULARY:
+    taken = VOCABULARY.get(effect.name)
+    if taken is not None and _source(taken) != _source(effect):
         raise InputError(f"effect: the name {effect.name!r} is taken; choose another")
     VOCABULARY[effect.name] = effect
     return effect
+
+
+def load_effects(names: Sequence[str], path: Callable[[str], pathlib.Path]) -> None:
+    """Add effects of the user's own, classes that a config names as ``file.py:Class`` or ``module:Class``.
+
+    Args:
+        names: of the classes.
+        path: resolves a path that stands in the config.
+
+    Raises:
+        InputError: a missing file or class, one that fails or is no effect, or a name that is taken.
+    """
+    for name in names:
+        maker = load_callable(
+            "own_effects", name, path=path, what="class {} that is an Effect", example="file.py:Class of an Effect"
+        )
+        with user_code("own_effects", name):
+            effect = maker()
+        if not isinstance(effect, Effect):
+            kind = type(effect).__name__
+            raise InputError(f"own_effects: {name} makes a {kind}; expected a subclass of dropo_torch.effects.Effect")
+        register(effect)
+
+
+def _source(effect: Effect) -> tuple[str, str]:
+    return type(effect).__module__, type(effect).__qualname__
 
 
 def find_effect(name: str) -> Effect:
@@ -75,5 +106,6 @@ __all__ = [
     "Setting",
     "Signals",
     "find_effect",
+    "load_effects",
     "register",
 ]

@@ -16,7 +16,7 @@ import torch
 from dropo_torch.bundled import BundledSim, bundled_sim
 from dropo_torch.config import Config
 from dropo_torch.distribution import Distribution
-from dropo_torch.effects import find_effect
+from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.errors import InputError, choices
 from dropo_torch.model import load_model
@@ -102,6 +102,7 @@ def make_training(config: Config) -> TrainingProblem:
     """
     if config.backend == "gymnasium":
         raise InputError("backend: gymnasium steps one environment at a time; train with backend mujoco or warp")
+    load_effects(config.own_effects, config.path)
     algorithm = config.algorithm or "ppo"
     settings = train_settings(algorithm, config.train)
     sim = None if config.sim is None else bundled_sim(config.sim)
