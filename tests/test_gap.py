@@ -33,10 +33,10 @@ from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Starts, cost_of, robu
 from dropo_torch.gap.intervals import deviations
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import Chart, cut_windows
-from dropo_torch.gap.naming import Rules, allowance, clears
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
 from dropo_torch.gap.result import NamedEffect, Strength
+from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score

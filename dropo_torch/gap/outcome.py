@@ -13,10 +13,11 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.intervals import deviations, step_errors
 from dropo_torch.gap.locate import dof_names, guilty, places, regime, residual_pictures
-from dropo_torch.gap.naming import FAR_OFF, Naming, Search
+from dropo_torch.gap.naming import Naming, Search
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Ranked, Strength
+from dropo_torch.gap.rules import FAR_OFF
 from dropo_torch.gap.scene import Scene, short_windows
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe

@@ -8,11 +8,12 @@ from pathlib import Path
 
 from dropo_torch.effects import VOCABULARY, Effect
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.naming import Naming, Report, Rules, Search, significant
+from dropo_torch.gap.naming import Naming, Report, Search
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import found_places, make_result
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
+from dropo_torch.gap.rules import Rules, significant
 from dropo_torch.gap.scene import Scene, contact_windows, prepare, short_windows, shorter_windows
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
