@@ -25,7 +25,8 @@ from sims.hopper.record import HopperLog, record
 from sims.hopper.study_tables import write_results
 
 SCHEMA = "dropo-torch/study/1"
-METHODS = ("dropo", "droid", "bayessim")
+#: Methods of Table 1, with BayesSim's features.
+METHODS = (("dropo", ""), ("droid", ""), ("bayessim", "mdnn"), ("bayessim", "mdrff"))
 #: What the torso's mass is not among in the ``unmodeled`` variant.
 UNMODELED = "torso_mass"
 #: Variance of the noise that ``record`` puts on the ``noisy`` variant.
@@ -90,6 +91,7 @@ class Cell:
         size: transitions of a bootstrap sample; ``None`` for the whole log.
         resample: number of the bootstrap sample.
         optimizer: of DROPO.
+        features: of BayesSim.
     """
 
     block: str
@@ -103,11 +105,12 @@ class Cell:
     size: int | None = None
     resample: int = 0
     optimizer: str = "fisher"
+    features: str = ""
 
     @property
     def name(self) -> str:
         """The cell's file, without suffix."""
-        parts = [self.block, self.variant, self.method, f"seed{self.seed}", f"eps{self.epsilon:g}"]
+        parts = [self.block, self.variant, self.method + self.features, f"seed{self.seed}", f"eps{self.epsilon:g}"]
         parts += ["known"] * self.knows_noise
         parts += [] if self.noise is None else [f"noise{self.noise:g}", "ends" if self.ends_only else "all"]
         parts += [] if self.size is None else [f"n{self.size}", f"b{self.resample}"]
@@ -154,12 +157,14 @@ def all_cells(plan: Plan) -> list[Cell]:
     """Return the study's cells, in the order in which they run."""
     cells: list[Cell] = []
     for seed in range(plan.seeds):
-        for method in METHODS:
+        for method, features in METHODS:
+            of: dict[str, Any] = {"method": method, "features": features, "seed": seed}
+            known: dict[str, Any] = {"epsilon": 1e-8, "knows_noise": True} if method == "dropo" else {}
             cells += [
-                Cell("table", "point", method, seed),
-                Cell("table", "noisy", method, seed, 1e-8 if method == "dropo" else 1e-5, method == "dropo"),
-                Cell("table", "unmodeled", method, seed, 1e-3),
-                Cell("recovery", "distribution", method, seed, 1e-7),
+                Cell("table", "point", **of),
+                Cell("table", "noisy", **of, **known),
+                Cell("table", "unmodeled", **of, epsilon=1e-3),
+                Cell("recovery", "distribution", **of, epsilon=1e-7),
             ]
         cells.append(Cell("table", "noisy", "dropo", seed, NOISE_VARIANCE))  # as in the paper: ε alone
     cells += [Cell("sweep", variant, epsilon=e) for variant in ("point", "noisy", "unmodeled") for e in plan.epsilons]
@@ -191,7 +196,7 @@ def run_cell(cell: Cell, plan: Plan, logs: Path) -> dict[str, Any]:
     log.save(path)
     options = {
         "droid": {"budget": plan.droid_budget},
-        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon},
+        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
     }
     parameters = {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED}
     begun = time.monotonic()

@@ -9,10 +9,18 @@ import numpy as np
 
 from dropo_torch.report import figures
 
-_COLOURS = {"dropo": "#0072b2", "dropo (noise given)": "#56b4e9", "droid": "#d55e00", "bayessim": "#009e73"}
+_COLOURS = {"dropo": "#0072b2", "dropo (noise given)": "#56b4e9", "droid": "#d55e00", "bayessim (mdnn)": "#009e73",
+            "bayessim (mdrff)": "#cc79a7"}  # fmt: skip
 _LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31", "#7b8794", "#999933")
 
 Result = dict[str, Any]
+
+
+def label(result: Result) -> str:
+    """Return the name of a result's method, with how it treats noise."""
+    cell = result["cell"]
+    notes = [cell["features"]] * bool(cell["features"]) + ["noise given"] * cell["knows_noise"]
+    return str(cell["method"]) + "".join(f" ({note})" for note in notes)
 
 
 def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
@@ -36,7 +44,7 @@ def recovery(results: Sequence[Result]) -> Any:
         box = chosen[0]["fit"]["parameters"][name]
         grid = np.linspace(box["low"], box["high"], 2000)
         curves = {"realised": (truth["mean"], max(truth["std"], 1e-3))} | {
-            str(r["cell"]["method"]): (
+            label(r): (
                 r["fit"]["parameters"][name]["mean"],
                 max(r["fit"]["parameters"][name]["std"], 1e-3),
             )

@@ -15,7 +15,7 @@ from dropo_torch.report import write_study_report
 from dropo_torch.report.figures import to_svg
 from dropo_torch.runs import plain_numbers, versions
 from dropo_torch.sweep import elbow
-from sims.hopper.study_figures import draw_all
+from sims.hopper.study_figures import Result, draw_all, label
 
 SCHEMA = "dropo-torch/study/1"
 #: A deviation below this share of the search box has collapsed to a point; one above the other is wide.
@@ -26,8 +26,6 @@ INTRODUCTION = (
     "Written by `dropo reproduce hopper`. The logs are recorded by this project, from slow random torques: "
     "compare with the paper in kind, not digit by digit."
 )
-
-Result = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -79,12 +77,6 @@ def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) ->
 def pick(results: Iterable[Result], block: str, **wanted: Any) -> list[Result]:
     """Return the results of a block whose cells have the wanted entries."""
     return [r for r in results if r["cell"]["block"] == block and all(r["cell"][key] == v for key, v in wanted.items())]
-
-
-def label(result: Result) -> str:
-    """Return the name of a result's method, with how it treats noise."""
-    cell = result["cell"]
-    return str(cell["method"]) + (" (noise given)" if cell["knows_noise"] else "")
 
 
 def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
