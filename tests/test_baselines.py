@@ -188,7 +188,9 @@ def test_a_mixtures_moments_match_its_draws() -> None:
 def test_a_mixture_stays_in_its_box() -> None:
     outside = Mixture(np.ones(1), np.array([[50.0]]), np.array([[[1.0]]]), np.zeros(1), np.ones(1))
     assert outside.sample(100, seed=0) == pytest.approx(1.0)
+    assert outside.share_inside == 0
     wide = Mixture(np.ones(1), np.array([[0.9]]), np.array([[[0.2]]]), np.zeros(1), np.ones(1))
+    assert wide.share_inside == pytest.approx(0.566, abs=0.02)
     draws = wide.sample(5000, seed=0)
     assert draws.min() >= 0
     assert draws.max() <= 1
@@ -206,6 +208,22 @@ def test_a_mixture_density_network_learns_a_gaussian_posterior(features: str) ->
     mean, covariance = found.moments
     assert mean[0] == pytest.approx(0.5, abs=0.04)
     assert np.sqrt(covariance[0, 0]) == pytest.approx(0.1, rel=0.25)
+
+
+def test_a_posterior_outside_the_box_ends_at_its_side_and_says_so(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A log that is unlike every simulation: the network extrapolates."""
+    away = lambda *_, low, width, **__: Mixture(  # noqa: E731
+        np.ones(1), (low + np.array([0.5, 30.0]) * width)[None], np.diag(width**2)[None] * 1e-4, low, low + width
+    )
+    monkeypatch.setattr("dropo_torch.baselines.bayessim.fit_mixture", away)
+    found = fit_problem(problem(folder, "bayessim", method_options={"simulations": 20, "horizon": 10}))
+    box = found.distribution
+    assert box.mean[1] == pytest.approx(box.high[1], rel=1e-6)
+    assert np.isfinite(box.std).all()
+    assert "outside the search box" in found.document()["stop_reason"]
+    assert found.document()["share_inside"] == 0
 
 
 def test_training_the_network_leaves_nothing_behind(

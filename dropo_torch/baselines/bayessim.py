@@ -18,6 +18,8 @@ from dropo_torch.trajectory import Replay
 
 #: Simulations of a batch.
 _BATCH = 100
+#: Share of the posterior inside the search box below which the network has guessed outside what it was trained on.
+_LEAST_INSIDE = 0.01
 
 
 def summary_sums(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
@@ -103,8 +105,13 @@ class BayesSimOptimizer(Optimizer):
 
     @property
     def stop_reason(self) -> str | None:
-        """The network is trained."""
-        return None if self._mixture is None else f"{self._settings.simulations} simulations of the prior are used"
+        """The network is trained; where its answer is outside the box, this says so."""
+        if self._mixture is None:
+            return None
+        reason = f"{self._settings.simulations} simulations of the prior are used"
+        if self._mixture.share_inside >= _LEAST_INSIDE:
+            return reason
+        return f"{reason}; the posterior lies outside the search box, so the log is unlike every simulation"
 
     @property
     def progress(self) -> Progress:
@@ -123,13 +130,17 @@ class BayesSimOptimizer(Optimizer):
         assert self._mixture is not None
         (mean, std), (_, covariance) = self.candidates()[0], self._mixture.moments_inside
         spread = np.sqrt(np.diag(covariance))
-        return [Distribution.over(space, mean, std, correlation=covariance / np.outer(spread, spread))]
+        spread = np.where(spread > 0, spread, 1.0)  # nothing correlates with what is pressed to the box's side
+        correlation = covariance / np.outer(spread, spread)
+        np.fill_diagonal(correlation, 1.0)
+        return [Distribution.over(space, mean, std, correlation=correlation)]
 
     def extras(self) -> dict[str, Any]:
         """Return the whole mixture, in coordinates, and what it was learned from."""
         assert self._mixture is not None
         return {
             "mixture": {"parameters": list(self._space.names), **self._mixture.document()},
+            "share_inside": self._mixture.share_inside,
             "features": self._settings.features,
             "horizon": self._replay.horizon,
             "simulations": self._settings.simulations,

@@ -37,22 +37,29 @@ class Mixture:
         A mixture with next to no mass in its box is drawn from at the box's nearest points.
         """
         generator = np.random.default_rng(seed)
-        roots = np.linalg.cholesky(self.covariances)
         kept: list[np.ndarray] = []
-        found = 0
-        draws = np.zeros((0, self.means.shape[1]))
         for _ in range(50):
-            which = generator.choice(len(self.weights), size=2 * count, p=self.weights)
-            normal = generator.standard_normal((2 * count, self.means.shape[1]))
-            draws = self.means[which] + np.einsum("nij,nj->ni", roots[which], normal)
-            inside = draws[((draws >= self.low) & (draws <= self.high)).all(1)]
-            kept.append(inside)
-            found += len(inside)
-            if found >= count:
+            draws = self._draws(2 * count, generator)
+            kept.append(draws[self._inside(draws)])
+            if sum(map(len, kept)) >= count:
                 break
         else:
             kept.append(np.clip(draws, self.low, self.high))
         return np.concatenate(kept)[:count]
+
+    @property
+    def share_inside(self) -> float:
+        """Share of the mixture's mass that is inside its box, from draws."""
+        return float(self._inside(self._draws(_MOMENT_DRAWS, np.random.default_rng(0))).mean())
+
+    def _draws(self, count: int, generator: np.random.Generator) -> np.ndarray:
+        """Draws of the mixture without its box, ``(count, d)``."""
+        which = generator.choice(len(self.weights), size=count, p=self.weights)
+        normal = generator.standard_normal((count, self.means.shape[1]))
+        return self.means[which] + np.einsum("nij,nj->ni", np.linalg.cholesky(self.covariances)[which], normal)
+
+    def _inside(self, draws: np.ndarray) -> np.ndarray:
+        return np.all((draws >= self.low) & (draws <= self.high), axis=1)
 
     def log_density(self, points: np.ndarray) -> np.ndarray:
         """Return the log-density of the mixture without its box at points ``(n, d)``, ``(n,)``."""
