@@ -6,13 +6,16 @@ VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test test-slow lint format benchmarks clean
+.PHONY: demo test study-reduced test-slow lint format benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/dropo demo --out out/demo
 
 test: lint
 	$(BIN)/python -m pytest --durations=8
+
+study-reduced: $(STAMP)
+	$(BIN)/dropo reproduce hopper --reduced --out out/study-reduced
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --durations=20
