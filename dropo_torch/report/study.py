@@ -1,4 +1,4 @@
-"""The page of a study: its tables and figures, one below the other."""
+"""The page of a study: its tables, one below the other, each with its figure."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def write_study_report(
         title: of the page.
         lead: what the study is.
         tables: each a heading, the columns' names and the rows.
-        figures: name → SVG.
+        figures: heading of the table that a figure stands above → SVG.
         versions: name → version of what the results depend on.
     """
     content = {
         "title": title,
         "lead": lead,
         "tables": list(tables),
-        "figures": {name: Markup(svg) for name, svg in figures.items()},
+        "figures": {heading: Markup(svg) for heading, svg in figures.items()},
         "config": "",
         "versions": dict(versions or {}),
     }

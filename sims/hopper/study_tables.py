@@ -22,8 +22,14 @@ SCHEMA = "dropo-torch/study/1"
 COLLAPSED, WIDE = 1e-3, 1e-2
 CASES = {"point": "noiseless", "noisy": "noisy", "unmodeled": "unmodeled torso", "distribution": "masses redrawn"}
 
+#: Tables of which a figure shows the same.
+RECOVERY, SWEEPS, AGAINST_NOISE, SIZES = (
+    "Recovery of a distribution: mean ± std", "Sweeps over ε", "ε against the noise", "Number of transitions",
+)  # fmt: skip
+FIGURES = {RECOVERY: "recovery.png", SWEEPS: "sweep.png", AGAINST_NOISE: "noise.png", SIZES: "size.png"}
+
 INTRODUCTION = (
-    "Written by `dropo reproduce hopper`. The logs are recorded by this project, from slow random torques: "
+    "Written by dropo reproduce hopper. The logs are recorded by this project, from slow random torques: "
     "compare with the paper in kind, not digit by digit."
 )
 
@@ -62,13 +68,13 @@ def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) ->
     page, figures = sections(tables, findings), draw_all(results, tables)
     for name, figure in figures.items():
         figure.savefig(out / name, dpi=110, facecolor="white", metadata={"Software": None})
-    write_atomically(out / "tables.md", markdown(page, figures).encode())
+    write_atomically(out / "tables.md", markdown(page).encode())
     write_study_report(
         out / "report.html",
         title="The paper's simulated Hopper",
         lead=INTRODUCTION,
         tables=[(section.title, section.head, section.rows) for section in page],
-        figures={name.removesuffix(".png"): to_svg(figure, name) for name, figure in figures.items()},
+        figures={title: to_svg(figures[name], name) for title, name in FIGURES.items()},
         versions=versions(),
     )
     return [f"{'holds' if f.holds else 'DOES NOT HOLD'}: {f.finding} ({f.measured})" for f in findings]
@@ -239,11 +245,11 @@ def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding
     return [
         Section("Findings", ["finding", "holds", "measured"], found),
         _methods("Table 1: mean ± std, averaged over seeds", tables["table"]),
-        _methods("Recovery of a distribution: mean ± std", tables["recovery"]),
-        Section("Sweeps over ε", swept, sweeps["sweep"]),
-        Section("ε against the noise", swept, sweeps["noise"]),
+        _methods(RECOVERY, tables["recovery"]),
+        Section(SWEEPS, swept, sweeps["sweep"]),
+        Section(AGAINST_NOISE, swept, sweeps["noise"]),
         Section(
-            "Number of transitions",
+            SIZES,
             ["case", "transitions", "parameter", "truth", "mean [90 % of bootstrap]", "std [90 %]"],
             sizes,
         ),
@@ -255,13 +261,14 @@ def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding
     ]
 
 
-def markdown(page: Sequence[Section], figures: Iterable[str]) -> str:
-    """Return the study's page as Markdown, with its figures at the end."""
+def markdown(page: Sequence[Section]) -> str:
+    """Return the study's page as Markdown."""
     parts = ["# The paper's simulated Hopper\n", INTRODUCTION + "\n"]
     for section in page:
         lines = [section.head, ["---"] * len(section.head), *section.rows]
-        parts += [f"## {section.title}\n", "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"]
-    parts += [f"![{name.removesuffix('.png')}]({name})\n" for name in figures]
+        figure = FIGURES.get(section.title)
+        parts += [f"## {section.title}\n", *([f"![{section.title}]({figure})\n"] if figure else [])]
+        parts += ["\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"]
     return "\n".join(parts)
 
 
@@ -273,8 +280,12 @@ def _methods(title: str, rows: Sequence[dict[str, Any]]) -> Section:
         own = {r["method"]: r for r in rows if (r["case"], r["parameter"]) == (case, parameter)}
         first = next(iter(own.values()))
         cells = [f"{own[m]['mean']:.3f} ± {own[m]['std']:.2g}" if m in own else "–" for m in methods]
-        lines.append([case, parameter, f"{first['truth']:.3f} ± {first['true_std']:.2g}", *cells])
+        lines.append([case, parameter, _spread(first["truth"], first["true_std"]), *cells])
     return Section(title, ["case", "parameter", "truth", *methods], lines)
+
+
+def _spread(mean: float, std: float) -> str:
+    return f"{mean:.3f} ± {std:.2g}" if std > 1e-9 else f"{mean:.3f}"  # rounding is no deviation
 
 
 def _number(value: float | None) -> str:
