@@ -2,9 +2,9 @@
 
     python benchmarks/calibration.py --logs 100 --out out/calibration     # --resume goes on
 
-Writes ``trials.jsonl``, a line a fit, and ``calibration.md``. Mass and damping are searched for; the log has 60
-transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.baselines.calibration` has the two kinds of
-log.
+Writes ``trials.jsonl``, a line a fit below the settings, and ``calibration.md``. Mass and damping are searched for; the
+log has 60 transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.baselines.calibration` has the
+two kinds of log.
 """
 
 from __future__ import annotations
@@ -99,10 +99,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if store.exists() and not given.resume:
         parser.error(f"{store} exists; add --resume, or name another folder")
     done = []
+    plan = json.dumps({"transitions": given.transitions, "noise": NOISE.tolist(), "methods": METHODS})
     if store.exists():
-        whole = store.read_text().rpartition("\n")[0]  # a line that was cut short is done again
-        store.write_text(whole + "\n" if whole else "")
-        done = [Trial(**json.loads(line)) for line in whole.splitlines()]
+        begun, *whole = store.read_text().splitlines(keepends=True)
+        if begun.strip() != plan:
+            parser.error(f"{store} holds fits with other settings; name another folder")
+        whole = [line for line in whole if line.endswith("\n")]  # a line that was cut short is done again
+        store.write_text(begun + "".join(whole))
+        done = [Trial(**json.loads(line)) for line in whole]
+    else:
+        store.write_text(plan + "\n")
     with tempfile.TemporaryDirectory() as folder, store.open("a") as stream:
 
         def keep(trial: Trial) -> None:

@@ -143,8 +143,12 @@ def _simulate(
 
 
 def estimates(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Standard errors ``(d,)`` and correlations ``(d, d)`` from an information matrix, however singular."""
+    """Standard errors ``(d,)`` and correlations ``(d, d)`` from an information matrix, however singular.
+
+    A direction of which the log says nothing has a very large variance, not none.
+    """
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
-    inverse = np.linalg.pinv(information / np.outer(scale, scale), rcond=1e-12, hermitian=True)
+    values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
+    inverse = (vectors / np.maximum(values, 1e-12 * max(float(values.max()), 1e-300))) @ vectors.T
     deviation = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
     return deviation / scale, np.clip(inverse / np.outer(deviation, deviation), -1, 1)

@@ -70,6 +70,10 @@ def truncated_moments(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, t
     return first, second, fourth
 
 
+#: Deviation of draws from a normal that ends :data:`TRUNCATION` deviations from its mean, as a share of σ: 0.8796.
+DRAWN_STD = float(truncated_moments(*torch.tensor([-TRUNCATION, TRUNCATION], dtype=torch.float64))[1].sqrt())
+
+
 @dataclass(frozen=True)
 class Distribution:
     """A fitted (or given) distribution over a simulator's parameters.

@@ -290,7 +290,7 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
     for candidate in search.distributions(space):
         objective.linearise(candidate.mean)
         evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None])[0]
-        results.append((evaluation.log_likelihood, candidate, evaluation))
+        results.append((evaluation.log_likelihood + search.bonus(candidate), candidate, evaluation))
     _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
     objective.linearise(distribution.mean)
     return Fit(

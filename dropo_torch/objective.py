@@ -183,9 +183,11 @@ class Objective:
         for block in _blocks(len(states), max(1, self._chunk_size // max(1, len(values) * replay.horizon))):
             after = self.simulator.rollout(states[block], controls[block], values)[..., self.observation.index]
             with single_thread():
-                logged = measured[block][:, None].expand_as(after)
-                compared = self.features(measured[block], measured[block])
-                part = reduce(self.features(after, logged), compared, controls[block][:, replay.history :])
+                logged = measured[block]
+                about = logged[:, :1].expand_as(logged) if replay.about_start else logged
+                compared = self.features(logged, about)
+                features = self.features(after, about[:, None].expand_as(after))
+                part = reduce(features, compared, controls[block][:, replay.history :])
                 total = part if total is None else total + part
         self.simulated_transitions += len(states) * len(values) * replay.horizon
         assert total is not None
@@ -422,8 +424,12 @@ def single_thread() -> Iterator[None]:
 
 def draw_uniforms(num_samples: int, num_parameters: int, *seeds: int) -> torch.Tensor:
     """Draw base uniforms ``(K, d)`` from a generator of its own, a pure function of the seeds."""
-    seed = int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]) >> 1
-    return base_uniforms(num_samples, num_parameters, torch.Generator().manual_seed(seed))
+    return base_uniforms(num_samples, num_parameters, torch.Generator().manual_seed(derived_seed(*seeds)))
+
+
+def derived_seed(*seeds: int) -> int:
+    """Return a seed that torch accepts, a pure function of seeds of any size."""
+    return int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]) >> 1
 
 
 def draw_normals(num_draws: int, width: int, seed: int) -> torch.Tensor:

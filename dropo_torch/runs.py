@@ -100,6 +100,7 @@ def run_sweep(
     """Fit at several ε, choose by the elbow, and write ``sweep.json`` and ``report.html`` to ``out``."""
     from dropo_torch.report import write_sweep_report
 
+    _only_dropo(config, "sweep-epsilon chooses the ε of DROPO")
     problem = make_problem(config)
     store = out / "sweep-progress.json"
     prepare_folder(out, problem.model_path, resume=resume and store.exists())
@@ -130,6 +131,11 @@ def run_sweep(
     )
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return sweep
+
+
+def _only_dropo(config: Config, what: str) -> None:
+    if config.method != "dropo":
+        raise InputError(f"method: {config.method} given, but {what}; leave method and method_options out")
 
 
 def run_certify(config: Config, out: Path, *, console: Console) -> Certificate:
@@ -166,6 +172,7 @@ def run_compare(
     """Fit by several optimizers and backends, and write ``compare.json`` and ``report.html`` to ``out``."""
     from dropo_torch.report import write_compare_report
 
+    _only_dropo(config, "compare runs the optimizers of DROPO")
     problem = make_problem(config)
     store = out / "compare-progress.json"
     prepare_folder(out, problem.model_path, resume=resume and store.exists())

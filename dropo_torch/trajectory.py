@@ -224,12 +224,14 @@ class Replay:
         controls: the controls applied, after those of ``history`` steps before, ``(W, history + H, nu)``.
         measured: observed columns after each of the H steps, ``(W, H, n)``.
         history: logged steps before a window whose controls come with it.
+        about_start: whether orientations are compared with the window's first measured one, instead of step by step.
     """
 
     states: np.ndarray
     controls: np.ndarray
     measured: np.ndarray
     history: int = 0
+    about_start: bool = False
 
     @property
     def horizon(self) -> int:
@@ -237,16 +239,20 @@ class Replay:
         return int(self.measured.shape[1])
 
 
-def make_replay(trajectories: Trajectories, observation: Observation, horizon: int, *, history: int = 0) -> Replay:
-    """Cut a log into consecutive windows of ``horizon`` transitions, or of the longest episode's where that is shorter.
+def make_replay(
+    trajectories: Trajectories, observation: Observation, horizon: int, *, history: int = 0, about_start: bool = False
+) -> Replay:
+    """Cut a log into consecutive windows of ``horizon`` transitions.
+
+    Where episodes are shorter, the windows are, too: of lengths down to half the horizon (or half the longest episode),
+    the one that leaves the fewest transitions out.
 
     Raises:
         InputError: a horizon below 1.
     """
     if horizon < 1:
         raise InputError(f"horizon: {horizon} given; expected a whole number of logged steps, 1 or more")
-    longest = int(np.bincount(trajectories.episodes).max())
-    steps = min(horizon, longest)
+    steps = _window_length(np.bincount(trajectories.episodes), horizon)
     windows = make_transitions(trajectories, observation, lag=steps, history=history)
     rows = (windows.rows[:, None] + np.arange(steps)).reshape(-1)
     measured = observation.observed(trajectories.next_observations[rows])
@@ -255,7 +261,16 @@ def make_replay(trajectories: Trajectories, observation: Observation, horizon: i
         controls=np.ascontiguousarray(windows.controls, dtype=np.float64),
         measured=np.ascontiguousarray(measured.reshape(len(windows), steps, -1)),
         history=history,
+        about_start=about_start,
     )
+
+
+def _window_length(lengths: np.ndarray, horizon: int) -> int:
+    """The length of windows for episodes of these lengths."""
+    longest = min(horizon, int(lengths.max()))
+    if (lengths >= longest).all():
+        return longest
+    return max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
 
 
 def _matrix(array: object, name: str, source: str) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,20 +11,22 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from conftest import LinearSimulator, linear_objective, space_of
+import yaml
+from conftest import LinearSimulator, generic_observation, linear_objective, space_of
 
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
 from dropo_torch.baselines.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
-from dropo_torch.baselines.density import fit_mixture
+from dropo_torch.baselines.density import farthest, fit_mixture
 from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.cli import main
 from dropo_torch.config import make_config
+from dropo_torch.diagnostics import estimates
 from dropo_torch.distribution import Distribution, truncated_moments
 from dropo_torch.errors import InputError
-from dropo_torch.fit import fit
+from dropo_torch.fit import Fit, fit
 from dropo_torch.objective import draw_uniforms
 from dropo_torch.optimizers.correlated import random_effects
 from dropo_torch.problem import Problem, make_problem
@@ -582,10 +584,27 @@ def test_an_unknown_study_is_refused(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "not an empty folder" in capsys.readouterr().err
 
 
+def fit_of(distribution: Distribution, **about: Any) -> Fit:
+    """A fit of which only the distribution matters."""
+    rest = {f.name: None for f in fields(Fit) if f.name not in ("distribution", "method", "extras")}
+    return Fit(**{**rest, "distribution": distribution, "method": "dropo", "extras": {}, **about})
+
+
+def test_intervals_of_a_posterior_are_its_own() -> None:
+    """Not those of draws, which end two σ from the mean; and of a mixture, not those of its normal."""
+    space = space_of(a=[0, 10])
+    made = Distribution.over(space, np.array([4.0]), np.array([0.5]))
+    low, high = interval(fit_of(made, method="laplace"), 0.9)
+    assert (low[0], high[0]) == pytest.approx((4 - 1.645 * 0.5, 4 + 1.645 * 0.5), rel=1e-3)
+    two = Mixture(np.full(2, 0.5), np.array([[2.0], [6.0]]), np.full((2, 1, 1), 1e-4), np.zeros(1), np.full(1, 10.0))
+    low, high = interval(fit_of(made, method="bayessim", extras={"mixture": two.document()}), 0.5)
+    assert (low[0], high[0]) == pytest.approx((2, 6), abs=0.05)
+
+
 def test_intervals_hold_their_share_of_draws() -> None:
     for uniform in (False, True):
         made = Distribution.over(space_of(a=[0, 10]), np.array([4.0]), np.array([0.5]), is_uniform=uniform)
-        low, high = interval(made, 0.9)
+        low, high = interval(fit_of(made), 0.9)
         draws = made.sample(20_000, torch.Generator().manual_seed(0)).numpy()
         assert np.mean((draws >= low) & (draws <= high)) == pytest.approx(0.9, abs=0.01)
     assert wilson(0.9, 100) == pytest.approx((0.826, 0.945), abs=2e-3)
@@ -616,3 +635,132 @@ def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(fol
     assert found["varying", "laplace", "mass"] < 0.5
     again = calibrate(ours, ["laplace"], logs=12, noise=noise, done=trials)
     assert again == trials
+
+
+# --- what each method must not hide ---------------------------------------------------------------------------
+
+
+def test_a_direction_that_the_log_does_not_see_is_uncertain() -> None:
+    """Two parameters of which only the sum is seen: wide, with correlation −1; not narrow, with +1."""
+    error, correlation = estimates(100 * np.ones((2, 2)))
+    assert (error > 1e3).all()
+    assert correlation[0, 1] == pytest.approx(-1, abs=1e-6)
+    plain, _ = estimates(np.diag([4.0, 25.0]))
+    assert plain == pytest.approx([0.5, 0.2])
+
+
+@pytest.mark.parametrize("command", [["compare"], ["sweep-epsilon"]])
+def test_commands_that_are_about_dropo_refuse_other_methods(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str]
+) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_text(yaml.safe_dump(config(folder, "droid")))
+    assert main([*command, str(path), "--out", str(tmp_path / "out")]) == 2
+    assert "method: droid given" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "extra", [{"budget": 300}, {"covariance": "full"}, {"entropy": 1.0}, {"optimizer": "cma"}, {"adam": {"steps": 3}}]
+)
+def test_a_method_refuses_what_it_would_ignore(folder: Path, extra: dict[str, Any]) -> None:
+    with pytest.raises(InputError, match=rf"^{next(iter(extra))}: .*method: laplace does not read"):
+        make_search(problem(folder, "laplace", **extra))
+
+
+def test_short_episodes_are_replayed_too() -> None:
+    """Windows of 16 of 17 steps leave nothing of the four shorter episodes out; of long ones they keep their length."""
+    count = np.array([16, 16, 16, 17, 15])
+    ends = np.isin(np.arange(80), count.cumsum() - 1)
+    states = np.arange(160.0).reshape(80, 2)
+    log = Trajectories(states, states, np.zeros((80, 1)), ends)
+    replay = make_replay(log, generic_observation(2), 50)
+    assert (replay.horizon, len(replay.states)) == (15, 5)
+    long = Trajectories(states, states, np.zeros((80, 1)), np.arange(80) == 79)
+    assert make_replay(long, generic_observation(2), 50).horizon == 50
+
+
+def test_bayessim_says_when_the_log_is_unlike_every_simulation(folder: Path) -> None:
+    """A mass far outside the box: the network would answer all the same."""
+    ours = problem(
+        folder, "bayessim", method_options={"simulations": 60, "horizon": 20, "epochs": 3},
+        parameters={"mass": {"field": "body_mass", "name": "bob", "bounds": [30.0, 31.0]}},
+    )  # fmt: skip
+    found = fit_problem(ours).document()
+    assert found["summary_distance"] > 5
+    assert "unlike every simulation" in found["stop_reason"]
+
+
+def test_a_few_wild_simulations_do_not_blind_the_network() -> None:
+    rng = np.random.default_rng(0)
+    shares = rng.uniform(size=(1000, 1))
+    x = shares + 0.05 * rng.standard_normal((1000, 1))
+    x[:3] += 1e6
+    assert farthest(x, np.array([0.5])) < 1
+    assert farthest(x, np.array([9.0])) > 5
+    assert farthest(np.ones((50, 1)), np.ones(1)) == 0
+    assert farthest(np.ones((50, 1)), np.zeros(1)) == np.inf
+    settings = BayesSimSettings(components=2, hidden=16, epochs=60)
+    found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
+    assert np.sqrt(found.moments_inside[1][0, 0]) < 0.12
+
+
+def test_bayessim_takes_a_seed_of_any_size(folder: Path) -> None:
+    options = {"simulations": 20, "horizon": 10, "epochs": 2}
+    fit_problem(problem(folder, "bayessim", method_options=options, noise=[0.01, 0.01], seed=10**30))
+
+
+def test_simopt_is_not_led_by_replays_that_explode(folder: Path) -> None:
+    """Costs of which three are enormous give the weights that the others alone would give."""
+    rng = np.random.default_rng(0)
+    costs = rng.uniform(1, 2, 97)
+    alone, together = reps_weights(costs, 0.5), reps_weights(np.concatenate([costs, np.full(3, 1e10)]), 0.5)
+    assert together[97:].max() < 1e-12
+    assert together[:97] == pytest.approx(alone, abs=0.01)
+    search = make_search(problem(folder, "simopt", method_options={"samples": 20}))
+    assert search is not None
+    with pytest.raises(InputError, match="only 1 of 20 samples"):
+        search.tell(torch.tensor([1.0] + [float("nan")] * 19, dtype=torch.float64))
+
+
+def test_the_entropy_bonus_widens_a_full_covariance() -> None:
+    """With β, C is larger by T / (T − β) where the data say it all."""
+    rng = np.random.default_rng(0)
+    draws = torch.from_numpy(0.1 * rng.standard_normal((60, 2)))
+    gram = torch.eye(2, dtype=torch.float64).expand(60, 2, 2) * 1e8
+    start = 0.01 * torch.eye(2, dtype=torch.float64)
+    plain, _ = random_effects(gram, draws * 1e8, start)
+    wide, _ = random_effects(gram, draws * 1e8, start, entropy=20.0)
+    assert wide.numpy() == pytest.approx(plain.numpy() * 60 / 40, rel=1e-3)
+    assert np.sqrt(np.diag(random_effects(gram, draws * 1e8, start, entropy=100.0)[0])).max() <= 1 + 1e-9
+
+
+def test_bayessim_summarises_orientations_of_log_and_replays_alike(tmp_path: Path) -> None:
+    """A ball that spins: without noise, the log's own parameters give the log's own summary."""
+    xml = """<mujoco><option timestep="0.01"/><worldbody><body><joint type="ball" damping="0.05"/>
+    <geom name="top" type="box" size=".1 .2 .05" pos=".1 0 .1" mass="1"/></body></worldbody>
+    </mujoco>"""
+    (tmp_path / "ball.xml").write_text(xml)
+    model = mujoco.MjModel.from_xml_string(xml)
+    data = mujoco.MjData(model)
+    data.qvel[:] = [1.0, -2.0, 0.5]
+    states = []
+    for _ in range(41):
+        states.append(np.concatenate([data.qpos, data.qvel]))
+        mujoco.mj_step(model, data)
+    np.savez(
+        tmp_path / "log.npz", observations=states[:-1], next_observations=states[1:], actions=np.zeros((40, 0)),
+        terminals=np.arange(40) == 39,
+    )  # fmt: skip
+    given = {
+        "model": "ball.xml", "data": "log.npz", "frame_skip": 1, "method": "bayessim",
+        "method_options": {"simulations": 20, "horizon": 20},
+        "parameters": {"mass": {"field": "body_mass", "name": "body1", "bounds": [0.5, 2.0], "scale_inertia": True}},
+    }  # fmt: skip
+    ours = make_problem(make_config(given, base=tmp_path))
+    search = make_search(ours)
+    assert search is not None
+    request = search.ask()
+    assert request.replay is not None
+    table = ours.objective.map_replay(request.replay, np.array([[1.0]]), request.reduce).reshape(2, -1).numpy()
+    assert table[0] == pytest.approx(table[1], abs=1e-9)
+    assert (table[1, 6:9] > 1e-3).all()  # mean squares of the orientation's changes

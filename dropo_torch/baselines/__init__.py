@@ -18,10 +18,12 @@ from dropo_torch.baselines.settings import (
     DroidSettings,
     SimOptSettings,
     UdrSettings,
+    method_options,
     method_settings,
 )
 from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
 from dropo_torch.baselines.udr import UdrOptimizer
+from dropo_torch.config import Config
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, HistoryEntry, fit
 from dropo_torch.optimizers import Optimizer, Progress
@@ -39,6 +41,8 @@ def make_search(problem: Problem) -> Optimizer | None:
         InputError: options that the method does not have.
     """
     config, objective = problem.config, problem.objective
+    if config.method != "dropo":
+        _refuse_options_of_dropo(config)
     settings = method_settings(config.method, config.method_options)
     space, seed = problem.space, config.seed
     if isinstance(settings, UdrSettings):
@@ -49,7 +53,10 @@ def make_search(problem: Problem) -> Optimizer | None:
         return LaplaceOptimizer(objective)
     if isinstance(settings, SimOptSettings | BayesSimSettings):
         history = objective.transitions.history
-        replay = make_replay(problem.trajectories, problem.observation, settings.horizon, history=history)
+        replay = make_replay(
+            problem.trajectories, problem.observation, settings.horizon, history=history,
+            about_start=isinstance(settings, BayesSimSettings),
+        )  # fmt: skip
         if isinstance(settings, SimOptSettings):
             return SimOptOptimizer(space, replay, column_scales(objective), settings=settings, seed=seed)
         if replay.horizon < 2:
@@ -63,6 +70,18 @@ def make_search(problem: Problem) -> Optimizer | None:
             noise=objective.noise_deviation,
         )
     return None
+
+
+def _refuse_options_of_dropo(config: Config) -> None:
+    """Raise an :class:`InputError` for a key that another method would ignore."""
+    for key in ("optimizer", "budget", "population", "covariance", "entropy", "adam", "common_random_numbers"):
+        given = getattr(config, key)
+        if given != Config.model_fields[key].default:
+            own = ", ".join(method_options(config.method)) or "none"
+            raise InputError(
+                f"{key}: {given!r} given, which method: {config.method} does not read; leave it out "
+                f"(its method_options are: {own})"
+            )
 
 
 def fit_problem(

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import fit_mixture, require_sbi
+from dropo_torch.baselines.density import FARTHEST, farthest, fit_mixture, require_sbi
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
-from dropo_torch.distribution import Distribution, SearchBox, to_values
-from dropo_torch.objective import ReplayReduce, draw_uniforms
+from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
+from dropo_torch.objective import ReplayReduce, derived_seed, draw_uniforms
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.trajectory import Replay
@@ -84,6 +84,7 @@ class BayesSimOptimizer(Optimizer):
         self._sums: list[np.ndarray] = []  # of each batch, (n, q)
         self._logged = np.zeros(0)
         self._mixture: Mixture | None = None
+        self._distance = 0.0
 
     def ask(self) -> Request:
         """Return the next batch of the prior, ``(n, d)``."""
@@ -101,17 +102,22 @@ class BayesSimOptimizer(Optimizer):
         self._sums.append(table[:-1].copy())
         self._logged = table[-1].copy()
         if len(self._sums) * _BATCH >= self._settings.simulations:
-            self._mixture = self._infer()
+            self._mixture, self._distance = self._infer()
 
     @property
     def stop_reason(self) -> str | None:
-        """The network is trained; where its answer is outside the box, this says so."""
+        """The network is trained; where it had to guess, this says so."""
         if self._mixture is None:
             return None
         reason = f"{self._settings.simulations} simulations of the prior are used"
-        if self._mixture.share_inside >= _LEAST_INSIDE:
-            return reason
-        return f"{reason}; the posterior lies outside the search box, so the log is unlike every simulation"
+        if self._distance > FARTHEST:
+            return (
+                f"{reason}; but the log is unlike every simulation: a summary of it is {self._distance:.3g} deviations "
+                "away from theirs, so the posterior is a guess"
+            )
+        if self._mixture.share_inside < _LEAST_INSIDE:
+            return f"{reason}; but the posterior lies outside the search box: the log is unlike every simulation"
+        return reason
 
     @property
     def progress(self) -> Progress:
@@ -133,7 +139,8 @@ class BayesSimOptimizer(Optimizer):
         spread = np.where(spread > 0, spread, 1.0)  # nothing correlates with what is pressed to the box's side
         correlation = covariance / np.outer(spread, spread)
         np.fill_diagonal(correlation, 1.0)
-        return [Distribution.over(space, mean, std, correlation=correlation)]
+        # draws end two σ from the mean: so wide that theirs have the posterior's deviation
+        return [Distribution.over(space, mean, std / DRAWN_STD, correlation=correlation)]
 
     def extras(self) -> dict[str, Any]:
         """Return the whole mixture, in coordinates, and what it was learned from."""
@@ -141,6 +148,8 @@ class BayesSimOptimizer(Optimizer):
         return {
             "mixture": {"parameters": list(self._space.names), **self._mixture.document()},
             "share_inside": self._mixture.share_inside,
+            "summary_distance": self._distance,
+            "windows": len(self._replay.states),
             "features": self._settings.features,
             "horizon": self._replay.horizon,
             "simulations": self._settings.simulations,
@@ -149,18 +158,18 @@ class BayesSimOptimizer(Optimizer):
     def state(self) -> dict[str, Any]:
         """Return the summaries so far, and the mixture."""
         mixture = None if self._mixture is None else self._mixture.document()
-        return {"sums": self._sums, "logged": self._logged, "mixture": mixture}
+        return {"sums": self._sums, "logged": self._logged, "mixture": mixture, "distance": self._distance}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
-        self._sums, self._logged = list(state["sums"]), state["logged"]
+        self._sums, self._logged, self._distance = list(state["sums"]), state["logged"], state["distance"]
         self._mixture = None if state["mixture"] is None else Mixture.of(state["mixture"])
 
     def _measured(self, batch: int) -> ReplayReduce:
         """The sums of a batch's summaries, noise added to what is simulated."""
         if self._noise is None:
             return summary_sums
-        noise, generator = self._noise, torch.Generator().manual_seed(self._seed * 1_000_003 + batch)
+        noise, generator = self._noise, torch.Generator().manual_seed(derived_seed(self._seed, 19, batch))
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
             drawn = noise * torch.randn(features.shape, generator=generator, dtype=features.dtype)
@@ -173,17 +182,18 @@ class BayesSimOptimizer(Optimizer):
         count = min(_BATCH, self._settings.simulations - batch * _BATCH)
         return draw_uniforms(count, len(self._space), self._seed, 13, batch).numpy()
 
-    def _infer(self) -> Mixture:
-        """The posterior at the log's summary."""
+    def _infer(self) -> tuple[Mixture, float]:
+        """The posterior at the log's summary, and how far that is from the simulations'."""
         shares = np.concatenate([self._shares(i) for i in range(len(self._sums))])
         count = len(self._replay.states) * (self._replay.horizon - 1)
         found = summaries(np.concatenate([*self._sums, self._logged[None]]), self._num_columns, count)
-        return fit_mixture(
+        mixture = fit_mixture(
             found[:-1],
             shares,
             found[-1],
             settings=self._settings,
-            seed=self._seed,
+            seed=derived_seed(self._seed, 29),
             low=self._box.low,
             width=self._box.width,
         )
+        return mixture, farthest(found[:-1], found[-1])

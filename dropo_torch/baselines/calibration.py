@@ -5,8 +5,8 @@ Logs are simulated under known parameters, with the starts and actions of a give
 ``fixed``    one vector of parameters holds throughout, drawn from the search box: is it inside the interval?
 ``varying``  every transition has parameters of its own, drawn around such a vector: which share is inside?
 
-A method that says how uncertain a fixed value is should pass the first, one that says how much a value varies the
-second.
+In both, starts are exact and the ends have noise. A method that says how uncertain a fixed value is should pass the
+first, one that says how much a value varies the second.
 """
 
 from __future__ import annotations
@@ -17,18 +17,22 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
+import scipy.special
 import torch
 
-from dropo_torch.baselines import fit_problem
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.baselines import Mixture, fit_problem
+from dropo_torch.distribution import SearchBox, to_values
+from dropo_torch.fit import Fit
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import make_transitions
 
 Kind = Literal["fixed", "varying"]
 KINDS: tuple[Kind, ...] = ("fixed", "varying")
 LEVELS = (0.5, 0.9)
-#: Truths are drawn from this inner share of the search box.
+#: Truths of ``varying`` logs are drawn around this inner share of the search box; those of ``fixed`` ones, all over it.
 _INNER = 0.6
+#: Draws of a mixture of which its quantiles are taken.
+_DRAWS = 20_000
 #: Deviation of the parameters of ``varying`` logs, as a share of the search width.
 SPREAD = 0.1
 
@@ -112,15 +116,29 @@ def draw_truths(problem: Problem, kind: Kind, seed: int) -> np.ndarray:
     """Return parameters of each transition of a log, in coordinates, ``(T, d)``."""
     box, generator = SearchBox.of(problem.space), np.random.default_rng([seed, 23])
     d, count = len(problem.space), len(problem.trajectories)
-    center = box.middle + _INNER * (generator.uniform(size=d) - 0.5) * box.width
+    share = generator.uniform(size=d) - 0.5
     if kind == "fixed":
-        return np.tile(center, (count, 1))
+        return np.tile(box.middle + share * box.width, (count, 1))
+    center = box.middle + _INNER * share * box.width
     draws = generator.standard_normal((count, d)).clip(-2, 2)
     return center + SPREAD * box.width * draws
 
 
-def interval(distribution: Distribution, level: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return each parameter's central interval under the law that draws follow, in units, ``(d,)`` each."""
+def interval(found: Fit, level: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return each parameter's central interval, in units, ``(d,)`` each.
+
+    Of a mixture it is the mixture's own, of a Laplace posterior the normal's, of all others that of the law which draws
+    follow.
+    """
+    distribution = found.distribution
+    if "mixture" in found.extras:
+        draws = Mixture.of(found.extras["mixture"]).sample(_DRAWS, seed=0)
+        low, high = np.quantile(draws, [0.5 - level / 2, 0.5 + level / 2], axis=0)
+        return to_values(low, distribution.is_log), to_values(high, distribution.is_log)
+    if found.method == "laplace":
+        reach = float(scipy.special.ndtri(0.5 + level / 2)) * distribution.std
+        ends = (distribution.mean - reach, distribution.mean + reach)
+        return to_values(ends[0], distribution.is_log), to_values(ends[1], distribution.is_log)
     tails = torch.tensor([0.5 - level / 2, 0.5 + level / 2], dtype=torch.float64)
     alone = replace(distribution, correlation=None)
     low, high = alone.rsample(tails[:, None].expand(2, len(distribution))).numpy()
@@ -137,13 +155,14 @@ def try_method(problem: Problem, truths: np.ndarray, *, kind: Kind, name: str, l
         name: what the method is called in the result.
         log: number of the log.
     """
-    found = fit_problem(problem).distribution
+    fitted = fit_problem(problem)
+    found = fitted.distribution
     values = to_values(truths, problem.space.is_log)
     box = SearchBox.of(problem.space)
     names = problem.space.names
     inside, width = {}, {}
     for level in LEVELS:
-        low, high = interval(found, level)
+        low, high = interval(fitted, level)
         held = ((values >= low) & (values <= high)).mean(0)
         share = (high - low) / (problem.space.high - problem.space.low)
         inside[f"{level:g}"] = dict(zip(names, map(float, held), strict=True))

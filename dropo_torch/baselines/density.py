@@ -27,7 +27,9 @@ _PATIENCE = 40
 #: Share of the pairs by which training is stopped.
 _VALIDATION = 0.1
 #: Standardised inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
-_FARTHEST = 5.0
+FARTHEST = 5.0
+#: Interquartile range of a standard normal.
+_QUARTILES = 1.349
 #: Added to the precisions, as by the network itself: no component is wider than a hundred deviations of the prior.
 _PRECISION_FLOOR = 1e-4
 #: Deviation of a share that is uniform in [0, 1].
@@ -93,10 +95,8 @@ def fit_mixture(
             "narrow the bounds, or shorten method_options.horizon"
         )
     inputs, shares = inputs[alive], shares[alive]
-    center, scale = inputs.mean(0), inputs.std(0)
-    moves = scale > 1e-12 * (1 + np.abs(center))
-    scale = np.where(moves, scale, 1)
-    x, here = (((rows - center) / scale)[..., moves].clip(-_FARTHEST, _FARTHEST) for rows in (inputs, at))
+    center, scale, moves = _standard(inputs)
+    x, here = (((rows - center) / scale)[..., moves].clip(-FARTHEST, FARTHEST) for rows in (inputs, at))
     with torch.random.fork_rng(devices=[]), single_thread():
         torch.manual_seed(seed)
         estimator = _train(_float(x), _float((shares - 0.5) / _UNIFORM), settings, seed)
@@ -112,6 +112,25 @@ def fit_mixture(
         low=low,
         high=low + width,
     )
+
+
+def farthest(inputs: np.ndarray, at: np.ndarray) -> float:
+    """Return how far a log's x is from those of the simulations, in deviations of the column where it is farthest."""
+    alive = inputs[np.isfinite(inputs).all(1)]
+    if not len(alive):
+        return float("inf")
+    center, scale, moves = _standard(alive)
+    same = np.isclose(at, center, rtol=1e-9, atol=1e-12)
+    return float(np.where(moves, np.abs(at - center) / scale, np.where(same, 0.0, np.inf)).max())
+
+
+def _standard(inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Median and robust deviation of each column, which a few wild simulations do not move, and which columns vary."""
+    center = np.median(inputs, axis=0)
+    quartiles = np.diff(np.quantile(inputs, [0.25, 0.75], axis=0), axis=0)[0] / _QUARTILES
+    scale = np.where(quartiles > 0, quartiles, inputs.std(0))
+    moves = scale > 1e-12 * (1 + np.abs(center))
+    return center, np.where(moves, scale, 1.0), moves
 
 
 def _train(x: torch.Tensor, theta: torch.Tensor, settings: BayesSimSettings, seed: int) -> MixtureDensityEstimator:

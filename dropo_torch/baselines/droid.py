@@ -29,7 +29,7 @@ class DroidOptimizer(Optimizer):
     """CMA-ES over parameter vectors, scaled to [0, 4], first step 1, start in the middle.
 
     Each logged transition (window of λ steps) is replayed from its logged start; the error is the squared L2 distance
-    in the compared columns, summed. The distribution is the normal from which the last generation was drawn: it says
+    in the compared columns, summed. The distribution is the search's normal after the last generation: it says
     how far the search had contracted when it stopped, and nothing about the log.
 
     Args:
@@ -55,7 +55,7 @@ class DroidOptimizer(Optimizer):
             "tolfunhist": 1e-13,
         }
         if settings.population:
-            options["popsize"] = max(2, settings.population)
+            options["popsize"] = settings.population
         start = np.full(max(2, len(space)), SearchBox.WIDTH / 2)  # pycma needs two dimensions; the second is idle
         self._search = cma.CMAEvolutionStrategy(start, 1.0, options)
         self._asked: list[np.ndarray] | None = None

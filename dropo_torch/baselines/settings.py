@@ -97,8 +97,13 @@ _OF: dict[str, type[Settings]] = {
     "laplace": LaplaceSettings,
 }
 #: Smallest value of a setting where it is not 1.
-_LEAST = {"samples": 4, "simulations": 20, "horizon": 1, "population": 0, "box": 0}
+_LEAST = {"samples": 4, "population": 2, "simulations": 20, "horizon": 1, "box": 0}
 _FEATURES = ("mdnn", "mdrff")
+
+
+def method_options(method: str) -> tuple[str, ...]:
+    """Return the names of a method's own options."""
+    return tuple(f.name for f in fields(_OF[method]))
 
 
 def method_settings(method: str, given: Mapping[str, Any]) -> Settings:
@@ -133,6 +138,8 @@ def _check(key: str, value: Any, default: Any) -> None:
     whole = isinstance(default, int)
     if isinstance(value, bool) or not isinstance(value, int if whole else (int, float)):
         raise InputError(f"method_options.{key}: {value!r} given; expected a {'whole ' if whole else ''}number")
+    if key == "population" and value == 0:
+        return
     least = _LEAST.get(key, 1)
     if (whole and value < least) or (not whole and not 0 < value < float("inf")):
         raise InputError(

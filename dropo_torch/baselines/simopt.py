@@ -9,7 +9,8 @@ import scipy.optimize
 import torch
 
 from dropo_torch.baselines.settings import SimOptSettings
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
+from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
@@ -42,10 +43,10 @@ def reps_weights(costs: np.ndarray, kl: float) -> np.ndarray:
     if not finite.any():
         return np.full(len(costs), 1 / len(costs))
     low = costs[finite].min()
-    spread = costs[finite].std()
+    spread = float(np.diff(np.quantile(costs[finite], [0.25, 0.75]))[0]) or float(costs[finite].std())
     if spread == 0:
         return finite / finite.sum()
-    gain = np.where(finite, (costs - low) / spread, np.inf)
+    gain = np.where(finite, (costs - low) / spread, np.inf)  # quartiles: a few replays that explode set no scale
 
     def dual(log_eta: float) -> float:
         eta = float(np.exp(log_eta))
@@ -102,6 +103,12 @@ class SimOptOptimizer(Optimizer):
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Fit the distribution to the weighted samples."""
         draws, costs = self._draws(), sums.numpy()
+        alive, least = int(np.isfinite(costs).sum()), min(len(costs), max(4, len(self._mean) + 2))
+        if alive < least:
+            raise InputError(
+                f"method: simopt: only {alive} of {len(costs)} samples were replayed without divergence; "
+                "narrow the bounds, or shorten method_options.horizon"
+            )
         weights = reps_weights(costs, self._settings.kl)
         self._mean = weights @ draws
         centred = draws - self._mean
@@ -110,7 +117,7 @@ class SimOptOptimizer(Optimizer):
         covariance /= max(1 - lost, 0.1)
         floor = (self._box.min_std / self._box.width) ** 2
         self._covariance = covariance + np.diag(np.maximum(floor - np.diag(covariance), 0))
-        self._cost = float(weights @ np.nan_to_num(costs))
+        self._cost = float(weights @ np.where(np.isfinite(costs), costs, 0.0))
         self._iteration += 1
 
     @property
@@ -137,11 +144,12 @@ class SimOptOptimizer(Optimizer):
         mean, std = self.candidates()[0]
         spread = np.sqrt(np.diag(self._covariance))
         correlation = self._covariance / np.outer(spread, spread)
-        return [Distribution.over(space, mean, std, correlation=correlation)]
+        # draws end two σ from the mean: so wide that theirs have the search's deviation
+        return [Distribution.over(space, mean, std / DRAWN_STD, correlation=correlation)]
 
     def extras(self) -> dict[str, Any]:
-        """Return the weighted discrepancy of the last iteration, and the windows' length."""
-        return {"discrepancy": self._cost, "horizon": self._replay.horizon}
+        """Return the weighted discrepancy of the last iteration, and the windows' length and number."""
+        return {"discrepancy": self._cost, "horizon": self._replay.horizon, "windows": len(self._replay.states)}
 
     def state(self) -> dict[str, Any]:
         """Return the distribution and the iteration."""

@@ -56,6 +56,14 @@ class Progress:
     fraction: float
 
 
+def entropy_of(distribution: Distribution) -> float:
+    """Return the entropy of a distribution in coordinates, but for a constant and for its cut: ½ log det of C."""
+    entropy = float(np.log(distribution.std).sum())
+    if distribution.correlation is not None:
+        entropy += 0.5 * float(np.log(np.maximum(np.linalg.eigvalsh(distribution.correlation), 1e-12)).sum())
+    return entropy
+
+
 class Optimizer(abc.ABC):
     """Moves φ = (μ, σ), in coordinates, towards the maximum of the likelihood.
 
@@ -92,6 +100,10 @@ class Optimizer(abc.ABC):
     def distributions(self, space: ParameterSpace) -> list[Distribution]:
         """Return the final distributions to choose from: normals of the candidates unless the method has others."""
         return [Distribution.over(space, mean, std) for mean, std in self.candidates()]
+
+    def bonus(self, distribution: Distribution) -> float:
+        """Return what the method adds to the log-likelihood by which final distributions are chosen."""
+        return 0.0
 
     def extras(self) -> dict[str, Any]:
         """Return what the method found beside a distribution, as plain data for ``fit.json``."""

@@ -9,9 +9,9 @@ import cma
 import numpy as np
 import torch
 
-from dropo_torch.distribution import SearchBox, values_from_uniforms
+from dropo_torch.distribution import Distribution, SearchBox, values_from_uniforms
 from dropo_torch.objective import Objective, draw_uniforms
-from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.optimizers.base import Optimizer, Progress, Request, entropy_of
 from dropo_torch.parameters import ParameterSpace
 
 
@@ -138,6 +138,10 @@ class CMAOptimizer(Optimizer):
     def extras(self) -> dict[str, Any]:
         """Return the weight of the entropy, where there is one."""
         return {"entropy": self._entropy} if self._entropy else {}
+
+    def bonus(self, distribution: Distribution) -> float:
+        """Return the weighted entropy."""
+        return self._entropy * entropy_of(distribution) if self._entropy else 0.0
 
     def state(self) -> dict[str, Any]:
         """Return pycma's own pickle and what stands beside it."""

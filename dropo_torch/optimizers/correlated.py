@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.distribution import TRUNCATION, Distribution, to_values, truncated_moments
+from dropo_torch.distribution import DRAWN_STD, Distribution, to_values
 from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.base import Progress, Request
 from dropo_torch.optimizers.fisher import FisherOptimizer
@@ -26,14 +26,20 @@ _ITERATIONS = 500
 _AT_REST = 1e-4
 
 
-def random_effects(gram: torch.Tensor, force: torch.Tensor, start: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+def random_effects(
+    gram: torch.Tensor, force: torch.Tensor, start: torch.Tensor, entropy: float = 0.0
+) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the covariance C ``(d, d)`` and the shift of μ ``(d,)`` that make the residuals most likely.
+
+    With ``entropy`` β, the log-likelihood plus ½ β log det C is maximised: each step's C is larger by T / (T − β).
 
     Args:
         gram: G_t, ``(T, d, d)``.
         force: g_t, ``(T, d)``.
-        start: first guess of C, positive definite, ``(d, d)``.
+        start: first guess of C, positive definite, ``(d, d)``; its deviations stay below 1.
+        entropy: β.
     """
+    wider = len(gram) / max(len(gram) - entropy, 1e-3 * len(gram))
     eye = torch.eye(len(start), dtype=start.dtype)
     covariance, total = start, torch.zeros(len(start), dtype=start.dtype)
     for _ in range(_ITERATIONS):
@@ -43,7 +49,9 @@ def random_effects(gram: torch.Tensor, force: torch.Tensor, start: torch.Tensor)
         means = (inner @ (force - gram @ total)[..., None])[..., 0]
         shift = means.mean(0)
         centred = means - shift
-        updated = inner.mean(0) + centred.T @ centred / len(means)
+        updated = wider * (inner.mean(0) + centred.T @ centred / len(means))
+        within = updated.diagonal().clamp(min=1.0).rsqrt()
+        updated = updated * torch.outer(within, within)
         change = (updated - covariance).abs().max() / covariance.diagonal().max().clamp(min=1e-300)
         covariance, total = 0.5 * (updated + updated.T), total + shift
         if float(change) < 1e-6:
@@ -87,6 +95,7 @@ class CorrelatedOptimizer(FisherOptimizer):
             gram * torch.outer(scale, scale),
             force * scale,
             torch.from_numpy(start) / torch.outer(scale, scale),
+            entropy=self._entropy,
         )
         self._covariance = (found * torch.outer(scale, scale)).numpy()
         moved = np.clip(self._at + (shift * scale).numpy(), self._box.low, self._box.high)
@@ -112,8 +121,7 @@ class CorrelatedOptimizer(FisherOptimizer):
         if self._covariance is None:
             return independent
         deviation = np.sqrt(np.maximum(np.diag(self._covariance), 1e-300))
-        wide = torch.tensor(TRUNCATION, dtype=torch.float64)
-        std = deviation / np.sqrt(float(truncated_moments(-wide, wide)[1]))  # the cut takes its share again
+        std = deviation / DRAWN_STD  # the cut takes its share again
         correlation = self._covariance / np.outer(deviation, deviation)
         bounded = np.clip(std, self._box.min_std, self._box.max_std)
         return [*independent, Distribution.over(space, self._at, bounded, correlation=correlation)]

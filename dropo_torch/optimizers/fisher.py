@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from dropo_torch.distribution import (
+    Distribution,
     SearchBox,
     coordinate_limits,
     to_values,
@@ -22,7 +23,7 @@ from dropo_torch.distribution import (
 )
 from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density
 from dropo_torch.objective import Reduce, draw_uniforms
-from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.optimizers.base import Optimizer, Progress, Request, entropy_of
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.sampled import MAX_DAMPING, SampledStage, judge, scoring_step
 from dropo_torch.parameters import ParameterSpace
@@ -296,6 +297,10 @@ class FisherOptimizer(Optimizer):
     def extras(self) -> dict[str, Any]:
         """Return the weight of the entropy, where there is one."""
         return {"entropy": self._entropy} if self._entropy else {}
+
+    def bonus(self, distribution: Distribution) -> float:
+        """Return the weighted entropy."""
+        return self._entropy * entropy_of(distribution) if self._entropy else 0.0
 
     def _with_entropy(self, stage: ScoringStage | SampledStage, sums: torch.Tensor) -> torch.Tensor:
         """Add the bonus to a stage's objective and to its scores of log σ.

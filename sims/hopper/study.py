@@ -61,7 +61,7 @@ class Plan:
     epsilons: tuple[float, ...] = tuple(10.0**k for k in range(-9, 0))
     noise_variances: tuple[float, ...] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
     sizes: tuple[int, ...] = (10, 30, 100, 300, 1000, 3000)
-    resamples: int = 10
+    resamples: int = 19
     cma_steps: int = 100
     cma_budget: int = 800
     cma_samples: int = 50
@@ -209,8 +209,7 @@ def run_cell(cell: Cell, plan: Plan, logs: Path) -> dict[str, Any]:
                     "parameters": parameters,
                     "method": cell.method,
                     "method_options": options.get(cell.method, {}),
-                    "optimizer": cell.optimizer,
-                    "budget": plan.cma_budget,
+                    **({"optimizer": "cma", "budget": plan.cma_budget} if cell.optimizer == "cma" else {}),
                     "samples": sized.samples,
                     "seed": cell.seed,
                     "epsilon": cell.epsilon,

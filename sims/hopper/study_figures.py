@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dropo_torch.distribution import DRAWN_STD
 from dropo_torch.report import figures
 
 _COLOURS = {"dropo": "#0072b2", "dropo (noise given)": "#56b4e9", "droid": "#d55e00", "bayessim (mdnn)": "#009e73",
@@ -21,6 +22,11 @@ def label(result: Result) -> str:
     cell = result["cell"]
     notes = [cell["features"]] * bool(cell["features"]) + ["noise given"] * cell["knows_noise"]
     return str(cell["method"]) + "".join(f" ({note})" for note in notes)
+
+
+def drawn_std(result: Result, parameter: str) -> float:
+    """Return the deviation of a fit's draws: they end two σ from the mean."""
+    return float(DRAWN_STD * result["fit"]["parameters"][parameter]["std"])
 
 
 def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
@@ -46,7 +52,7 @@ def recovery(results: Sequence[Result]) -> Any:
         curves = {"realised": (truth["mean"], max(truth["std"], 1e-3))} | {
             label(r): (
                 r["fit"]["parameters"][name]["mean"],
-                max(r["fit"]["parameters"][name]["std"], 1e-3),
+                max(drawn_std(r, name), 1e-3),
             )
             for r in chosen
         }

@@ -15,7 +15,7 @@ from dropo_torch.report import write_study_report
 from dropo_torch.report.figures import to_svg
 from dropo_torch.runs import plain_numbers, versions
 from dropo_torch.sweep import elbow
-from sims.hopper.study_figures import Result, draw_all, label
+from sims.hopper.study_figures import Result, draw_all, drawn_std, label
 
 SCHEMA = "dropo-torch/study/1"
 #: A deviation below this share of the search box has collapsed to a point; one above the other is wide.
@@ -24,7 +24,7 @@ CASES = {"point": "noiseless", "noisy": "noisy", "unmodeled": "unmodeled torso",
 
 #: Tables of which a figure shows the same.
 RECOVERY, SWEEPS, AGAINST_NOISE, SIZES = (
-    "Recovery of a distribution: mean ± std", "Sweeps over ε", "ε against the noise", "Number of transitions",
+    "Recovery of a distribution: mean ± std of draws", "Sweeps over ε", "ε against the noise", "Number of transitions",
 )  # fmt: skip
 FIGURES = {RECOVERY: "recovery.png", SWEEPS: "sweep.png", AGAINST_NOISE: "noise.png", SIZES: "size.png"}
 
@@ -95,7 +95,7 @@ def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
             for method in dict.fromkeys(label(r) for r in case):
                 own = [r for r in case if label(r) == method]
                 means = np.array([r["fit"]["parameters"][parameter]["mean"] for r in own])
-                stds = np.array([r["fit"]["parameters"][parameter]["std"] for r in own])
+                stds = np.array([drawn_std(r, parameter) for r in own])
                 truths = np.array([r["truth"][parameter]["mean"] for r in own])
                 rows.append(
                     {
@@ -144,7 +144,10 @@ def sweep_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
 
 
 def size_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return one row for each case, number of transitions and parameter, with 90 % bootstrap intervals."""
+    """Return one row for each case, number of transitions and parameter, with the range of n bootstrap samples.
+
+    Another sample is inside that range with probability (n − 1) / (n + 1), ``level``.
+    """
     rows = []
     chosen = pick(results, "size")
     for variant in dict.fromkeys(r["cell"]["variant"] for r in chosen):
@@ -159,11 +162,11 @@ def size_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
                     "truth": truth["mean"],
                     "true_std": truth["std"],
                     "resamples": len(group),
+                    "level": (len(group) - 1) / (len(group) + 1),
                 }
-                for key in ("mean", "std"):
-                    values = [r["fit"]["parameters"][parameter][key] for r in group]
-                    low, middle, high = np.quantile(values, [0.05, 0.5, 0.95])
-                    row |= {key: float(middle), f"{key}_low": float(low), f"{key}_high": float(high)}
+                means = [r["fit"]["parameters"][parameter]["mean"] for r in group]
+                for key, values in (("mean", means), ("std", [drawn_std(r, parameter) for r in group])):
+                    row |= {key: float(np.median(values)), f"{key}_low": min(values), f"{key}_high": max(values)}
                 rows.append(row)
     return rows
 
@@ -189,7 +192,7 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
     droid = max(_widest(r) for r in results if r["cell"]["method"] == "droid")
     unmodeled = pick(results, "table", variant="unmodeled", method="dropo")
     before, after = (float(np.mean([_widest(r) for r in group])) for group in (point["dropo"], unmodeled))
-    wide = min(_widest(r) for r in pick(results, "table", method="bayessim"))
+    wide = min(_widest(r) for r in results if r["cell"]["method"] == "bayessim")
     found = [
         Finding(
             "DROPO and DROID find the point dynamics",
@@ -209,7 +212,7 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
         Finding(
             "BayesSim is wide in every case",
             wide > WIDE,
-            f"its widest deviation is {100 * wide:.2g} % of the search box or more",
+            f"its widest parameter's deviation is {100 * wide:.2g} % of the search box or more",
         ),
     ]
     for ends, words in ((True, "ends of transitions"), (False, "every measurement")):
@@ -240,17 +243,18 @@ def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding
         + [f"{_number(r[k])} [{_number(r[k + '_low'])}, {_number(r[k + '_high'])}]" for k in ("mean", "std")]
         for r in tables["size"]
     ]
+    level = min((r["level"] for r in tables["size"]), default=0.0)
     cma = [[v if isinstance(v, str) else _number(v) for v in r.values()] for r in tables["cma"]]
     swept = ["case", "noise variance", "noise on", "ε at the elbow", "ratio"]
     return [
         Section("Findings", ["finding", "holds", "measured"], found),
-        _methods("Table 1: mean ± std, averaged over seeds", tables["table"]),
+        _methods("Table 1: mean ± std of draws, averaged over seeds", tables["table"]),
         _methods(RECOVERY, tables["recovery"]),
         Section(SWEEPS, swept, sweeps["sweep"]),
         Section(AGAINST_NOISE, swept, sweeps["noise"]),
         Section(
             SIZES,
-            ["case", "transitions", "parameter", "truth", "mean [90 % of bootstrap]", "std [90 %]"],
+            ["case", "transitions", "parameter", "truth", f"mean [{100 * level:.0f} % of bootstrap]", "std of draws"],
             sizes,
         ),
         Section(
