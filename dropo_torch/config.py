@@ -57,7 +57,7 @@ class Config(pydantic.BaseModel):
     )
     samples: int = pydantic.Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
     lag: int = pydantic.Field(1, ge=1, description="λ, logged steps per window")
-    seed: int = pydantic.Field(0, ge=0, description="seed of everything that is random")
+    seed: int = pydantic.Field(0, ge=0, lt=2**63, description="seed of everything that is random")
     mask: list[str | int] = pydantic.Field([], description="observed columns which the likelihood leaves out")
     scaling: bool = pydantic.Field(False, description="divide each column by its deviation over the log")
     budget: int = pydantic.Field(1000, ge=1, description="with cma: evaluations of the objective")
@@ -108,6 +108,8 @@ class Config(pydantic.BaseModel):
         for key in ("environment", "task"):
             if key in document:
                 document[key] = self._absolute_code(document[key])
+        if isinstance(self.distribution, str) and self.distribution not in ("uniform", "nominal"):
+            document["distribution"] = str(self.path(self.distribution).resolve())
         if self.own_effects:
             document["own_effects"] = [self._absolute_code(name) for name in self.own_effects]
         return document

@@ -250,6 +250,18 @@ class Distribution:
         if laws not in ({"normal"}, {"uniform"}):
             raise InputError(f"distribution: {path}: law {', '.join(sorted(laws))}; expected all normal or all uniform")
         is_log = np.array([entry.get("scale") == "log" for entry in entries.values()])
+        for (name, entry), log in zip(entries.items(), is_log, strict=True):
+            for key in ("log_mean", "log_std") if log else ():
+                if not isinstance(entry.get(key), (int, float)):
+                    raise InputError(f"distribution: {path}: parameters.{name} has scale: log and no number {key!r}")
+            values = [
+                float(entry[k]) for k in ("mean", "std", "low", "high", *(("log_mean", "log_std") if log else ()))
+            ]
+            if not np.isfinite(values).all() or entry["log_std" if log else "std"] <= 0:
+                raise InputError(
+                    f"distribution: {path}: parameters.{name} has mean {entry['mean']} and std {entry['std']}; "
+                    "expected finite numbers, and a std above 0"
+                )
         pick = [("log_mean", "log_std") if log else ("mean", "std") for log in is_log]
         limits = [entry.get("limits") or [None, None] for entry in entries.values()]
         return cls(

@@ -18,7 +18,7 @@ from dropo_torch.fit import write_atomically
 from dropo_torch.progress import TrainProgress
 from dropo_torch.report.train import WORLDS, evaluations, write_train_report
 from dropo_torch.rl.problem import TrainingProblem, make_training
-from dropo_torch.rl.train import Progress, TrainEntry, Training, train
+from dropo_torch.rl.train import Progress, TrainEntry, Training, check_training, train
 from dropo_torch.rl.video import chosen_frames, draw, record
 from dropo_torch.runs import check_log_option, plain_numbers, prepare_folder, versions
 
@@ -42,6 +42,7 @@ def run_train(config: Config, out: Path, *, console: Console, resume: bool = Fal
     checkpoint = out / "train-progress.pt"
     continued = resume and checkpoint.exists()
     _keep_distribution(problem, out, continued)
+    check_training(problem)  # before an earlier run is moved aside
     prepare_folder(out, problem.model_path, resume=continued)
     curves = _Curves(out / "tensorboard", problem.settings.steps) if log == "tensorboard" else None
     with TrainProgress(console, problem.settings.steps) as progress:

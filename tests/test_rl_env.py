@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import json
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -728,3 +729,95 @@ def test_gymnasiums_wrappers_understand_the_view() -> None:
     with pytest.raises(InputError, match="seed: several given"):
         vector.env.reset(seed=[1, 2, 3, 4])
     vector.close()
+
+
+# --- numbers that are not numbers -----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("broken", ["reward", "observe"])
+def test_a_task_that_gives_no_number_ends_the_episode(broken: str) -> None:
+    """Nothing that is not finite leaves the environment; the step is counted, and its episode is over."""
+    task = stretched()
+    sound, calls = getattr(task, broken), [0]
+
+    def sometimes(*arguments: torch.Tensor) -> torch.Tensor:
+        out = sound(*arguments)
+        calls[0] += 1
+        if calls[0] % 5 == 3 and len(out) == 4:
+            out = out.clone()
+            out[2] = torch.nan
+        return out
+
+    env = RandomizedEnv(task, 4)
+    setattr(env.task, broken, sometimes)
+    data = env.rollout(40, break_when_any_done=False)
+    after = data["next"]
+    assert torch.isfinite(after["reward"]).all()
+    assert torch.isfinite(after["observation"]).all()
+    ended = after["terminated"][..., 0].sum(1)
+    assert ended[2] == env.num_repaired > 0
+    assert ended[[0, 1, 3]].sum() == 0
+    setattr(env.task, "observe", lambda states: torch.full((len(states), 4), torch.nan))  # noqa: B010
+    with pytest.raises(InputError, match="observe gives a number that is not finite for a start state"):
+        env.reset()
+
+
+def test_a_state_in_memory_is_a_snapshot() -> None:
+    """Episodes that begin after it was taken change nothing in it."""
+    env = RandomizedEnv("hopper", 8, space=MASSES, seed=1)
+    td = env.reset()
+    actions = actions_of(env, 60)
+    state = env.state_dict()
+    first, _ = driven(env, actions, td=td.clone())
+    driven(env, actions_of(env, 60, 5), td=env.reset())
+    env.load_state_dict(state)
+    again, _ = driven(env, actions, td=td.clone())
+    for a, b in zip(first, again, strict=True):
+        assert torch.equal(a["next", "observation"], b["next", "observation"])
+
+
+def test_a_space_over_another_model_brings_its_bounds_and_its_time() -> None:
+    spec = mujoco.MjSpec.from_file(str(SIM.model))
+    spec.option.timestep = 0.001
+    for actuator in spec.actuators:
+        actuator.ctrlrange = [-3, 3]
+    env = RandomizedEnv("hopper", 2, space=ParameterSpace.empty(spec.compile()))
+    assert env.action_spec.high.tolist() == [[3, 3, 3]] * 2
+    assert env.task.timestep == pytest.approx(0.001 * env.task.frame_skip)
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("frame_skip", 2.0, "frame_skip is 2.0; expected a whole number"),
+        ("frame_skip", 0, "frame_skip is 0"),
+        ("max_episode_steps", float("inf"), "max_episode_steps is inf"),
+        ("action_low", np.array([2.0]), "action 0 is between 2 and"),
+        ("action_high", np.array([np.inf]), "expected two finite numbers"),
+        ("action_low", -1.0, "have shapes"),
+    ],
+)
+def test_numbers_of_a_task_are_checked(name: str, value: Any, message: str) -> None:
+    task = CartPole()
+    setattr(task, name, value)
+    with pytest.raises(InputError, match=message):
+        RandomizedEnv(task, 1)
+
+
+def test_a_distribution_is_of_what_the_model_allows(tmp_path: Path) -> None:
+    space = ParameterSpace(CartPole().model, {"mass": {"field": "body_mass", "name": "cart", "bounds": [0.5, 2.0],
+                                                       "unit": "kg"}})  # fmt: skip
+    with pytest.raises(InputError, match=r"distribution: mass is -2; the model allows 0"):
+        load_source({"mass": -2.0}, space)
+    good = {"mean": 1.0, "std": 0.1, "low": 0.5, "high": 2.0, "unit": "kg"}
+    for change, message in {
+        ("mean", -2.0): "mass reaches from",
+        ("std", -0.1): "a std above 0",
+        ("mean", float("nan")): "finite numbers",
+        ("unit", "g"): "mass is in 'g' there and in 'kg' here",
+        ("scale", "log"): "no number 'log_mean'",
+    }.items():
+        path = tmp_path / "d.json"
+        path.write_text(json.dumps({"parameters": {"mass": {**good, change[0]: change[1]}}}))
+        with pytest.raises(InputError, match=message):
+            load_source(str(path), space)

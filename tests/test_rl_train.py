@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import subprocess
@@ -439,3 +440,56 @@ def test_without_gl_a_note_says_how_to_get_it(folder: Path, monkeypatch: pytest.
     assert frames[0] == 0
     assert max(frames) == 100
     assert chosen_frames(1, 0.01) == [0] * 16
+
+
+def test_an_evaluation_that_is_no_number_is_never_the_best(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first evaluation gives NaN: a later one is kept all the same."""
+    from dropo_torch.rl import train as module
+
+    found, count = module.evaluate, [0]
+
+    def first_is_nan(*arguments: Any) -> Any:
+        count[0] += 1
+        evaluation = found(*arguments)
+        return dataclasses.replace(evaluation, returns=(float("nan"),)) if count[0] == 1 else evaluation
+
+    monkeypatch.setattr(module, "evaluate", first_is_nan)
+    result = train(problem(folder, train={**TINY["ppo"], "evaluations": 4}))
+    assert [e.kept for e in result.evaluations][:2] == [True, True]
+
+
+def test_what_could_learn_nothing_is_refused_before_anything_is_moved(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "c.yaml"
+    config.write_text(json.dumps({"task": f"{folder}/push.py:Push"}))
+    out = tmp_path / "out"
+    out.mkdir()
+    for name in ("train.json", "policy.pt"):
+        (out / name).write_text("mine")
+    for options, message in (
+        (["--train.steps", "10"], "one iteration takes"),
+        (["--algorithm", "sac", "--train.steps", "5000"], "learning begins after train.warmup 10000"),
+    ):
+        assert main(["train", str(config), "--out", str(out), *options]) == 2
+        assert message in capsys.readouterr().err
+        assert sorted(p.name for p in out.iterdir()) == ["policy.pt", "train.json"]
+
+
+def test_a_correlation_is_part_of_the_training(folder: Path, tmp_path: Path) -> None:
+    """Two distributions that differ in it alone have different fingerprints, and the policy tells it."""
+    entry = {"mean": 2.0, "std": 0.1, "low": 1.0, "high": 4.0, "unit": "kg"}
+    drag = {"mean": 0.5, "std": 0.1, "low": 0.1, "high": 1.0, "unit": ""}
+    found = []
+    for name, correlation in (("a", 0.0), ("b", 0.9)):
+        path = tmp_path / f"{name}.json"
+        matrix = [[1.0, correlation], [correlation, 1.0]]
+        path.write_text(json.dumps({"parameters": {"mass": entry, "drag": drag}, "correlation": matrix}))
+        drags = {"field": "dof_damping", "name": "rail", "bounds": [0.1, 1.0]}
+        found.append(problem(folder, parameters={"mass": MASS, "drag": drags}, distribution=str(path)))
+    assert found[0].fingerprint != found[1].fingerprint
+    assert found[1].distribution["correlation"][0][1] == 0.9
+
+
+def test_a_seed_of_any_size_trains(folder: Path) -> None:
+    train(problem(folder, seed=20250101123000))

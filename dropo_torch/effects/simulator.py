@@ -264,7 +264,14 @@ def apply_native(model: mujoco.MjModel, effects: EffectSet) -> mujoco.MjModel:
     out = copy.copy(model)
     for entry in effects.entries:
         entry.effect.apply(out, entry.target, np.asarray(entry.fixed))
-    mujoco.mj_setConst(out, mujoco.MjData(out))
+    try:
+        mujoco.mj_setConst(out, mujoco.MjData(out))
+    except mujoco.FatalError as error:
+        places = ", ".join(e.place for e in effects.entries)
+        raise InputError(
+            f"effects: MuJoCo refuses the model with {places}: {error}; a free body whose mass or centre changes must "
+            "not be compiled as simple: name the model by its path, so that it is compiled for it"
+        ) from None
     return out
 
 

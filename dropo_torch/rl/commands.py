@@ -201,4 +201,4 @@ class Commands:
     def load_state_dict(self, state: list[dict[str, torch.Tensor]]) -> None:
         """Go on from memories; the numbers have been given by :meth:`reset`."""
         for f, saved in zip(self._filters, state, strict=True):
-            f.fresh, f.memory = (saved[k].to(f.fresh.device) for k in ("fresh", "memory"))
+            f.fresh, f.memory = (saved[k].to(f.fresh.device, copy=True) for k in ("fresh", "memory"))

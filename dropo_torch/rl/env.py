@@ -30,7 +30,8 @@ class RandomizedEnv(EnvBase):
 
     The model that is simulated is the one that ``space`` (or ``effects``) belongs to, and the task's where there is
     neither. A simulation that diverges ends its episode: it is terminated with reward 0 and its last good observation,
-    and counted in ``num_diverged``. A time limit truncates.
+    and counted in ``num_diverged``. So is a step for which the task gives a number that is not finite, counted in
+    ``num_repaired``. A time limit truncates.
 
     Args:
         task: the task, or what :func:`~dropo_torch.rl.task.load_task` understands.
@@ -47,6 +48,7 @@ class RandomizedEnv(EnvBase):
 
     Attributes:
         num_diverged: simulations that have diverged so far.
+        num_repaired: steps so far whose reward or observation was not finite.
 
     Raises:
         InputError: a task, parameters, effects and a backend that do not fit each other.
@@ -71,8 +73,10 @@ class RandomizedEnv(EnvBase):
         super().__init__(device=torch.device(device), batch_size=torch.Size([num_envs]))
         self.task = load_task(task)
         check_task(self.task)
-        self.num_envs, self.num_diverged = num_envs, 0
+        self.num_envs, self.num_diverged, self.num_repaired = num_envs, 0, 0
         self.space = _checked_space(self.task, space, source, effects)
+        if self.space.model is not self.task.model and self.space.model is not None:
+            self.task = self.task.on(self.space.model)
         self.source = (UniformSource(self.space) if source is None else source).over(self.space)
         self._stepper = make_stepper(
             backend, self.space, num_envs, frame_skip=self.task.frame_skip, effects=effects, num_threads=num_threads,
@@ -149,9 +153,11 @@ class RandomizedEnv(EnvBase):
         observation = self.task.observe(shown).to(torch.float32)
         reward = self.task.reward(before, actions, self._states).to(torch.float32)
         terminated = self.task.terminated(self._states)
-        if not all_good:
-            observation = torch.where(good[:, None], observation, self._observation)
-            reward, terminated = torch.where(good, reward, 0.0), terminated | ~good
+        sound = good & torch.isfinite(reward) & torch.isfinite(observation).all(1)
+        if not bool(sound.all()):
+            self.num_repaired += int((good & ~sound).sum())
+            observation = torch.where(sound[:, None], observation, self._observation)
+            reward, terminated = torch.where(sound, reward, 0.0), terminated | ~sound
         self._observation, self._count = observation, self._count + 1
         truncated = self._count >= self.task.max_episode_steps
         terminated = terminated[:, None]
@@ -196,7 +202,10 @@ class RandomizedEnv(EnvBase):
         if self._sensors is not None:
             self._sensors.reset(at, start, values.numpy())
             shown = self._sensors.show(self._states)[at]
-        self._observation = self._observation.index_copy(0, at, self.task.observe(shown).to(torch.float32))
+        observation = self.task.observe(shown).to(torch.float32)
+        if not bool(torch.isfinite(observation).all()):
+            raise InputError(f"task: {self.task.name}: observe gives a number that is not finite for a start state")
+        self._observation = self._observation.index_copy(0, at, observation)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -205,9 +214,10 @@ class RandomizedEnv(EnvBase):
     def get_extra_state(self) -> dict[str, Any]:
         """Return all that the next steps depend on; it is what ``state_dict`` holds."""
         state: dict[str, Any] = {
-            "stepper": self._stepper.state_dict(), "generator": self._generator.get_state(), "values": self._values,
+            "stepper": self._stepper.state_dict(), "generator": self._generator.get_state(),
+            "values": self._values.clone(),
             "states": self._states, "observation": self._observation, "count": self._count,
-            "num_diverged": self.num_diverged,
+            "num_diverged": self.num_diverged, "num_repaired": self.num_repaired,
         }  # fmt: skip
         if self._commands is not None:
             state["commands"] = self._commands.state_dict()
@@ -228,7 +238,7 @@ class RandomizedEnv(EnvBase):
         self._states, self._observation, self._count = (
             state[k].to(self.device) for k in ("states", "observation", "count")
         )
-        self.num_diverged = int(state["num_diverged"])
+        self.num_diverged, self.num_repaired = int(state["num_diverged"]), int(state["num_repaired"])
         self._stepper.load_state_dict(state["stepper"], self._values)
         every = torch.arange(self.num_envs, device=self.device)
         if self._commands is not None:

@@ -258,7 +258,8 @@ def describe(world: World, given: Any) -> dict[str, Any]:
         values = {n: {"value": v, "unit": units[n]} for n, v in zip(source.names, vector, strict=True)}
         return {"kind": "nominal" if given == "nominal" else "point", "parameters": values}
     distribution = given if isinstance(given, Distribution) else Distribution.load(given)
-    return {"kind": "fitted", "parameters": distribution.summary()}
+    together = {} if distribution.correlation is None else {"correlation": distribution.correlation.tolist()}
+    return {"kind": "fitted", "parameters": distribution.summary(), **together}
 
 
 def _fingerprint(
@@ -266,14 +267,16 @@ def _fingerprint(
 ) -> str:
     """A digest of what decides a training's course."""
     ignored = ("data", "trajectories", "optimizer", "budget", "population", "adam", "samples", "epsilon", "noise",
-               "mask", "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm")  # fmt: skip
+               "mask", "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm", "method",
+               "method_options", "entropy", "covariance", "environment")  # fmt: skip
     learning = settings.model_dump(mode="json", exclude={"checkpoint_seconds"})
     text = json.dumps([config.fingerprint(*ignored), algorithm, learning, dict(distribution)], sort_keys=True)
     digest = hashlib.sha256(text.encode())
     digest.update(f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}".encode())
-    where, _, _ = (config.task or "").rpartition(":")
-    if where.endswith(".py"):
-        digest.update(config.path(where).read_bytes())
+    for name in (config.task or "", *config.own_effects):
+        where, _, _ = name.rpartition(":")
+        if where.endswith(".py"):
+            digest.update(config.path(where).read_bytes())
     buffer = np.empty(mujoco.mj_sizeModel(task.model), np.uint8)
     mujoco.mj_saveModel(task.model, None, buffer)
     digest.update(buffer.tobytes())

@@ -120,9 +120,10 @@ def load_source(
     if isinstance(given, ParameterSource):
         return given.over(space)
     if isinstance(given, Distribution):
-        return DistributionSource(given).over(space)
+        return _checked(DistributionSource(given), space)
     if isinstance(given, Mapping):
-        space.vector(given)
+        vector = space.vector(given)
+        _check_limits(vector, vector, space)
         return PointSource(given).over(space)
     if given == "uniform":
         return UniformSource(space)
@@ -131,4 +132,26 @@ def load_source(
         if unknown:
             raise InputError(f"distribution: the model has no nominal value of {unknown[0]!r}; give name: value of all")
         return PointSource(space.named(space.nominal))
-    return DistributionSource(Distribution.load(given)).over(space)
+    return _checked(DistributionSource(Distribution.load(given)), space)
+
+
+def _checked(source: DistributionSource, space: ParameterSpace) -> ParameterSource:
+    """A distribution in a space's order, all of whose values the model can have, in the model's units."""
+    found, ordered = source.distribution, source.over(space)
+    for name, unit in zip(found.names, found.units, strict=True):
+        own = space.parameters[space.names.index(name)].unit
+        if unit and own and unit != own:
+            raise InputError(f"distribution: {name} is in {unit!r} there and in {own!r} here; expected the same unit")
+    columns = [found.names.index(n) for n in space.names]
+    low, high = (to_values(end, found.is_log)[columns] for end in found.ends)
+    _check_limits(low, high, space)
+    return ordered
+
+
+def _check_limits(low: np.ndarray, high: np.ndarray, space: ParameterSpace) -> None:
+    """Raise for values from ``low`` to ``high``, ``(d,)`` each, of which the model does not allow some."""
+    for name, a, b, (least, most) in zip(space.names, low, high, space.limits, strict=True):
+        slack = 1e-9 * max(abs(a), abs(b))
+        if not (least - slack <= a and b <= most + slack):
+            reaches = f"is {a:g}" if a == b else f"reaches from {a:g} to {b:g}"
+            raise InputError(f"distribution: {name} {reaches}; the model allows {least:g} to {most:g}")

@@ -116,4 +116,4 @@ class Sensors:
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Go on from a memory; the numbers have been given by :meth:`reset`."""
-        self._past = state["past"].to(self._past.device)
+        self._past = state["past"].to(self._past.device, copy=True)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import abc
 import copy
-from functools import cached_property
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -14,6 +15,16 @@ import torch
 from dropo_torch.bundled import bundled_sim
 from dropo_torch.errors import InputError
 from dropo_torch.usercode import load_callable, user_code
+
+
+class _FromModel:
+    """An attribute that is computed from the model each time, unless the task sets one of its own."""
+
+    def __init__(self, compute: Callable[[Task], np.ndarray]) -> None:
+        self._compute, self.__doc__ = compute, compute.__doc__
+
+    def __get__(self, task: Task | None, kind: type | None = None) -> Any:
+        return self if task is None else self._compute(task)
 
 
 class Task(abc.ABC):
@@ -55,12 +66,12 @@ class Task(abc.ABC):
         """Return the model's controls ``(N, nu)`` of actions; the actions themselves by default."""
         return actions
 
-    @cached_property
+    @_FromModel
     def action_low(self) -> np.ndarray:
         """Lowest actions, ``(num_actions,)``; by default the model's ``ctrlrange``."""
         return self._control_range()[0]
 
-    @cached_property
+    @_FromModel
     def action_high(self) -> np.ndarray:
         """Highest actions, ``(num_actions,)``; by default the model's ``ctrlrange``."""
         return self._control_range()[1]
@@ -127,6 +138,11 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
 def check_task(task: Task) -> None:
     """Raise an :class:`InputError` for a task whose methods fail, or return other shapes than they should."""
     width, where = task.model.nq + task.model.nv, f"task: {task.name}"
+    for name in ("frame_skip", "max_episode_steps", "num_observations"):
+        given = getattr(task, name)
+        if isinstance(given, bool) or not isinstance(given, int | np.integer) or given < 1:
+            raise InputError(f"{where}: {name} is {given!r}; expected a whole number, 1 or more")
+    _check_bounds(task, where)
     with user_code("task", task.name):
         middle = torch.from_numpy(0.5 * (np.asarray(task.action_low) + np.asarray(task.action_high)))[None]
         states = task.initial_states(1, torch.Generator().manual_seed(0))
@@ -139,6 +155,20 @@ def check_task(task: Task) -> None:
         _expect(f"{where}: terminated", ends, (1,))
     if ends.dtype != torch.bool:
         raise InputError(f"{where}: terminated returns {ends.dtype}; expected torch.bool")
+
+
+def _check_bounds(task: Task, where: str) -> None:
+    """Raise for bounds of actions that are no bounds."""
+    low, high = (np.asarray(getattr(task, name), dtype=np.float64) for name in ("action_low", "action_high"))
+    if low.ndim != 1 or low.shape != high.shape:
+        raise InputError(f"{where}: action_low and action_high have shapes {low.shape} and {high.shape}; expected one")
+    fits = np.isfinite(low) & np.isfinite(high) & (low < high)
+    if not fits.all():
+        column = int(np.flatnonzero(~fits)[0])
+        raise InputError(
+            f"{where}: action {column} is between {low[column]:g} and {high[column]:g}; expected two finite numbers, "
+            "the lower first"
+        )
 
 
 def _expect(what: str, given: object, shape: tuple[int, ...]) -> None:

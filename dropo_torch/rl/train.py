@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -152,6 +153,7 @@ def train(
     Raises:
         InputError: a checkpoint of another training; losses that stay infinite.
     """
+    check_training(problem)
     with _own_random_numbers(problem.config.seed, problem.device), single_thread():
         run = _Run(problem, checkpoint)
         if resume:
@@ -165,6 +167,27 @@ def train(
         return run.result()
 
 
+def check_training(problem: TrainingProblem) -> None:
+    """Refuse what could only fail, or learn nothing, before anything is written.
+
+    Raises:
+        InputError: too few steps, or a task, parameters, effects and a backend that do not fit each other.
+    """
+    settings = problem.settings
+    per_iteration = settings.num_envs * (settings.horizon if isinstance(settings, PPOSettings) else 1)
+    if per_iteration > settings.steps:
+        raise InputError(
+            f"train.steps: {settings.steps} given, but one iteration takes {per_iteration} "
+            "(num_envs times horizon); give more steps, or fewer environments"
+        )
+    if isinstance(settings, SACSettings) and settings.steps <= max(settings.warmup, settings.minibatch):
+        raise InputError(
+            f"train.steps: {settings.steps} given, but learning begins after train.warmup {settings.warmup} and "
+            f"train.minibatch {settings.minibatch} steps; give more steps, or less of these"
+        )
+    problem.env(problem.training, 1, 0).reset()
+
+
 class _Run:
     """A training that is under way."""
 
@@ -175,11 +198,6 @@ class _Run:
         self.learner = _make_learner(problem, self.policy)
         self.collector = Collector(self.env, self.policy.to_action)
         self.per_iteration = settings.num_envs * self.learner.horizon
-        if self.per_iteration > settings.steps:
-            raise InputError(
-                f"train.steps: {settings.steps} given, but one iteration takes {self.per_iteration} "
-                "(num_envs times horizon); give more steps, or fewer environments"
-            )
         self.checkpoints = Checkpoints(checkpoint, problem.fingerprint, settings.checkpoint_seconds)
         self.steps, self.iterations, self.stride = 0, 0, 1
         self.spent, self.simulating, self.learning = 0.0, 0.0, 0.0
@@ -227,7 +245,8 @@ class _Run:
         return Training(
             policy=self.policy, algorithm=problem.algorithm, history=tuple(self.history),
             evaluations=tuple(self.evaluations), training=training, nominal=nominal, target=target, steps=self.steps,
-            episodes=self.collector.episodes, diverged=int(self.env.num_diverged), repaired=self.collector.repaired,
+            episodes=self.collector.episodes, diverged=int(self.env.num_diverged),
+            repaired=self.collector.repaired + int(self.env.num_repaired),
             skipped=self.learner.skipped, seconds=self._seconds(), simulating=self.simulating, learning=self.learning,
             seed=problem.config.seed, stop_reason="all steps are done",
         )  # fmt: skip
@@ -266,16 +285,17 @@ class _Run:
     def _evaluate(self) -> Progress:
         """Evaluate under the training's distribution, and keep the policy if it is the best."""
         found = self._episodes(self.problem.training, 0)
-        better = self.best is None or found.mean > self.best[0]
+        score = found.mean if math.isfinite(found.mean) else -math.inf
+        better = self.best is None or score > self.best[0]
         if better:
-            self.best = (found.mean, {k: v.detach().cpu().clone() for k, v in self.policy.state_dict().items()})
+            self.best = (score, {k: v.detach().cpu().clone() for k, v in self.policy.state_dict().items()})
         progress = Progress(self.steps, found.mean, found.std, better)
         self.evaluations.append(progress)
         return progress
 
     def _episodes(self, world: World, number: int) -> Evaluation:
         """Episodes of the policy as it is; the same starts and parameters for the same number."""
-        seed = (self.problem.config.seed * 4 + number) * 1_000_003 + 17
+        seed = ((self.problem.config.seed * 4 + number) * 1_000_003 + 17) % 2**63
         with _own_random_numbers(seed, self.problem.device):
             return evaluate(self.policy, self.problem.env(world, self.problem.settings.episodes, seed % 2**31))
 
