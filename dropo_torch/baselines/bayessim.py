@@ -51,8 +51,8 @@ class BayesSimOptimizer(Optimizer):
     logged actions, under parameter vectors of the prior. A replay is summarised by mean and variance of the columns'
     changes per step and their correlation with the controls, over all windows together. A network learns the
     parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
-    posterior. The result is the normal with the posterior's mean and covariance inside the box, its correlation
-    included; the mixture is kept beside it. With ``noise``, replays are measured as the log was.
+    posterior. The result is the normal whose draws have the posterior's mean and covariance inside the box, its
+    correlation included; the mixture is kept beside it. With ``noise``, replays are measured as the log was.
 
     Args:
         space: what varies.
