@@ -19,6 +19,7 @@ from tensordict import TensorDict
 
 import dropo_torch as dropo
 from dropo_torch.cli import main
+from dropo_torch.errors import InputError
 from dropo_torch.rl.collect import Collector
 from dropo_torch.rl.evaluate import evaluate
 from dropo_torch.rl.networks import Normalizer
@@ -493,3 +494,39 @@ def test_a_correlation_is_part_of_the_training(folder: Path, tmp_path: Path) -> 
 
 def test_a_seed_of_any_size_trains(folder: Path) -> None:
     train(problem(folder, seed=20250101123000))
+
+
+FLY = '''
+import mujoco, torch
+from dropo_torch.rl import Task
+
+class Fly(Task):
+    name, frame_skip, max_episode_steps, num_observations = "fly", 2, 8, 13
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_string("""<mujoco><worldbody><body name="b"><freejoint/>
+        <geom size=".1" mass="1"/></body></worldbody>
+        <actuator><adhesion name="m" body="b" ctrlrange="0 1" gain="1"/></actuator></mujoco>""")
+    def initial_states(self, count, generator):
+        states = torch.zeros(count, 13, dtype=torch.float64)
+        states[:, 3] = 1
+        return states
+    def observe(self, states):
+        return states
+    def reward(self, states, actions, next_states):
+        return next_states[:, 2]
+    def terminated(self, next_states):
+        return torch.zeros(len(next_states), dtype=torch.bool)
+'''
+
+
+@pytest.mark.parametrize("varies", [False, True])
+def test_a_free_body_that_was_compiled_as_simple_is_told(tmp_path: Path, varies: bool) -> None:
+    """An effect on its mass needs a model that was compiled for it, which a task's own is not."""
+    (tmp_path / "fly.py").write_text(FLY)
+    payload = {"effect": "payload", "target": "b", "mass": 0.5, "x": 0.1, "y": 0.0, "z": 0.0}
+    document: dict[str, Any] = {"task": "fly.py:Fly", "effects": [payload], "train": TINY["ppo"]}
+    if varies:
+        del payload["mass"]
+        document["parameters"] = {"m": {"effect": "payload", "name": "b", "index": "mass", "bounds": [0.1, 0.5]}}
+    with pytest.raises(InputError, match="compiled as simple"):
+        train(make_training(dropo.make_config(document, base=tmp_path)))
