@@ -48,9 +48,9 @@ class Study(Protocol):
     """A published study, redone: results into a folder, finished parts kept where it resumes."""
 
     def __call__(
-        self, out: Path, *, reduced: bool, resume: bool, report: Callable[[str, float], None]
+        self, out: Path, *, reduced: bool, resume: bool, report: Callable[[str, float], None], workers: int
     ) -> Sequence[str]:
-        """Run it; return what it found, in sentences."""
+        """Run it by so many processes; return what it found, in sentences."""
 
 
 def bundled_study(name: str) -> Study:

@@ -83,8 +83,12 @@ def _dispatch(given: list[str]) -> int:
         return 0
     if parsed.command == "reproduce":
         if rest:
-            raise InputError(f"reproduce: {rest[0]} is not understood; it takes --out, --resume and --reduced")
-        runs.run_reproduce(parsed.study, parsed.out, console=console, reduced=parsed.reduced, resume=parsed.resume)
+            takes = "--out, --resume, --reduced and --workers"
+            raise InputError(f"reproduce: {rest[0]} is not understood; it takes {takes}")
+        workers = _processors() if parsed.workers is None else _count("--workers", parsed.workers)
+        runs.run_reproduce(
+            parsed.study, parsed.out, console=console, reduced=parsed.reduced, resume=parsed.resume, workers=workers
+        )
         return 0
     config = load_config(parsed.config, overrides)
     if parsed.command == "fit":
@@ -99,9 +103,8 @@ def _dispatch(given: list[str]) -> int:
         runs.run_certify(config, parsed.out, console=console)
     elif parsed.command == "compare":
         methods = METHODS if parsed.methods is None else [m.strip() for m in parsed.methods.split(",")]
-        runs.run_compare(
-            config, parsed.out, console=console, methods=methods, seeds=_count(parsed.seeds), resume=parsed.resume
-        )
+        seeds = _count("--seeds", parsed.seeds)
+        runs.run_compare(config, parsed.out, console=console, methods=methods, seeds=seeds, resume=parsed.resume)
     else:
         epsilons = None if parsed.epsilons is None else _numbers(parsed.epsilons)
         runs.run_sweep(config, parsed.out, console=console, epsilons=epsilons, resume=parsed.resume)
@@ -132,6 +135,7 @@ def _parser() -> argparse.ArgumentParser:
     study.add_argument("--out", type=_folder, required=True, metavar="DIR", help="folder of the results")
     study.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
     study.add_argument("--reduced", action="store_true", help="short logs and few seeds: minutes instead of hours")
+    study.add_argument("--workers", metavar="N", help="fits side by side (default: one a processor)")
     demo = commands.add_parser("demo", help="fit the bundled Hopper's masses", allow_abbrev=False)
     demo.add_argument("--out", type=_folder, default=Path("out/demo"), metavar="DIR", help="folder of the results")
     demo.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
@@ -171,9 +175,14 @@ def _folder(text: str) -> Path:
     return Path(text)
 
 
-def _count(text: str) -> int:
+def _processors() -> int:
+    """How many processors this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _count(option: str, text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
-        raise InputError(f"--seeds: {text!r} given; expected a whole number, 1 or more")
+        raise InputError(f"{option}: {text!r} given; expected a whole number, 1 or more")
     return int(text)
 
 

@@ -206,12 +206,12 @@ def run_compare(
 
 
 def run_reproduce(
-    name: str, out: Path, *, console: Console, reduced: bool = False, resume: bool = False
+    name: str, out: Path, *, console: Console, reduced: bool = False, resume: bool = False, workers: int = 1
 ) -> Sequence[str]:
-    """Redo the published study of a bundled simulation in ``out``, and print what it found."""
+    """Redo the published study of a bundled simulation in ``out`` by so many processes; print what it found."""
     study = bundled_study(name)
     with StageProgress(console, f"reproduce {name}") as progress:
-        found = study(out, reduced=reduced, resume=resume, report=progress.update)
+        found = study(out, reduced=reduced, resume=resume, report=progress.update, workers=workers)
     for line in found:
         console.print(f"  - {line}", highlight=False, markup=False, soft_wrap=True)
     console.print(

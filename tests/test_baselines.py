@@ -554,14 +554,18 @@ def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None
     cells = sorted((out / "cells").iterdir())
     assert len(cells) == len(all_cells(TINY))
     before = {p.name: p.stat().st_mtime_ns for p in cells}
+    first = json.loads(cells[0].read_text())["fit"]["parameters"]
     cells[0].unlink()
+    cells[1].unlink()
     with pytest.raises(InputError, match="add --resume"):
         run_study(out, plan=TINY)
     with pytest.raises(InputError, match="another size"):
         run_study(out, plan=replace(TINY, seeds=2), resume=True)
-    assert [line.split("(")[0] for line in run_study(out, plan=TINY, resume=True)] == [f.split("(")[0] for f in found]
+    again = run_study(out, plan=TINY, resume=True, workers=2)
+    assert [line.split("(")[0] for line in again] == [f.split("(")[0] for f in found]
     after = {p.name: p.stat().st_mtime_ns for p in (out / "cells").iterdir()}
-    assert {n for n in before if after[n] != before[n]} == {cells[0].name}
+    assert {n for n in before if after[n] != before[n]} == {cells[0].name, cells[1].name}
+    assert json.loads(cells[0].read_text())["fit"]["parameters"] == first  # to the bit, in a process of its own
 
 
 @pytest.mark.slow

@@ -7,13 +7,19 @@ recorded here (:mod:`sims.hopper.record`): compare numbers with the paper's in k
 from __future__ import annotations
 
 import json
+import multiprocessing
+import os
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
@@ -46,6 +52,7 @@ class Plan:
         horizon: logged steps that BayesSim replays.
         epsilons: values of the sweeps.
         noise_variances: of the sweeps against noise.
+        noise_steps: length of the episodes of their log.
         sizes: numbers of transitions whose estimates are compared.
         resamples: bootstrap samples of each size.
         cma_steps, cma_budget, cma_samples: length of the log's episodes, evaluations and K of the CMA-ES run.
@@ -60,9 +67,10 @@ class Plan:
     horizon: int = 50
     epsilons: tuple[float, ...] = tuple(10.0**k for k in range(-9, 0))
     noise_variances: tuple[float, ...] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
+    noise_steps: int = 150
     sizes: tuple[int, ...] = (10, 30, 100, 300, 1000, 3000)
-    resamples: int = 19
-    cma_steps: int = 100
+    resamples: int = 9
+    cma_steps: int = 50
     cma_budget: int = 800
     cma_samples: int = 50
 
@@ -70,7 +78,7 @@ class Plan:
 #: Minutes instead of hours: short logs, one seed, coarse sweeps.
 REDUCED = Plan(
     seeds=1, steps=60, samples=40, droid_budget=400, simulations=200, horizon=20,
-    epsilons=(1e-8, 1e-6, 1e-4, 1e-2), noise_variances=(1e-5, 1e-4), sizes=(10, 30, 100), resamples=4,
+    epsilons=(1e-8, 1e-6, 1e-4, 1e-2), noise_variances=(1e-5, 1e-4), noise_steps=60, sizes=(10, 30, 100), resamples=4,
     cma_steps=20, cma_budget=60, cma_samples=10,
 )  # fmt: skip
 
@@ -125,6 +133,7 @@ def run_study(
     resume: bool = False,
     report: Callable[[str, float], None] = lambda stage, share: None,
     plan: Plan | None = None,
+    workers: int = 1,
 ) -> Sequence[str]:
     """Run every cell that is not there yet, then write tables and figures.
 
@@ -135,6 +144,7 @@ def run_study(
         resume: keep finished cells of the same plan.
         report: called with what is being done and the share that is.
         plan: a size of one's own.
+        workers: processes that fit cells side by side. The results do not depend on it.
 
     Raises:
         InputError: a folder with another study, or with one that is not to be resumed.
@@ -142,13 +152,11 @@ def run_study(
     plan = plan or (REDUCED if reduced else Plan())
     _claim(out, plan, resume=resume)
     cells = all_cells(plan)
-    results = []
-    for number, cell in enumerate(cells):
-        path = out / "cells" / f"{cell.name}.json"
-        if not path.exists():
-            report(f"{number + 1} of {len(cells)}: {cell.name}", number / len(cells))
-            write_atomically(path, json.dumps(run_cell(cell, plan, out / "logs"), indent=1).encode() + b"\n")
-        results.append(json.loads(path.read_text()))
+    waiting = [cell for cell in cells if not _path(out, cell).exists()]
+    report(f"{len(cells) - len(waiting)} of {len(cells)} fits are done", 1 - len(waiting) / len(cells))
+    for number, cell in enumerate(_run_cells(waiting, plan, out, workers), len(cells) - len(waiting) + 1):
+        report(f"{number} of {len(cells)}: {cell.name}", number / len(cells))
+    results = [json.loads(_path(out, cell).read_text()) for cell in cells]
     report("tables and figures", 1.0)
     return write_results(out, results, asdict(plan))
 
@@ -174,18 +182,60 @@ def all_cells(plan: Plan) -> list[Cell]:
         for ends in (True, False)
         for e in plan.epsilons
     ]
-    cells += [
+    cells += [Cell("cma", "point"), Cell("cma", "point", optimizer="cma")]
+    return cells + [
         Cell("size", variant, epsilon=epsilon, knows_noise=variant == "noisy", size=size, resample=b)
         for variant, epsilon in (("noisy", 1e-8), ("distribution", 1e-7))
         for size in plan.sizes
         for b in range(plan.resamples)
     ]
-    return [*cells, Cell("cma", "point"), Cell("cma", "point", optimizer="cma")]
 
 
-def run_cell(cell: Cell, plan: Plan, logs: Path) -> dict[str, Any]:
+def _path(out: Path, cell: Cell) -> Path:
+    return out / "cells" / f"{cell.name}.json"
+
+
+def _run_cells(cells: Sequence[Cell], plan: Plan, out: Path, workers: int) -> Iterator[Cell]:
+    """Run cells and write their files; yield each when it is done."""
+    if workers == 1:
+        for cell in cells:
+            _write_cell(cell, plan, out, threads=0)
+            yield cell
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
+        running = {pool.submit(_write_cell, cell, plan, out, threads=1): cell for cell in cells}
+        try:
+            for done in as_completed(running):
+                done.result()
+                yield running[done]
+        finally:
+            pool.shutdown(cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """Compute on one thread, and end when the process that began this one is gone, however that ended."""
+    torch.set_num_threads(1)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        wait([parent.sentinel])
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+def _write_cell(cell: Cell, plan: Plan, out: Path, *, threads: int) -> None:
+    found = run_cell(cell, plan, out / "logs", threads=threads)
+    write_atomically(_path(out, cell), json.dumps(found, indent=1).encode() + b"\n")
+
+
+def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[str, Any]:
     """Record the cell's log, fit it, and return what was found beside what is true."""
     sized = plan
+    if cell.block == "noise":
+        sized = replace(plan, steps=plan.noise_steps)
     if cell.block == "cma":
         sized = replace(plan, steps=plan.cma_steps, samples=plan.cma_samples)
     if cell.size is not None:
@@ -212,6 +262,7 @@ def run_cell(cell: Cell, plan: Plan, logs: Path) -> dict[str, Any]:
                     **({"optimizer": "cma", "budget": plan.cma_budget} if cell.optimizer == "cma" else {}),
                     "samples": sized.samples,
                     "seed": cell.seed,
+                    "threads": threads,
                     "epsilon": cell.epsilon,
                     **({"noise": NOISE_VARIANCE**0.5} if cell.knows_noise else {}),
                 }
