@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import wait
@@ -25,7 +25,7 @@ from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.errors import InputError
 from dropo_torch.fit import write_atomically
-from dropo_torch.problem import make_problem
+from dropo_torch.problem import Problem, make_problem
 from sims.hopper import SIM
 from sims.hopper.record import HopperLog, record
 from sims.hopper.study_tables import write_results
@@ -249,36 +249,40 @@ def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[st
         "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
     }
     parameters = {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED}
+    document = {
+        "sim": "hopper",
+        "data": str(path.resolve()),
+        "parameters": parameters,
+        "method": cell.method,
+        "method_options": options.get(cell.method, {}),
+        **({"optimizer": "cma", "budget": plan.cma_budget} if cell.optimizer == "cma" else {}),
+        "samples": sized.samples,
+        "seed": cell.seed,
+        "threads": threads,
+        "epsilon": cell.epsilon,
+        **({"noise": NOISE_VARIANCE**0.5} if cell.knows_noise else {}),
+    }
+    problem = make_problem(make_config(document))
     begun = time.monotonic()
-    fit = fit_problem(
-        make_problem(
-            make_config(
-                {
-                    "sim": "hopper",
-                    "data": str(path.resolve()),
-                    "parameters": parameters,
-                    "method": cell.method,
-                    "method_options": options.get(cell.method, {}),
-                    **({"optimizer": "cma", "budget": plan.cma_budget} if cell.optimizer == "cma" else {}),
-                    "samples": sized.samples,
-                    "seed": cell.seed,
-                    "threads": threads,
-                    "epsilon": cell.epsilon,
-                    **({"noise": NOISE_VARIANCE**0.5} if cell.knows_noise else {}),
-                }
-            )
-        )
-    )
+    fit = fit_problem(problem)
+    seconds = time.monotonic() - begun
     path.unlink()
-    document = fit.document()
     realised = {f"{link}_mass": log.masses[:, i] for i, link in enumerate(("torso", "thigh", "leg", "foot"))}
     return {
         "cell": asdict(cell),
         "truth": {n: {"mean": float(m.mean()), "std": float(m.std())} for n, m in realised.items()},
+        "mse_at_truth": mse_at(problem, {n: float(m.mean()) for n, m in realised.items()}),
         "transitions": len(log.actions),
-        "wall_seconds": round(time.monotonic() - begun, 3),
-        "fit": document,
+        "wall_seconds": round(seconds, 3),
+        "fit": fit.document(),
     }
+
+
+def mse_at(problem: Problem, values: Mapping[str, float]) -> float:
+    """Return the mean squared error of the log's predicted ends at values of the parameters."""
+    row = [values[name] for name in problem.simulator.parameters.names]
+    two = torch.tensor([[row, row]], dtype=torch.float64)  # a likelihood needs two samples; both are the same
+    return problem.objective.evaluate_values(two)[0].mse
 
 
 def _log(cell: Cell, plan: Plan) -> HopperLog:
