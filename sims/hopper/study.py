@@ -16,7 +16,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import asdict, dataclass, replace
 from multiprocessing.connection import wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -56,6 +56,7 @@ class Plan:
         sizes: numbers of transitions whose estimates are compared.
         resamples: bootstrap samples of each size.
         cma_steps, cma_budget, cma_samples: length of the log's episodes, evaluations and K of the CMA-ES run.
+        backend: of all fits. The logs are MuJoCo's own.
     """
 
     seeds: int = 3
@@ -67,19 +68,20 @@ class Plan:
     horizon: int = 50
     epsilons: tuple[float, ...] = tuple(10.0**k for k in range(-9, 0))
     noise_variances: tuple[float, ...] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
-    noise_steps: int = 150
+    noise_steps: int = 100
     sizes: tuple[int, ...] = (10, 30, 100, 300, 1000, 3000)
     resamples: int = 9
     cma_steps: int = 50
     cma_budget: int = 800
     cma_samples: int = 50
+    backend: Literal["mujoco", "warp"] = "warp"
 
 
 #: Minutes instead of hours: short logs, one seed, coarse sweeps.
 REDUCED = Plan(
     seeds=1, steps=60, samples=40, droid_budget=400, simulations=200, horizon=20,
     epsilons=(1e-8, 1e-6, 1e-4, 1e-2), noise_variances=(1e-5, 1e-4), noise_steps=60, sizes=(10, 30, 100), resamples=4,
-    cma_steps=20, cma_budget=60, cma_samples=10,
+    cma_steps=20, cma_budget=60, cma_samples=10, backend="mujoco",
 )  # fmt: skip
 
 
@@ -252,6 +254,7 @@ def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[st
     document = {
         "sim": "hopper",
         "data": str(path.resolve()),
+        "backend": plan.backend,
         "parameters": parameters,
         "method": cell.method,
         "method_options": options.get(cell.method, {}),
