@@ -21,7 +21,7 @@ class Collector:
     """Steps a batch of environments, and goes on where it stopped.
 
     Args:
-        env: N environments that reset on their own time limits and terminations.
+        env: N environments that reset on their own time limits and terminations, and give finite numbers only.
         to_action: maps actions in [-1, 1] to the environment's units.
     """
 
@@ -33,15 +33,13 @@ class Collector:
         self.returns: deque[float] = deque(maxlen=WINDOW)
         self.lengths: deque[int] = deque(maxlen=WINDOW)
         self.episodes = 0
-        self.repaired = 0
 
     @torch.no_grad()
     def collect(self, act: Act, horizon: int) -> TensorDict:
         """Return ``horizon`` steps of every environment, batch ``(N, horizon)``.
 
         Entries: observation, parameters, action (in [-1, 1]), what ``act`` adds, and below next: observation, reward,
-        done and terminated. Every number is finite: a step that is not ends its episode with reward 0, and is counted
-        in ``repaired``.
+        done and terminated.
         """
         rows = []
         now = self._env.reset() if self._now is None else self._now
@@ -58,20 +56,12 @@ class Collector:
         self, observation: torch.Tensor, parameters: torch.Tensor, unit: torch.Tensor,
         extra: Mapping[str, torch.Tensor], after: TensorDictBase,
     ) -> TensorDict:  # fmt: skip
-        reward, following = after.get("reward"), after.get("observation")
-        done, terminated = after.get("done"), after.get("terminated")
-        sound = torch.isfinite(reward) & torch.isfinite(following).all(-1, keepdim=True)
-        if not bool(sound.all()):
-            self.repaired += int((~sound).sum())
-            reward = torch.where(sound, reward, 0.0)
-            following = torch.where(sound, following, observation)
-            done, terminated = done | ~sound, terminated | ~sound
-        self._count(reward[:, 0], done[:, 0])
+        self._count(after.get("reward")[:, 0], after.get("done")[:, 0])
         return TensorDict._new_unsafe(
             {
                 "observation": observation, "parameters": parameters, "action": unit, **extra,
                 "next": TensorDict._new_unsafe(
-                    {"observation": following, "reward": reward, "done": done, "terminated": terminated},
+                    {key: after.get(key) for key in ("observation", "reward", "done", "terminated")},
                     batch_size=unit.shape[:1],
                 ),
             },
@@ -101,7 +91,6 @@ class Collector:
             "returns": list(self.returns),
             "lengths": list(self.lengths),
             "episodes": self.episodes,
-            "repaired": self.repaired,
             "env": self._env.state_dict(),
         }
 
@@ -113,7 +102,7 @@ class Collector:
             self._now = TensorDict(state["now"], batch_size=self._env.batch_size, device=self._env.device)
         self._return, self._length = state["return"].clone(), state["length"].clone()
         self.returns, self.lengths = deque(state["returns"], WINDOW), deque(state["lengths"], WINDOW)
-        self.episodes, self.repaired = state["episodes"], state["repaired"]
+        self.episodes = state["episodes"]
 
 
 def _parameters(now: TensorDictBase) -> torch.Tensor:

@@ -246,7 +246,7 @@ class _Run:
             policy=self.policy, algorithm=problem.algorithm, history=tuple(self.history),
             evaluations=tuple(self.evaluations), training=training, nominal=nominal, target=target, steps=self.steps,
             episodes=self.collector.episodes, diverged=int(self.env.num_diverged),
-            repaired=self.collector.repaired + int(self.env.num_repaired),
+            repaired=int(self.env.num_repaired),
             skipped=self.learner.skipped, seconds=self._seconds(), simulating=self.simulating, learning=self.learning,
             seed=problem.config.seed, stop_reason="all steps are done",
         )  # fmt: skip
