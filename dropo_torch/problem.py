@@ -32,6 +32,8 @@ from dropo_torch.usercode import load_callable, user_code
 
 #: Relative difference between the log's time step and the simulator's that is still called equal.
 TIME_TOLERANCE = 1e-3
+#: Seconds between rows beyond which stamps are rather in another unit.
+SLOWEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -295,6 +297,11 @@ def _frame_skip(
             f"config: no frame_skip given, and the log has no time stamps; the model's step is {step:g} s, "
             "so a log sampled every x seconds needs frame_skip: x / step"
         )
+    if trajectories.dt > SLOWEST:
+        raise InputError(
+            f"data: sampled every {trajectories.dt:g} s by its time stamps; are they in seconds? Milliseconds are "
+            "data: {time: {signal: NAME, scale: 1e-3}}. If they are, say frame_skip"
+        )
     ratio = trajectories.dt / step
     if round(ratio) < 1 or abs(ratio - round(ratio)) > TIME_TOLERANCE * ratio:
         raise InputError(
@@ -317,6 +324,8 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
     step = ours / frame_skip
     right = theirs / step
     hint = f"expected frame_skip {round(right)}" if abs(right - round(right)) < 0.01 * right else "resample the log"
+    if theirs > SLOWEST:
+        hint = "if its time stamps are not in seconds, data: {time: {signal: NAME, scale: 1e-3}}; otherwise " + hint
     raise InputError(
         f"frame_skip: {frame_skip} steps of {step:g} s make {ours:g} s, "
         f"but the log is sampled every {theirs:g} s; {hint}"

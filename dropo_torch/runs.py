@@ -250,7 +250,7 @@ def run_gap(config: Config, out: Path, *, console: Console, source: Path | None 
     name = config.sim or config.model or "model"
     write_gap_report(
         out / "report.html", gap, config=config.document(), versions=versions(), title=f"What {name} lacks",
-        model_note=" ".join(notes),
+        model_note=" ".join(notes), has_config=written.exists(),
     )  # fmt: skip
     _show_gap(gap, out, console)
     return gap

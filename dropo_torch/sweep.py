@@ -89,7 +89,7 @@ def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, st
 
 
 def default_epsilons(measured: np.ndarray) -> list[float]:
-    """Return ten decades of ε, up to the order of a tenth of the measured columns' variance ``(T, m)``."""
+    """Return nine values of ε, a decade apart, up to about a tenth of the measured columns' variance ``(T, m)``."""
     top = math.ceil(math.log10(max(float(np.mean(np.var(measured, axis=0))), 1e-12))) - 1
     return [10.0**k for k in range(top - 8, top + 1)]
 

@@ -682,6 +682,14 @@ def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
     return attempt
 
 
+def test_noise_of_columns_is_that_of_features() -> None:
+    """Of a quaternion's four columns, which stand between others, to three rotations and back."""
+    chart = Chart(plain=(0, 5), quaternions=((1, 2, 3, 4),), labels=("a", "b", "x", "y", "z"), units=("",) * 5)
+    columns = np.array([0.1, 0.02, 0.02, 0.02, 0.02, 0.3])
+    assert chart.feature_noise(columns) == pytest.approx([0.1, 0.3, 0.04, 0.04, 0.04])
+    assert chart.column_noise(chart.feature_noise(columns)) == pytest.approx(columns)
+
+
 def test_command_writes_its_files(cart: Path) -> None:
     assert {p.name for p in (cart / "out").iterdir()} == FILES
     assert "hinge" in (cart / "out" / "report.html").read_text()
@@ -694,6 +702,9 @@ def test_model_has_the_effect(cart: Path) -> None:
 
 
 def test_config_is_one_that_a_fit_accepts(cart: Path, tmp_path: Path) -> None:
+    noise = yaml.safe_load((cart / "out" / "config.yaml").read_text())["noise"]
+    estimated = json.loads((cart / "out" / "gap.json").read_text())["noise"]
+    assert noise == pytest.approx(list(estimated.values()), rel=1e-2)
     assert run("fit", cart / "out" / "config.yaml", "--out", tmp_path / "fit", "--samples", 20) == 0
     fitted = json.loads((tmp_path / "fit" / "fit.json").read_text())["parameters"]
     means = {name: entry["mean"] for name, entry in fitted.items()}

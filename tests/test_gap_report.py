@@ -190,7 +190,7 @@ def test_single(tmp_path: Path) -> None:
         "Hold shoulder still",
         "The model with the effect is in the file model.xml.",
         "0.3412",
-        f"dropo fit {tmp_path.name}/config.yaml",
+        f"dropo fit {tmp_path.name}/config.yaml --out DIR",
         "1,843,220",
         "4.0.1",
         "data: log.h5",
@@ -372,7 +372,8 @@ def test_when(when: str, text: str) -> None:
 def test_the_command_to_go_on_names_the_folder_as_given(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     Path("runs/arm").mkdir(parents=True)
-    assert "dropo fit runs/arm/config.yaml" in page(Path("runs/arm"), single())
+    assert "dropo fit runs/arm/config.yaml --out DIR" in page(Path("runs/arm"), single())
+    assert "config.yaml" not in page(Path("runs/arm"), single(), has_config=False)
 
 
 def test_running_median_follows_a_step() -> None:

@@ -57,6 +57,18 @@ def test_time_stamps_that_are_no_multiple_of_the_models_step_are_refused(
         problem(data=data)
 
 
+def test_time_stamps_in_milliseconds_are_asked_about_not_believed(
+    folder: Folder, problem: Callable[..., Problem]
+) -> None:
+    data = table(folder, "milliseconds.csv", step=1000 * DT)
+    with pytest.raises(InputError, match=r"are they in seconds.*scale: 1e-3"):
+        problem(data=data, frame_skip=...)
+    with pytest.raises(InputError, match=r"not in seconds.*scale: 1e-3"):
+        problem(data=data, frame_skip=2)
+    right = {**data, "time": {"signal": data["time"], "scale": 1e-3}}
+    assert problem(data=right, frame_skip=...).simulator.frame_skip == 2
+
+
 def test_preprocessing_resamples_to_the_simulators_step(folder: Folder, problem: Callable[..., Problem]) -> None:
     data = {**table(folder, "fast.csv", step=0.0154), "observations": COLUMNS[:2], "preprocess": {}}
     found = problem(data=data)

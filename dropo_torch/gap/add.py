@@ -4,11 +4,13 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.export import write_config, write_model
 from dropo_torch.errors import InputError
-from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.log import Chart, make_setting
 from dropo_torch.gap.result import FAMILY, Gap
 from dropo_torch.problem import Problem
 
@@ -41,7 +43,8 @@ def intervals(gap: Gap, setting: Setting) -> dict[tuple[str, str | None], dict[s
 def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     """Write ``model.xml`` with the effects that MJCF can express, and ``config.yaml`` that uses all of them.
 
-    The declared parameters stand in ``model.xml`` with the values that were fitted beside the effects.
+    The declared parameters stand in ``model.xml`` with the values that were fitted beside the effects. Where the config
+    had no noise, the one that is written has the estimate.
 
     Args:
         problem: the problem that was searched.
@@ -66,6 +69,9 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     except InputError as error:
         notes.append(f"No model.xml was written: {error}.")
     setting = make_setting(problem, problem.trajectories)
-    known = intervals(gap, setting)
-    write_config(problem.config, problem.space, setting, placed, known, model, folder / "config.yaml")
+    config = problem.config
+    if config.noise is None:
+        columns = Chart.of(problem.observation).column_noise(np.array(gap.noise))
+        config = config.model_copy(update={"noise": [float(f"{v:.3g}") for v in columns]})
+    write_config(config, problem.space, setting, placed, intervals(gap, setting), model, folder / "config.yaml")
     return notes

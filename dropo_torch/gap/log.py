@@ -54,6 +54,19 @@ class Chart:
         """Number of features m."""
         return len(self.plain) + 3 * len(self.quaternions)
 
+    def feature_noise(self, columns: np.ndarray) -> np.ndarray:
+        """Return deviations of the features ``(m,)`` from those of columns ``(n,)``; a quaternion's ν turns by 2ν."""
+        turned = [np.repeat(2 * columns[list(q)].mean(), 3) for q in self.quaternions]
+        return np.concatenate([columns[list(self.plain)], *turned])
+
+    def column_noise(self, features: np.ndarray) -> np.ndarray:
+        """Return deviations of the columns ``(n,)`` that give those of the features ``(m,)``; one to a quaternion."""
+        columns = np.empty(len(self.plain) + 4 * len(self.quaternions))
+        columns[list(self.plain)] = features[: len(self.plain)]
+        for q, turned in zip(self.quaternions, features[len(self.plain) :].reshape(-1, 3), strict=True):
+            columns[list(q)] = 0.5 * np.sqrt(np.mean(turned**2))
+        return columns
+
     def difference(self, measured: np.ndarray, simulated: np.ndarray) -> np.ndarray:
         """Return measured minus simulated, ``(..., m)``, of columns ``(..., n)``."""
         parts = [(measured - simulated)[..., list(self.plain)]]

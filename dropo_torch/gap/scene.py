@@ -93,12 +93,8 @@ def _check_observed(problem: Problem) -> None:
 
 def _noise(problem: Problem, twin: Twin, train: Trajectories, begin: Hypothesis) -> np.ndarray:
     """The noise of each feature, as given or estimated."""
-    chart = Chart.of(problem.observation)
     if problem.objective.noise is not None:
-        given = problem.objective.noise.numpy()
-        plain = given[list(chart.plain)]
-        turned = [np.repeat(2 * given[list(q)].mean(), 3) for q in chart.quaternions]
-        return np.concatenate([plain, *turned])
+        return Chart.of(problem.observation).feature_noise(problem.objective.noise.numpy())
     return free_forces(twin, short_windows(problem, train), begin.variant).noise
 
 

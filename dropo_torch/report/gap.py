@@ -34,6 +34,7 @@ def write_gap_report(
     versions: Mapping[str, str] | None,
     title: str,
     model_note: str = "",
+    has_config: bool = True,
 ) -> None:
     """Write the report of a search for a gap as one self-contained file, whole or not at all.
 
@@ -44,6 +45,7 @@ def write_gap_report(
         versions: name → version of what the result depends on.
         title: of the page.
         model_note: what was written besides, such as a model that has the effects; a sentence.
+        has_config: whether a config with the effects stands beside the report.
     """
     named = [e for e in gap.effects if gap_words.is_named(e)]
     headline, items = gap_words.answer(gap)
@@ -56,6 +58,7 @@ def write_gap_report(
         "named": len(named),
         "partly": bool(named) and len(named) < len(gap.effects),
         "known": len(VOCABULARY),
+        "has_config": has_config,
         "tied": _tied(named),
         "model_note": model_note,
         "next_experiment": gap.next_experiment or "",

@@ -4,7 +4,7 @@
 
 Names the missing effects from the first three quarters of the measured log, and compares their strengths and the
 open-loop prediction of the unseen quarter with the published reference model (see emps.py). The report of the same
-search is made by `dropo gap examples/emps/gap.yaml --data.path path/to/DATA_EMPS.mat --out out/emps`.
+search is made by `dropo gap examples/emps/gap.yaml --data.path /path/to/DATA_EMPS.mat --out out/emps`.
 """
 
 from __future__ import annotations
