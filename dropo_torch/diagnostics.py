@@ -34,6 +34,7 @@ class Diagnostics:
         correlation: of the estimates of the means, ``(d, d)``.
         confounded: pairs of parameters that this log cannot tell apart, with their correlation.
         diverged: simulations that diverged.
+        at_rest: joints that every window starts at rest, because the log has their position alone.
     """
 
     labels: tuple[str, ...]
@@ -50,6 +51,7 @@ class Diagnostics:
     correlation: np.ndarray
     confounded: tuple[tuple[str, str, float], ...]
     diverged: int
+    at_rest: tuple[str, ...] = ()
 
     @property
     def residual(self) -> np.ndarray:
@@ -106,6 +108,7 @@ def diagnose(
         correlation=correlation,
         confounded=tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs),
         diverged=lost,
+        at_rest=objective.observation.at_rest,
     )
 
 

@@ -51,6 +51,7 @@ class Observation:
         default_state: the state of what is not observed, ``(nq + nv,)``: the model's ``qpos0`` and zero.
         units: for each observed column ``"m"``, ``"rad"``, ``"m/s"``, ``"rad/s"`` or ``"-"``.
         quaternions: observed columns of each complete quaternion, a tuple of four each.
+        at_rest: joints whose position is observed and whose velocity is not: every window starts with them at rest.
     """
 
     columns: tuple[int, ...]
@@ -60,6 +61,7 @@ class Observation:
     default_state: tuple[float, ...]
     units: tuple[str, ...]
     quaternions: tuple[tuple[int, int, int, int], ...] = ()
+    at_rest: tuple[str, ...] = ()
 
     @property
     def size(self) -> int:
@@ -127,7 +129,8 @@ def parse_observation(
         described = "[qpos, qvel]" if entries is None else str(list(entries)).replace("'", "")
         raise InputError(
             f"observation: {described} has {width} columns and the log has {log_width}; "
-            f"list what each of the log's columns is (the model has nq={model.nq}, nv={model.nv}), 'skip' for none"
+            f"list what each of the log's columns is (the model has nq={model.nq}, nv={model.nv}), 'skip' for none; "
+            "velocities that it lacks are derived by data: preprocess"
         )
     default = np.concatenate([model.qpos0, np.zeros(model.nv)])
     return Observation(
@@ -138,6 +141,7 @@ def parse_observation(
         default_state=tuple(default.tolist()),
         units=tuple(units[c] for c in columns),
         quaternions=_complete_quaternions(model, columns),
+        at_rest=_at_rest(model, set(columns)),
     )
 
 
@@ -220,6 +224,17 @@ def _joint_columns(model: mujoco.MjModel, name: str, position: bool, entry: str)
     else:
         start, width = model.nq + int(model.jnt_dofadr[j]), _DOF_WIDTH[kind]
     return list(range(start, start + width))
+
+
+def _at_rest(model: mujoco.MjModel, columns: set[int]) -> tuple[str, ...]:
+    """Joints of which a position is observed, and not every velocity."""
+    found = []
+    for joint in range(model.njnt):
+        nq, nv = {0: (7, 6), 1: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
+        first, begin = int(model.jnt_qposadr[joint]), model.nq + int(model.jnt_dofadr[joint])
+        if columns.intersection(range(first, first + nq)) and not columns.issuperset(range(begin, begin + nv)):
+            found.append(joint_name(model, joint))
+    return tuple(found)
 
 
 def _complete_quaternions(model: mujoco.MjModel, columns: list[int]) -> tuple[tuple[int, int, int, int], ...]:

@@ -152,3 +152,12 @@ def test_the_default_state_is_a_state_of_the_model():
     observation = parse_observation(BOX, ["hang.position"])
     data = mujoco.MjData(BOX)
     np.testing.assert_array_equal(observation.default_state, np.concatenate([data.qpos, data.qvel]))
+
+
+def test_joints_whose_velocity_is_not_observed_start_at_rest() -> None:
+    assert parse_observation(ARM, None).at_rest == ()
+    assert parse_observation(ARM, ["qvel"]).at_rest == ()
+    first, *_, last = [ARM.joint(i).name for i in range(ARM.njnt)]
+    assert parse_observation(ARM, ["qpos", f"{last}.velocity"]).at_rest[0] == first
+    assert last not in parse_observation(ARM, ["qpos", f"{last}.velocity"]).at_rest
+    assert parse_observation(BOX, ["root.position", "qvel[0:5]"]).at_rest == ("root",)

@@ -131,6 +131,7 @@ def test_fit_warnings(fit: Fit, expected: list[str]) -> None:
     [
         ({"confounded": (("torso", "foot", -0.99),)}, ["torso and foot (−0.99)"]),
         ({"diverged": 1}, ["1 simulation diverged"]),
+        ({"at_rest": ("elbow",)}, ["Velocities that the log lacks", "elbow"]),
         ({"standard_error": np.array([0.01, 0.01, 9.0])}, ["The log says little about some means"]),
         ({"expected": np.full((50, 2), 0.002)}, ["does not explain the log in 2 of 2 columns"]),
         ({"expected": np.full((50, 2), 1.0)}, ["Columns that hardly count", "with room to spare"]),

@@ -14,7 +14,6 @@ from dropo_torch.gap.log import Chart, cut_windows, make_setting, start_values
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.verify import hold_out, spread
-from dropo_torch.observation import joint_name
 from dropo_torch.problem import Problem
 from dropo_torch.trajectory import Trajectories
 
@@ -77,18 +76,11 @@ def prepare(problem: Problem) -> Scene:
 
 def _check_observed(problem: Problem) -> None:
     """A window needs its start: where a position is observed, its velocity must be, too."""
-    model, columns = problem.space.model, set(problem.observation.columns)
-    assert model is not None
-    for joint in range(model.njnt):
-        width = {0: (7, 6), 1: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
-        positions = range(int(model.jnt_qposadr[joint]), int(model.jnt_qposadr[joint]) + width[0])
-        velocities = range(int(model.jnt_dofadr[joint]), int(model.jnt_dofadr[joint]) + width[1])
-        missing = [v for v in velocities if model.nq + v not in columns]
-        if columns.intersection(positions) and missing:
-            raise InputError(
-                f"gap: the velocity of {joint_name(model, joint)} is not observed; derive velocities from positions "
-                "(data: preprocess), and name them in observation"
-            )
+    for joint in problem.observation.at_rest:
+        raise InputError(
+            f"gap: the velocity of {joint} is not observed; derive velocities from positions "
+            "(data: preprocess), and name them in observation"
+        )
 
 
 def _noise(problem: Problem, twin: Twin, train: Trajectories, begin: Hypothesis) -> np.ndarray:

@@ -51,6 +51,7 @@ class Finding:
 def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
     """Return what needs attention first, then what is good to know."""
     found = [
+        *_unobserved(diagnostics),
         *_at_bounds(fit.distribution),
         *(_deviations(fit.distribution) if fit.method == "dropo" else _of_method(fit)),
         *_residuals(diagnostics),
@@ -59,6 +60,19 @@ def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
         *_failures(fit, diagnostics),
     ]
     return sorted(found, key=lambda finding: finding.level != "attention")
+
+
+def _unobserved(diagnostics: Diagnostics) -> list[Finding]:
+    if not diagnostics.at_rest:
+        return []
+    return [
+        Finding(
+            "attention",
+            "Velocities that the log lacks",
+            f"{joined(diagnostics.at_rest)}: every simulated window starts with them at rest, which the robot was not. "
+            "Let data: preprocess derive velocities from the positions, and name them in observation.",
+        )
+    ]
 
 
 def headline(fit: Fit, diagnostics: Diagnostics) -> str:
