@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, ZERO, f64, mat33, vec2, vec3
+from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, PARALLEL, ZERO, f64, mat33, vec2, vec3
 
 #: distance, point, normal
 vec7: Any = wp.types.vector(7, wp.float64)
@@ -110,7 +110,7 @@ def _clip(x: f64) -> f64:
 def closest(c1: vec3, a1: vec3, c2: vec3, a2: vec3, which: int) -> vec2:
     """Places in [−1, 1] along two half-axes a1, a2 where two capsules touch; a sphere has a zero half-axis.
 
-    Parallel capsules have up to two contacts: ``which`` 1 to 4 fixes one end of one of them.
+    Parallel capsules have two contacts: ``which`` 1 to 4 fixes one end of one of them (:func:`overlap_end`).
     """
     ma = wp.dot(a1, a1)
     mc = wp.dot(a2, a2)
@@ -155,6 +155,35 @@ def closest(c1: vec3, a1: vec3, c2: vec3, a2: vec3, which: int) -> vec2:
     elif ma > ZERO:
         x1 = _clip(u / ma)
     return vec2(x1, x2)
+
+
+@wp.func
+def are_parallel(a1: vec3, a2: vec3) -> bool:
+    """Whether two capsules are parallel to MuJoCo's tolerance, an angle; a sphere is parallel to nothing."""
+    ma = wp.dot(a1, a1)
+    mc = wp.dot(a2, a2)
+    mb = wp.dot(a1, a2)
+    return ma > ZERO and mc > ZERO and ma * mc - mb * mb < PARALLEL * (ma * mc)
+
+
+@wp.func
+def overlap_end(c1: vec3, a1: vec3, c2: vec3, a2: vec3, upper: int) -> int:
+    """Which end of parallel capsules bounds their overlap, as :func:`closest` numbers it.
+
+    Along a1, the lower (``upper`` 0) or the upper end; beyond the second capsule both are the end that is nearest.
+    """
+    sign = f64(2 * upper - 1)
+    mb = -wp.dot(a1, a2)
+    far = sign
+    if mb > ZERO:
+        far = -sign
+    x1 = (-wp.dot(a1, c1 - c2) - far * mb) / wp.dot(a1, a1)
+    which = int(wp.where(far > ZERO, 3, 4))
+    if x1 > ONE:
+        which = 1
+    elif x1 < -ONE:
+        which = 2
+    return which
 
 
 @wp.func

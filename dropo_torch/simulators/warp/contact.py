@@ -17,6 +17,7 @@ from dropo_torch.simulators.warp.collide import (
     PLANE_SPHERE,
     ROUND,
     SPHERE_BOX,
+    are_parallel,
     box_closest,
     capsule_box_codes,
     capsule_box_contact,
@@ -24,6 +25,7 @@ from dropo_torch.simulators.warp.collide import (
     corner,
     cylinder_point,
     ellipsoid_point,
+    overlap_end,
     plane_point,
     round_contact,
     vec7,
@@ -94,11 +96,11 @@ def pair_count(m: Tables, k: int, parallel: bool) -> int:
     """How many points of a pair may touch."""
     kind = m.pair_kind[k]
     n = int(wp.where(kind == CAPSULE_BOX, 2, 1))
-    if kind == PLANE_CAPSULE:
+    if kind == PLANE_CAPSULE or (kind == ROUND and parallel):
         n = 2
     elif kind == PLANE_BOX:
         n = 8
-    elif kind == PLANE_CYLINDER or (kind == ROUND and parallel):
+    elif kind == PLANE_CYLINDER:
         n = 4
     return n
 
@@ -174,22 +176,12 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                 else:
                     which = int(0)
                     if parallel:
-                        which = i + 1
-                        possible = n - start < 2
+                        which = overlap_end(c1, a1, c2, a2, i)
                     x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
                 if possible and x[0] < margin:
                     _add(s, t, n, k, which, x, hint)
                     n += 1
     return n
-
-
-@wp.func
-def are_parallel(a1: vec3, a2: vec3) -> bool:
-    """Whether two capsules are parallel to MuJoCo's tolerance; a sphere is parallel to nothing."""
-    ma = wp.dot(a1, a1)
-    mc = wp.dot(a2, a2)
-    mb = wp.dot(a1, a2)
-    return ma > ZERO and mc > ZERO and wp.abs(ma * mc - mb * mb) < MINVAL
 
 
 @wp.func(inline=True)
