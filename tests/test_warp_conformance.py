@@ -352,6 +352,13 @@ def scene(bodies: str, **changes: str) -> str:
 BOX = free("box", "0 0 .11", 'type="box" size=".15 .1 .1"')
 CYLINDER = free("cylinder", "0 0 .13", 'type="cylinder" size=".1 .12"', "0.9 0.2 0 0.1")
 ELLIPSOID = free("ellipsoid", "0 0 .1", 'type="ellipsoid" size=".15 .1 .08"', "0.9 0.2 0.1 0.1")
+#: Lengthwise on each other and free in all that keeps them parallel.
+PARALLEL = "".join(
+    f'''<body name="{name}" pos="{pos}"><joint type="slide" axis="1 0 0"/><joint type="slide" axis="0 1 0"/>
+    <joint type="slide" axis="0 0 1"/><joint type="hinge" axis="1 0 0"/>
+    <geom name="g{name}" type="capsule" size="{size}" euler="0 90 0" friction=".6 .01 .01"/></body>'''
+    for name, pos, size in (("one", "0 0 .1", ".1 .15"), ("two", ".05 .02 .27", ".08 .1"))
+)
 CAPSULES = free("one", "0 0 .1", 'type="capsule" size=".1 .15"', "0.7 0.7 0 0.1") + free(
     "two", "0.05 0 .28", 'type="capsule" size=".08 .1"', "0.7 0 0.7 0.2"
 )
@@ -384,6 +391,14 @@ CONTACTS = [
     Case("cylinder", scene(CYLINDER), contact_parameters("cylinder"), length=40),
     Case("ellipsoid", scene(ELLIPSOID), contact_parameters("ellipsoid"), length=40),
     Case("capsules", scene(CAPSULES), contact_parameters("one"), length=40),
+    Case(
+        "capsules, parallel",
+        scene(PARALLEL),
+        contact_parameters("one"),
+        length=40,
+        push=0.3,
+        idle=("inertia", "solref", "margin", "friction"),
+    ),
     Case("capsules, elliptic", scene(CAPSULES, cone="elliptic"), contact_parameters("two"), length=40, states=1e-8),
     Case("sphere pushes box", scene(PUSH, slope="0"), contact_parameters("box"), length=40),
     Case(
