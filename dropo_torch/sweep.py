@@ -58,6 +58,8 @@ class Sweep:
 def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, str]:
     """Return the ε beyond which the error no longer falls, and the reason in words.
 
+    Errors at a smaller ε that are as small by chance, with larger ones between, do not count.
+
     Args:
         epsilons: rising values.
         errors: mean squared errors of the fits at them; one that is not finite never counts as small.
@@ -70,7 +72,9 @@ def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, st
     if math.isinf(best):
         raise InputError("epsilons: no fit at any of them predicts the log; see what `dropo fit` says about it")
     slack = TOLERANCE * best + 0.01 * min(epsilons)
-    first = next(i for i, error in enumerate(errors) if error <= best + slack)
+    first = errors.index(best)
+    while first > 0 and errors[first - 1] <= best + slack:
+        first -= 1
     chosen = epsilons[first]
     if first == 0:
         return chosen, (

@@ -28,6 +28,7 @@ EPSILONS = [1e-8, 1e-7, 1e-6, 1e-5, 1e-4]
         ([9, 5, 2, 3, 4], 1e-6, "no larger value lowers it"),  # too much ε worsens the fit again
         ([float("nan"), 5, 2, 2, float("inf")], 1e-6, "no larger value lowers it"),
         ([0, 0, 0, 0, 0], 1e-8, "or less"),
+        ([9, 2.09, 3, 2, 2], 1e-5, "no larger value lowers it"),  # as small by chance, where σ covers the noise
     ],
 )
 def test_the_elbow_is_where_the_error_stops_falling(errors: list[float], chosen: float, words: str) -> None:
