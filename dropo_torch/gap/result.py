@@ -171,7 +171,6 @@ class Gap:
                 }
                 for name, s in (("before", self.before), ("after", self.after), ("noise_floor", self.noise_floor))
             },
-            "rollout_seconds": self.rollout_seconds,
             "next_experiment": self.next_experiment,
             "declared": {
                 n: {"given": a, "alone": b, "with_effects": c} for n, (a, b, c) in self.declared.items()
