@@ -1,6 +1,6 @@
 """Does a policy that is trained over a fitted distribution work where the model is wrong?
 
-    python examples/transfer_hopper.py --out out/transfer --seeds 3
+    python examples/transfer_hopper.py --out out/transfer --seeds 3 --workers 2
 
 The paper's unmodeled Hopper: the model's torso is 1 kg too heavy, and its mass is not among the parameters. The masses
 of thigh, leg and foot are fitted to a log of the target. Then policies are trained over
@@ -11,12 +11,15 @@ of thigh, leg and foot are fitted to a log of the target. Then policies are trai
 ``true``     the target's own masses, which nobody knows in practice,
 
 and each is evaluated in the target. Every seed has a log, a fit and policies of its own. What is finished is kept in
-``--out``: the same command goes on where it was interrupted. ``--steps`` makes it small.
+``--out``: the same command goes on where it was interrupted. ``--steps`` makes it small. Numbers do not depend on
+``--workers``.
 """
 
 from __future__ import annotations
 
 import argparse
+import functools
+import itertools
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -28,8 +31,9 @@ import scipy.stats
 
 import dropo_torch as dropo
 from dropo_torch.fit import write_atomically
+from dropo_torch.parallel import in_parallel
 from dropo_torch.rl.problem import make_training
-from dropo_torch.rl.train import train
+from dropo_torch.rl.train import Progress, TrainEntry, train
 from sims.hopper import SIM
 from sims.hopper.record import nominal_masses, record
 
@@ -63,7 +67,7 @@ def fit_log(folder: Path, seed: int, given: argparse.Namespace) -> Path:
     return path
 
 
-def training_config(method: str, fit: Path, seed: int, given: argparse.Namespace) -> dropo.Config:
+def training_config(method: str, fit: Path, seed: int, given: argparse.Namespace, threads: int) -> dropo.Config:
     """The config of one training."""
     names = tuple(SIM.parameters) if method == "true" else FITTED
     distribution: str | dict[str, float] = str(fit.resolve())
@@ -76,20 +80,22 @@ def training_config(method: str, fit: Path, seed: int, given: argparse.Namespace
         distribution = dict(zip(found.names, found.center.tolist(), strict=True))
     document: dict[str, Any] = {
         "sim": "hopper", "parameters": {n: dict(SIM.parameters[n]) for n in names}, "distribution": distribution,
-        "target": target_masses(), "algorithm": given.algorithm, "seed": seed, "threads": given.threads,
+        "target": target_masses(), "algorithm": given.algorithm, "seed": seed, "threads": threads,
         "train": {"episodes": given.episodes, **({} if given.steps is None else {"steps": given.steps})},
     }  # fmt: skip
     return dropo.make_config(document, {f"train.{k}": json.loads(v) for k, v in given.train})
 
 
-def run(method: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
-    """Train one policy, or go on with it, or take the result that is there."""
+def run(cell: tuple[int, str], given: argparse.Namespace, threads: int) -> dict[str, Any]:
+    """Train the policy of a seed and a method, or go on with it, or take the result that is there."""
+    seed, method = cell
     folder = given.out / f"{method}-{seed}"
     result = folder / "train.json"
-    fit = fit_log(given.out / f"fit-{seed}", seed, given)
     if not result.exists():
-        problem = make_training(training_config(method, fit, seed, given))
-        found = train(problem, checkpoint=folder / "train-progress.pt", resume=True)
+        fit = given.out / f"fit-{seed}" / "fit.json"
+        problem = make_training(training_config(method, fit, seed, given, threads or given.threads))
+        tell = functools.partial(show_progress, f"{method:<8} seed {seed}")
+        found = train(problem, checkpoint=folder / "train-progress.pt", resume=True, on_progress=tell)
         found.policy.save(folder / "policy.pt")
         write_atomically(result, json.dumps(found.document(), indent=2).encode())
         (folder / "train-progress.pt").unlink()
@@ -99,6 +105,12 @@ def run(method: str, seed: int, given: argparse.Namespace) -> dict[str, Any]:
         "method": method, "seed": seed, "target": evaluation["target"]["mean"],
         "own": evaluation["distribution"]["mean"], "seconds": document["seconds"], "steps": document["steps"],
     }  # fmt: skip
+
+
+def show_progress(name: str, entry: TrainEntry, evaluation: Progress | None) -> None:
+    """Print each evaluation on the way."""
+    if evaluation is not None:
+        print(f"{name}: {entry.steps:,} steps, {evaluation.mean:.1f} in training", flush=True)
 
 
 def same_settings(given: argparse.Namespace) -> bool:
@@ -174,21 +186,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--epsilon", type=float, default=EPSILON, help="of the fit")
     parser.add_argument("--log-steps", type=int, default=500, help="transitions of each of the log's two episodes")
     parser.add_argument("--threads", type=int, default=0, help="of the simulator")
+    parser.add_argument("--workers", type=int, default=1, help="trainings side by side")
     parser.add_argument(
         "--train", nargs=2, action="append", default=[], metavar=("KEY", "VALUE"), help="a setting of the training"
     )
     given = parser.parse_args(arguments)
+    if given.workers < 1:
+        parser.error(f"--workers {given.workers}: expected 1 or more")
     if not same_settings(given):
         parser.error(f"{given.out} holds a study with other settings; name another folder")
-    runs = []
     for seed in range(given.seeds):
-        for method in METHODS:
-            runs.append(run(method, seed, given))
-            print(f"{method:<8} seed {seed}: {runs[-1]['target']:.1f} in the target, {runs[-1]['own']:.1f} in training")
-    found = summary(runs)
-    write_atomically(given.out / "transfer.json", json.dumps(found, indent=2).encode())
-    draw(found, given.out / "transfer.png")
-    show(found)
+        fit_log(given.out / f"fit-{seed}", seed, given)
+    cells = list(itertools.product(range(given.seeds), METHODS))
+    done: dict[tuple[int, str], dict[str, Any]] = {}
+    for (seed, method), found in in_parallel(functools.partial(run, given=given), cells, given.workers):
+        done[seed, method] = found
+        told = f"{found['target']:.1f} in the target, {found['own']:.1f} in training"
+        print(f"{method:<8} seed {seed}: {told}", flush=True)
+    runs = [done[cell] for cell in cells]
+    study = summary(runs)
+    write_atomically(given.out / "transfer.json", json.dumps(study, indent=2).encode())
+    draw(study, given.out / "transfer.png")
+    show(study)
 
 
 if __name__ == "__main__":

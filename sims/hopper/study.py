@@ -6,15 +6,11 @@ recorded here (:mod:`sims.hopper.record`): compare numbers with the paper's in k
 
 from __future__ import annotations
 
+import functools
 import json
-import multiprocessing
-import os
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,6 +21,7 @@ from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.errors import InputError
 from dropo_torch.fit import write_atomically
+from dropo_torch.parallel import in_parallel
 from dropo_torch.problem import Problem, make_problem
 from sims.hopper import SIM
 from sims.hopper.record import HopperLog, record
@@ -156,7 +153,8 @@ def run_study(
     cells = all_cells(plan)
     waiting = [cell for cell in cells if not _path(out, cell).exists()]
     report(f"{len(cells) - len(waiting)} of {len(cells)} fits are done", 1 - len(waiting) / len(cells))
-    for number, cell in enumerate(_run_cells(waiting, plan, out, workers), len(cells) - len(waiting) + 1):
+    work = functools.partial(_write_cell, plan=plan, out=out)
+    for number, (cell, _) in enumerate(in_parallel(work, waiting, workers), len(cells) - len(waiting) + 1):
         report(f"{number} of {len(cells)}: {cell.name}", number / len(cells))
     results = [json.loads(_path(out, cell).read_text()) for cell in cells]
     report("tables and figures", 1.0)
@@ -197,38 +195,7 @@ def _path(out: Path, cell: Cell) -> Path:
     return out / "cells" / f"{cell.name}.json"
 
 
-def _run_cells(cells: Sequence[Cell], plan: Plan, out: Path, workers: int) -> Iterator[Cell]:
-    """Run cells and write their files; yield each when it is done."""
-    if workers == 1:
-        for cell in cells:
-            _write_cell(cell, plan, out, threads=0)
-            yield cell
-        return
-    context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(workers, mp_context=context, initializer=_end_with_parent) as pool:
-        running = {pool.submit(_write_cell, cell, plan, out, threads=1): cell for cell in cells}
-        try:
-            for done in as_completed(running):
-                done.result()
-                yield running[done]
-        finally:
-            pool.shutdown(cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """Compute on one thread, and end when the process that began this one is gone, however that ended."""
-    torch.set_num_threads(1)
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def watch() -> None:
-        wait([parent.sentinel])
-        os._exit(1)
-
-    threading.Thread(target=watch, daemon=True).start()
-
-
-def _write_cell(cell: Cell, plan: Plan, out: Path, *, threads: int) -> None:
+def _write_cell(cell: Cell, *, plan: Plan, out: Path, threads: int) -> None:
     found = run_cell(cell, plan, out / "logs", threads=threads)
     write_atomically(_path(out, cell), json.dumps(found, indent=1).encode() + b"\n")
 
