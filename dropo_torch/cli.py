@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from dropo_torch.claim import claimed
 from dropo_torch.errors import InputError, choices
 
 COMMANDS = ("fit", "gap", "train", "sweep-epsilon", "certify", "compare", "reproduce", "demo")
@@ -66,6 +67,13 @@ def _dispatch(given: list[str]) -> int:
     if parsed.command is None:
         _parser().print_help()
         return 0
+    with claimed(parsed.out):
+        _run(parsed, rest)
+    return 0
+
+
+def _run(parsed: argparse.Namespace, rest: Sequence[str]) -> None:
+    """Run the command that was given; ``rest`` are overrides of its config."""
     from rich.console import Console
 
     from dropo_torch import runs
@@ -80,7 +88,7 @@ def _dispatch(given: list[str]) -> int:
     overrides = parse_overrides(rest)
     if parsed.command == "demo":
         runs.run_demo(parsed.out, console=console, overrides=overrides, resume=parsed.resume)
-        return 0
+        return
     if parsed.command == "reproduce":
         if rest:
             takes = "--out, --resume, --reduced and --workers"
@@ -89,7 +97,7 @@ def _dispatch(given: list[str]) -> int:
         runs.run_reproduce(
             parsed.study, parsed.out, console=console, reduced=parsed.reduced, resume=parsed.resume, workers=workers
         )
-        return 0
+        return
     config = load_config(parsed.config, overrides)
     if parsed.command == "fit":
         runs.run_fit(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
@@ -108,7 +116,6 @@ def _dispatch(given: list[str]) -> int:
     else:
         epsilons = None if parsed.epsilons is None else _numbers(parsed.epsilons)
         runs.run_sweep(config, parsed.out, console=console, epsilons=epsilons, resume=parsed.resume)
-    return 0
 
 
 def _parser() -> argparse.ArgumentParser:

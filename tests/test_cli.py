@@ -298,6 +298,26 @@ def test_a_folder_that_cannot_be_written_gives_one_line(
     assert (tmp_path / "file").read_text() == "mine"
 
 
+def test_two_runs_do_not_share_a_folder(folder: Folder, refused: Callable[..., str], tmp_path: Path) -> None:
+    out = tmp_path / "runs" / "robot"
+    first = start("fit", folder.config(optimizer="cma", budget=1_000_000, samples=100), "--out", out)
+    while not (out / "checkpoint.pkl").exists():
+        assert first.poll() is None
+        time.sleep(0.05)
+    assert f"another run is using {out}" in refused("fit", folder.config(), "--out", out, "--resume")
+    first.kill()
+    first.communicate()
+    assert main(["fit", str(folder.config()), "--out", str(out)]) == 0  # a lock ends with its process
+    assert {p.name for p in out.iterdir()} == RESULTS | {"previous-1"}
+
+
+def test_a_refused_run_leaves_no_empty_folder(refused: Callable[..., str], tmp_path: Path) -> None:
+    (tmp_path / "there").mkdir()
+    for out in ("there/new/one", "there"):
+        refused("fit", tmp_path / "none.yaml", "--out", tmp_path / out)
+    assert [p.name for p in tmp_path.rglob("*")] == ["there"]
+
+
 def test_a_run_touches_nothing_of_the_users_in_its_folder(
     folder: Folder, refused: Callable[..., str], tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
