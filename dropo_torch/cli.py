@@ -115,7 +115,10 @@ def _run(parsed: argparse.Namespace, rest: Sequence[str]) -> None:
         runs.run_compare(config, parsed.out, console=console, methods=methods, seeds=seeds, resume=parsed.resume)
     else:
         epsilons = None if parsed.epsilons is None else _numbers(parsed.epsilons)
-        runs.run_sweep(config, parsed.out, console=console, epsilons=epsilons, resume=parsed.resume)
+        runs.run_sweep(
+            config, parsed.out, console=console, epsilons=epsilons, noisy_starts=parsed.noisy_starts,
+            resume=parsed.resume,
+        )  # fmt: skip
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -133,6 +136,10 @@ def _parser() -> argparse.ArgumentParser:
     train.add_argument("--log", metavar="tensorboard", help="write the learning curves as TensorBoard events, too")
     sweep = _command(commands, "sweep-epsilon", "fit at several ε and choose one by the elbow")
     sweep.add_argument("--epsilons", metavar="1e-6,1e-5,...", help="the values to try")
+    sweep.add_argument(
+        "--noisy-starts", action="store_true",
+        help="take ε for the variance of every measurement, of the starts of transitions, too",
+    )  # fmt: skip
     _command(commands, "certify", "compare the gradients of the warp backend with MuJoCo's own differences")
     comparison = _command(commands, "compare", "fit by several optimizers and backends, side by side")
     comparison.add_argument("--methods", metavar="fisher-warp,...", help="optimizer-backend pairs, all by default")

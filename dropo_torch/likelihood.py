@@ -6,6 +6,7 @@ Beside the paper's Gaussians: what a noisy start state does to them, and how ori
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import torch
 
@@ -15,6 +16,8 @@ DIVERGENCE_PENALTY = 1e3
 LOST_TRANSITION = -1e4
 #: Degrees of freedom of Student's law, by which windows that noise does not explain are widened.
 STUDENT_DOF = 5.0
+#: Log-density ``(...)`` of residuals ``(..., n)`` under covariances ``(..., n, n)``.
+LogDensity = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 def sample_moments(samples: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -38,6 +41,24 @@ def gaussian_log_density(residual: torch.Tensor, covariance: torch.Tensor) -> to
     white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
     log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
     return -0.5 * white.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
+
+
+def student_log_density(residual: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+    """Return the log-density of Student's multivariate t law, :data:`STUDENT_DOF` degrees of freedom.
+
+    Args:
+        residual: ``(..., n)``.
+        scale: the law's scale matrix, positive definite, ``(..., n, n)``.
+
+    Returns:
+        ``(...)``.
+    """
+    n, dof = residual.shape[-1], STUDENT_DOF
+    factor = robust_cholesky(scale)
+    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
+    constant = math.lgamma((dof + n) / 2) - math.lgamma(dof / 2) - 0.5 * n * math.log(dof * math.pi)
+    return constant - log_det - 0.5 * (dof + n) * torch.log1p(white.square().sum(-1) / dof)
 
 
 def robust_cholesky(covariance: torch.Tensor) -> torch.Tensor:
@@ -122,8 +143,9 @@ def rotation_vector(measured: torch.Tensor, simulated: torch.Tensor) -> torch.Te
 
 
 def likelihood_with_losses(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int,
+    log_density: LogDensity = gaussian_log_density,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
     """Log-likelihood, squared error and number of diverged samples, ``(t, P)`` each, of ``(t, P, K, m)``.
 
     The squared error of a transition of which nothing is left is NaN.
@@ -131,28 +153,28 @@ def likelihood_with_losses(
     finite = torch.isfinite(samples).all(-1)
     lost = (~finite).sum(-1)
     if not bool(lost.any()):
-        values, squared = _gaussian(samples, measured, covariance, num_rotations)
+        values, squared = _likelihood(samples, measured, covariance, num_rotations, log_density)
         return values, squared, lost.double()
     values = torch.full(lost.shape, LOST_TRANSITION, dtype=samples.dtype)
     squared = torch.full_like(values, torch.nan)
     num_samples = samples.shape[2]
     for t, p in (finite.sum(-1) >= 2).nonzero().tolist():
         kept = samples[t, p, finite[t, p]]
-        one, error = _gaussian(kept, measured[t, 0], covariance[t, 0], num_rotations)
+        one, error = _likelihood(kept, measured[t, 0], covariance[t, 0], num_rotations, log_density)
         values[t, p] = one - DIVERGENCE_PENALTY * lost[t, p] / num_samples
         squared[t, p] = error
     return values, squared, lost.double()
 
 
-def _gaussian(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
+def _likelihood(
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int, log_density: LogDensity
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Log-likelihood, with rotations by their angles and both signs, and squared error of the mean features."""
     squared = (measured - samples.mean(-2)).square().sum(-1)
     if num_rotations:
         samples, measured, covariance = _rotation_angles(samples, measured, covariance, num_rotations)
     mean, sampled = sample_moments(samples)
-    return gaussian_log_density(measured - mean, sampled + covariance), squared
+    return log_density(measured - mean, sampled + covariance), squared
 
 
 def _rotation_angles(

@@ -16,7 +16,15 @@ import torch
 
 from dropo_torch.distribution import SearchBox, base_uniforms, to_values, values_from_uniforms
 from dropo_torch.errors import InputError, choices
-from dropo_torch.likelihood import likelihood_with_losses, propagate, rotation_vector, widen
+from dropo_torch.likelihood import (
+    LogDensity,
+    gaussian_log_density,
+    likelihood_with_losses,
+    propagate,
+    rotation_vector,
+    student_log_density,
+    widen,
+)
 from dropo_torch.observation import Observation
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.trajectory import Replay, Transitions
@@ -108,6 +116,7 @@ class Objective:
             if scaling
             else torch.ones(self.num_features, dtype=torch.float64)
         )
+        self._column_scale = _scales(measured, 0) if scaling else torch.ones(observation.size, dtype=torch.float64)
         self._raw = measured
         self.measured = self.features(measured, measured)
         self.epsilon = _per_entry("epsilon", epsilon, self.num_features, "feature", self.labels)
@@ -268,6 +277,22 @@ class Objective:
             for value, squared, kept, lost in found
         ]
 
+    def robust_log_likelihood(self, mean: np.ndarray, values: torch.Tensor) -> float:
+        """Return the log-likelihood of φ under Student's t law, with the noise as it is given.
+
+        The Gaussian one widens what the noise does not explain, window by window, and so hardly tells a noise that is
+        too small; this one may be compared between noises.
+
+        Args:
+            mean: μ in coordinates, ``(d,)``, at which the starts' noise is propagated.
+            values: samples of φ, ``(K, d)``, in units.
+        """
+        other = self.on(self.transitions)
+        other.linearise(mean, widened=False)
+        sums = other.map(values, other.likelihood_reduction(1, student_log_density))
+        self.simulated_transitions += other.simulated_transitions
+        return float(sums[0])
+
     def values(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> torch.Tensor:
         """Return parameter values ``(P, K, d)``, in units, of φ ``(P, d)`` and base uniforms."""
         space = self.simulator.parameters
@@ -276,7 +301,7 @@ class Objective:
             uniforms.expand(len(mean), *uniforms.shape[-2:]), mu, sigma, space.limits, space.is_log
         )
 
-    def likelihood_reduction(self, num_phi: int) -> Reduce:
+    def likelihood_reduction(self, num_phi: int, log_density: LogDensity = gaussian_log_density) -> Reduce:
         """Return the reduction to log-likelihood, squared error, transitions and divergences of P φ, ``(4 P,)``.
 
         The squared error counts only transitions of which some samples are left.
@@ -285,7 +310,7 @@ class Objective:
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
             samples = features.unflatten(1, (num_phi, -1))
             values, squared, lost = likelihood_with_losses(
-                samples, measured[:, None], covariance[:, None], self._angles
+                samples, measured[:, None], covariance[:, None], self._angles, log_density
             )
             return torch.cat([values.sum(0), squared.nansum(0), squared.isfinite().sum(0).double(), lost.sum(0)])
 
@@ -305,14 +330,14 @@ class Objective:
             return (fixed + torch.diag(self._end_variance())).expand(count, -1, -1)
         return fixed + self._noise_covariance[block]
 
-    def linearise(self, mean: np.ndarray) -> None:
+    def linearise(self, mean: np.ndarray, *, widened: bool = True) -> None:
         """Propagate the start states' noise through the simulation at μ ``(d,)``, in coordinates.
 
         Statistical linearisation: each start state is simulated from antithetic draws of its noise. The
         mean of the outcomes shifts the prediction. The regression of the outcomes on the draws gives
         G and with it the covariance G diag(ν) Gᵀ, to which the variance that the regression leaves is
         added: a contact that some draws make and others do not. Windows that the result still does
-        not explain have their covariance widened, as under Student's t law. Without noise, nothing happens.
+        not explain have their covariance ``widened``, as under Student's t law. Without noise, nothing happens.
         """
         if self.noise is None:
             return
@@ -328,9 +353,11 @@ class Objective:
                 outcomes = features.reshape(-1, len(draws), self.num_features)
                 shift, covariance = propagate(outcomes, draws)
                 centre = torch.nan_to_num(outcomes[:, 0])
-                widened = widen(self.measured[block] - centre - shift, covariance + fixed) - torch.diag(self.epsilon)
+                total = covariance + fixed
+                if widened:
+                    total = widen(self.measured[block] - centre - shift, total)
             shifts.append(shift)
-            covariances.append(widened)
+            covariances.append(total - torch.diag(self.epsilon))
         self._noise_shift, self._noise_covariance = torch.cat(shifts), torch.cat(covariances)
         self.linearised_at = np.asarray(mean, dtype=np.float64).copy()
 
@@ -376,6 +403,15 @@ class Objective:
     def noise_deviation(self) -> torch.Tensor | None:
         """Standard deviation of the measurement in each feature, ``(m,)``; ``None`` without noise."""
         return None if self.noise is None else self._end_variance().sqrt()
+
+    def noise_of(self, variance: float) -> list[float]:
+        """Return the noise of each observed column, ``(n,)``, that gives each feature such a variance.
+
+        The inverse of what a given ``noise`` does to the features; quaternions turn by twice their noise.
+        """
+        deviations = variance**0.5 * self._column_scale
+        deviations[[c for q in self._quaternions for c in q]] = 0.5 * variance**0.5
+        return deviations.tolist()
 
     def _end_variance(self) -> torch.Tensor:
         """Variance of the measured features, ``(m,)``; a quaternion's noise ν turns by 2ν."""

@@ -230,7 +230,8 @@ def _at_rest(model: mujoco.MjModel, columns: set[int]) -> tuple[str, ...]:
     """Joints of which a position is observed, and not every velocity."""
     found = []
     for joint in range(model.njnt):
-        nq, nv = {0: (7, 6), 1: (4, 3)}.get(int(model.jnt_type[joint]), (1, 1))
+        kind = int(model.jnt_type[joint])
+        nq, nv = _QPOS_WIDTH[kind], _DOF_WIDTH[kind]
         first, begin = int(model.jnt_qposadr[joint]), model.nq + int(model.jnt_dofadr[joint])
         if columns.intersection(range(first, first + nq)) and not columns.issuperset(range(begin, begin + nv)):
             found.append(joint_name(model, joint))

@@ -34,7 +34,7 @@ from dropo_torch.objective import Objective
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.progress import FitProgress, StageProgress
 from dropo_torch.report.gap_words import answer
-from dropo_torch.sweep import Sweep, default_epsilons, sweep_epsilon
+from dropo_torch.sweep import Sweep, SweepPoint, default_epsilons, noise_keys, robust_log_likelihood, sweep_epsilon
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
@@ -95,42 +95,59 @@ def run_demo(out: Path, *, console: Console, overrides: Mapping[str, Any] | None
 
 
 def run_sweep(
-    config: Config, out: Path, *, console: Console, epsilons: Sequence[float] | None = None, resume: bool = False
+    config: Config,
+    out: Path,
+    *,
+    console: Console,
+    epsilons: Sequence[float] | None = None,
+    noisy_starts: bool = False,
+    resume: bool = False,
 ) -> Sweep:
-    """Fit at several ε, choose by the elbow, and write ``sweep.json`` and ``report.html`` to ``out``."""
+    """Fit at several ε, choose by the elbow, and write ``sweep.json`` and ``report.html`` to ``out``.
+
+    Args:
+        config: the config.
+        out: the folder.
+        console: where progress and results are shown.
+        epsilons: the values to try.
+        noisy_starts: take ε for the variance of every measurement, of the starts of transitions, too.
+        resume: continue an interrupted run in ``out``.
+    """  # fmt: skip
     from dropo_torch.report import write_sweep_report
 
     _only_dropo(config, "sweep-epsilon chooses the ε of DROPO")
+    if noisy_starts and config.noise is not None:
+        raise InputError(f"noise: {config.noise} given, which --noisy-starts is to find; leave one of them out")
     problem = make_problem(config)
     store = out / "sweep-progress.json"
     prepare_folder(out, problem.model_path, resume=resume and store.exists())
     values = default_epsilons(problem.objective.measured.numpy()) if epsilons is None else list(epsilons)
 
-    def fit_at(epsilon: float) -> Fit:
-        part = make_problem(config.model_copy(update={"epsilon": epsilon}))
-        return _fit(part, None, resume=False, console=console, label=f"ε = {epsilon:g}")
+    def point_at(epsilon: float) -> SweepPoint:
+        keys = noise_keys(problem.objective, epsilon) if noisy_starts else {"epsilon": epsilon}
+        part = make_problem(config.model_copy(update=keys))
+        fit = _fit(part, None, resume=False, console=console, label=f"ε = {epsilon:g}")
+        return SweepPoint.of(epsilon, fit, robust_log_likelihood(part.objective, fit) if noisy_starts else None)
 
-    sweep = sweep_epsilon(fit_at, values, fingerprint=problem.fingerprint, store=store)
-    table = Table("ε", "mean squared error", "log-likelihood", *problem.space.names)
-    for p in sweep.points:
-        marked = "[bold]" if p.epsilon == sweep.chosen else ""
-        cells = [f"{p.mean[n]:.4g} ± {p.std[n]:.2g}" for n in problem.space.names]
-        table.add_row(f"{marked}{p.epsilon:g}", f"{p.mse:.4g}", f"{p.log_likelihood:.1f}", *cells)
-    console.print(table)
-    console.print(f"chosen: [bold]epsilon: {sweep.chosen:g}[/], since {sweep.reason}")
+    sweep = sweep_epsilon(point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store)
+    chosen = noise_keys(problem.objective, sweep.chosen) if noisy_starts else {"epsilon": sweep.chosen}
+    _show_sweep(sweep, chosen, problem.space.names, console)
     write_atomically(out / "sweep.json", json.dumps(sweep.document(), indent=2).encode() + b"\n")
-    write_sweep_report(
-        out / "report.html",
-        epsilons=[p.epsilon for p in sweep.points],
-        mse=[p.mse for p in sweep.points],
-        log_likelihood=[p.log_likelihood for p in sweep.points],
-        chosen=sweep.chosen,
-        reason=sweep.reason,
-        config=config.document(),
-        versions=versions(),
-    )
+    write_sweep_report(out / "report.html", sweep, use=chosen, config=config.document(), versions=versions())
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return sweep
+
+
+def _show_sweep(sweep: Sweep, chosen: Mapping[str, Any], names: Sequence[str], console: Console) -> None:
+    table = Table("ε", "mean squared error", "log-likelihood", *names)
+    for p in sweep.points:
+        marked = "[bold]" if p.epsilon == sweep.chosen else ""
+        cells = [f"{p.mean[n]:.4g} ± {p.std[n]:.2g}" for n in names]
+        value = p.log_likelihood if p.robust_log_likelihood is None else p.robust_log_likelihood
+        table.add_row(f"{marked}{p.epsilon:g}", f"{p.mse:.4g}", f"{value:.1f}", *cells)
+    console.print(table)
+    keys = yaml.safe_dump(dict(chosen), default_flow_style=True, width=10_000).strip()[1:-1]
+    console.print(f"chosen: [bold]{keys}[/], since {sweep.reason}", soft_wrap=True)
 
 
 def _only_dropo(config: Config, what: str) -> None:

@@ -1,4 +1,7 @@
-"""Choosing ε by the elbow: raise it until the mean simulated next state fits no better."""
+"""Choosing ε by the elbow: raise it until the mean simulated next state fits no better.
+
+Or, where the starts of transitions are as noisy as their ends: raise the noise of both until the log is no likelier.
+"""
 
 from __future__ import annotations
 
@@ -13,10 +16,13 @@ import numpy as np
 
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, write_atomically
+from dropo_torch.objective import Objective, draw_uniforms
 
 SCHEMA = "dropo-torch/sweep/1"
 #: An error within this share of the smallest one counts as no larger.
 TOLERANCE = 0.05
+#: ε beside a noise of the starts and ends, as a share of its variance: the noise stands for all.
+NEGLIGIBLE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -28,6 +34,7 @@ class SweepPoint:
         mse: mean squared difference between measured and simulated mean.
         log_likelihood: in nats.
         mean, std: the fitted distribution, name → value in its unit.
+        robust_log_likelihood: of a sweep with noisy starts: the one that may be compared between noises, in nats.
     """
 
     epsilon: float
@@ -35,20 +42,43 @@ class SweepPoint:
     log_likelihood: float
     mean: dict[str, float]
     std: dict[str, float]
+    robust_log_likelihood: float | None = None
+
+    @classmethod
+    def of(cls, epsilon: float, fit: Fit, robust_log_likelihood: float | None = None) -> SweepPoint:
+        """Return what a sweep keeps of a fit."""
+        summary = fit.distribution.summary()
+        return cls(
+            epsilon=epsilon,
+            mse=fit.mse,
+            log_likelihood=fit.log_likelihood,
+            mean={name: entry["mean"] for name, entry in summary.items()},
+            std={name: entry["std"] for name, entry in summary.items()},
+            robust_log_likelihood=robust_log_likelihood,
+        )
 
 
 @dataclass(frozen=True)
 class Sweep:
-    """All fits of a sweep, by rising ε, the ε chosen and why."""
+    """All fits of a sweep, by rising ε, the ε chosen and why.
+
+    Attributes:
+        points: the fits.
+        chosen: the ε to use; with noisy starts the variance of the noise.
+        reason: why, in words.
+        noisy_starts: whether ε stood for the variance of starts and ends alike.
+    """
 
     points: tuple[SweepPoint, ...]
     chosen: float
     reason: str
+    noisy_starts: bool = False
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``sweep.json``."""
         return {
             "schema": SCHEMA,
+            "noisy_starts": self.noisy_starts,
             "chosen": self.chosen,
             "reason": self.reason,
             "points": [asdict(p) for p in self.points],
@@ -92,6 +122,44 @@ def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, st
     )
 
 
+def likeliest(epsilons: Sequence[float], log_likelihoods: Sequence[float]) -> tuple[float, str]:
+    """Return the variance of the noise beyond which the log is no likelier, and the reason in words.
+
+    Args:
+        epsilons: rising values.
+        log_likelihoods: robust ones of the fits at them, in nats; one that is not finite is never the largest.
+
+    Raises:
+        InputError: none is finite.
+    """
+    values = [v if math.isfinite(v) else -math.inf for v in log_likelihoods]
+    best = values.index(max(values))
+    if math.isinf(values[best]):
+        raise InputError("epsilons: no fit at any of them predicts the log; see what `dropo fit` says about it")
+    chosen = epsilons[best]
+    if best == 0:
+        return chosen, f"no larger noise makes the log likelier: its variance is {chosen:g} or less"
+    if best == len(epsilons) - 1:
+        return chosen, f"the log still becomes likelier at the largest value tried, {chosen:g}: sweep further"
+    below, above = (values[best] - values[i] for i in (best - 1, best + 1))
+    return chosen, (
+        f"with noise of that variance on starts and ends the log is likeliest, by {below:.3g} nats against "
+        f"{epsilons[best - 1]:g} and {above:.3g} against {epsilons[best + 1]:g}"
+    )
+
+
+def noise_keys(objective: Objective, variance: float) -> dict[str, Any]:
+    """Return the config's ``noise`` and ``epsilon`` for a variance of every measurement, in compared features."""
+    noise = objective.noise_of(variance)
+    return {"noise": noise[0] if len(set(noise)) == 1 else noise, "epsilon": NEGLIGIBLE * variance}
+
+
+def robust_log_likelihood(objective: Objective, fit: Fit) -> float:
+    """Return a fit's log-likelihood that may be compared between noises, in nats."""
+    uniforms = draw_uniforms(fit.samples, len(fit.distribution.names), fit.seed, 0)
+    return objective.robust_log_likelihood(fit.distribution.mean, fit.distribution.rsample(uniforms))
+
+
 def default_epsilons(measured: np.ndarray) -> list[float]:
     """Return nine values of ε, a decade apart, up to about a tenth of the measured columns' variance ``(T, m)``."""
     top = math.ceil(math.log10(max(float(np.mean(np.var(measured, axis=0))), 1e-12))) - 1
@@ -99,21 +167,22 @@ def default_epsilons(measured: np.ndarray) -> list[float]:
 
 
 def sweep_epsilon(
-    fit_at: Callable[[float], Fit],
+    point_at: Callable[[float], SweepPoint],
     epsilons: Sequence[float],
     *,
+    noisy_starts: bool = False,
     fingerprint: str = "",
     store: Path | None = None,
-    on_point: Callable[[SweepPoint], None] | None = None,
 ) -> Sweep:
-    """Fit at each ε and choose by the elbow.
+    """Fit at each ε and choose by the elbow, or with noisy starts by the robust log-likelihood.
 
     Args:
-        fit_at: fits at an ε.
+        point_at: fits at an ε.
         epsilons: the values to try.
+        noisy_starts: whether ε stands for the variance of starts and ends alike; its points are then judged by their
+            robust log-likelihood.
         fingerprint: identifies config and log.
         store: file in which finished fits are kept; those of the same fingerprint are not repeated.
-        on_point: called after each fit.
 
     Raises:
         InputError: fewer than three values, or one that is not positive.
@@ -121,27 +190,22 @@ def sweep_epsilon(
     values = sorted({float(e) for e in epsilons})
     if len(values) < 3 or not all(0 < value < math.inf for value in values):
         raise InputError(f"epsilons: {list(epsilons)} given; expected three or more positive numbers")
-    done = _stored(store, fingerprint)
+    owner = fingerprint + ("-noisy-starts" if noisy_starts else "")
+    done = _stored(store, owner)
     for value in values:
         if value in done:
             continue
-        result = fit_at(value)
-        summary = result.distribution.summary()
-        done[value] = SweepPoint(
-            epsilon=value,
-            mse=result.mse,
-            log_likelihood=result.log_likelihood,
-            mean={name: entry["mean"] for name, entry in summary.items()},
-            std={name: entry["std"] for name, entry in summary.items()},
-        )
+        done[value] = point_at(value)
         if store is not None:
-            content = {"fingerprint": fingerprint, "points": [asdict(p) for p in done.values()]}
+            content = {"fingerprint": owner, "points": [asdict(p) for p in done.values()]}
             write_atomically(store, json.dumps(content).encode())
-        if on_point is not None:
-            on_point(done[value])
     points = tuple(done[value] for value in values)
-    chosen, reason = elbow(values, [p.mse for p in points])
-    return Sweep(points, chosen, reason)
+    if noisy_starts:
+        robust = [math.nan if p.robust_log_likelihood is None else p.robust_log_likelihood for p in points]
+        chosen, reason = likeliest(values, robust)
+    else:
+        chosen, reason = elbow(values, [p.mse for p in points])
+    return Sweep(points, chosen, reason, noisy_starts)
 
 
 def _stored(store: Path | None, fingerprint: str) -> dict[float, SweepPoint]:

@@ -402,6 +402,41 @@ def test_a_window_that_the_noise_does_not_explain_is_widened_as_under_students_l
     np.testing.assert_allclose(found[3], covariance, rtol=1e-9)
 
 
+def test_the_robust_likelihood_is_students_under_the_noise_as_it_is_given():
+    noise = np.array([0.02, 0.3])
+    objective, _ = slide_objective(noise)
+    measured = objective.transitions.measured.copy()
+    measured[2] += [0.5, -4.0]  # far outside: the Gaussian likelihood would widen its covariance
+    states, controls = (torch.from_numpy(x) for x in (objective.transitions.states, objective.transitions.controls))
+    objective = objective.on(windows(states, controls, measured))
+    mean, std, uniforms = np.array([2.1]), np.array([0.3]), draw_uniforms(12, 1, 0)
+    values = objective.values(mean[None], std[None], uniforms)[0]
+    base = matrix_at(objective, mean) + np.diag(noise**2) + 1e-6 * np.eye(2)
+    theirs = 0.0
+    for samples, logged in zip(objective.simulated(values).numpy(), measured, strict=True):
+        scale = base + np.cov(samples, rowvar=False)
+        theirs += scipy.stats.multivariate_t.logpdf(logged - samples.mean(0), shape=scale, df=5)
+    assert objective.robust_log_likelihood(mean, values) == pytest.approx(theirs, rel=1e-9)
+    assert objective.linearised_at is None  # it leaves no trace
+
+
+def matrix_at(objective: Objective, mean: np.ndarray) -> np.ndarray:
+    """What the starts' noise becomes at μ: a block on a spring is linear."""
+    h, pull = 0.01, 30 / mean[0]
+    step = np.linalg.matrix_power(np.array([[1 - h * h * pull, h], [-h * pull, 1]]), 6)
+    return step @ np.diag(objective.noise.numpy() ** 2) @ step.T
+
+
+@pytest.mark.parametrize("scaling", [False, True])
+def test_the_noise_of_columns_gives_every_feature_its_variance(scaling):
+    """Also of a box's pose, whose orientation turns by twice its quaternion's noise."""
+    objective = box_objective(scaling=scaling)
+    noise = objective.noise_of(4e-6)
+    assert len(noise) == 7
+    given = box_objective(scaling=scaling, noise=noise)
+    np.testing.assert_allclose(given.noise_deviation, np.full(6, 2e-3), rtol=1e-12)
+
+
 def test_start_noise_follows_scaling_and_masks():
     noise = np.array([0.02, 0.3])
     scaled, matrix = slide_objective(noise, scaling=True)

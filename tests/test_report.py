@@ -12,6 +12,7 @@ from dropo_torch.distribution import Distribution
 from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.report import figures, words, write_fit_report, write_sweep_report
 from dropo_torch.report.html import shown_columns, worst_stretch
+from dropo_torch.sweep import Sweep, SweepPoint
 
 NAMES = ("torso", "damping", "foot")
 
@@ -242,14 +243,14 @@ def test_ticks_keep_their_digits() -> None:
 
 def test_sweep(tmp_path: Path) -> None:
     path = tmp_path / "sweep.html"
-    write_sweep_report(
-        path, epsilons=[1e-2, 1e-4, 1e-3], mse=[3.0, 1.0, np.nan], log_likelihood=[-np.inf, 5.0, 6.0], chosen=1e-4,
-        reason="it is <best>", config={"epsilon": 1e-4}, versions={"mujoco": "4"},
-    )  # fmt: skip
+    of = ((1e-4, 1.0, 5.0), (1e-3, np.nan, 6.0), (1e-2, 3.0, -np.inf))
+    points = tuple(SweepPoint(epsilon=e, mse=m, log_likelihood=v, mean={}, std={}) for e, m, v in of)
+    sweep = Sweep(points, 1e-4, "it is <best>")
+    write_sweep_report(path, sweep, use={"epsilon": 1e-4}, config={"epsilon": 1e-4}, versions={"mujoco": "4"})
     text = path.read_text()
     assert "http" not in text
     assert "it is &lt;best&gt;" in text
-    assert "Use ε = 0.0001." in text
+    assert "<pre>epsilon: 0.0001</pre>" in text
     rows = re.findall(
         r'<td class="n">([^<]*)</td><td class="n">([^<]*)</td><td class="n">([^<]*)</td><td>(.*?)</td>', text
     )

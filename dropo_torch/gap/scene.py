@@ -76,9 +76,9 @@ def prepare(problem: Problem) -> Scene:
 
 def _check_observed(problem: Problem) -> None:
     """A window needs its start: where a position is observed, its velocity must be, too."""
-    for joint in problem.observation.at_rest:
+    if blind := problem.observation.at_rest:
         raise InputError(
-            f"gap: the velocity of {joint} is not observed; derive velocities from positions "
+            f"gap: the velocity of {blind[0]} is not observed; derive velocities from positions "
             "(data: preprocess), and name them in observation"
         )
 

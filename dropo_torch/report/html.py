@@ -18,6 +18,7 @@ from dropo_torch.distribution import Distribution, to_values
 from dropo_torch.fit import Fit, HistoryEntry, write_atomically
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report import figures, words
+from dropo_torch.sweep import Sweep
 
 #: Columns with figures of their own; of more, the worst explained are shown.
 MAX_COLUMNS = 24
@@ -81,12 +82,9 @@ def write_fit_report(
 
 def write_sweep_report(
     path: str | Path,
+    sweep: Sweep,
     *,
-    epsilons: Sequence[float],
-    mse: Sequence[float],
-    log_likelihood: Sequence[float],
-    chosen: float,
-    reason: str,
+    use: Mapping[str, Any],
     config: Mapping[str, Any] | None,
     versions: Mapping[str, str] | None = None,
     title: str = "Choice of ε",
@@ -95,29 +93,30 @@ def write_sweep_report(
 
     Args:
         path: the HTML file; written whole or not at all.
-        epsilons: the values tried, n of them.
-        mse, log_likelihood: of the fit at each, n of each.
-        chosen: the ε to use, one of ``epsilons``.
-        reason: why, in words.
+        sweep: the sweep.
+        use: the config's keys that are recommended, name → value.
         config: the runs' config, printed as YAML.
         versions: name → version of what the result depends on.
         title: of the page.
     """
-    order = np.argsort(np.asarray(epsilons, dtype=float), kind="stable")
-    x, y, ll = (np.asarray(values, dtype=float)[order] for values in (epsilons, mse, log_likelihood))
+    points = sweep.points
+    values = [p.robust_log_likelihood if sweep.noisy_starts else p.log_likelihood for p in points]
+    x, y, ll = (np.array(v, dtype=float) for v in ([p.epsilon for p in points], [p.mse for p in points], values))
     rows = [
         {
-            "epsilon": figures.plain(float(e)),
-            "mse": words.number(m),
-            "log_likelihood": nats(v),
-            "chosen": bool(np.isclose(e, chosen)),
+            "epsilon": figures.plain(p.epsilon),
+            "mse": words.number(p.mse),
+            "log_likelihood": nats(value),
+            "chosen": p.epsilon == sweep.chosen,
         }
-        for e, m, v in zip(x, y, ll, strict=True)
+        for p, value in zip(points, ll.tolist(), strict=True)
     ]
+    chosen = sweep.chosen
     content = {
         "title": title,
-        "chosen": figures.plain(float(chosen)),
-        "reason": reason,
+        "use": yaml.safe_dump(dict(use), sort_keys=False, allow_unicode=True).strip(),
+        "noisy_starts": sweep.noisy_starts,
+        "reason": sweep.reason,
         "rows": rows,
         "mse_figure": Markup(figures.log_log(x, y, chosen=chosen, x_label="ε", y_label="mean squared difference")),
         "likelihood_figure": Markup(

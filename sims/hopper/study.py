@@ -23,6 +23,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.fit import write_atomically
 from dropo_torch.parallel import in_parallel
 from dropo_torch.problem import Problem, make_problem
+from dropo_torch.sweep import NEGLIGIBLE, robust_log_likelihood
 from sims.hopper import SIM
 from sims.hopper.record import HopperLog, record
 from sims.hopper.study_tables import write_results
@@ -95,6 +96,7 @@ class Cell:
         knows_noise: whether the fit is given the deviation of the noise.
         noise: variance of noise put on a noiseless log, ``None`` for the variant's own.
         ends_only: whether that noise is on the ends of transitions alone, not on their starts.
+        noisy_starts: whether ε stands for the variance of every measurement, of the starts, too.
         size: transitions of a bootstrap sample; ``None`` for the whole log.
         resample: number of the bootstrap sample.
         optimizer: of DROPO.
@@ -109,6 +111,7 @@ class Cell:
     knows_noise: bool = False
     noise: float | None = None
     ends_only: bool = False
+    noisy_starts: bool = False
     size: int | None = None
     resample: int = 0
     optimizer: str = "fisher"
@@ -119,6 +122,7 @@ class Cell:
         """The cell's file, without suffix."""
         parts = [self.block, self.variant, self.method + self.features, f"seed{self.seed}", f"eps{self.epsilon:g}"]
         parts += ["known"] * self.knows_noise
+        parts += ["starts"] * self.noisy_starts
         parts += [] if self.noise is None else [f"noise{self.noise:g}", "ends" if self.ends_only else "all"]
         parts += [] if self.size is None else [f"n{self.size}", f"b{self.resample}"]
         parts += [] if self.optimizer == "fisher" else [self.optimizer]
@@ -175,11 +179,12 @@ def all_cells(plan: Plan) -> list[Cell]:
                 Cell("recovery", "distribution", **of, epsilon=1e-7),
             ]
         cells.append(Cell("table", "noisy", "dropo", seed, NOISE_VARIANCE))  # as in the paper: ε alone
-    cells += [Cell("sweep", variant, epsilon=e) for variant in ("point", "noisy", "unmodeled") for e in plan.epsilons]
+    sweeps = (("point", False), ("noisy", False), ("noisy", True), ("unmodeled", False))
+    cells += [Cell("sweep", variant, epsilon=e, noisy_starts=s) for variant, s in sweeps for e in plan.epsilons]
     cells += [
-        Cell("noise", "point", epsilon=e, noise=noise, ends_only=ends)
+        Cell("noise", "point", epsilon=e, noise=noise, ends_only=ends, noisy_starts=starts)
         for noise in plan.noise_variances
-        for ends in (True, False)
+        for ends, starts in ((True, False), (False, False), (False, True))
         for e in plan.epsilons
     ]
     cells += [Cell("cma", "point"), Cell("cma", "point", optimizer="cma")]
@@ -218,6 +223,7 @@ def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[st
         "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
     }
     parameters = {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED}
+    noisy = cell.knows_noise or cell.noisy_starts
     document = {
         "sim": "hopper",
         "data": str(path.resolve()),
@@ -229,8 +235,8 @@ def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[st
         "samples": sized.samples,
         "seed": cell.seed,
         "threads": threads,
-        "epsilon": cell.epsilon,
-        **({"noise": NOISE_VARIANCE**0.5} if cell.knows_noise else {}),
+        "epsilon": cell.epsilon * (NEGLIGIBLE if cell.noisy_starts else 1),
+        **({"noise": (NOISE_VARIANCE if cell.knows_noise else cell.epsilon) ** 0.5} if noisy else {}),
     }
     problem = make_problem(make_config(document))
     begun = time.monotonic()
@@ -242,6 +248,7 @@ def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[st
         "cell": asdict(cell),
         "truth": {n: {"mean": float(m.mean()), "std": float(m.std())} for n, m in realised.items()},
         "mse_at_truth": mse_at(problem, {n: float(m.mean()) for n, m in realised.items()}),
+        **({"robust_log_likelihood": robust_log_likelihood(problem.objective, fit)} if cell.noisy_starts else {}),
         "transitions": len(log.actions),
         "wall_seconds": round(seconds, 3),
         "fit": fit.document(),

@@ -34,7 +34,7 @@ def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]])
     return {
         "recovery.png": recovery(results),
         "sweep.png": sweeps(tables["sweep"]),
-        "noise.png": sweeps(tables["noise"]),
+        "noise.png": against_noise(tables["noise"]),
         "size.png": sizes(tables["size"]),
     }
 
@@ -73,7 +73,7 @@ def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
     for i, (key, title) in enumerate((("mse", "mean squared error"), ("mean_std", "mean deviation (kg)"))):
         axes = _part(figure, i, 2)
         for colour, row in zip(_LINES, rows, strict=False):
-            noise = "" if row["noise_variance"] is None else f", {row['noise_variance']:g} on {row['noise_on']}"
+            noise = "" if row["noise_variance"] is None else f", ε of {row['stands_for']}"
             axes.loglog(
                 row["epsilons"], row[key], color=colour, marker=".", linewidth=1.2,
                 label=row["case"] + noise if i == 0 else None,
@@ -83,6 +83,24 @@ def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
         axes.set_xlabel("ε")
         axes.set_ylabel(title)
     figure.legend(loc="upper center", ncol=3, frameon=False, fontsize=7)
+    return figure
+
+
+def against_noise(rows: Sequence[dict[str, Any]]) -> Any:
+    """Draw the ε that is chosen against the noise's variance, a line a kind of noise and of sweep."""
+    figure = figures.new_figure(560, 340)
+    axes = _part(figure, 0, 1)
+    kinds = list(dict.fromkeys((r["noise_on"], r["stands_for"]) for r in rows))
+    for number, (colour, kind) in enumerate(zip(_LINES, kinds, strict=False)):
+        own = sorted((r["noise_variance"], r["chosen"]) for r in rows if (r["noise_on"], r["stands_for"]) == kind)
+        x, y = np.array(own).T
+        words = f"noise on {kind[0]}, ε of {kind[1]}"
+        axes.loglog(x, y, color=colour, marker="osD"[number % 3], markersize=5, linewidth=1.2, label=words)
+    ends = np.array([min(r["noise_variance"] for r in rows), max(r["noise_variance"] for r in rows)])
+    axes.fill_between(ends, ends / 10, 10 * ends, color="#7b8794", alpha=0.15, linewidth=0, label="within a factor 10")
+    axes.set_xlabel("variance of the noise")
+    axes.set_ylabel("ε chosen")
+    figure.legend(loc="upper center", ncol=2, frameon=False, fontsize=7)
     return figure
 
 
