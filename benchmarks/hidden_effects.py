@@ -8,17 +8,15 @@ python benchmarks/hidden_effects.py --out out/hidden --resume        # go on whe
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import math
-import multiprocessing
-import os
 import sys
 import tempfile
 import time
 import traceback
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +26,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.hidden.cases import CaseSpec, cases, select
 from benchmarks.hidden.truths import Case
+from dropo_torch.parallel import in_parallel
 
 KINDS = ("null", "single", "double", "outside")
 #: The parameters that say how strong an effect is, with their neutral value; all of an effect's where not listed.
@@ -162,23 +161,6 @@ def _plain(value: Any) -> Any:
     return value.tolist() if isinstance(value, np.ndarray | np.generic) else str(value)
 
 
-def attempts(specs: Sequence[CaseSpec], backend: str, jobs: int) -> Iterator[dict[str, Any]]:
-    """Yield the cases' results as they come; side by side, each has its part of the processors."""
-    if jobs == 1:
-        yield from (attempt(s, backend) for s in specs)
-        return
-    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
-        threads = max(1, (os.cpu_count() or 1) // jobs)
-        waiting = {pool.submit(attempt, s, backend, threads): s for s in specs}
-        for done in as_completed(waiting):
-            try:
-                yield done.result()
-            except Exception:  # the process itself died
-                s = waiting[done]
-                failure = traceback.format_exc()
-                yield {"name": s.name, "kind": s.kind, "system": s.system, "seed": s.seed[0], "failure": failure}
-
-
 # --- the summary ----------------------------------------------------------------------------------------------
 
 
@@ -269,7 +251,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text("".join(json.dumps(r) + "\n" for r in kept), encoding="utf-8")
     waiting = [s for s in specs if s.name not in {r["name"] for r in results}]
-    for number, result in enumerate(attempts(waiting, given.backend, given.jobs), len(results) + 1):
+    work = functools.partial(attempt, backend=given.backend)
+    for number, (_, result) in enumerate(in_parallel(work, waiting, given.jobs), len(results) + 1):
         results.append(result)
         print(f"{number}/{len(specs)} {one_line(result)}", flush=True)
         if path is not None:
