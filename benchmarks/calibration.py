@@ -1,6 +1,6 @@
 """How often the intervals of each method hold the truth, over simulated logs of a driven pendulum.
 
-    python benchmarks/calibration.py --logs 100 --out out/calibration     # --resume goes on
+    python benchmarks/calibration.py --logs 100 --out out/calibration --workers 2     # --resume goes on
 
 Writes ``trials.jsonl``, a line a fit below the settings, and ``calibration.md``. Mass and damping are searched for; the
 log has 60 transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.baselines.calibration` has the
@@ -10,6 +10,7 @@ two kinds of log.
 from __future__ import annotations
 
 import argparse
+import functools
 import json
 import tempfile
 from collections.abc import Sequence
@@ -19,7 +20,8 @@ from typing import Any
 import numpy as np
 
 import dropo_torch as dropo
-from dropo_torch.baselines.calibration import LEVELS, Coverage, Trial, calibrate, coverages, plain
+from dropo_torch.baselines.calibration import Coverage, Trial, calibrate, coverages, plain
+from dropo_torch.parallel import in_parallel
 
 MODEL = """
 <mujoco>
@@ -50,7 +52,7 @@ METHODS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def problem_of(folder: Path, name: str, transitions: int) -> dropo.Problem:
+def problem_of(folder: Path, name: str, transitions: int, threads: int) -> dropo.Problem:
     """The pendulum fitted by a method; the log gives actions and a start."""
     (folder / "pendulum.xml").write_text(MODEL)
     torque = 3 * np.sin(0.31 * np.arange(transitions)) + np.sin(1.1 * np.arange(transitions))
@@ -69,10 +71,18 @@ def problem_of(folder: Path, name: str, transitions: int) -> dropo.Problem:
         },
         "epsilon": (NOISE**2).tolist(),
         "samples": 50,
-        "threads": 1,
+        "threads": threads,
         **METHODS[name],
     }
     return dropo.make_problem(dropo.make_config(document, base=folder))
+
+
+def fit_log(log: int, *, done: Sequence[Trial], methods: Sequence[str], transitions: int, threads: int) -> list[Trial]:
+    """Fit the logs of a number, one of each kind, by the methods; return the trials that are not done."""
+    with tempfile.TemporaryDirectory() as folder:
+        problems = functools.partial(problem_of, Path(folder), transitions=transitions, threads=threads)
+        trials = calibrate(problems, methods, logs=[log], noise=NOISE, done=done)
+    return trials[len(done) :]
 
 
 def markdown(rows: Sequence[Coverage]) -> str:
@@ -92,6 +102,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--transitions", type=int, default=60)
     parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--workers", type=int, default=1, help="logs at a time")
     parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
@@ -109,20 +120,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
         done = [Trial(**json.loads(line)) for line in whole]
     else:
         store.write_text(plan + "\n")
-    with tempfile.TemporaryDirectory() as folder, store.open("a") as stream:
-
-        def keep(trial: Trial) -> None:
-            stream.write(json.dumps(plain(trial)) + "\n")
+    asked = [t for t in done if t.log < given.logs and t.method in given.methods]
+    count = 2 * len(given.methods)  # fits of a log of each kind
+    waiting = [n for n in range(given.logs) if sum(t.log == n for t in asked) < count]
+    work = functools.partial(fit_log, done=done, methods=given.methods, transitions=given.transitions)
+    trials = list(asked)
+    with store.open("a") as stream:
+        for number, (_, found) in enumerate(in_parallel(work, waiting, given.workers), given.logs - len(waiting) + 1):
+            stream.writelines(json.dumps(plain(trial)) + "\n" for trial in found)
             stream.flush()
-            inside = "  ".join(
-                f"{level:g}: {np.mean(list(trial.inside[f'{level:g}'].values())):.2f}" for level in LEVELS
-            )
-            print(f"log {trial.log:<4} {trial.kind:<8} {trial.method:<24} inside {inside}", flush=True)
-
-        trials = calibrate(
-            lambda name: problem_of(Path(folder), name, given.transitions),
-            given.methods, logs=given.logs, noise=NOISE, done=done, on_trial=keep,
-        )  # fmt: skip
+            trials += found
+            print(f"{number} of {given.logs} logs of each kind", flush=True)
     table = markdown(coverages(trials))
     (given.out / "calibration.md").write_text(table)
     print(table)

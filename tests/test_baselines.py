@@ -632,13 +632,13 @@ def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(fol
     def ours(method: str) -> Problem:
         return problem(folder, method, epsilon=(noise**2).tolist())
 
-    trials = calibrate(ours, ["laplace", "dropo"], logs=12, noise=noise)
+    trials = calibrate(ours, ["laplace", "dropo"], logs=range(12), noise=noise)
     found = {(c.kind, c.method, c.parameter): c.covered for c in coverages(trials) if c.level == 0.9}
     assert found["fixed", "laplace", "mass"] > 0.7
     assert found["fixed", "laplace", "damping"] > 0.7
     assert found["varying", "dropo", "mass"] == pytest.approx(0.9, abs=0.08)  # damping hardly shows in one step
     assert found["varying", "laplace", "mass"] < 0.5
-    again = calibrate(ours, ["laplace"], logs=12, noise=noise, done=trials)
+    again = calibrate(ours, ["laplace"], logs=range(12), noise=noise, done=trials)
     assert again == trials
 
 

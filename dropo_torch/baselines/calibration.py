@@ -175,7 +175,7 @@ def calibrate(
     problems: Callable[[str], Problem],
     methods: Sequence[str],
     *,
-    logs: int,
+    logs: Iterable[int],
     noise: np.ndarray,
     done: Iterable[Trial] = (),
     on_trial: Callable[[Trial], None] | None = None,
@@ -185,7 +185,7 @@ def calibrate(
     Args:
         problems: name of a method → the problem that fits by it; their logs give starts and actions.
         methods: names.
-        logs: number of logs of each kind.
+        logs: numbers of the logs of each kind; the number seeds a log.
         noise: deviation on each observed column of the ends of transitions, ``(n,)``.
         done: trials of an interrupted run, which are not repeated.
         on_trial: called after each new trial.
@@ -193,7 +193,7 @@ def calibrate(
     trials = list(done)
     known = {(t.kind, t.method, t.log) for t in trials}
     given = {method: problems(method) for method in methods}
-    for log in range(logs):
+    for log in logs:
         for kind in KINDS:
             for method in methods:
                 if (kind, method, log) in known:
