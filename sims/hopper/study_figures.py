@@ -91,11 +91,12 @@ def against_noise(rows: Sequence[dict[str, Any]]) -> Any:
     figure = figures.new_figure(560, 340)
     axes = _part(figure, 0, 1)
     kinds = list(dict.fromkeys((r["noise_on"], r["stands_for"]) for r in rows))
-    for number, (colour, kind) in enumerate(zip(_LINES, kinds, strict=False)):
+    for number, (colour, kind) in enumerate(zip(_LINES[:3], kinds, strict=False)):
         own = sorted((r["noise_variance"], r["chosen"]) for r in rows if (r["noise_on"], r["stands_for"]) == kind)
         x, y = np.array(own).T
         words = f"noise on {kind[0]}, ε of {kind[1]}"
-        axes.loglog(x, y, color=colour, marker="osD"[number % 3], markersize=5, linewidth=1.2, label=words)
+        width, size = 4.8 - 1.8 * number, 11 - 3 * number  # lines that coincide show one another
+        axes.loglog(x, y, color=colour, marker="osD"[number], markersize=size, linewidth=width, label=words)
     ends = np.array([min(r["noise_variance"] for r in rows), max(r["noise_variance"] for r in rows)])
     axes.fill_between(ends, ends / 10, 10 * ends, color="#7b8794", alpha=0.15, linewidth=0, label="within a factor 10")
     axes.set_xlabel("variance of the noise")
