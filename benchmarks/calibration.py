@@ -77,8 +77,9 @@ def problem_of(folder: Path, name: str, transitions: int, threads: int) -> dropo
     return dropo.make_problem(dropo.make_config(document, base=folder))
 
 
-def fit_log(log: int, *, done: Sequence[Trial], methods: Sequence[str], transitions: int, threads: int) -> list[Trial]:
-    """Fit the logs of a number, one of each kind, by the methods; return the trials that are not done."""
+def fit_log(task: tuple[int, list[Trial]], *, methods: Sequence[str], transitions: int, threads: int) -> list[Trial]:
+    """Fit the logs of a number, one of each kind, by the methods; return what is not among the trials done."""
+    log, done = task
     with tempfile.TemporaryDirectory() as folder:
         problems = functools.partial(problem_of, Path(folder), transitions=transitions, threads=threads)
         trials = calibrate(problems, methods, logs=[log], noise=NOISE, done=done)
@@ -105,6 +106,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=1, help="logs at a time")
     parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
     given = parser.parse_args(arguments)
+    if given.workers < 1:
+        parser.error(f"--workers {given.workers}: expected 1 or more")
     given.out.mkdir(parents=True, exist_ok=True)
     store = given.out / "trials.jsonl"
     if store.exists() and not given.resume:
@@ -120,11 +123,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         done = [Trial(**json.loads(line)) for line in whole]
     else:
         store.write_text(plan + "\n")
-    asked = [t for t in done if t.log < given.logs and t.method in given.methods]
-    count = 2 * len(given.methods)  # fits of a log of each kind
-    waiting = [n for n in range(given.logs) if sum(t.log == n for t in asked) < count]
-    work = functools.partial(fit_log, done=done, methods=given.methods, transitions=given.transitions)
-    trials = list(asked)
+    kept = [[t for t in done if t.log == n and t.method in given.methods] for n in range(given.logs)]
+    waiting = [task for task in enumerate(kept) if len(task[1]) < 2 * len(given.methods)]  # two kinds of log
+    work = functools.partial(fit_log, methods=given.methods, transitions=given.transitions)
+    trials = list(done)
     with store.open("a") as stream:
         for number, (_, found) in enumerate(in_parallel(work, waiting, given.workers), given.logs - len(waiting) + 1):
             stream.writelines(json.dumps(plain(trial)) + "\n" for trial in found)

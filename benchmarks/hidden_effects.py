@@ -17,6 +17,7 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -235,6 +236,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--resume", action="store_true", help="skip the cases that are in results.jsonl; its seed")
     parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
     given = parser.parse_args(arguments)
+    if given.jobs < 1:
+        parser.error(f"--jobs {given.jobs}: expected 1 or more")
     if given.resume and given.out is None:
         parser.error("--resume needs --out")
     path = None if given.out is None else given.out / "results.jsonl"
@@ -252,12 +255,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
         path.write_text("".join(json.dumps(r) + "\n" for r in kept), encoding="utf-8")
     waiting = [s for s in specs if s.name not in {r["name"] for r in results}]
     work = functools.partial(attempt, backend=given.backend)
-    for number, (_, result) in enumerate(in_parallel(work, waiting, given.jobs), len(results) + 1):
-        results.append(result)
-        print(f"{number}/{len(specs)} {one_line(result)}", flush=True)
-        if path is not None:
-            with path.open("a", encoding="utf-8") as stream:
-                stream.write(json.dumps(result) + "\n")
+    try:
+        for number, (_, result) in enumerate(in_parallel(work, waiting, given.jobs), len(results) + 1):
+            results.append(result)
+            print(f"{number}/{len(specs)} {one_line(result)}", flush=True)
+            if path is not None:
+                with path.open("a", encoding="utf-8") as stream:
+                    stream.write(json.dumps(result) + "\n")
+    except BrokenProcessPool:
+        missing = [s.name for s in specs if s.name not in {r["name"] for r in results}]
+        print(f"a process died, of the first of these: {', '.join(missing)}", flush=True)
     print("\n" + confusion(results) + "\n")
     for name, value in scores(results).items():
         print(f"{name:45s} {value}")

@@ -19,22 +19,22 @@ except ImportError:  # Windows has no such locks: there two runs in one folder a
 def claimed(folder: Path) -> Iterator[None]:
     """Keep other processes' runs out of a folder, which is made, until this one ends, however it ends.
 
-    A folder made in vain is taken away again; one that cannot be made or locked is left to whoever writes there.
+    A folder made in vain is taken away again; one that cannot be made or locked (as on NFS) is left to whoever writes
+    there.
 
     Raises:
         InputError: another run is using it.
     """
+    made: list[Path] = []
     with contextlib.ExitStack() as stack:
-        try:
+        with contextlib.suppress(OSError):
             made = [p for p in (folder, *folder.parents) if not p.exists()]
             folder.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # Windows opens no folders
             handle = os.open(folder, os.O_RDONLY)
-        except OSError:
-            handle = None
-        if handle is not None:
             stack.callback(os.close, handle)
-            stack.callback(_remove_empty, made)
             _lock(handle, folder)
+        stack.callback(_remove_empty, made)
         yield
 
 
@@ -45,8 +45,6 @@ def _lock(handle: int, folder: Path) -> None:
         fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError:
         raise InputError(f"--out: another run is using {folder}; wait for it, or name another folder") from None
-    except OSError:  # a file system without locks
-        return
 
 
 def _remove_empty(folders: list[Path]) -> None:

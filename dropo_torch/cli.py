@@ -79,6 +79,7 @@ def _run(parsed: argparse.Namespace, rest: Sequence[str]) -> None:
     from dropo_torch import runs
     from dropo_torch.compare import METHODS
     from dropo_torch.config import load_config, parse_overrides
+    from dropo_torch.parallel import processors
 
     class Output(Console):
         def on_broken_pipe(self) -> None:
@@ -93,7 +94,7 @@ def _run(parsed: argparse.Namespace, rest: Sequence[str]) -> None:
         if rest:
             takes = "--out, --resume, --reduced and --workers"
             raise InputError(f"reproduce: {rest[0]} is not understood; it takes {takes}")
-        workers = _processors() if parsed.workers is None else _count("--workers", parsed.workers)
+        workers = processors() if parsed.workers is None else _count("--workers", parsed.workers)
         runs.run_reproduce(
             parsed.study, parsed.out, console=console, reduced=parsed.reduced, resume=parsed.resume, workers=workers
         )
@@ -187,11 +188,6 @@ def _folder(text: str) -> Path:
     if not text:
         raise argparse.ArgumentTypeError("no folder given")
     return Path(text)
-
-
-def _processors() -> int:
-    """How many processors this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _count(option: str, text: str) -> int:

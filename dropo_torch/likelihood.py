@@ -14,9 +14,9 @@ import torch
 DIVERGENCE_PENALTY = 1e3
 #: Log-likelihood of a transition of which fewer than two samples are left.
 LOST_TRANSITION = -1e4
-#: Degrees of freedom of Student's law, by which windows that noise does not explain are widened.
+#: Degrees of freedom of Student's t distribution, by which windows that noise does not explain are widened.
 STUDENT_DOF = 5.0
-#: Log-density ``(...)`` of residuals ``(..., n)`` under covariances ``(..., n, n)``.
+#: Log-density ``(...)`` of residuals ``(..., n)``, given covariances or scale matrices ``(..., n, n)``.
 LogDensity = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
@@ -44,11 +44,11 @@ def gaussian_log_density(residual: torch.Tensor, covariance: torch.Tensor) -> to
 
 
 def student_log_density(residual: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
-    """Return the log-density of Student's multivariate t law, :data:`STUDENT_DOF` degrees of freedom.
+    """Return the log-density of Student's multivariate t distribution, :data:`STUDENT_DOF` degrees of freedom.
 
     Args:
         residual: ``(..., n)``.
-        scale: the law's scale matrix, positive definite, ``(..., n, n)``.
+        scale: its scale matrix, positive definite, ``(..., n, n)``.
 
     Returns:
         ``(...)``.
@@ -118,7 +118,7 @@ def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor
 def widen(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """Return covariances ``(t, m, m)`` widened where the residual ``(t, m)`` lies far outside them.
 
-    The factor is that of the scale-mixture form of Student's t law: (ν + χ²) / (ν + m), at least 1.
+    The factor is that of the scale-mixture form of Student's t distribution: (ν + χ²) / (ν + m), at least 1.
     """
     factor = robust_cholesky(covariance)
     white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)

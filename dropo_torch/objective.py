@@ -278,7 +278,7 @@ class Objective:
         ]
 
     def robust_log_likelihood(self, mean: np.ndarray, values: torch.Tensor) -> float:
-        """Return the log-likelihood of φ under Student's t law, with the noise as it is given.
+        """Return the log-likelihood of φ under Student's t distribution, with the noise as it is given.
 
         The Gaussian one widens what the noise does not explain, window by window, and so hardly tells a noise that is
         too small; this one may be compared between noises.
@@ -337,7 +337,8 @@ class Objective:
         mean of the outcomes shifts the prediction. The regression of the outcomes on the draws gives
         G and with it the covariance G diag(ν) Gᵀ, to which the variance that the regression leaves is
         added: a contact that some draws make and others do not. Windows that the result still does
-        not explain have their covariance ``widened``, as under Student's t law. Without noise, nothing happens.
+        not explain have their covariance ``widened``, as under Student's t distribution. Without noise, nothing
+        happens.
         """
         if self.noise is None:
             return
@@ -407,10 +408,11 @@ class Objective:
     def noise_of(self, variance: float) -> list[float]:
         """Return the noise of each observed column, ``(n,)``, that gives each feature such a variance.
 
+        Masked columns, which set the start, have noise as the others.
         The inverse of what a given ``noise`` does to the features; quaternions turn by twice their noise.
         """
         deviations = variance**0.5 * self._column_scale
-        deviations[[c for q in self._quaternions for c in q]] = 0.5 * variance**0.5
+        deviations[[c for q in self.observation.quaternions for c in q]] = 0.5 * variance**0.5
         return deviations.tolist()
 
     def _end_variance(self) -> torch.Tensor:

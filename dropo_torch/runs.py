@@ -132,21 +132,22 @@ def run_sweep(
     sweep = sweep_epsilon(point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store)
     chosen = noise_keys(problem.objective, sweep.chosen) if noisy_starts else {"epsilon": sweep.chosen}
     _show_sweep(sweep, chosen, problem.space.names, console)
-    write_atomically(out / "sweep.json", json.dumps(sweep.document(), indent=2).encode() + b"\n")
+    write_atomically(out / "sweep.json", json.dumps({**sweep.document(), "use": chosen}, indent=2).encode() + b"\n")
     write_sweep_report(out / "report.html", sweep, use=chosen, config=config.document(), versions=versions())
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return sweep
 
 
 def _show_sweep(sweep: Sweep, chosen: Mapping[str, Any], names: Sequence[str], console: Console) -> None:
-    table = Table("ε", "mean squared error", "log-likelihood", *names)
+    heads = ("variance of the noise", "robust log-likelihood") if sweep.noisy_starts else ("ε", "log-likelihood")
+    table = Table(heads[0], "mean squared error", heads[1], *names)
     for p in sweep.points:
         marked = "[bold]" if p.epsilon == sweep.chosen else ""
         cells = [f"{p.mean[n]:.4g} ± {p.std[n]:.2g}" for n in names]
         value = p.log_likelihood if p.robust_log_likelihood is None else p.robust_log_likelihood
         table.add_row(f"{marked}{p.epsilon:g}", f"{p.mse:.4g}", f"{value:.1f}", *cells)
     console.print(table)
-    keys = yaml.safe_dump(dict(chosen), default_flow_style=True, width=10_000).strip()[1:-1]
+    keys = yaml.safe_dump(dict(chosen), default_flow_style=True, sort_keys=False, width=10_000).strip()[1:-1]
     console.print(f"chosen: [bold]{keys}[/], since {sweep.reason}", soft_wrap=True)
 
 

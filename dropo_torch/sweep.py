@@ -143,7 +143,7 @@ def likeliest(epsilons: Sequence[float], log_likelihoods: Sequence[float]) -> tu
         return chosen, f"the log still becomes likelier at the largest value tried, {chosen:g}: sweep further"
     below, above = (values[best] - values[i] for i in (best - 1, best + 1))
     return chosen, (
-        f"with noise of that variance on starts and ends the log is likeliest, by {below:.3g} nats against "
+        f"with noise of variance {chosen:g} on starts and ends the log is likeliest, by {below:.3g} nats against "
         f"{epsilons[best - 1]:g} and {above:.3g} against {epsilons[best + 1]:g}"
     )
 
@@ -218,5 +218,8 @@ def _stored(store: Path | None, fingerprint: str) -> dict[float, SweepPoint]:
     except (ValueError, KeyError, TypeError) as error:
         raise InputError(f"resume: {store} is no record of a sweep ({error}); start again without --resume") from None
     if owner != fingerprint:
-        raise InputError(f"resume: {store} belongs to another config or log; start again without --resume")
+        raise InputError(
+            f"resume: {store} belongs to another config or log, or to another kind of sweep; "
+            "start again without --resume"
+        )
     return {p.epsilon: p for p in points}

@@ -93,7 +93,7 @@ def run(cell: tuple[int, str], given: argparse.Namespace, threads: int) -> dict[
     result = folder / "train.json"
     if not result.exists():
         fit = given.out / f"fit-{seed}" / "fit.json"
-        problem = make_training(training_config(method, fit, seed, given, threads or given.threads))
+        problem = make_training(training_config(method, fit, seed, given, given.threads or threads))
         tell = functools.partial(show_progress, f"{method:<8} seed {seed}")
         found = train(problem, checkpoint=folder / "train-progress.pt", resume=True, on_progress=tell)
         found.policy.save(folder / "policy.pt")

@@ -301,12 +301,16 @@ def test_a_folder_that_cannot_be_written_gives_one_line(
 def test_two_runs_do_not_share_a_folder(folder: Folder, refused: Callable[..., str], tmp_path: Path) -> None:
     out = tmp_path / "runs" / "robot"
     first = start("fit", folder.config(optimizer="cma", budget=1_000_000, samples=100), "--out", out)
-    while not (out / "checkpoint.pkl").exists():
-        assert first.poll() is None
-        time.sleep(0.05)
-    assert f"another run is using {out}" in refused("fit", folder.config(), "--out", out, "--resume")
-    first.kill()
-    first.communicate()
+    try:
+        deadline = time.monotonic() + 100
+        while not (out / "checkpoint.pkl").exists():
+            assert first.poll() is None
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        assert f"another run is using {out}" in refused("fit", folder.config(), "--out", out, "--resume")
+    finally:
+        first.kill()
+        first.communicate()
     assert main(["fit", str(folder.config()), "--out", str(out)]) == 0  # a lock ends with its process
     assert {p.name for p in out.iterdir()} == RESULTS | {"previous-1"}
 

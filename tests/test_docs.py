@@ -271,7 +271,9 @@ def test_transfer_hopper(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     example = load_example(path)
     arguments = ["--out", str(tmp_path), "--seeds", "2", "--steps", "16", "--episodes", "2", "--log-steps", "30"]
     arguments += options
-    told = subprocess.run([sys.executable, path, *arguments, "--workers", "2"], capture_output=True, text=True)
+    told = subprocess.run(
+        [sys.executable, path, *arguments, "--workers", "2"], capture_output=True, text=True, timeout=300
+    )
     assert "target's own masses" in told.stdout, told.stderr
     found = json.loads((tmp_path / "transfer.json").read_text())
     assert {(r["method"], r["seed"]) for r in found["runs"]} == {(m, s) for m in example.METHODS for s in (0, 1)}

@@ -435,6 +435,8 @@ def test_the_noise_of_columns_gives_every_feature_its_variance(scaling):
     assert len(noise) == 7
     given = box_objective(scaling=scaling, noise=noise)
     np.testing.assert_allclose(given.noise_deviation, np.full(6, 2e-3), rtol=1e-12)
+    masked = box_objective(scaling=scaling, mask=["root.position[qw]"])
+    np.testing.assert_allclose(masked.noise_of(4e-6), noise)  # its start is as noisy
 
 
 def test_start_noise_follows_scaling_and_masks():

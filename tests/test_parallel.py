@@ -1,5 +1,6 @@
 """Tasks on several processes: results, errors, and an end when nobody waits any more."""
 
+import functools
 import os
 import signal
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from dropo_torch.parallel import in_parallel
+from dropo_torch.parallel import in_parallel, processors
 
 #: A parent whose workers write their process numbers into a folder and sleep.
 PARENT = """
@@ -70,7 +71,7 @@ def assert_gone(workers: list[int]) -> None:
 def test_every_task_comes_back_with_its_result(workers: int) -> None:
     found = dict(in_parallel(double, range(5), workers))
     assert {task: result[0] for task, result in found.items()} == {n: 2 * n for n in range(5)}
-    threads = 0 if workers == 1 else max(1, (os.cpu_count() or 1) // workers)
+    threads = 0 if workers == 1 else max(1, processors() // workers)
     assert {result[1] for result in found.values()} == {threads}
 
 
@@ -96,13 +97,31 @@ def test_workers_end_with_their_parent(sent: signal.Signals, group: bool, tmp_pa
     """Ctrl-C in a terminal reaches the whole group; a kill, the parent alone."""
     script = tmp_path / "parent.py"
     script.write_text(PARENT)
-    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    here = os.pathsep.join([str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")])
+    listen = functools.partial(
+        signal.signal, signal.SIGINT, signal.SIG_DFL
+    )  # ignored where tests run in the background
     parent = subprocess.Popen(
-        [sys.executable, script, tmp_path], env=environment, start_new_session=True, stderr=subprocess.PIPE, text=True
-    )
-    workers = begun(tmp_path, 2)
-    (os.killpg if group else os.kill)(parent.pid, sent)
-    _, errors = parent.communicate(timeout=60)
+        [sys.executable, script, tmp_path], env={**os.environ, "PYTHONPATH": here}, start_new_session=True,
+        preexec_fn=listen, stderr=subprocess.PIPE, text=True,
+    )  # fmt: skip
+    try:
+        workers = begun(tmp_path, 2)
+        (os.killpg if group else os.kill)(parent.pid, sent)
+        errors = parent.communicate(timeout=60)[1]
+    finally:
+        parent.kill()
     assert parent.returncode == (130 if sent == signal.SIGINT else -signal.SIGKILL)
     assert "Traceback" not in errors
     assert_gone(workers)
+
+
+def test_the_end_of_one_iteration_is_not_that_of_another() -> None:
+    first, second = in_parallel(double, range(4), 2), in_parallel(double, range(6), 2)
+    next(first), next(second)
+    first.close()
+    assert len(list(second)) == 5
+
+
+def test_no_task_needs_no_worker() -> None:
+    assert list(in_parallel(double, [], 2)) == []

@@ -145,6 +145,7 @@ def test_the_noise_of_every_measurement_is_found(variance: float, tmp_path: Path
     found = json.loads((out / "sweep.json").read_text())
     assert found["noisy_starts"]
     assert found["chosen"] == pytest.approx(variance)
+    assert found["use"] == {"noise": pytest.approx(variance**0.5), "epsilon": pytest.approx(1e-3 * variance)}
     assert f"noise: {variance**0.5}" in (out / "report.html").read_text()
     assert main([*command, "--resume"]) == 0
     assert json.loads((out / "sweep.json").read_text()) == found

@@ -178,7 +178,6 @@ def calibrate(
     logs: Iterable[int],
     noise: np.ndarray,
     done: Iterable[Trial] = (),
-    on_trial: Callable[[Trial], None] | None = None,
 ) -> list[Trial]:
     """Fit every simulated log by every method.
 
@@ -188,7 +187,6 @@ def calibrate(
         logs: numbers of the logs of each kind; the number seeds a log.
         noise: deviation on each observed column of the ends of transitions, ``(n,)``.
         done: trials of an interrupted run, which are not repeated.
-        on_trial: called after each new trial.
     """
     trials = list(done)
     known = {(t.kind, t.method, t.log) for t in trials}
@@ -202,8 +200,6 @@ def calibrate(
                 values = to_values(truths, given[method].space.is_log)
                 made = synthesise(given[method], values, noise, seed=log)
                 trials.append(try_method(made, truths, kind=kind, name=method, log=log))
-                if on_trial is not None:
-                    on_trial(trials[-1])
     return trials
 
 

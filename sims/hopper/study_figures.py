@@ -68,7 +68,7 @@ def recovery(results: Sequence[Result]) -> Any:
 
 
 def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
-    """Draw error and mean deviation against ε, a line a case, the elbow marked."""
+    """Draw error and mean deviation against ε, a line a case, the ε chosen marked."""
     figure = figures.new_figure(920, 320)
     for i, (key, title) in enumerate((("mse", "mean squared error"), ("mean_std", "mean deviation (kg)"))):
         axes = _part(figure, i, 2)

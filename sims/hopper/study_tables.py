@@ -115,7 +115,7 @@ def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
 
 
 def sweep_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
-    """Return one row for each sweep over ε, with the elbow and, where there is noise, its variance."""
+    """Return one row for each sweep over ε, with the one chosen and, where there is noise, its variance."""
     groups: dict[tuple[Any, ...], list[Result]] = {}
     for r in results:
         cell = r["cell"]
