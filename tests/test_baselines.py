@@ -534,7 +534,7 @@ TINY = Plan(
 def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None:
     out = tmp_path / "study"
     found = run_study(out, plan=TINY)
-    assert len(found) == 7
+    assert len(found) == 8
     assert all(line.startswith(("holds", "DOES NOT HOLD")) for line in found)
     document = json.loads((out / "study.json").read_text())
     cases = {(r["case"], r["method"]) for r in document["tables"]["table"]}
