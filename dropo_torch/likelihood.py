@@ -37,10 +37,8 @@ def gaussian_log_density(residual: torch.Tensor, covariance: torch.Tensor) -> to
     Returns:
         ``(...)``.
     """
-    factor = robust_cholesky(covariance)
-    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
-    log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
-    return -0.5 * white.square().sum(-1) - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
+    chi2, log_det = _whitened(residual, covariance)
+    return -0.5 * chi2 - log_det - 0.5 * residual.shape[-1] * math.log(2 * math.pi)
 
 
 def student_log_density(residual: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
@@ -54,11 +52,16 @@ def student_log_density(residual: torch.Tensor, scale: torch.Tensor) -> torch.Te
         ``(...)``.
     """
     n, dof = residual.shape[-1], STUDENT_DOF
-    factor = robust_cholesky(scale)
-    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
-    log_det = torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
+    chi2, log_det = _whitened(residual, scale)
     constant = math.lgamma((dof + n) / 2) - math.lgamma(dof / 2) - 0.5 * n * math.log(dof * math.pi)
-    return constant - log_det - 0.5 * (dof + n) * torch.log1p(white.square().sum(-1) / dof)
+    return constant - log_det - 0.5 * (dof + n) * torch.log1p(chi2 / dof)
+
+
+def _whitened(residual: torch.Tensor, matrix: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return rᵀM⁻¹r and half of log |M|, ``(...)`` each."""
+    factor = robust_cholesky(matrix)
+    white = torch.linalg.solve_triangular(factor, residual.unsqueeze(-1), upper=False).squeeze(-1)
+    return white.square().sum(-1), torch.diagonal(factor, dim1=-2, dim2=-1).log().sum(-1)
 
 
 def robust_cholesky(covariance: torch.Tensor) -> torch.Tensor:

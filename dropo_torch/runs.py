@@ -112,7 +112,7 @@ def run_sweep(
         epsilons: the values to try.
         noisy_starts: take ε for the variance of every measurement, of the starts of transitions, too.
         resume: continue an interrupted run in ``out``.
-    """  # fmt: skip
+    """
     from dropo_torch.report import write_sweep_report
 
     _only_dropo(config, "sweep-epsilon chooses the ε of DROPO")
