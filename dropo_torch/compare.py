@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.fit import Fit, write_atomically
+from dropo_torch.files import write_atomically
+from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective, draw_uniforms
 
 SCHEMA = "dropo-torch/compare/1"

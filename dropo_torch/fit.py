@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
 import math
-import os
 import pickle
 import time
 from collections.abc import Callable, Mapping
@@ -18,6 +15,7 @@ import numpy as np
 from dropo_torch.certify import certify, has_reference
 from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError, choices
+from dropo_torch.files import write_atomically, write_json
 from dropo_torch.objective import Objective, draw_uniforms, no_effect
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer, Progress
 from dropo_torch.optimizers.correlated import CorrelatedOptimizer
@@ -112,7 +110,7 @@ class Fit:
 
     def save(self, path: str | Path) -> None:
         """Write ``fit.json``, whole or not at all."""
-        write_atomically(Path(path), json.dumps(self.document(), indent=2).encode() + b"\n")
+        write_json(Path(path), self.document())
 
 
 def fit(
@@ -349,21 +347,6 @@ def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objecti
         objective.linearise(linearised_at)
     objective.simulated_transitions = simulated
     return history
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, whatever interrupts it."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
-    try:
-        with open(temporary, "wb") as stream:
-            stream.write(content)
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    finally:
-        with contextlib.suppress(FileNotFoundError):
-            temporary.unlink()
 
 
 def without_history(result: Fit) -> Fit:

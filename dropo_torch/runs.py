@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-import json
-import math
 import platform
 import shutil
 import tempfile
@@ -28,7 +26,8 @@ from dropo_torch.diagnostics import diagnose
 from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
 from dropo_torch.export import export_model
-from dropo_torch.fit import Fit, refuse_dead_parameters, write_atomically
+from dropo_torch.files import write_atomically, write_json
+from dropo_torch.fit import Fit, refuse_dead_parameters
 from dropo_torch.gap import Gap, add, find_gap, prepare
 from dropo_torch.objective import Objective
 from dropo_torch.problem import Problem, make_problem
@@ -132,7 +131,7 @@ def run_sweep(
     sweep = sweep_epsilon(point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store)
     chosen = noise_keys(problem.objective, sweep.chosen) if noisy_starts else {"epsilon": sweep.chosen}
     _show_sweep(sweep, chosen, problem.space.names, console)
-    write_atomically(out / "sweep.json", json.dumps({**sweep.document(), "use": chosen}, indent=2).encode() + b"\n")
+    write_json(out / "sweep.json", {**sweep.document(), "use": chosen})
     write_sweep_report(out / "report.html", sweep, use=chosen, config=config.document(), versions=versions())
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return sweep
@@ -165,7 +164,7 @@ def run_certify(config: Config, out: Path, *, console: Console) -> Certificate:
     problem = make_problem(config.model_copy(update={"backend": "warp"}))
     prepare_folder(out, problem.model_path, resume=False)
     found = certify(problem.objective, seed=config.seed)
-    write_atomically(out / "certificate.json", json.dumps(found.document(), indent=2).encode() + b"\n")
+    write_json(out / "certificate.json", found.document())
     table = Table("parameter", "derivative", "median error", "99 %", "active set moved", "verdict")
     for p in found.parameters:
         numbers = (
@@ -217,7 +216,7 @@ def run_compare(
         fingerprint=problem.fingerprint,
         on_run=show,
     )
-    write_atomically(out / "compare.json", json.dumps(comparison.document(), indent=2).encode() + b"\n")
+    write_json(out / "compare.json", comparison.document())
     write_compare_report(out / "report.html", comparison, config=config.document(), versions=versions())
     console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
     return comparison
@@ -264,7 +263,7 @@ def run_gap(config: Config, out: Path, *, console: Console, source: Path | None 
         gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update, scene=scene)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
-    write_atomically(out / "gap.json", json.dumps(plain_numbers(gap.document()), indent=2).encode() + b"\n")
+    write_json(out / "gap.json", gap.document())
     name = config.sim or config.model or "model"
     write_gap_report(
         out / "report.html", gap, config=config.document(), versions=versions(), title=f"What {name} lacks",
@@ -298,17 +297,6 @@ def _show_gap(gap: Gap, out: Path, console: Console) -> None:
     )  # fmt: skip
     if (out / "config.yaml").exists():
         console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True, markup=False)
-
-
-def plain_numbers(document: Any) -> Any:
-    """Return plain data in which numbers that are not finite are ``None``, as JSON has none."""
-    if isinstance(document, dict):
-        return {k: plain_numbers(v) for k, v in document.items()}
-    if isinstance(document, (list, tuple)):
-        return [plain_numbers(v) for v in document]
-    if isinstance(document, float) and not math.isfinite(document):
-        return None
-    return float(document) if isinstance(document, np.floating) else document
 
 
 def versions() -> dict[str, str]:

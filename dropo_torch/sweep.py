@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.errors import InputError
-from dropo_torch.fit import Fit, write_atomically
+from dropo_torch.files import write_atomically
+from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective, draw_uniforms
 
 SCHEMA = "dropo-torch/sweep/1"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import shutil
 from collections.abc import Sequence
@@ -14,13 +13,13 @@ from torchrl.record.loggers import TensorboardLogger
 
 from dropo_torch.config import Config
 from dropo_torch.errors import InputError
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_json
 from dropo_torch.progress import TrainProgress
 from dropo_torch.report.train import WORLDS, evaluations, write_train_report
 from dropo_torch.rl.problem import TrainingProblem, make_training
 from dropo_torch.rl.train import Progress, TrainEntry, Training, check_training, train
 from dropo_torch.rl.video import chosen_frames, draw, record
-from dropo_torch.runs import check_log_option, plain_numbers, prepare_folder, versions
+from dropo_torch.runs import check_log_option, prepare_folder, versions
 
 #: The learning curves on TensorBoard have about this many points.
 POINTS = 1000
@@ -70,7 +69,6 @@ def _keep_distribution(problem: TrainingProblem, out: Path, continued: bool) -> 
 
 def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
     result.policy.save(out / "policy.pt")
-    document = json.dumps(plain_numbers(result.document()), indent=2)
     world = problem.target or problem.nominal or problem.training
     env = problem.env(world, 1, problem.config.seed)
     states = record(result.policy, env)
@@ -82,7 +80,7 @@ def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
         out / "report.html", result, config=problem.config.document(), versions=versions(),
         title=f"Policy for {env.task.name}", strip=strip, notes=notes,
     )  # fmt: skip
-    write_atomically(out / "train.json", document.encode() + b"\n")
+    write_json(out / "train.json", result.document())
 
 
 def _show(result: Training, out: Path, console: Console) -> None:

@@ -30,7 +30,7 @@ import numpy as np
 import scipy.stats
 
 import dropo_torch as dropo
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.parallel import in_parallel
 from dropo_torch.rl.problem import make_training
 from dropo_torch.rl.train import Progress, TrainEntry, train

@@ -28,6 +28,7 @@ from dropo_torch.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
+from dropo_torch.files import plain_numbers
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
 from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Starts, cost_of, robust_factors
 from dropo_torch.gap.intervals import deviations
@@ -42,7 +43,6 @@ from dropo_torch.gap.screen import all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
 from dropo_torch.observation import parse_observation
 from dropo_torch.problem import Problem, make_problem
-from dropo_torch.runs import plain_numbers
 
 #: The vocabulary of searches that are not about the whole of it.
 FEW = (

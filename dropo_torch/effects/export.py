@@ -20,7 +20,7 @@ from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.effects.simulator import is_native, is_outer, overlap
 from dropo_torch.errors import InputError
 from dropo_torch.export import read_spec, write_inertials
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.model import quiet_mujoco, unsimplify
 from dropo_torch.parameters import ParameterSpace, object_names, read_field, write_field
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.errors import InputError
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.gap.evidence import Evidence, caps_of, cost_of
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import Rules, allowance, clears, paired, significant, simplest

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from dropo_torch.compare import Comparison, Run
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.report import figures, words
 from dropo_torch.report.html import config_yaml, render
 

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.gap.result import Gap, NamedEffect, Ranked, Residuals
 from dropo_torch.report import figures, gap_figures, gap_words, words
 from dropo_torch.report.html import config_yaml, nats, render

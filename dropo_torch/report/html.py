@@ -15,7 +15,8 @@ from markupsafe import Markup
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, to_values
-from dropo_torch.fit import Fit, HistoryEntry, write_atomically
+from dropo_torch.files import write_atomically
+from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report import figures, words
 from dropo_torch.sweep import Sweep

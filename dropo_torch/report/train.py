@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.report import figures, words
 from dropo_torch.report.html import config_yaml, render
 from dropo_torch.rl.evaluate import Evaluation

@@ -12,7 +12,7 @@ import torch
 from torch import nn
 
 from dropo_torch.errors import InputError
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.rl.networks import Actor, Normalizer
 
 SCHEMA = "dropo-torch/policy/1"

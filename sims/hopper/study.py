@@ -20,7 +20,7 @@ import torch
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.errors import InputError
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically
 from dropo_torch.parallel import in_parallel
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.sweep import NEGLIGIBLE, robust_log_likelihood

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -10,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from dropo_torch.fit import write_atomically
+from dropo_torch.files import write_atomically, write_json
 from dropo_torch.report import write_study_report
 from dropo_torch.report.figures import to_svg
-from dropo_torch.runs import plain_numbers, versions
+from dropo_torch.runs import versions
 from dropo_torch.sweep import elbow, likeliest
 from sims.hopper.study_figures import Result, draw_all, drawn_std, label
 
@@ -64,7 +63,7 @@ def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) ->
         "cma": cma_rows(results),
     }
     document = {"schema": SCHEMA, "plan": plan, "findings": [asdict(f) for f in findings], "tables": tables}
-    write_atomically(out / "study.json", json.dumps(plain_numbers(document), indent=1).encode() + b"\n")
+    write_json(out / "study.json", document)
     page, figures = sections(tables, findings), draw_all(results, tables)
     for name, figure in figures.items():
         figure.savefig(out / name, dpi=110, facecolor="white", metadata={"Software": None})
