@@ -44,9 +44,12 @@ METHODS: dict[str, dict[str, Any]] = {
     "laplace": {"method": "laplace"},
     "droid": {"method": "droid", "method_options": {"budget": 600}},
     "simopt": {"method": "simopt", "method_options": {"samples": 60, "iterations": 15, "horizon": 20}},
-    "bayessim, mdnn": {"method": "bayessim", "method_options": {"simulations": 500, "horizon": 20}},
+    "bayessim, mdnn": {
+        "method": "bayessim", "noise": NOISE.tolist(), "method_options": {"simulations": 500, "horizon": 20},
+    },
     "bayessim, mdrff": {
-        "method": "bayessim", "method_options": {"simulations": 500, "horizon": 20, "features": "mdrff"},
+        "method": "bayessim", "noise": NOISE.tolist(),
+        "method_options": {"simulations": 500, "horizon": 20, "features": "mdrff"},
     },
     "udr": {"method": "udr"},
 }  # fmt: skip

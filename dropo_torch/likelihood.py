@@ -123,9 +123,7 @@ def widen(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
 
     The factor is that of the scale-mixture form of Student's t distribution: (ν + χ²) / (ν + m), at least 1.
     """
-    factor = robust_cholesky(covariance)
-    white = torch.linalg.solve_triangular(factor, residual[..., None], upper=False)
-    chi2 = white.square().sum((-2, -1))
+    chi2, _ = _whitened(residual, covariance)
     scale = (STUDENT_DOF + chi2) / (STUDENT_DOF + residual.shape[-1])
     return covariance * scale.clamp(min=1.0)[:, None, None]
 

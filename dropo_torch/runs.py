@@ -33,7 +33,16 @@ from dropo_torch.objective import Objective
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.progress import FitProgress, StageProgress
 from dropo_torch.report.gap_words import answer
-from dropo_torch.sweep import Sweep, SweepPoint, default_epsilons, noise_keys, robust_log_likelihood, sweep_epsilon
+from dropo_torch.sweep import (
+    Sweep,
+    SweepPoint,
+    default_epsilons,
+    epsilon_keys,
+    noise_keys,
+    rising,
+    robust_log_likelihood,
+    sweep_epsilon,
+)
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (
@@ -108,7 +117,7 @@ def run_sweep(
         config: the config.
         out: the folder.
         console: where progress and results are shown.
-        epsilons: the values to try.
+        epsilons: the values to try; where the config has an ε for every column, the geometric mean of the columns'.
         noisy_starts: take ε for the variance of every measurement, of the starts of transitions, too.
         resume: continue an interrupted run in ``out``.
     """
@@ -117,19 +126,26 @@ def run_sweep(
     _only_dropo(config, "sweep-epsilon chooses the ε of DROPO")
     if noisy_starts and config.noise is not None:
         raise InputError(f"noise: {config.noise} given, which --noisy-starts is to find; leave one of them out")
+    if noisy_starts and isinstance(config.epsilon, list):
+        raise InputError(f"epsilon: {config.epsilon} given, but --noisy-starts tries one for all columns; leave it out")
     problem = make_problem(config)
     store = out / "sweep-progress.json"
-    prepare_folder(out, problem.model_path, resume=resume and store.exists())
-    values = default_epsilons(problem.objective.measured.numpy()) if epsilons is None else list(epsilons)
+    values = default_epsilons(problem.objective.measured.numpy()) if epsilons is None else rising(epsilons)
+    continued = resume and store.exists()
+    if not continued:
+        refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
+    prepare_folder(out, problem.model_path, resume=continued)
+
+    def keys_of(epsilon: float) -> dict[str, Any]:
+        return noise_keys(problem.objective, epsilon) if noisy_starts else epsilon_keys(config.epsilon, epsilon)
 
     def point_at(epsilon: float) -> SweepPoint:
-        keys = noise_keys(problem.objective, epsilon) if noisy_starts else {"epsilon": epsilon}
-        part = make_problem(config.model_copy(update=keys))
+        part = make_problem(config.model_copy(update=keys_of(epsilon)))
         fit = _fit(part, None, resume=False, console=console, label=f"ε = {epsilon:g}")
         return SweepPoint.of(epsilon, fit, robust_log_likelihood(part.objective, fit) if noisy_starts else None)
 
     sweep = sweep_epsilon(point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store)
-    chosen = noise_keys(problem.objective, sweep.chosen) if noisy_starts else {"epsilon": sweep.chosen}
+    chosen = keys_of(sweep.chosen)
     _show_sweep(sweep, chosen, problem.space.names, console)
     write_json(out / "sweep.json", {**sweep.document(), "use": chosen})
     write_sweep_report(out / "report.html", sweep, use=chosen, config=config.document(), versions=versions())

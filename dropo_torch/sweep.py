@@ -149,6 +149,14 @@ def likeliest(epsilons: Sequence[float], log_likelihoods: Sequence[float]) -> tu
     )
 
 
+def epsilon_keys(given: float | Sequence[float], epsilon: float) -> dict[str, Any]:
+    """Return the config's ``epsilon``: the value, or values of that geometric mean in the ratios of those given."""
+    if not isinstance(given, Sequence):
+        return {"epsilon": epsilon}
+    ratios = np.asarray(given) / np.exp(np.mean(np.log(given)))
+    return {"epsilon": [float(f"{epsilon * ratio:.4g}") for ratio in ratios]}
+
+
 def noise_keys(objective: Objective, variance: float) -> dict[str, Any]:
     """Return the config's ``noise`` and ``epsilon`` for a variance of every measurement, in compared features."""
     noise = objective.noise_of(variance)
@@ -165,6 +173,18 @@ def default_epsilons(measured: np.ndarray) -> list[float]:
     """Return nine values of ε, a decade apart, up to about a tenth of the measured columns' variance ``(T, m)``."""
     top = math.ceil(math.log10(max(float(np.mean(np.var(measured, axis=0))), 1e-12))) - 1
     return [10.0**k for k in range(top - 8, top + 1)]
+
+
+def rising(epsilons: Sequence[float]) -> list[float]:
+    """Return the values to try, each once, in rising order.
+
+    Raises:
+        InputError: fewer than three values, or one that is not positive.
+    """
+    values = sorted({float(e) for e in epsilons})
+    if len(values) < 3 or not all(0 < value < math.inf for value in values):
+        raise InputError(f"epsilons: {list(epsilons)} given; expected three or more positive numbers")
+    return values
 
 
 def sweep_epsilon(
@@ -188,9 +208,7 @@ def sweep_epsilon(
     Raises:
         InputError: fewer than three values, or one that is not positive.
     """
-    values = sorted({float(e) for e in epsilons})
-    if len(values) < 3 or not all(0 < value < math.inf for value in values):
-        raise InputError(f"epsilons: {list(epsilons)} given; expected three or more positive numbers")
+    values = rising(epsilons)
     owner = fingerprint + ("-noisy-starts" if noisy_starts else "")
     done = _stored(store, owner)
     for value in values:

@@ -244,8 +244,8 @@ def make_replay(
 ) -> Replay:
     """Cut a log into consecutive windows of ``horizon`` transitions.
 
-    Where episodes are shorter, the windows are, too: of lengths down to half the horizon (or half the longest episode),
-    the one that leaves the fewest transitions out.
+    Of the lengths down to half the horizon (or half the longest episode), windows have the one that leaves the fewest
+    transitions out, the longest of several.
 
     Raises:
         InputError: a horizon below 1.
@@ -268,8 +268,6 @@ def make_replay(
 def _window_length(lengths: np.ndarray, horizon: int) -> int:
     """The length of windows for episodes of these lengths."""
     longest = min(horizon, int(lengths.max()))
-    if (lengths >= longest).all():
-        return longest
     return max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
 
 

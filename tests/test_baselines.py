@@ -23,13 +23,17 @@ from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.cli import main
 from dropo_torch.config import make_config
-from dropo_torch.diagnostics import estimates
+from dropo_torch.diagnostics import diagnose, estimates
 from dropo_torch.distribution import Distribution, truncated_moments
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, fit
+from dropo_torch.likelihood import DIVERGENCE_PENALTY
 from dropo_torch.objective import draw_uniforms
 from dropo_torch.optimizers.correlated import random_effects
+from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.problem import Problem, make_problem
+from dropo_torch.report import write_fit_report
+from dropo_torch.report.words import findings
 from dropo_torch.trajectory import Trajectories, make_replay
 from sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
@@ -130,6 +134,43 @@ def test_laplace_is_the_normal_of_least_squares(folder: Path) -> None:
     assert found.correlation[0, 1] == pytest.approx(covariance[0, 1] / np.sqrt(np.prod(np.diag(covariance))), rel=1e-4)
 
 
+@pytest.mark.parametrize("epsilon", [1e-12, 1e-5, 1.0])
+def test_laplace_does_not_depend_on_the_size_of_epsilon(folder: Path, epsilon: float) -> None:
+    """Errors of the log far below ε are errors all the same: the means are found as well as the log tells."""
+    found = fit_problem(problem(folder, "laplace", "noisy", epsilon=[1e-2 * epsilon, epsilon]))
+    matched = fit_problem(problem(folder, "laplace", "noisy"))
+    assert found.distribution.mean == pytest.approx(
+        matched.distribution.mean, abs=1e-2 * matched.distribution.std.min()
+    )
+    assert found.distribution.std == pytest.approx(matched.distribution.std, rel=1e-3)
+    assert found.extras["reduced_chi2"] * epsilon == pytest.approx(matched.extras["reduced_chi2"] * 1e-4, rel=1e-3)
+    exact = fit_problem(problem(folder, "laplace", "exact", epsilon=epsilon)).distribution
+    assert exact.mean == pytest.approx(TRUTH, rel=1e-6)
+
+
+def test_laplace_keeps_a_direction_that_the_log_knows_where_another_is_unknown() -> None:
+    """Only a + b is seen: its deviation is the log's, though a's and b's are their boxes'."""
+    rng = np.random.default_rng(0)
+    simulator = LinearSimulator(space_of(a=[0, 1], b=[0, 100]), np.array([[1.0, 1.0]]))
+    objective = linear_objective(simulator, 30.0 + 0.01 * rng.standard_normal((40, 1)), epsilon=1e-4)
+    found = fit(objective, search=LaplaceOptimizer(objective), samples=10).distribution
+    assert found.correlation is not None
+    covariance = found.correlation * np.outer(found.std, found.std)
+    assert np.sqrt(covariance.sum()) == pytest.approx(0.01 / np.sqrt(40), rel=0.3)
+    assert found.mean.sum() == pytest.approx(30.0, abs=0.01)
+    assert (found.std <= [1.0, 100.0]).all()
+
+
+def test_a_lost_transition_does_not_widen_laplace() -> None:
+    """The reduced χ² is that of the transitions that survived."""
+    sums = np.zeros(2 + 2 * 1 + 2 * 1)
+    sums[0] = 0.5 * 38 + DIVERGENCE_PENALTY
+    sums[1], sums[4] = 1, 1.0  # one lost; a curvature
+    stage = MeansStage(np.zeros(1), np.ones(1), np.full(1, 0.5), (20, 2))
+    stage.tell(torch.from_numpy(sums))
+    assert stage.reduced_chi2 == pytest.approx(38 / (19 * 2 - 1))
+
+
 def test_laplace_covers_the_truth_of_a_noisy_log(folder: Path) -> None:
     found = fit_problem(problem(folder, "laplace", "noisy")).distribution
     z = (TRUTH - found.mean) / found.std
@@ -193,6 +234,11 @@ def test_a_mixture_stays_in_its_box() -> None:
     assert outside.share_inside == 0
     wide = Mixture(np.ones(1), np.array([[0.9]]), np.array([[[0.2]]]), np.zeros(1), np.ones(1))
     assert wide.share_inside == pytest.approx(0.566, abs=0.02)
+    assert wide.shares_inside == pytest.approx([0.566], abs=1e-3)
+    points = np.linspace(-4, 6, 2001)
+    density = wide.marginal_density(0, points)
+    assert np.trapezoid(density, points) == pytest.approx(1, abs=1e-6)
+    assert points[density.argmax()] == pytest.approx(0.9, abs=0.01)
     draws = wide.sample(5000, seed=0)
     assert draws.min() >= 0
     assert draws.max() <= 1
@@ -224,7 +270,8 @@ def test_a_posterior_outside_the_box_ends_at_its_side_and_says_so(
     box = found.distribution
     assert box.mean[1] == pytest.approx(box.high[1], rel=1e-6)
     assert np.isfinite(box.std).all()
-    assert "outside the search box" in found.document()["stop_reason"]
+    assert "damping lies outside the search box" in found.document()["stop_reason"]
+    assert found.document()["extrapolates"]
     assert found.document()["share_inside"] == 0
 
 
@@ -468,7 +515,7 @@ def test_dropo_fit_writes_what_training_reads(folder: Path, tmp_path: Path, meth
     page = (tmp_path / "out" / "report.html").read_text()
     assert "What the standard deviations are" in page
     assert "Standard deviation at its floor" not in page
-    assert ("The posterior, pair by pair" in page) == (method == "bayessim")
+    assert ("<h2>The posterior</h2>" in page) == (method == "bayessim")
 
 
 @pytest.mark.parametrize(
@@ -539,6 +586,7 @@ def test_the_hopper_study_resumes_and_says_what_it_found(tmp_path: Path) -> None
     document = json.loads((out / "study.json").read_text())
     cases = {(r["case"], r["method"]) for r in document["tables"]["table"]}
     methods = ("dropo", "droid", "bayessim (mdnn)", "bayessim (mdrff)")
+    assert ("noisy", "bayessim (mdnn) (noise given)") in cases
     assert cases >= {(c, m) for c in ("noiseless", "noisy", "unmodeled torso") for m in methods}
     assert ("noisy", "dropo (noise given)") in cases
     torso = {r["case"] for r in document["tables"]["table"] if r["parameter"] == "torso_mass"}
@@ -633,6 +681,8 @@ def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(fol
         return problem(folder, method, epsilon=(noise**2).tolist())
 
     trials = calibrate(ours, ["laplace", "dropo"], logs=range(12), noise=noise)
+    boxes = calibrate(ours, ["udr"], logs=range(3), noise=noise)
+    assert len({trial.width["0.9"]["mass"] for trial in boxes}) == 3  # fits of several logs are independent
     found = {(c.kind, c.method, c.parameter): c.covered for c in coverages(trials) if c.level == 0.9}
     assert found["fixed", "laplace", "mass"] > 0.7
     assert found["fixed", "laplace", "damping"] > 0.7
@@ -673,7 +723,7 @@ def test_a_method_refuses_what_it_would_ignore(folder: Path, extra: dict[str, An
 
 
 def test_short_episodes_are_replayed_too() -> None:
-    """Windows of 16 of 17 steps leave nothing of the four shorter episodes out; of long ones they keep their length."""
+    """Windows have the length that leaves the fewest transitions out, down to half of what was asked for."""
     count = np.array([16, 16, 16, 17, 15])
     ends = np.isin(np.arange(80), count.cumsum() - 1)
     states = np.arange(160.0).reshape(80, 2)
@@ -681,7 +731,9 @@ def test_short_episodes_are_replayed_too() -> None:
     replay = make_replay(log, generic_observation(2), 50)
     assert (replay.horizon, len(replay.states)) == (15, 5)
     long = Trajectories(states, states, np.zeros((80, 1)), np.arange(80) == 79)
-    assert make_replay(long, generic_observation(2), 50).horizon == 50
+    assert make_replay(long, generic_observation(2), 50).horizon == 40
+    assert make_replay(long, generic_observation(2), 80).horizon == 80
+    assert make_replay(long, generic_observation(2), 20).horizon == 20
 
 
 def test_bayessim_says_when_the_log_is_unlike_every_simulation(folder: Path) -> None:
@@ -690,9 +742,23 @@ def test_bayessim_says_when_the_log_is_unlike_every_simulation(folder: Path) -> 
         folder, "bayessim", method_options={"simulations": 60, "horizon": 20, "epochs": 3},
         parameters={"mass": {"field": "body_mass", "name": "bob", "bounds": [30.0, 31.0]}},
     )  # fmt: skip
-    found = fit_problem(ours).document()
+    result = fit_problem(ours)
+    found = result.document()
     assert found["summary_distance"] > 5
     assert "unlike every simulation" in found["stop_reason"]
+    told = findings(result, diagnose(ours.objective, result.distribution))
+    (about,) = [f for f in told if f.title == "What the standard deviations are"]
+    assert about.level == "attention"
+    assert "the posterior is a guess: the log is unlike every simulation" in about.text
+    write_fit_report(
+        folder / "guess.html",
+        fit=result,
+        diagnostics=diagnose(ours.objective, result.distribution),
+        config=None,
+        title="t",
+    )
+    page = (folder / "guess.html").read_text()
+    assert page.split("<h2>The posterior</h2>")[1].split("<h2>")[0].count("<svg") == 1  # one parameter has no pairs
 
 
 def test_a_few_wild_simulations_do_not_blind_the_network() -> None:
@@ -703,7 +769,8 @@ def test_a_few_wild_simulations_do_not_blind_the_network() -> None:
     assert farthest(x, np.array([0.5])) < 1
     assert farthest(x, np.array([9.0])) > 5
     assert farthest(np.ones((50, 1)), np.ones(1)) == 0
-    assert farthest(np.ones((50, 1)), np.zeros(1)) == np.inf
+    assert farthest(np.ones((50, 1)), np.zeros(1)) == 0  # a column that nothing moves is not seen by the network
+    assert farthest(np.full((50, 1), np.nan), np.zeros(1)) == np.inf
     settings = BayesSimSettings(components=2, hidden=16, epochs=60)
     found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
     assert np.sqrt(found.moments_inside[1][0, 0]) < 0.12

@@ -12,7 +12,7 @@ from arm import Folder
 
 from dropo_torch.cli import main
 from dropo_torch.errors import InputError
-from dropo_torch.sweep import SweepPoint, default_epsilons, elbow, likeliest, sweep_epsilon
+from dropo_torch.sweep import SweepPoint, default_epsilons, elbow, epsilon_keys, likeliest, sweep_epsilon
 from sims.hopper.record import record
 
 EPSILONS = [1e-8, 1e-7, 1e-6, 1e-5, 1e-4]
@@ -149,6 +149,31 @@ def test_the_noise_of_every_measurement_is_found(variance: float, tmp_path: Path
     assert f"noise: {variance**0.5}" in (out / "report.html").read_text()
     assert main([*command, "--resume"]) == 0
     assert json.loads((out / "sweep.json").read_text()) == found
+
+
+def test_an_epsilon_of_each_column_is_swept_in_its_ratios(tmp_path: Path) -> None:
+    assert epsilon_keys(1e-5, 1e-3) == {"epsilon": 1e-3}
+    assert epsilon_keys([1e-6, 1e-4], 1e-3) == {"epsilon": [1e-4, 1e-2]}
+    config = Folder(tmp_path / "robot").config(epsilon=[1e-6, 1e-6, 1e-4, 1e-4])
+    out = tmp_path / "out"
+    assert main(["sweep-epsilon", str(config), "--out", str(out), "--epsilons", "1e-4,1e-6,1e-5"]) == 0
+    found = json.loads((out / "sweep.json").read_text())
+    assert found["chosen"] == 1e-6
+    assert found["use"] == {"epsilon": [1e-7, 1e-7, 1e-5, 1e-5]}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [["--epsilons", "1e-6,1e-5"], ["--parameters.idle", "{field: qpos_spring, name: shoulder, bounds: [-1, 1]}"]],
+)
+def test_a_sweep_that_is_refused_leaves_an_earlier_one_alone(wrong: list[str], tmp_path: Path) -> None:
+    """Too few values; a parameter that moves nothing."""
+    config = Folder(tmp_path / "robot").config()
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "sweep.json").write_text("{}")
+    assert main(["sweep-epsilon", str(config), "--out", str(out), *wrong]) == 2
+    assert {p.name for p in out.iterdir()} == {"sweep.json"}
 
 
 def test_a_given_noise_is_not_to_be_found(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:

@@ -18,7 +18,7 @@ from dropo_torch.trajectory import Replay
 
 #: Simulations of a batch.
 _BATCH = 100
-#: Share of the posterior inside the search box below which the network has guessed outside what it was trained on.
+#: Share of a parameter's posterior between its bounds below which the network has guessed outside its training data.
 _LEAST_INSIDE = 0.01
 
 
@@ -110,14 +110,19 @@ class BayesSimOptimizer(Optimizer):
         if self._mixture is None:
             return None
         reason = f"{self._settings.simulations} simulations of the prior are used"
+        doubt = self._doubt()
+        return f"{reason}; but {doubt}, so the posterior is a guess" if doubt else reason
+
+    def _doubt(self) -> str:
+        """Why the network had to guess outside what it was trained on; empty where it had not."""
+        assert self._mixture is not None
         if self._distance > FARTHEST:
-            return (
-                f"{reason}; but the log is unlike every simulation: a summary of it is {self._distance:.3g} deviations "
-                "away from theirs, so the posterior is a guess"
-            )
-        if self._mixture.share_inside < _LEAST_INSIDE:
-            return f"{reason}; but the posterior lies outside the search box: the log is unlike every simulation"
-        return reason
+            return f"the log is unlike every simulation: a summary is {self._distance:.3g} deviations away from theirs"
+        shares = zip(self._space.names, self._mixture.shares_inside, strict=True)
+        outside = [name for name, share in shares if share < _LEAST_INSIDE]
+        if outside:
+            return f"that of {', '.join(outside)} lies outside the search box: the log is unlike every simulation"
+        return ""
 
     @property
     def progress(self) -> Progress:
@@ -149,6 +154,7 @@ class BayesSimOptimizer(Optimizer):
             "mixture": {"parameters": list(self._space.names), **self._mixture.document()},
             "share_inside": self._mixture.share_inside,
             "summary_distance": self._distance,
+            "extrapolates": bool(self._doubt()),
             "windows": len(self._replay.states),
             "features": self._settings.features,
             "horizon": self._replay.horizon,

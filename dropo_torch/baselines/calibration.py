@@ -112,6 +112,11 @@ def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: in
     )
 
 
+def with_seed(problem: Problem, seed: int) -> Problem:
+    """Return the problem whose fit draws other random numbers, so that fits of several logs are independent."""
+    return replace(problem, config=problem.config.model_copy(update={"seed": seed}))
+
+
 def draw_truths(problem: Problem, kind: Kind, seed: int) -> np.ndarray:
     """Return parameters of each transition of a log, in coordinates, ``(T, d)``."""
     box, generator = SearchBox.of(problem.space), np.random.default_rng([seed, 23])
@@ -198,7 +203,7 @@ def calibrate(
                     continue
                 truths = draw_truths(given[method], kind, log)
                 values = to_values(truths, given[method].space.is_log)
-                made = synthesise(given[method], values, noise, seed=log)
+                made = with_seed(synthesise(given[method], values, noise, seed=log), log)
                 trials.append(try_method(made, truths, kind=kind, name=method, log=log))
     return trials
 

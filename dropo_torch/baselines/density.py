@@ -115,13 +115,15 @@ def fit_mixture(
 
 
 def farthest(inputs: np.ndarray, at: np.ndarray) -> float:
-    """Return how far a log's x is from those of the simulations, in deviations of the column where it is farthest."""
+    """Return how far a log's x is from those of the simulations, in deviations of the column where it is farthest.
+
+    Columns that no simulation moves do not count, as the network does not see them; infinite without a simulation.
+    """
     alive = inputs[np.isfinite(inputs).all(1)]
     if not len(alive):
         return float("inf")
     center, scale, moves = _standard(alive)
-    same = np.isclose(at, center, rtol=1e-9, atol=1e-12)
-    return float(np.where(moves, np.abs(at - center) / scale, np.where(same, 0.0, np.inf)).max())
+    return float((np.abs(at - center) / scale)[moves].max(initial=0.0))
 
 
 def _standard(inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -21,7 +21,8 @@ class LaplaceOptimizer(Optimizer):
 
     The transitions of the log are simulated one by one from their logged starts, as for DROPO. The covariance is
     s² (ΣJᵀC⁻¹J)⁻¹ with C of ε and the noise, and s² the reduced χ² of the residuals: ε only weighs the columns, the
-    size of the residuals is the log's own. It says how uncertain a fixed vector is, not how much parameters vary.
+    size of the residuals is the log's own. A normal of the box's width is its prior, for what the log does not tell. It
+    says how uncertain a fixed vector is, not how much parameters vary.
 
     Args:
         objective: gives the reduction and the size of the log; it is not evaluated here.
@@ -33,8 +34,8 @@ class LaplaceOptimizer(Optimizer):
     def __init__(self, objective: Objective) -> None:
         self._space: ParameterSpace = objective.simulator.parameters
         self._box = SearchBox.of(self._space)
-        self._num_residuals = len(objective) * objective.num_features
-        self._means = MeansStage(self._box.low, self._box.high, self._box.middle)
+        self._shape = (len(objective), objective.num_features)
+        self._means = MeansStage(self._box.low, self._box.high, self._box.middle, self._shape)
         self._linearised: np.ndarray | None = None if objective.noise is None else self._means.point
         self._round = 0
 
@@ -57,7 +58,7 @@ class LaplaceOptimizer(Optimizer):
         point = self._means.point
         if bool((np.abs(point - before) > AT_REST * self._box.width).any()):
             self._round, self._linearised = self._round + 1, point
-            self._means = MeansStage(self._box.low, self._box.high, point)
+            self._means = MeansStage(self._box.low, self._box.high, point, self._shape)
 
     @property
     def stop_reason(self) -> str | None:
@@ -74,7 +75,7 @@ class LaplaceOptimizer(Optimizer):
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the point estimate and its standard errors."""
         error, _ = self._posterior()
-        return [(self._means.point, np.clip(error, self._box.min_std, self._box.width))]
+        return [(self._means.point, np.maximum(error, self._box.min_std))]
 
     def distributions(self, space: ParameterSpace) -> list[Distribution]:
         """Return the posterior with its correlation."""
@@ -83,7 +84,7 @@ class LaplaceOptimizer(Optimizer):
 
     def extras(self) -> dict[str, Any]:
         """Return the reduced χ², 1 where ε (and the noise) are as large as the residuals."""
-        return {"reduced_chi2": self._scale()}
+        return {"reduced_chi2": self._means.reduced_chi2}
 
     def state(self) -> dict[str, Any]:
         """Return the stage as plain data."""
@@ -99,9 +100,8 @@ class LaplaceOptimizer(Optimizer):
         d = len(self._space)
         if self._means.hessian.shape != (d, d):  # nothing has been simulated yet, or nothing survived
             return self._box.width.copy(), np.eye(d)
-        error, correlation = estimates(self._means.hessian)
-        return np.sqrt(self._scale()) * error, correlation
-
-    def _scale(self) -> float:
-        freedom = max(1, self._num_residuals - len(self._space))
-        return float(2 * self._means.cost / freedom)
+        width = np.outer(self._box.width, self._box.width)
+        scale = self._means.reduced_chi2
+        shared = self._means.hessian * width + scale * np.eye(d)  # in widths, where the prior has the deviation 1
+        error, correlation = estimates(shared)
+        return np.sqrt(scale) * error * self._box.width, correlation

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.special
 
 from dropo_torch.errors import InputError
 
@@ -52,6 +53,13 @@ class Mixture:
         """Share of the mixture's mass that is inside its box, from draws."""
         return float(self._inside(self._draws(_MOMENT_DRAWS, np.random.default_rng(0))).mean())
 
+    @property
+    def shares_inside(self) -> np.ndarray:
+        """Share of each coordinate's own density between its bounds, ``(d,)``, exact."""
+        std = np.sqrt(np.diagonal(self.covariances, axis1=1, axis2=2))
+        below, above = (scipy.special.ndtr((end - self.means) / std) for end in (self.low, self.high))
+        return np.asarray(self.weights @ (above - below))
+
     def _draws(self, count: int, generator: np.random.Generator) -> np.ndarray:
         """Draws of the mixture without its box, ``(count, d)``."""
         which = generator.choice(len(self.weights), size=count, p=self.weights)
@@ -71,6 +79,12 @@ class Mixture:
             log_det = np.log(np.diag(root)).sum()
             parts.append(np.log(weight + 1e-300) - 0.5 * (white**2).sum(0) - log_det - 0.5 * d * np.log(2 * np.pi))
         return np.asarray(np.logaddexp.reduce(parts, axis=0))
+
+    def marginal_density(self, index: int, points: np.ndarray) -> np.ndarray:
+        """Return the density of one coordinate, without its box, at points ``(n,)``, ``(n,)``."""
+        std = np.sqrt(self.covariances[:, index, index])
+        z = (points[:, None] - self.means[:, index]) / std
+        return np.asarray(np.exp(-0.5 * z**2) / std @ self.weights / np.sqrt(2 * np.pi))
 
     @property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:

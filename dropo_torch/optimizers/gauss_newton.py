@@ -24,13 +24,19 @@ class MeansStage:
     Attributes:
         low, high: the box of μ in coordinates, ``(d,)``.
         point: the best μ so far, ``(d,)``.
+        shape: transitions and columns of the log, where the residuals' own size is to tell when μ is good enough;
+            by default C tells.
+        cost: ½ Σ rᵀC⁻¹r at ``point``, and a penalty for every transition that diverges there.
+        lost: how many do.
     """
 
     low: np.ndarray
     high: np.ndarray
     point: np.ndarray
+    shape: tuple[int, int] | None = None
     damping: float = 1e-3
     cost: float = np.inf
+    lost: float = 0.0
     iterations: int = 0
     reason: str | None = None
     candidate: np.ndarray | None = None
@@ -45,7 +51,7 @@ class MeansStage:
         return np.concatenate([center[None], center + np.diag(self._steps(center))])
 
     def reduction(self) -> Reduce:
-        """Return the reduction to cost, normal equations and moments, ``(1 + 2d + 2d²,)``."""
+        """Return the reduction to cost, losses, normal equations and moments, ``(2 + 2d + 2d²,)``."""
         center = self.point if self.candidate is None else self.candidate
         steps = torch.from_numpy(self._steps(center))
 
@@ -62,12 +68,12 @@ class MeansStage:
         if np.isfinite(cost) and cost < self.cost:
             gain = self.cost - cost
             self.point = self.point if self.candidate is None else self.candidate
-            self.cost = cost
-            vectors, matrices = sums[1 : 1 + 2 * d].numpy(), sums[1 + 2 * d :].numpy()
+            self.cost, self.lost = cost, float(sums[1])
+            vectors, matrices = sums[2 : 2 + 2 * d].numpy(), sums[2 + 2 * d :].numpy()
             self.gradient, self.excess = vectors.reshape(2, d).copy()
             self.hessian, self.squares = matrices.reshape(2, d, d).copy()
             self.damping = max(self.damping / 8, 1e-12)
-            if np.isfinite(gain) and (gain < 1e-4 or step < 1e-10):
+            if np.isfinite(gain) and (gain < 1e-4 * self.reduced_chi2 or step < 1e-10):
                 self.reason = "the means no longer improve"
         elif self.candidate is None:
             self.reason = "no simulation succeeded at the starting point"
@@ -97,6 +103,15 @@ class MeansStage:
         scale = np.sqrt(np.maximum(np.diag(self.squares), 1e-300))
         variances = scipy.optimize.nnls(self.squares / np.outer(scale, scale), self.excess / scale)[0] / scale
         return np.clip(np.sqrt(variances), np.maximum(box.width / 100, box.min_std), box.max_std / 2)
+
+    @property
+    def reduced_chi2(self) -> float:
+        """The residuals' mean square in units of C, over what μ leaves free; 1 if C tells. Losses do not count."""
+        if self.shape is None:
+            return 1.0
+        transitions, columns = self.shape
+        freedom = (transitions - self.lost) * columns - len(self.low)
+        return float(2 * (self.cost - self.lost * DIVERGENCE_PENALTY) / max(1.0, freedom))
 
     @property
     def _width(self) -> np.ndarray:
@@ -129,9 +144,9 @@ def damped_step(matrix: np.ndarray, force: np.ndarray, free: np.ndarray, damping
 def normal_equations(
     features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor
 ) -> torch.Tensor:
-    """Return cost, gradient and Gauss-Newton matrix of ½ Σ rᵀC⁻¹r, and two moments for σ, ``(1 + 2d + 2d²,)``.
+    """Return cost, gradient and Gauss-Newton matrix of ½ Σ rᵀC⁻¹r, and two moments for σ, ``(2 + 2d + 2d²,)``.
 
-    The order is cost, gradient, Σ (JᵀC⁻¹r)² − diag JᵀC⁻¹J, Gauss-Newton matrix, Σ (JᵀC⁻¹J)².
+    The order is cost, transitions lost, gradient, Σ (JᵀC⁻¹r)² − diag JᵀC⁻¹J, Gauss-Newton matrix, Σ (JᵀC⁻¹J)².
 
     Args:
         features: at μ, then at μ + stepᵢeᵢ, ``(t, d + 1, m)``.
@@ -141,7 +156,7 @@ def normal_equations(
     """
     base, moved = features[:, 0], features[:, 1:]
     alive = torch.isfinite(base).all(-1)
-    lost = float((~alive).sum()) * 2 * DIVERGENCE_PENALTY
+    lost = (~alive).sum().to(base.dtype)
     jacobian = torch.nan_to_num((moved - base[:, None]) / steps[:, None])  # a diverged column says nothing
     jacobian = torch.where(alive[:, None, None], jacobian, torch.zeros_like(jacobian))
     residual = torch.where(alive[:, None], measured - base, torch.zeros_like(base))
@@ -157,4 +172,5 @@ def normal_equations(
     excess = (pulled.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0)
     squares = gram.square().sum(0)
     matrices = [(flat.T @ flat).flatten(), squares.flatten()]
-    return torch.cat([0.5 * (r.square().sum() + lost)[None], gradient, excess, *matrices])
+    cost = 0.5 * r.square().sum() + lost * DIVERGENCE_PENALTY
+    return torch.cat([cost[None], lost[None], gradient, excess, *matrices])

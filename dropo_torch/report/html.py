@@ -69,7 +69,7 @@ def write_fit_report(
         "parameters": _parameter_rows(fit.distribution, diagnostics, config, space, nominal),
         "densities": _densities(fit.distribution, nominal),
         "law": words.law(fit),
-        "pairs_drawn": _drawn_pairs(fit),
+        **_posterior(fit),
         "has_nominal": bool(np.isfinite(nominal).any()),
         **_column_content(diagnostics, shown),
         **_convergence(fit),
@@ -251,24 +251,32 @@ def _densities(distribution: Distribution, nominal: np.ndarray) -> list[dict[str
     return panels
 
 
-def _drawn_pairs(fit: Fit) -> list[dict[str, Any]]:
-    """Panels of every pair of parameters' draws, of a posterior that is more than a normal."""
+def _posterior(fit: Fit) -> dict[str, Any]:
+    """Panels of every parameter's own density and of pairs' draws, of a posterior that is more than a normal."""
     if "mixture" not in fit.extras:
-        return []
+        return {"marginals": [], "pairs_drawn": [], "pairs_omitted": 0}
     distribution, mixture = fit.distribution, Mixture.of(fit.extras["mixture"])
-    draws = to_values(mixture.sample(PAIR_DRAWS, seed=0), distribution.is_log)
+    names, is_log = distribution.names, distribution.is_log
     axes = [
-        figures.Axis(float(distribution.low[i]), float(distribution.high[i]), bool(distribution.is_log[i]))
-        for i in range(len(distribution))
+        figures.Axis(float(low), float(high), bool(log))
+        for low, high, log in zip(distribution.low, distribution.high, is_log, strict=True)
     ]
-    pairs = [(i, j) for i in range(len(distribution)) for j in range(i)][:MAX_DRAWN_PAIRS]
-    return [
+    marginals = []
+    for i, name in enumerate(names):
+        points = np.linspace(mixture.low[i], mixture.high[i], 400)
+        values, density = to_values(points, np.full(len(points), is_log[i])), mixture.marginal_density(i, points)
+        svg = figures.distribution_row(axes[i], values, density, float(distribution.center[i]), float("nan"))
+        marginals.append({"name": name, "unit": distribution.units[i], "log": axes[i].is_log, "svg": Markup(svg)})
+    draws = to_values(mixture.sample(PAIR_DRAWS, seed=0), is_log)
+    pairs = [(i, j) for i in range(len(names)) for j in range(i)]
+    drawn = [
         {
-            "name": f"{distribution.names[i]} over {distribution.names[j]}",
+            "name": f"{names[i]} over {names[j]}",
             "svg": Markup(figures.pair_panel(axes[j], axes[i], draws[:, j], draws[:, i])),
         }
-        for i, j in pairs
+        for i, j in pairs[:MAX_DRAWN_PAIRS]
     ]
+    return {"marginals": marginals, "pairs_drawn": drawn, "pairs_omitted": len(pairs) - len(drawn)}
 
 
 def _column_content(diagnostics: Diagnostics, shown: Sequence[int]) -> dict[str, Any]:

@@ -346,8 +346,10 @@ def _of_method(fit: Fit) -> list[Finding]:
         "simopt": ("note", "Other iterations or another bound on their steps give others."),
         "laplace": ("note", "The model lacking something does not widen them; a longer log narrows them."),
         "udr": ("note", "The log has no part in them."),
-        "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior pair by pair."),
+        "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior below."),
     }
+    if fit.extras.get("extrapolates"):
+        texts["bayessim"] = ("attention", f"But the posterior is a guess: {fit.stop_reason.split('; but ')[-1]}.")
     level, text = texts.get(fit.method, ("note", ""))
     found = [Finding(cast(Level, level), "What the standard deviations are", f"{law(fit).split('. ')[1]}. {text}")]
     vague = [name for name, s in zip(fit.distribution.names, share, strict=True) if s > 0.8 / math.sqrt(12)]

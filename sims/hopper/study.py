@@ -18,6 +18,7 @@ import numpy as np
 import torch
 
 from dropo_torch.baselines import fit_problem
+from dropo_torch.baselines.density import require_sbi
 from dropo_torch.config import make_config
 from dropo_torch.errors import InputError
 from dropo_torch.files import write_atomically
@@ -94,7 +95,8 @@ class Cell:
         seed: of the log and the fit.
         epsilon: ε.
         knows_noise: whether the fit is given the deviation of the noise.
-        noise: variance of noise put on a noiseless log, ``None`` for the variant's own.
+        noise: variance of noise put on a noiseless log, on the end of a transition independently of the next one's
+            start; ``None`` for the variant's own, whose transitions share a measurement.
         ends_only: whether that noise is on the ends of transitions alone, not on their starts.
         noisy_starts: whether ε stands for the variance of every measurement, of the starts, too.
         size: transitions of a bootstrap sample; ``None`` for the whole log.
@@ -150,8 +152,9 @@ def run_study(
         workers: processes that fit cells side by side. The results do not depend on it.
 
     Raises:
-        InputError: a folder with another study, or with one that is not to be resumed.
+        InputError: a folder with another study, or with one that is not to be resumed; ``sbi`` is not installed.
     """
+    require_sbi()
     plan = plan or (REDUCED if reduced else Plan())
     _claim(out, plan, resume=resume)
     cells = all_cells(plan)
@@ -179,6 +182,8 @@ def all_cells(plan: Plan) -> list[Cell]:
                 Cell("recovery", "distribution", **of, epsilon=1e-7),
             ]
         cells.append(Cell("table", "noisy", "dropo", seed, NOISE_VARIANCE))  # as in the paper: ε alone
+        given = [(m, f) for m, f in METHODS if m == "bayessim"]
+        cells += [Cell("table", "noisy", m, seed, features=f, knows_noise=True) for m, f in given]
     sweeps = (("point", False), ("noisy", False), ("noisy", True), ("unmodeled", False))
     cells += [Cell("sweep", variant, epsilon=e, noisy_starts=s) for variant, s in sweeps for e in plan.epsilons]
     cells += [
@@ -292,7 +297,9 @@ def _claim(out: Path, plan: Plan, *, resume: bool) -> None:
         if not resume:
             raise InputError(f"--out: {out} holds a study; add --resume to go on with it, or name another folder")
         if json.loads(mark.read_text()) != wanted:
-            raise InputError(f"resume: {out} holds a study of another size; name another folder, or drop --reduced")
+            raise InputError(
+                f"resume: {out} holds a study of another size; name another folder, or give --reduced as at its start"
+            )
     elif out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise InputError(f"--out: {out} is not an empty folder; name another one")
     write_atomically(mark, json.dumps(wanted, indent=2).encode() + b"\n")
