@@ -17,7 +17,7 @@ from conftest import LinearSimulator, generic_observation, linear_objective, spa
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
 from dropo_torch.baselines.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
-from dropo_torch.baselines.density import farthest, fit_mixture
+from dropo_torch.baselines.density import fit_mixture, unlikeness
 from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
@@ -744,7 +744,7 @@ def test_bayessim_says_when_the_log_is_unlike_every_simulation(folder: Path) -> 
     )  # fmt: skip
     result = fit_problem(ours)
     found = result.document()
-    assert found["summary_distance"] > 5
+    assert found["summary_distance"] > 1.5
     assert "unlike every simulation" in found["stop_reason"]
     told = findings(result, diagnose(ours.objective, result.distribution))
     (about,) = [f for f in told if f.title == "What the standard deviations are"]
@@ -761,16 +761,27 @@ def test_bayessim_says_when_the_log_is_unlike_every_simulation(folder: Path) -> 
     assert page.split("<h2>The posterior</h2>")[1].split("<h2>")[0].count("<svg") == 1  # one parameter has no pairs
 
 
+def test_a_log_off_the_surface_of_the_simulations_is_unlike_them() -> None:
+    """Two columns move together; a log between the simulations' values of each, but off their line, is far."""
+    rng = np.random.default_rng(0)
+    along = rng.uniform(-1, 1, 500)
+    x = np.stack([along, along + 0.03 * rng.standard_normal(500), np.ones(500)], 1)
+    assert unlikeness(x, np.array([0.3, 0.3, 1.0])) < 1
+    assert unlikeness(x, np.array([0.3, -0.3, 1.0])) > 5
+    assert unlikeness(x, np.array([0.3, 0.3, 7.0])) < 1  # a column that nothing moves is not seen by the network
+    assert unlikeness(np.ones((50, 1)), np.zeros(1)) == 0
+    assert unlikeness(np.full((50, 1), np.nan), np.zeros(1)) == np.inf
+    own = [unlikeness(np.delete(x, i, 0), x[i]) for i in range(100)]
+    assert np.mean(np.array(own) > 1) < 0.05
+
+
 def test_a_few_wild_simulations_do_not_blind_the_network() -> None:
     rng = np.random.default_rng(0)
     shares = rng.uniform(size=(1000, 1))
     x = shares + 0.05 * rng.standard_normal((1000, 1))
     x[:3] += 1e6
-    assert farthest(x, np.array([0.5])) < 1
-    assert farthest(x, np.array([9.0])) > 5
-    assert farthest(np.ones((50, 1)), np.ones(1)) == 0
-    assert farthest(np.ones((50, 1)), np.zeros(1)) == 0  # a column that nothing moves is not seen by the network
-    assert farthest(np.full((50, 1), np.nan), np.zeros(1)) == np.inf
+    assert unlikeness(x, np.array([0.5])) < 1
+    assert unlikeness(x, np.array([9.0])) > 5
     settings = BayesSimSettings(components=2, hidden=16, epochs=60)
     found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
     assert np.sqrt(found.moments_inside[1][0, 0]) < 0.12

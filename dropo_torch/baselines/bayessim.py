@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import FARTHEST, farthest, fit_mixture, require_sbi
+from dropo_torch.baselines.density import fit_mixture, require_sbi, unlikeness
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
@@ -16,6 +16,8 @@ from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.trajectory import Replay
 
+#: Unlikeness above which the network has guessed outside what it was trained on.
+_UNLIKE = 1.5
 #: Simulations of a batch.
 _BATCH = 100
 #: Share of a parameter's posterior between its bounds below which the network has guessed outside its training data.
@@ -116,8 +118,11 @@ class BayesSimOptimizer(Optimizer):
     def _doubt(self) -> str:
         """Why the network had to guess outside what it was trained on; empty where it had not."""
         assert self._mixture is not None
-        if self._distance > FARTHEST:
-            return f"the log is unlike every simulation: a summary is {self._distance:.3g} deviations away from theirs"
+        if self._distance > _UNLIKE:
+            return (
+                f"the log is unlike every simulation: its summary is {self._distance:.3g} times as far from the "
+                "nearest ones as those are from each other"
+            )
         shares = zip(self._space.names, self._mixture.shares_inside, strict=True)
         outside = [name for name, share in shares if share < _LEAST_INSIDE]
         if outside:
@@ -202,4 +207,4 @@ class BayesSimOptimizer(Optimizer):
             low=self._box.low,
             width=self._box.width,
         )
-        return mixture, farthest(found[:-1], found[-1])
+        return mixture, unlikeness(found[:-1], found[-1])

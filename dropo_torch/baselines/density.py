@@ -5,10 +5,12 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import io
+import math
 import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy.spatial
 import torch
 from torch import nn
 
@@ -28,6 +30,11 @@ _PATIENCE = 40
 _VALIDATION = 0.1
 #: Standardised inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
 FARTHEST = 5.0
+#: The neighbour to which distances are measured.
+_NEIGHBOURS = 5
+#: Directions in which simulations differ by less than this share of the largest count as none, as the smallest noise
+#: would be far there; and there is at most one for so many simulations, as few do not show how far apart they are.
+_FLAT, _ROWS_PER_DIRECTION = 1e-2, 5
 #: Interquartile range of a standard normal.
 _QUARTILES = 1.349
 #: Added to the precisions, as by the network itself: no component is wider than a hundred deviations of the prior.
@@ -114,16 +121,33 @@ def fit_mixture(
     )
 
 
-def farthest(inputs: np.ndarray, at: np.ndarray) -> float:
-    """Return how far a log's x is from those of the simulations, in deviations of the column where it is farthest.
+def unlikeness(inputs: np.ndarray, at: np.ndarray) -> float:
+    """Return how far a log's x is from the simulations', compared with how far they are from each other.
 
-    Columns that no simulation moves do not count, as the network does not see them; infinite without a simulation.
+    That is its distance to the fifth nearest simulation over the distance that 99 % of them have to theirs: a log that
+    the simulator explains is seldom above 1. Distances are those of standardised and then whitened columns, so that a
+    summary between the simulations, but off the surface on which they lie, is far. Columns that no simulation moves do
+    not count, as the network does not see them.
+
+    Args:
+        inputs: x of the simulations, ``(n, q)``; rows that are not finite are left out.
+        at: the log's, ``(q,)``.
     """
     alive = inputs[np.isfinite(inputs).all(1)]
-    if not len(alive):
+    if len(alive) <= _NEIGHBOURS:
         return float("inf")
     center, scale, moves = _standard(alive)
-    return float((np.abs(at - center) / scale)[moves].max(initial=0.0))
+    if not moves.any():
+        return 0.0
+    rows, here = ((alive - center) / scale)[:, moves].clip(-FARTHEST, FARTHEST), ((at - center) / scale)[moves]
+    mean = rows.mean(0)
+    _, size, directions = np.linalg.svd(rows - mean, full_matrices=False)
+    kept = (size > _FLAT * size[0]) & (np.arange(len(size)) < max(1, len(rows) // _ROWS_PER_DIRECTION))
+    white = directions[kept].T / size[kept] * math.sqrt(len(rows))
+    tree = scipy.spatial.KDTree((rows - mean) @ white)
+    among = tree.query(tree.data, k=_NEIGHBOURS + 1)[0][:, -1]  # the nearest of all is the point itself
+    nearest = tree.query((here - mean) @ white, k=_NEIGHBOURS)[0][-1]
+    return float(nearest / np.quantile(among, 0.99))
 
 
 def _standard(inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
