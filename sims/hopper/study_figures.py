@@ -40,31 +40,36 @@ def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]])
 
 
 def recovery(results: Sequence[Result]) -> Any:
-    """Draw the fitted normals of the redrawn masses over the realised ones, first seed."""
+    """Draw the fitted normals of the redrawn masses over the realised ones, first seed; points as upright lines."""
     chosen = [r for r in results if r["cell"]["block"] == "recovery" and r["cell"]["seed"] == 0]
     names = list(chosen[0]["fit"]["parameters"])
     figure = figures.new_figure(230 * len(names), 230)
     for i, name in enumerate(names):
         axes = _part(figure, i, len(names))
         truth = chosen[0]["truth"][name]
-        box = chosen[0]["fit"]["parameters"][name]
-        grid = np.linspace(box["low"], box["high"], 2000)
-        curves = {"realised": (truth["mean"], max(truth["std"], 1e-3))} | {
-            label(r): (
-                r["fit"]["parameters"][name]["mean"],
-                max(drawn_std(r, name), 1e-3),
-            )
-            for r in chosen
+        curves = {"realised": (truth["mean"], truth["std"])} | {
+            label(r): (r["fit"]["parameters"][name]["mean"], drawn_std(r, name)) for r in chosen
         }
+        reach = 3.5 * max(std for _, std in curves.values())
         for method, (mean, std) in curves.items():
-            density = np.exp(-0.5 * ((grid - mean) / std) ** 2)  # of equal height: some are points
-            colour = _COLOURS.get(method, "#1f2933")
-            axes.plot(grid, density, color=colour, linewidth=1.4, label=method if i == 0 else None,
-                      linestyle="--" if method == "realised" else "-")  # fmt: skip
+            x, density = _bell(mean, std, 1e-2 * reach)
+            style = {"color": "#1f2933", "linestyle": "--", "zorder": 3} if method == "realised" else {}
+            axes.plot(x, density, **{"color": _COLOURS.get(method), "linewidth": 1.4, "label": method, **style})
+        centers = [mean for mean, _ in curves.values()]
+        axes.set_xlim(min(centers) - reach, max(centers) + reach)
         axes.set_yticks([])
         axes.set_xlabel(f"{name} (kg)")
-    figure.legend(loc="upper center", ncol=4, frameon=False, fontsize=9)
+    lines, labels = figure.axes[0].get_legend_handles_labels()
+    figure.legend(lines, labels, loc="upper center", ncol=5, frameon=False, fontsize=9)
     return figure
+
+
+def _bell(mean: float, std: float, narrow: float) -> tuple[np.ndarray, np.ndarray]:
+    """A normal density of height 1, ``(n,)`` each; an upright line where it is narrow."""
+    if std < narrow:
+        return np.full(2, mean), np.array([0.0, 1.0])
+    z = np.linspace(-4, 4, 201)
+    return mean + std * z, np.exp(-0.5 * z**2)
 
 
 def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
