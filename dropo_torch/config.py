@@ -13,6 +13,7 @@ import pydantic
 import yaml
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.model import CENTRES
 
 
 class Config(pydantic.BaseModel):
@@ -93,6 +94,17 @@ class Config(pydantic.BaseModel):
     def path(self, given: str) -> Path:
         """Return a path of the config as one that can be opened."""
         return self.base / Path(given).expanduser()
+
+    @property
+    def has_effects(self) -> bool:
+        """Whether effects are named, or numbers of them are parameters."""
+        return bool(self.effects) or any("effect" in p for p in (self.parameters or {}).values())
+
+    @property
+    def moves_centres(self) -> bool:
+        """Whether bodies' centres of mass or their axes may move: by effects, or as parameters."""
+        fields = (str(p.get("field", "")) for p in (self.parameters or {}).values())
+        return self.has_effects or any(field.startswith(CENTRES) for field in fields)
 
     def document(self) -> dict[str, Any]:
         """Return the config as plain data, as it would stand in a file."""

@@ -55,6 +55,10 @@ def quiet_mujoco() -> Iterator[None]:
         library.mju_setLogConfig(before)
 
 
+#: Fields of bodies that MuJoCo takes for granted where it has compiled the body as simple.
+CENTRES = ("body_ipos", "body_iquat")
+
+
 def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> mujoco.MjModel:
     """Return ``model``, compiled from MJCF, URDF or MJB when it is a path.
 

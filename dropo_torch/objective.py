@@ -426,26 +426,28 @@ class Objective:
 def no_effect(objective: Objective, *, max_transitions: int = 500) -> list[str]:
     """Return the names of parameters that move no compared column of this log.
 
-    Each is moved to 1/4 and 3/4 of its box with the others in the middle; first on transitions spread
-    over the log, then, where nothing moved, on all of them.
+    Each is moved to 1/4 and 4/5 of its box with the others in the middle, as it is itself for comparison: an effect
+    that is even about the middle shows, too. First on transitions spread over the log, then, where nothing moved, on
+    all of them.
     """
     box, space = objective.box, objective.simulator.parameters
     d = len(space)
-    points = np.repeat(box.middle[None], 2 * d, axis=0)
+    points = np.repeat(box.middle[None], 2 * d + 1, axis=0)
     points[np.arange(d), np.arange(d)] = box.low + 0.25 * box.width
-    points[np.arange(d) + d, np.arange(d)] = box.low + 0.75 * box.width
+    points[np.arange(d) + d, np.arange(d)] = box.low + 0.8 * box.width
     values = to_values(points, space.is_log)
 
-    def moved(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-        change = torch.nan_to_num(features[:, :d] - features[:, d:], nan=1.0).abs()
+    def count_moved(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+        moved = features[:, : 2 * d] - features[:, 2 * d :]
+        change = torch.nan_to_num(moved, nan=1.0).abs().unflatten(1, (2, d)).amax(1)
         magnitude = 1e-12 * torch.nan_to_num(features).abs().amax((0, 1))
         return (change > magnitude).sum((0, 2)).double()
 
     spread = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
     sparse = objective.on(objective.transitions.select(spread))
-    if bool((sparse.map(values, moved) > 0).all()):
+    if bool((sparse.map(values, count_moved) > 0).all()):
         return []
-    counts = objective.map(values, moved)
+    counts = objective.map(values, count_moved)
     return [name for name, count in zip(space.names, counts, strict=True) if count == 0]
 
 

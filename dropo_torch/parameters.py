@@ -22,7 +22,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.model import load_model
+from dropo_torch.model import CENTRES, load_model
 
 #: Fields whose values must be positive, whatever the search bounds.
 POSITIVE_FIELDS = frozenset({"body_mass", "body_inertia", "opt.timestep", "opt.impratio", "geom_size", "pair_friction"})
@@ -227,6 +227,39 @@ class ParameterSpace:
                 write_field(model, target.field, target.index, target.factor * vector[column])
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
+
+
+#: Fields that move a frame → what marks it as coinciding with another, so that MuJoCo need not compute it.
+_FRAMES = {
+    "body_ipos": "body_sameframe", "body_iquat": "body_sameframe", "geom_pos": "geom_sameframe",
+    "geom_quat": "geom_sameframe", "site_pos": "site_sameframe", "site_quat": "site_sameframe",
+}  # fmt: skip
+
+
+def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
+    """Tell MuJoCo that the frames which the parameters move coincide with no other, in place.
+
+    ``mj_setConst`` does so for a single model; the simulations of a batch share these marks.
+
+    Raises:
+        InputError: the centre of mass of a body that is compiled as simple.
+    """
+    none = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+    for parameter in space.parameters:
+        for target in parameter.targets:
+            if target.field not in _FRAMES:
+                continue
+            row = target.index // read_field(model, target.field).shape[-1]
+            getattr(model, _FRAMES[target.field])[row] = none
+            if target.field not in CENTRES:
+                continue
+            if model.body_simple[row]:
+                raise InputError(
+                    f"parameters: {parameter.name!r}: body {row} ({model.body(row).name}) is compiled as simple, its "
+                    'centre of mass in its frame; give the path of the model, or compile it with simple="false"'
+                )
+            model.geom_sameframe[model.geom_bodyid == row] = none  # some coincide with the body's inertial frame
+            model.site_sameframe[model.site_bodyid == row] = none
 
 
 def read_field(model: mujoco.MjModel, field: str) -> np.ndarray:

@@ -81,13 +81,13 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         if config.environment is not None:
             raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
         model_path = _model_path(config, sim)
-        space = _space(load_model(model_path, general=general or _has_effects(config)), config, sim)
+        space = _space(load_model(model_path, general=general or config.moves_centres), config, sim)
         source = space.model
     trajectories = _log(config, sim, space.model)
     frame_skip = _frame_skip(config, sim, space.model, trajectories)
     width = trajectories.observations.shape[1]
     effects, history = None, 0
-    if _has_effects(config):
+    if config.has_effects:
         observation = _observation(config, sim, space.model, _num_states(config, source), width)
         space, effects = _effects(config, space, observation, frame_skip)
         simulator, history = _with_effects(config, source, effects, space, trajectories)
@@ -170,11 +170,6 @@ def _model_path(config: Config, sim: BundledSim | None) -> Path:
         both = "both model and sim are" if sim else "neither model nor sim is"
         raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
     return sim.model if sim is not None else config.path(str(config.model))
-
-
-def _has_effects(config: Config) -> bool:
-    """Whether the config names effects."""
-    return bool(config.effects) or any("effect" in p for p in (config.parameters or {}).values())
 
 
 def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None) -> ParameterSpace:

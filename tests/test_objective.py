@@ -522,3 +522,10 @@ def test_draws_depend_on_their_seeds_alone():
     torch.manual_seed(1)
     assert torch.equal(draw_uniforms(5, 2, 3, 4), first)
     assert not torch.equal(draw_uniforms(5, 2, 4, 3), first)
+
+
+def test_a_parameter_whose_effect_is_even_about_its_middle_is_no_dead_one() -> None:
+    simulator = LinearSimulator(space_of(a=[-1, 1], b=[-1, 1]), np.eye(2), transform=lambda v: v.square())
+    assert no_effect(linear_objective(simulator, np.zeros((5, 2)))) == []
+    half = LinearSimulator(space_of(a=[-1, 1], b=[-1, 1]), np.array([[1.0, 0.0], [1.0, 0.0]]), transform=torch.square)
+    assert no_effect(linear_objective(half, np.zeros((5, 2)))) == ["b"]

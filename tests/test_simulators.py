@@ -27,7 +27,9 @@ from conftest import (
 )
 
 from dropo_torch.errors import InputError
+from dropo_torch.model import unsimplify
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.rl.stepper import make_stepper
 from dropo_torch.simulators import GymnasiumSimulator, MujocoEnvAdapter, MujocoSimulator, Simulator, make_simulator
 from dropo_torch.simulators.warp import WarpSimulator
 
@@ -434,3 +436,76 @@ def test_an_environment_that_is_none_of_mujocos_is_refused():
 def test_an_unknown_backend_is_refused_with_the_nearest():
     with pytest.raises(InputError, match="unknown 'mujocco'; did you mean 'mujoco'"):
         make_simulator("mujocco", None, parameters=pendulum_space())
+
+
+#: A link whose frame, inertial frame, geom and site coincide, so that MuJoCo computes one for all.
+COINCIDING_XML = """
+<mujoco>
+  <option gravity="0 -9.81 0"/>
+  <worldbody>
+    <body name="link">
+      <joint name="hinge" axis="0 0 1"/>
+      <geom name="bar" type="box" size=".2 .1 .1" mass="2"/>
+      <site name="tip"/>
+      <body name="tool" pos=".5 0 0">
+        <joint axis="0 0 1"/>
+        <geom type="box" size=".1 .1 .1" pos="0 .1 0" mass="1" contype="0" conaffinity="0"/>
+      </body>
+    </body>
+    <geom name="stop" type="box" size=".1 .1 .1" pos=".1 -.22 0"/>
+  </worldbody>
+  <actuator><general site="tip" gear="0 1 0 0 0 0"/></actuator>
+</mujoco>"""
+
+
+MOVED_FRAMES = (
+    {"field": "body_ipos[0]", "name": "link", "bounds": [0.05, 0.4]},
+    {"field": "body_iquat[3]", "name": "link", "bounds": [0.3, 0.8]},
+    {"field": "geom_pos[1]", "name": "bar", "bounds": [-0.05, 0.03]},
+    {"field": "site_pos[0]", "name": "tip", "bounds": [0.1, 0.5]},
+)
+
+
+@pytest.mark.parametrize(
+    ("entry", "backend"),
+    [(entry, backend) for entry in MOVED_FRAMES for backend in ("mujoco", "environments")]
+    + [(MOVED_FRAMES[0], "warp")],
+    ids=lambda x: x if isinstance(x, str) else x["field"],
+)
+def test_a_frame_that_coincided_with_another_moves_with_its_parameter(entry: dict[str, object], backend: str) -> None:
+    """As in one model with the value written and ``mj_setConst`` run."""
+    xml = COINCIDING_XML
+    if backend == "warp":  # it has neither forces at sites nor boxes that touch boxes
+        xml = xml.replace('site="tip" gear="0 1 0 0 0 0"', 'joint="hinge"').replace(
+            'name="stop"', 'contype="0" conaffinity="0"'
+        )
+    spec = mujoco.MjSpec.from_string(xml)
+    unsimplify(spec)
+    space = ParameterSpace(spec.compile(), {"moved": entry})
+    values = np.linspace(space.low, space.high, 3)
+    start, control = np.array([0.1, -0.2, 0.5, 0.3]), np.array([3.0])
+    expected = []
+    for value in values:
+        model = space.apply(value)
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = start[:2], start[2:], control
+        mujoco.mj_step(model, data, nstep=20)
+        expected.append(np.concatenate([data.qpos, data.qvel]))
+    assert np.abs(np.diff(expected, axis=0)).max() > 1e-4
+    if backend == "environments":
+        stepper = make_stepper("mujoco", space, len(values), frame_skip=20)
+        stepper.reset(torch.arange(3), torch.from_numpy(start).repeat(3, 1), torch.from_numpy(values))
+        found = stepper.step(torch.from_numpy(control).repeat(3, 1, 1))[:, -1]
+    else:
+        simulator = make_simulator(backend, space.model, parameters=space, frame_skip=20)
+        rows = torch.from_numpy(start)[None], torch.from_numpy(control)[None, None]
+        found = simulator.simulate(*rows, torch.from_numpy(values))[0]
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 if backend == "warp" else 0)
+
+
+def test_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(COINCIDING_XML)
+    model.body_simple[1] = 1
+    space = ParameterSpace(model, {"x": {"field": "body_ipos[0]", "name": "link", "bounds": [-0.4, 0.4]}})
+    with pytest.raises(InputError, match=r"'x': body 1 \(link\) is compiled as simple"):
+        MujocoSimulator(model, parameters=space)

@@ -131,7 +131,7 @@ def _task(config: Config, sim: BundledSim | None) -> tuple[Task, Path | None]:
     path = sim.model if sim is not None else (None if config.model is None else config.path(config.model))
     if path is None:
         return task, None
-    model = load_model(path, general=_has_effects(config))
+    model = load_model(path, general=config.moves_centres)
     for size in ("nq", "nv", "nu"):
         if getattr(model, size) != getattr(task.model, size):
             raise InputError(
@@ -139,10 +139,6 @@ def _task(config: Config, sim: BundledSim | None) -> tuple[Task, Path | None]:
                 f"{path} has {getattr(model, size)}"
             )
     return task.on(model), path
-
-
-def _has_effects(config: Config) -> bool:
-    return bool(config.effects) or any("effect" in p for p in (config.parameters or {}).values())
 
 
 def _given_distribution(config: Config, varies: bool) -> tuple[str | dict[str, float], Path | None]:

@@ -13,7 +13,7 @@ import torch
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.errors import InputError, choices
 from dropo_torch.model import quiet_mujoco
-from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.rl.inside import Forces, RowModels, inside_model
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.mujoco import default_row
@@ -90,6 +90,7 @@ class MujocoStepper(BatchStepper):
         inside = inside_model(space, effects)
         model = inside.model
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
+        unmark_frames(model, space)
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
         self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
         self._row = default_row(model)

@@ -12,7 +12,7 @@ import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.model import load_model, quiet_mujoco
-from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Simulator
 
 
@@ -51,6 +51,7 @@ class MujocoSimulator(Simulator):
             raise InputError(f"frame_skip {frame_skip}, chunk_size {chunk_size}: both must be 1 or more")
         self.model = copy.copy(model)
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
+        unmark_frames(self.model, parameters)
         self.parameters = parameters
         self.frame_skip = int(frame_skip)
         self.num_states = model.nq + model.nv
