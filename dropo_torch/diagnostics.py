@@ -81,7 +81,7 @@ def diagnose(
         chosen = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
         part = objective.on(objective.transitions.select(chosen))
         if objective.linearised_at is not None:
-            part.linearise(objective.linearised_at)
+            part.linearise(objective.linearised_at, objective.linearised_std)
         objective = part
     values = distribution.rsample(draw_uniforms(samples, len(distribution), seed, 3))
     stencil, steps = _stencil(objective, distribution)

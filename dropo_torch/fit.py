@@ -247,9 +247,9 @@ def _run(
     evaluations = history[-1].evaluations if history else 0
     while search.stop_reason is None:
         request = search.ask()
-        at = request.linearise_at
-        if at is not None and (objective.linearised_at is None or not np.array_equal(at, objective.linearised_at)):
-            objective.linearise(at)
+        at, std = request.linearise_at, request.linearise_std
+        if at is not None and not (_same(at, objective.linearised_at) and _same(std, objective.linearised_std)):
+            objective.linearise(at, std)
         if request.replay is not None:
             search.tell(objective.map_replay(request.replay, request.values, request.reduce))
         elif request.gradient:
@@ -311,6 +311,10 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
     )
 
 
+def _same(one: np.ndarray | None, other: np.ndarray | None) -> bool:
+    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+
+
 def _save_checkpoint(
     path: Path, fingerprint: str, search: Optimizer, objective: Objective, history: list[HistoryEntry]
 ) -> None:
@@ -320,7 +324,7 @@ def _save_checkpoint(
         "state": search.state(),
         "history": [vars(entry) for entry in history],
         "simulated_transitions": objective.simulated_transitions,
-        "linearised_at": objective.linearised_at,
+        "linearised": (objective.linearised_at, objective.linearised_std),
     }
     write_atomically(path, pickle.dumps(state))
 
@@ -335,7 +339,7 @@ def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objecti
         if owner == fingerprint and stored == search.name:
             search.restore(state["state"])
             history = [HistoryEntry(**entry) for entry in state["history"]]
-            simulated, linearised_at = state["simulated_transitions"], state["linearised_at"]
+            simulated, (linearised_at, linearised_std) = state["simulated_transitions"], state["linearised"]
     except Exception as error:
         raise InputError(f"resume: {path} is no checkpoint of a fit ({error}); start again without --resume") from None
     if owner != fingerprint or stored != search.name:
@@ -344,7 +348,7 @@ def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objecti
             "or start again without --resume"
         )
     if linearised_at is not None:
-        objective.linearise(linearised_at)
+        objective.linearise(linearised_at, linearised_std)
     objective.simulated_transitions = simulated
     return history
 

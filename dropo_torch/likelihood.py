@@ -118,14 +118,13 @@ def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor
     return shift, gain @ gain.mT + torch.diag_embed(variance)
 
 
-def widen(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-    """Return covariances ``(t, m, m)`` widened where the residual ``(t, m)`` lies far outside them.
+def widening(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+    """Return the factors ``(t,)`` by which covariances ``(t, m, m)`` are too small for residuals ``(t, m)``.
 
-    The factor is that of the scale-mixture form of Student's t distribution: (ν + χ²) / (ν + m), at least 1.
+    They are those of the scale-mixture form of Student's t distribution: (ν + χ²) / (ν + m), at least 1.
     """
     chi2, _ = _whitened(residual, covariance)
-    scale = (STUDENT_DOF + chi2) / (STUDENT_DOF + residual.shape[-1])
-    return covariance * scale.clamp(min=1.0)[:, None, None]
+    return ((STUDENT_DOF + chi2) / (STUDENT_DOF + residual.shape[-1])).clamp(min=1.0)
 
 
 def rotation_vector(measured: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:

@@ -23,7 +23,7 @@ from dropo_torch.likelihood import (
     propagate,
     rotation_vector,
     student_log_density,
-    widen,
+    widening,
 )
 from dropo_torch.observation import Observation
 from dropo_torch.simulators.base import Simulator
@@ -127,6 +127,8 @@ class Objective:
             self.noise = None  # no noise in any column: the starts are exact
         self._noise_covariance: torch.Tensor | None = None
         self._noise_shift: torch.Tensor | None = None
+        self.linearised_std: np.ndarray | None = None
+        self.widening: torch.Tensor | None = None
 
     def on(self, transitions: Transitions) -> Objective:
         """Return the same objective over other transitions of the same log, not yet linearised."""
@@ -138,6 +140,7 @@ class Objective:
         other.measured = other.features(other._raw, other._raw)
         other.simulated_transitions = 0
         other.linearised_at, other._noise_covariance, other._noise_shift = None, None, None
+        other.linearised_std, other.widening = None, None
         return other
 
     @property
@@ -330,15 +333,15 @@ class Objective:
             return (fixed + torch.diag(self._end_variance())).expand(count, -1, -1)
         return fixed + self._noise_covariance[block]
 
-    def linearise(self, mean: np.ndarray, *, widened: bool = True) -> None:
+    def linearise(self, mean: np.ndarray, std: np.ndarray | None = None, *, widened: bool = True) -> None:
         """Propagate the start states' noise through the simulation at μ ``(d,)``, in coordinates.
 
         Statistical linearisation: each start state is simulated from antithetic draws of its noise. The
         mean of the outcomes shifts the prediction. The regression of the outcomes on the draws gives
         G and with it the covariance G diag(ν) Gᵀ, to which the variance that the regression leaves is
         added: a contact that some draws make and others do not. Windows that the result still does
-        not explain have their covariance ``widened``, as under Student's t distribution. Without noise, nothing
-        happens.
+        not explain, nor parameters that vary with deviation σ ``(d,)`` around μ, have their covariance ``widened``, as
+        under Student's t distribution. Without noise, nothing happens.
         """
         if self.noise is None:
             return
@@ -347,7 +350,7 @@ class Objective:
         half = draw_normals(NOISE_DRAWS * len(columns), len(columns), NOISE_SEED)
         draws = torch.cat([torch.zeros(1, len(columns), dtype=torch.float64), half, -half])
         fixed = torch.diag(self.epsilon) + torch.diag(self._end_variance())
-        shifts, covariances = [], []
+        shifts, covariances, factors = [], [], []
         for block in _blocks(len(self), max(1, self._chunk_size // len(draws))):
             features = self._simulate(self._perturbed(block, columns, draws), block, values, copies=len(draws))
             with single_thread():
@@ -355,12 +358,27 @@ class Objective:
                 shift, covariance = propagate(outcomes, draws)
                 centre = torch.nan_to_num(outcomes[:, 0])
                 total = covariance + fixed
+                spread = 0.0 if std is None else self._spread(block, np.asarray(mean), std)
+                factor = widening(self.measured[block] - centre - shift, total + spread)
                 if widened:
-                    total = widen(self.measured[block] - centre - shift, total)
+                    total = total * factor[:, None, None]
             shifts.append(shift)
             covariances.append(total - torch.diag(self.epsilon))
+            factors.append(factor)
         self._noise_shift, self._noise_covariance = torch.cat(shifts), torch.cat(covariances)
         self.linearised_at = np.asarray(mean, dtype=np.float64).copy()
+        self.linearised_std = None if std is None else np.asarray(std, dtype=np.float64).copy()
+        self.widening = torch.cat(factors)
+
+    def _spread(self, block: slice, mean: np.ndarray, std: np.ndarray) -> torch.Tensor:
+        """Covariance of features by parameters that vary with σ around μ, to first order, ``(t, m, m)``."""
+        box = self.box
+        ends = np.clip(mean + np.concatenate([np.diag(std), -np.diag(std)]), box.low, box.high)
+        values = torch.from_numpy(to_values(ends, self.simulator.parameters.is_log))
+        features = self._simulate(self._states[block], block, values)
+        reach = torch.from_numpy(2 * std / np.maximum(np.diag(ends[: len(std)] - ends[len(std) :]), 1e-300))
+        half = torch.nan_to_num(0.5 * (features[:, : len(std)] - features[:, len(std) :]) * reach[:, None])
+        return half.mT @ half
 
     def simulated(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
         """Return the observed columns ``(T, P, n)`` that the simulator gives for values ``(P, d)``, in units."""

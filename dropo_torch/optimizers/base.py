@@ -24,6 +24,7 @@ class Request:
         reduce: what to sum over transitions, handed to :meth:`Objective.map`.
         evaluations: how many evaluations of the objective this counts as.
         linearise_at: μ in coordinates at which the start noise is propagated first, or ``None``.
+        linearise_std: σ that then counts as explained when windows are widened, or ``None``.
         rows: the transitions to simulate, ascending; ``None`` for all of them.
         replay: windows that are replayed open loop in place of the log's transitions; ``reduce`` is then a
             :data:`~dropo_torch.objective.ReplayReduce`.
@@ -35,6 +36,7 @@ class Request:
     reduce: Reduce | ReplayReduce
     evaluations: int
     linearise_at: np.ndarray | None = None
+    linearise_std: np.ndarray | None = None
     rows: np.ndarray | None = None
     gradient: bool = False
     is_stencil: bool = False

@@ -80,6 +80,7 @@ class CorrelatedOptimizer(FisherOptimizer):
             reduce=self._gather(stage.points()),
             evaluations=1,
             linearise_at=self._linearised,
+            linearise_std=self._explained,
             is_stencil=True,
         )
 

@@ -35,6 +35,9 @@ SMALL_GAIN = 0.01
 NOISY_ROUNDS = 6
 #: The means rest when no refit moves them by more than this share of their box.
 AT_REST = 1e-3
+#: Change of σ, as a share of it or of 1/20 of the search width, below which it rests; and how often it is fitted anew.
+RESTS = 0.1
+SPREAD_ROUNDS = 3
 #: Curvature that counts for more than this in the likelihood calls for sampling, in nats.
 MUCH_BENDING = 1.0
 
@@ -213,6 +216,8 @@ class FisherOptimizer(Optimizer):
         self._sampled: SampledStage | None = None
         self._round = 0
         self._linearised: np.ndarray | None = self._means.point if noisy else None
+        self._explained: np.ndarray | None = None  # σ of the last round, which no window need be widened for
+        self._spread_round = 0
 
     def ask(self) -> Request:
         """Return the points of the stage at work."""
@@ -222,6 +227,7 @@ class FisherOptimizer(Optimizer):
             reduce=stage.reduction(),
             evaluations=1,
             linearise_at=self._linearised,
+            linearise_std=self._explained,
             gradient=self._differentiable and stage is self._sampled,
             is_stencil=stage is self._means,
         )
@@ -230,6 +236,7 @@ class FisherOptimizer(Optimizer):
         """Hand the sums to the stage at work, and change stages when it has finished."""
         if self._sampled is not None:
             self._sampled.tell(self._with_entropy(self._sampled, sums), gradient)
+            self._after_deviations(self._sampled)
         elif self._scoring is not None:
             self._scoring.tell(self._with_entropy(self._scoring, sums))
             if self._scoring.reason is not None and self._misleads(self._scoring):
@@ -241,6 +248,8 @@ class FisherOptimizer(Optimizer):
                     self._scoring.std,
                     is_log=self._space.is_log,
                 )
+            else:
+                self._after_deviations(self._scoring)
         else:
             self._means.tell(sums)
             if self._means.reason is not None:
@@ -280,6 +289,8 @@ class FisherOptimizer(Optimizer):
             "sampled": None if self._sampled is None else self._sampled.state(),
             "round": self._round,
             "linearised": self._linearised,
+            "explained": self._explained,
+            "spread_round": self._spread_round,
         }
 
     def restore(self, state: dict[str, Any]) -> None:
@@ -293,6 +304,7 @@ class FisherOptimizer(Optimizer):
                 self._box, self._limits, self._uniforms, is_log=self._space.is_log, **state["sampled"]
             )
         self._round, self._linearised = state["round"], state["linearised"]
+        self._spread_round, self._explained = state["spread_round"], state["explained"]
 
     def extras(self) -> dict[str, Any]:
         """Return the weight of the entropy, where there is one."""
@@ -328,6 +340,21 @@ class FisherOptimizer(Optimizer):
                 self._means = MeansStage(self._box.low, self._box.high, point)
                 return
         self._scoring = ScoringStage(self._box, self._limits, point, self._means.deviations(self._box))
+
+    def _after_deviations(self, stage: ScoringStage | SampledStage) -> None:
+        """Refit around noise whose windows are widened for what σ does not explain either, until σ rests.
+
+        The first fit takes what varies for outliers. It so finds deviations that are too small, but none where there
+        are none: from there they grow.
+        """
+        if stage.reason is None or not self._noisy or self._spread_round >= SPREAD_ROUNDS:
+            return
+        before = self._box.min_std if self._explained is None else self._explained
+        if bool((np.abs(stage.std - before) <= RESTS * np.maximum(stage.std, self._box.width / 20)).all()):
+            return
+        self._spread_round += 1
+        self._linearised, self._explained = stage.mean, stage.std
+        self._scoring, self._sampled = ScoringStage(self._box, self._limits, stage.mean, stage.std), None
 
     @staticmethod
     def _misleads(stage: ScoringStage) -> bool:
