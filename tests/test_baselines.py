@@ -24,7 +24,7 @@ from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.cli import main
 from dropo_torch.config import make_config
 from dropo_torch.diagnostics import diagnose, estimates
-from dropo_torch.distribution import Distribution, truncated_moments
+from dropo_torch.distribution import DRAWN_STD, Distribution, truncated_moments
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, fit
 from dropo_torch.likelihood import DIVERGENCE_PENALTY
@@ -847,3 +847,23 @@ def test_bayessim_summarises_orientations_of_log_and_replays_alike(tmp_path: Pat
     table = ours.objective.map_replay(request.replay, np.array([[1.0]]), request.reduce).reshape(2, -1).numpy()
     assert table[0] == pytest.approx(table[1], abs=1e-9)
     assert (table[1, 6:9] > 1e-3).all()  # mean squares of the orientation's changes
+
+
+def test_what_varies_is_no_outlier_where_the_starts_are_noisy(folder: Path) -> None:
+    """Deviations are found as well with noise on every measurement as on the ends alone, where no window is widened."""
+    noise = np.array([1e-4, 5e-4])
+    found, true = [], []
+    for seed in range(3):
+        exact = problem(folder, "dropo", epsilon=(noise**2).tolist())
+        truths = draw_truths(exact, "varying", seed)
+        made = synthesise(exact, truths, noise, seed=seed)
+        log = made.trajectories
+        starts = log.observations + noise * np.random.default_rng([seed, 1]).standard_normal(log.observations.shape)
+        np.savez(
+            folder / "varying.npz", observations=starts, next_observations=log.next_observations, actions=log.actions,
+            terminals=log.terminals,
+        )  # fmt: skip
+        noisy = problem(folder, "dropo", "varying", noise=noise.tolist(), epsilon=1e-10)
+        found.append([fit_problem(p).distribution.std[0] for p in (made, noisy)])
+        true.append(truths[:, 0].std() / DRAWN_STD)
+    assert np.mean(found, axis=0) == pytest.approx(np.full(2, np.mean(true)), rel=0.15)
