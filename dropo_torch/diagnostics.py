@@ -27,6 +27,7 @@ class Diagnostics:
         mean: mean of the simulated next states over p_φ, ``(T, m)``.
         spread: their standard deviation, ``(T, m)``.
         expected: square root of the diagonal of Σ: spread, ε and start noise together, ``(T, m)``.
+        given: what ε and the noise alone let expect, ``(T, m)``.
         at_center: the simulated next state at μ, ``(T, m)``.
         sensitivity: root mean square change of each column when a parameter moves by 1 % of its
             search width, ``(d, m)``.
@@ -45,6 +46,7 @@ class Diagnostics:
     mean: np.ndarray
     spread: np.ndarray
     expected: np.ndarray
+    given: np.ndarray
     at_center: np.ndarray
     sensitivity: np.ndarray
     standard_error: np.ndarray
@@ -89,6 +91,8 @@ def diagnose(
     covariance = torch.cat([objective.base_covariance(slice(i, i + 1)) for i in range(len(objective))])
     information = torch.einsum("tdm,tmn,ten->de", jacobian, torch.linalg.inv(covariance), jacobian).numpy()
     error, correlation = estimates(information)
+    base = torch.diagonal(covariance, dim1=-2, dim2=-1)
+    widened = torch.ones(1) if objective.widening is None else objective.widening[:, None]
     width = objective.box.width[:, None]
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
@@ -101,7 +105,8 @@ def diagnose(
         measured=objective.measured.numpy(),
         mean=mean.numpy(),
         spread=variance.sqrt().numpy(),
-        expected=(variance + torch.diagonal(covariance, dim1=-2, dim2=-1)).sqrt().numpy(),
+        expected=(variance + base).sqrt().numpy(),
+        given=(base / widened).sqrt().numpy(),
         at_center=center.numpy(),
         sensitivity=0.01 * width * jacobian.square().mean(0).sqrt().numpy(),
         standard_error=error,

@@ -286,11 +286,13 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
     uniforms = draw_uniforms(samples, len(space), seed, 0)
     results = []
     for candidate in search.distributions(space):
-        objective.linearise(candidate.mean)
+        objective.linearise(candidate.mean, objective.varying(candidate.std))
         evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None])[0]
         results.append((evaluation.log_likelihood + search.bonus(candidate), candidate, evaluation))
     _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
-    objective.linearise(distribution.mean)
+    objective.linearise(distribution.mean, objective.varying(distribution.std))
+    dropped = distribution.correlation is None and any(c.correlation is not None for _, c, _ in results)
+    remark = ", but makes the log no likelier: parameters vary independently" if dropped else ""
     return Fit(
         distribution=distribution,
         log_likelihood=best.log_likelihood,
@@ -304,7 +306,7 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
         simulated_transitions=objective.simulated_transitions,
         diverged=best.diverged,
         seconds=spent + time.monotonic() - begun,
-        stop_reason=search.stop_reason or "",
+        stop_reason=(search.stop_reason or "") + remark,
         history=tuple(history),
         method=search.method,
         extras=search.extras(),

@@ -370,6 +370,10 @@ class Objective:
         self.linearised_std = None if std is None else np.asarray(std, dtype=np.float64).copy()
         self.widening = torch.cat(factors)
 
+    def varying(self, std: np.ndarray) -> np.ndarray | None:
+        """Return σ ``(d,)`` for :meth:`linearise`; ``None`` where each is at its floor, a point estimate."""
+        return None if (std <= 2 * self.box.min_std).all() else np.asarray(std)
+
     def _spread(self, block: slice, mean: np.ndarray, std: np.ndarray) -> torch.Tensor:
         """Covariance of features by parameters that vary with σ around μ, to first order, ``(t, m, m)``."""
         box = self.box

@@ -232,6 +232,11 @@ def test_a_mixture_stays_in_its_box() -> None:
     outside = Mixture(np.ones(1), np.array([[50.0]]), np.array([[[1.0]]]), np.zeros(1), np.ones(1))
     assert outside.sample(100, seed=0) == pytest.approx(1.0)
     assert outside.share_inside == 0
+    assert len(outside.peaks(0)) < 2
+    two = Mixture(np.full(2, 0.5), np.array([[0.2], [0.7]]), np.full((2, 1, 1), 0.01), np.zeros(1), np.ones(1))
+    assert two.peaks(0) == pytest.approx([0.2, 0.7], abs=0.01)
+    near = Mixture(np.full(2, 0.5), np.array([[0.4], [0.6]]), np.full((2, 1, 1), 0.01), np.zeros(1), np.ones(1))
+    assert len(near.peaks(0)) == 1
     wide = Mixture(np.ones(1), np.array([[0.9]]), np.array([[[0.2]]]), np.zeros(1), np.ones(1))
     assert wide.share_inside == pytest.approx(0.566, abs=0.02)
     assert wide.shares_inside == pytest.approx([0.566], abs=1e-3)
@@ -867,3 +872,20 @@ def test_what_varies_is_no_outlier_where_the_starts_are_noisy(folder: Path) -> N
         found.append([fit_problem(p).distribution.std[0] for p in (made, noisy)])
         true.append(truths[:, 0].std() / DRAWN_STD)
     assert np.mean(found, axis=0) == pytest.approx(np.full(2, np.mean(true)), rel=0.15)
+
+
+def test_several_explanations_are_told(folder: Path) -> None:
+    """A centre of mass to one side or the other swings alike where nothing pulls it."""
+    xml = PENDULUM_XML.replace('timestep="0.005"', 'timestep="0.005" gravity="0 0 0"').replace("0 0 -.5", "0 0 -.3")
+    (folder / "turntable.xml").write_text(xml)
+    given = config(folder, "bayessim", method_options={"simulations": 400, "horizon": 20}) | {
+        "model": str(folder / "turntable.xml"),
+        "parameters": {"offset": {"field": "body_ipos[2]", "name": "bob", "bounds": [-0.5, 0.5]}},
+    }
+    ours = synthesise(make_problem(make_config(given)), np.full((STEPS, 1), 0.3), np.full(2, 1e-4), seed=0)
+    result = fit_problem(ours)
+    told = {f.title: f.text for f in findings(result, diagnose(ours.objective, result.distribution))}
+    assert "Several values explain the log" in told
+    low, high = Mixture.of(result.extras["mixture"]).peaks(0)
+    assert (low, high) == pytest.approx((-0.3, 0.3), abs=0.03)
+    assert "Hardly narrower than the search box" not in told

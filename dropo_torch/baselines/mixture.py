@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.signal
 import scipy.special
 
 from dropo_torch.errors import InputError
 
 #: Draws of the truncated mixture from which its moments are taken.
 _MOMENT_DRAWS = 20_000
+#: Points of a coordinate's box at which its density is looked at.
+_GRID = 400
 
 
 @dataclass(frozen=True)
@@ -85,6 +88,14 @@ class Mixture:
         std = np.sqrt(self.covariances[:, index, index])
         z = (points[:, None] - self.means[:, index]) / std
         return np.asarray(np.exp(-0.5 * z**2) / std @ self.weights / np.sqrt(2 * np.pi))
+
+    def peaks(self, index: int) -> np.ndarray:
+        """Return where one coordinate's density has peaks in its box, twice as high as what parts them or more."""
+        points = np.linspace(self.low[index], self.high[index], _GRID)
+        density = np.concatenate([[0.0], self.marginal_density(index, points), [0.0]])
+        found, about = scipy.signal.find_peaks(density, prominence=0)
+        clear = (about["prominences"] >= 0.5 * density[found]) & (density[found] > 0.1 * density.max())
+        return np.asarray(points[found[clear] - 1])
 
     @property
     def moments(self) -> tuple[np.ndarray, np.ndarray]:

@@ -62,11 +62,13 @@ def write_fit_report(
         "title": title,
         "headline": words.headline(fit, diagnostics),
         "explained": ok,
+        "tag": "Not judged" if fit.method == "udr" else "✓ Explained" if ok else "! Not fully explained",
+        "has_errors": words.has_standard_errors(fit),
         "verdict": verdict,
         "findings": words.findings(fit, diagnostics),
         "notes": list(notes),
         "tiles": _tiles(fit, diagnostics),
-        "parameters": _parameter_rows(fit.distribution, diagnostics, config, space, nominal),
+        "parameters": _parameter_rows(fit, diagnostics, config, space, nominal),
         "densities": _densities(fit.distribution, nominal),
         "law": words.law(fit),
         **_posterior(fit),
@@ -190,13 +192,14 @@ def _tiles(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
 
 
 def _parameter_rows(
-    distribution: Distribution,
+    fit: Fit,
     diagnostics: Diagnostics,
     config: Mapping[str, Any] | None,
     space: ParameterSpace | None,
     nominal: np.ndarray,
 ) -> list[dict[str, Any]]:
     """The table of parameters, one dictionary a row."""
+    distribution, has_errors = fit.distribution, words.has_standard_errors(fit)
     specs = (config or {}).get("parameters")
     specs = specs if isinstance(specs, Mapping) else {}
     places = {} if space is None else {p.name: p.where for p in space.parameters if p.field or p.effect}
@@ -213,7 +216,7 @@ def _parameter_rows(
                 "mean": words.number(mean, std),
                 "std": words.number(std, std),
                 "log": bool(distribution.is_log[i]),
-                "error": words.number(error * float(scale[i]), error * float(scale[i])),
+                "error": words.number(error * float(scale[i]), error * float(scale[i])) if has_errors else "",
                 "unit": distribution.units[i],
                 "low": figures.plain(float(distribution.low[i])),
                 "high": figures.plain(float(distribution.high[i])),
@@ -404,7 +407,9 @@ def _likelihood(history: Sequence[HistoryEntry], begins: Sequence[int]) -> tuple
     """Gap to the best log-likelihood, one column a stage, so that no line joins two stages."""
     values = np.array([entry.log_likelihood for entry in history])
     best = np.max(values, initial=-np.inf, where=np.isfinite(values))
-    gap = np.where(np.isfinite(values), np.maximum(best - values, 0.1), np.nan)
+    finite = np.isfinite(values)
+    gap = np.full(len(values), np.nan)
+    gap[finite] = np.maximum(best - values[finite], 0.1)
     lines = np.full((len(history), len(begins)), np.nan)
     for column, (a, b) in enumerate(zip(begins, [*begins[1:], len(history)], strict=True)):
         lines[a:b, column] = gap[a:b]

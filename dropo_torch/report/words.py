@@ -9,6 +9,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
+from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, SearchBox, coordinate_limits, to_coordinates, to_values
 from dropo_torch.fit import Fit
@@ -54,7 +55,7 @@ def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
         *_unobserved(diagnostics),
         *_at_bounds(fit.distribution),
         *(_deviations(fit.distribution) if fit.method == "dropo" else _of_method(fit)),
-        *_residuals(diagnostics),
+        *([] if fit.method == "udr" else _residuals(diagnostics)),
         *_confounded(diagnostics),
         *_vague(fit.distribution, diagnostics),
         *_failures(fit, diagnostics),
@@ -102,6 +103,8 @@ def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
     at_worst = f"{diagnostics.labels[worst]} is worst, at {rms(standardised[worst])}"
     limit = unexplained_above(diagnostics)
     scale = f"Measured next states lie {rms(overall)} expected deviations from the simulated ones (rms; 1 is ideal)"
+    if fit.method == "udr":
+        return True, f"A box was drawn at random; the log had no part in it. {scale}; {at_worst}."
     if standardised[worst] > limit:
         bad = int(np.sum(standardised > limit))
         where = "" if len(standardised) == 1 else f" in {bad} of {len(standardised)} columns"
@@ -140,6 +143,11 @@ def standardised_residual(diagnostics: Diagnostics) -> np.ndarray:
 def unexplained_above(diagnostics: Diagnostics) -> float:
     """Return the rms above which a column is not explained: wider for a short log, whose rms varies by chance."""
     return UNEXPLAINED + 3 / np.sqrt(2 * max(len(diagnostics.rows), 1))
+
+
+def has_standard_errors(fit: Fit) -> bool:
+    """Whether the means are where the likelihood is largest, so that its curvature tells their standard errors."""
+    return fit.method not in ("bayessim", "simopt", "udr")
 
 
 def search_box(distribution: Distribution) -> SearchBox:
@@ -343,7 +351,10 @@ def _of_method(fit: Fit) -> list[Finding]:
             "attention",
             "They shrink with every generation, noise or not. Take the means, and spread of your own.",
         ),
-        "simopt": ("note", "Other iterations or another bound on their steps give others."),
+        "simopt": (
+            "attention",
+            "Other iterations or another bound on their steps give others. Take the means, and spread of your own.",
+        ),
         "laplace": ("note", "The model lacking something does not widen them; a longer log narrows them."),
         "udr": ("note", "The log has no part in them."),
         "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior below."),
@@ -352,16 +363,47 @@ def _of_method(fit: Fit) -> list[Finding]:
         texts["bayessim"] = ("attention", f"But the posterior is a guess: {fit.stop_reason.split('; but ')[-1]}.")
     level, text = texts.get(fit.method, ("note", ""))
     found = [Finding(cast(Level, level), "What the standard deviations are", f"{law(fit).split('. ')[1]}. {text}")]
-    vague = [name for name, s in zip(fit.distribution.names, share, strict=True) if s > 0.8 / math.sqrt(12)]
-    if fit.method == "bayessim" and vague:
+    if fit.method != "bayessim":
+        return found
+    several = _several_peaks(fit)
+    if several:
+        found.append(
+            Finding(
+                "attention",
+                "Several values explain the log",
+                f"{joined([f'{name}: {joined(values)}' for name, values in several.items()])}. The normal distribution "
+                "above covers the values between them, too, which the log excludes: do not train on it. Narrow the "
+                "bounds to one of them, or log a motion that tells them apart.",
+            )
+        )
+    vague = [
+        name
+        for name, s in zip(fit.distribution.names, share, strict=True)
+        if s > 0.8 / math.sqrt(12) and name not in several
+    ]
+    if vague:
         found.append(
             Finding(
                 "attention",
                 "Hardly narrower than the search box",
-                f"{joined(vague)}. The network has learned next to nothing about it: more simulations, or a horizon "
-                "over which the parameter shows, may help.",
+                f"{joined(vague)}. By itself the log tells next to nothing about it, or the network has not learned "
+                "it: if the posterior's dots form a line, only a combination with another parameter is known; if not, "
+                "more simulations, or a horizon over which the parameter shows, may help.",
             )
         )
+    return found
+
+
+def _several_peaks(fit: Fit) -> dict[str, list[str]]:
+    """The parameters whose posterior has more than one peak, and where the peaks are."""
+    mixture = Mixture.of(fit.extras["mixture"])
+    found = {}
+    for i, (name, is_log) in enumerate(zip(fit.distribution.names, fit.distribution.is_log, strict=True)):
+        peaks = mixture.peaks(i)
+        if len(peaks) > 1:
+            found[name] = [
+                number(float(v), 0.01 * abs(float(v))) for v in to_values(peaks, np.full(len(peaks), is_log))
+            ]
     return found
 
 
@@ -370,7 +412,7 @@ def _residuals(diagnostics: Diagnostics) -> list[Finding]:
     limit = unexplained_above(diagnostics)
     order = np.argsort(-np.nan_to_num(standardised, nan=-1))
     bad = [f"{diagnostics.labels[i]} ({rms(standardised[i])})" for i in order if standardised[i] > limit]
-    drowned = [diagnostics.labels[i] for i in range(len(standardised)) if standardised[i] < DROWNED]
+    drowned = [diagnostics.labels[i] for i in range(len(standardised)) if _is_drowned(diagnostics, i)]
     found = []
     if bad:
         found.append(
@@ -396,6 +438,15 @@ def _residuals(diagnostics: Diagnostics) -> list[Finding]:
     if lost:
         found.append(Finding("attention", "Columns without a finite residual", f"{joined(lost)}."))
     return found
+
+
+def _is_drowned(diagnostics: Diagnostics, column: int) -> bool:
+    """Whether ε and the noise given for a column are far larger than what the simulator misses by."""
+    residual, given = diagnostics.residual[:, column], diagnostics.given[:, column]
+    finite = np.isfinite(residual) & np.isfinite(given)
+    if not finite.any():
+        return False
+    return bool(np.sqrt(np.mean(residual[finite] ** 2)) < DROWNED * np.median(given[finite]))
 
 
 def _confounded(diagnostics: Diagnostics) -> list[Finding]:
