@@ -145,7 +145,7 @@ def run_sweep(
         return SweepPoint.of(epsilon, fit, robust_log_likelihood(part.objective, fit) if noisy_starts else None)
 
     sweep = sweep_epsilon(point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store)
-    chosen = keys_of(sweep.chosen)
+    chosen = keys_of(sweep.chosen) | ({"scaling": True} if config.scaling else {})  # which ε is in units of
     _show_sweep(sweep, chosen, problem.space.names, console)
     write_json(out / "sweep.json", {**sweep.document(), "use": chosen})
     write_sweep_report(out / "report.html", sweep, use=chosen, config=config.document(), versions=versions())

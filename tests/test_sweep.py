@@ -162,6 +162,16 @@ def test_an_epsilon_of_each_column_is_swept_in_its_ratios(tmp_path: Path) -> Non
     assert found["use"] == {"epsilon": [1e-7, 1e-7, 1e-5, 1e-5]}
 
 
+def test_what_is_to_be_used_says_that_it_is_scaled(tmp_path: Path) -> None:
+    config = Folder(tmp_path / "robot").config(scaling=True)
+    out = tmp_path / "out"
+    command = ["sweep-epsilon", str(config), "--out", str(out), "--epsilons", "1e-8,1e-7,1e-6", "--noisy-starts"]
+    assert main(command) == 0
+    use = json.loads((out / "sweep.json").read_text())["use"]
+    assert use["scaling"] is True
+    assert len(set(use["noise"])) == 4  # one share of each column's variance
+
+
 @pytest.mark.parametrize(
     "wrong",
     [["--epsilons", "1e-6,1e-5"], ["--parameters.idle", "{field: qpos_spring, name: shoulder, bounds: [-1, 1]}"]],
