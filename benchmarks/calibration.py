@@ -3,7 +3,7 @@
     python benchmarks/calibration.py --logs 100 --out out/calibration --workers 2     # --resume goes on
 
 Writes ``trials.jsonl``, a line a fit below the settings, and ``calibration.md``. Mass and damping are searched for; the
-log has 60 transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.baselines.calibration` has the
+log has 60 transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.studies.calibration` has the
 two kinds of log.
 """
 
@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 import dropo_torch as dropo
-from dropo_torch.baselines.calibration import Coverage, Trial, calibrate, coverages, plain
-from dropo_torch.parallel import in_parallel
+from dropo_torch.studies.calibration import Coverage, Trial, calibrate, coverages, plain
+from dropo_torch.support.parallel import in_parallel
 
 MODEL = """
 <mujoco>

@@ -21,12 +21,12 @@ import gymnasium
 import mujoco.batch
 import numpy as np
 import torch
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.task import HopperTask
 from torchrl.envs import EnvBase, HopperEnv
 
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl import MujocoStepper, RandomizedEnv
-from sims.hopper import SIM
-from sims.hopper.task import HopperTask
 
 SKIP = SIM.frame_skip
 #: A contestant: makes environment steps until the given time has passed; returns steps per second.

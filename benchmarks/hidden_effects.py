@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.hidden.cases import CaseSpec, cases, select
 from benchmarks.hidden.truths import Case
-from dropo_torch.parallel import in_parallel
+from dropo_torch.support.parallel import in_parallel
 
 KINDS = ("null", "single", "double", "outside")
 #: The parameters that say how strong an effect is, with their neutral value; all of an effect's where not listed.

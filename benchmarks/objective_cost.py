@@ -14,11 +14,11 @@ from collections.abc import Callable, Sequence
 import mujoco.batch
 import numpy as np
 import torch
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.record import record
 
 import dropo_torch as dropo
 from dropo_torch.objective import draw_uniforms
-from sims.hopper import SIM
-from sims.hopper.record import record
 
 
 def make_objective(transitions: int) -> dropo.Objective:

@@ -10,22 +10,22 @@ from typing import TYPE_CHECKING, Any
 
 from dropo_torch import baselines, gap
 from dropo_torch.config import Config, load_config, make_config
+from dropo_torch.data.observation import Observation, parse_observation
+from dropo_torch.data.preprocess import Preprocess, preprocess
+from dropo_torch.data.readers import read_recording, read_trajectories
+from dropo_torch.data.recording import Recording
+from dropo_torch.data.trajectory import Trajectories, Transitions, make_transitions
 from dropo_torch.diagnostics import Diagnostics, diagnose
 from dropo_torch.distribution import Distribution
 from dropo_torch.effects import Effect, Placed, Quantity
 from dropo_torch.errors import InputError
-from dropo_torch.export import export_model
 from dropo_torch.fit import Fit, fit
 from dropo_torch.likelihood import log_likelihood
+from dropo_torch.models.export import export_model
 from dropo_torch.objective import Objective
-from dropo_torch.observation import Observation, parse_observation
 from dropo_torch.parameters import Parameter, ParameterSpace
-from dropo_torch.preprocess import Preprocess, preprocess
 from dropo_torch.problem import Problem, make_problem
-from dropo_torch.readers import read_recording, read_trajectories
-from dropo_torch.recording import Recording
 from dropo_torch.simulators import Simulator, make_simulator
-from dropo_torch.trajectory import Trajectories, Transitions, make_transitions
 
 if TYPE_CHECKING:
     from dropo_torch.rl.policy import load_policy

@@ -13,7 +13,7 @@ import pydantic
 import yaml
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.model import CENTRES
+from dropo_torch.models.load import CENTRES
 
 
 class Config(pydantic.BaseModel):

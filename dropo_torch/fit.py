@@ -15,10 +15,10 @@ import numpy as np
 from dropo_torch.certify import certify, has_reference
 from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError, choices
-from dropo_torch.files import write_atomically, write_json
 from dropo_torch.objective import Objective, draw_uniforms, no_effect
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer, Progress
 from dropo_torch.optimizers.correlated import CorrelatedOptimizer
+from dropo_torch.support.files import write_atomically, write_json
 
 SCHEMA = "dropo-torch/fit/1"
 OPTIMIZERS = ("fisher", "cma", "adam")

@@ -14,6 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from dropo_torch.data.observation import Observation
+from dropo_torch.data.trajectory import Replay, Transitions
 from dropo_torch.distribution import SearchBox, base_uniforms, to_values, values_from_uniforms
 from dropo_torch.errors import InputError, choices
 from dropo_torch.likelihood import (
@@ -25,9 +27,7 @@ from dropo_torch.likelihood import (
     student_log_density,
     widening,
 )
-from dropo_torch.observation import Observation
 from dropo_torch.simulators.base import Simulator
-from dropo_torch.trajectory import Replay, Transitions
 
 #: Antithetic pairs of start noise per noisy column, and their seed.
 NOISE_DRAWS = 2

@@ -22,7 +22,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.model import CENTRES, load_model
+from dropo_torch.models.load import CENTRES, load_model
 
 #: Fields whose values must be positive, whatever the search bounds.
 POSITIVE_FIELDS = frozenset({"body_mass", "body_inertia", "opt.timestep", "opt.impratio", "geom_size", "pair_friction"})

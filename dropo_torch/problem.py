@@ -15,20 +15,20 @@ import gymnasium
 import mujoco
 import numpy as np
 
-from dropo_torch.bundled import BundledSim, bundled_sim
 from dropo_torch.config import TRAINING_KEYS, Config
+from dropo_torch.data.observation import Observation, generic_observation, parse_observation
+from dropo_torch.data.readers import read_trajectories
+from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.errors import InputError
-from dropo_torch.model import load_model
+from dropo_torch.models.bundled import BundledSim, bundled_sim
+from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
-from dropo_torch.observation import Observation, generic_observation, parse_observation
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.readers import read_trajectories
 from dropo_torch.simulators import Adapter, MujocoEnvAdapter, Simulator, make_simulator
-from dropo_torch.trajectory import Trajectories, make_transitions
-from dropo_torch.usercode import load_callable, user_code
+from dropo_torch.support.usercode import load_callable, user_code
 
 #: Relative difference between the log's time step and the simulator's that is still called equal.
 TIME_TOLERANCE = 1e-3

@@ -18,9 +18,9 @@ import yaml
 from rich.console import Console
 
 import dropo_torch as dropo
+from dropo_torch.commands.runs import run_fit, run_gap
 from dropo_torch.effects import Quantity, Setting
 from dropo_torch.effects.joint import JointEffect
-from dropo_torch.runs import run_fit, run_gap
 
 DOOR = """
 <mujoco>

@@ -28,14 +28,14 @@ from typing import Any
 import matplotlib
 import numpy as np
 import scipy.stats
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.record import nominal_masses, record
 
 import dropo_torch as dropo
-from dropo_torch.files import write_atomically
-from dropo_torch.parallel import in_parallel
 from dropo_torch.rl.problem import make_training
 from dropo_torch.rl.train import Progress, TrainEntry, train
-from sims.hopper import SIM
-from sims.hopper.record import nominal_masses, record
+from dropo_torch.support.files import write_atomically
+from dropo_torch.support.parallel import in_parallel
 
 METHODS = ("true", "fitted", "point", "uniform")
 LABELS = {"true": "target's own masses", "fitted": "fitted distribution", "point": "its means", "uniform": "bounds"}

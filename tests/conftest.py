@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import torch
 
+from dropo_torch.data.observation import generic_observation
+from dropo_torch.data.trajectory import Transitions
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.objective import Objective
-from dropo_torch.observation import generic_observation
 from dropo_torch.optimizers import Optimizer
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import Simulator
-from dropo_torch.trajectory import Transitions
 
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True, max_examples=60, database=None)
 hypothesis.settings.load_profile("tests")

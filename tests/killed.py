@@ -20,7 +20,7 @@ import threading
 from pathlib import Path
 from typing import Any
 
-from dropo_torch.cli import main
+from dropo_torch.commands.cli import main
 
 RESULTS = ("distribution.yaml", "model.xml", "fitted_config.yaml")
 

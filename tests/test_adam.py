@@ -5,6 +5,8 @@ import pickle
 import numpy as np
 import pytest
 import torch
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.record import record
 
 import dropo_torch as dropo
 from dropo_torch.certify import certify
@@ -12,8 +14,6 @@ from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective, draw_uniforms
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, FisherOptimizer
 from dropo_torch.optimizers.adam import adam_settings
-from sims.hopper import SIM
-from sims.hopper.record import record
 
 pytest.importorskip("warp")
 

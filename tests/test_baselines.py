@@ -13,16 +13,17 @@ import pytest
 import torch
 import yaml
 from conftest import LinearSimulator, generic_observation, linear_objective, space_of
+from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
-from dropo_torch.baselines.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
 from dropo_torch.baselines.density import fit_mixture, unlikeness
 from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
-from dropo_torch.cli import main
+from dropo_torch.commands.cli import main
 from dropo_torch.config import make_config
+from dropo_torch.data.trajectory import Trajectories, make_replay
 from dropo_torch.diagnostics import diagnose, estimates
 from dropo_torch.distribution import DRAWN_STD, Distribution, truncated_moments
 from dropo_torch.errors import InputError
@@ -34,8 +35,7 @@ from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.report import write_fit_report
 from dropo_torch.report.words import findings
-from dropo_torch.trajectory import Trajectories, make_replay
-from sims.hopper.study import REDUCED, Plan, all_cells, run_study
+from dropo_torch.studies.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
 
 #: A driven pendulum; the rod has no mass, the bob's is to be found.
 PENDULUM_XML = """

@@ -19,7 +19,7 @@ import pytest
 import yaml
 from arm import ADAPTER, CONFIG, PARAMETERS, XML, Folder, record
 
-from dropo_torch.cli import COMMANDS, main
+from dropo_torch.commands.cli import COMMANDS, main
 from dropo_torch.config import KEYS
 
 RESULTS = {"fit.json", "report.html", "distribution.yaml", "fitted_config.yaml", "model.xml", "checkpoint.pkl"}
@@ -437,7 +437,7 @@ def test_without_a_command_there_is_help(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_the_demo_finds_four_masses_within_two_percent(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    from sims.hopper import SIM
+    from dropo_sims.hopper import SIM
 
     assert main(["demo", "--out", str(tmp_path)]) == 0
     assert {p.name for p in tmp_path.iterdir()} == RESULTS
@@ -453,7 +453,7 @@ def test_the_demo_takes_other_parameters(tmp_path: Path) -> None:
 
 def start(*arguments: object, **options: Any) -> subprocess.Popen[str]:
     """A command of its own, which Ctrl-C reaches even where the tests run in the background."""
-    command = [sys.executable, "-m", "dropo_torch.cli", *map(str, arguments)]
+    command = [sys.executable, "-m", "dropo_torch", *map(str, arguments)]
     listen = functools.partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, preexec_fn=listen, **options)
 

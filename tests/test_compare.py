@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from dropo_torch.cli import main
-from dropo_torch.compare import METHODS, compare
+from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
+from dropo_torch.studies.compare import METHODS, compare
 
 CONFIG = "sim: hopper\ntrajectories: [0]\nsamples: 6\nbudget: 14\nadam: {steps: 4, samples: 4}\n"
 

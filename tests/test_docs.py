@@ -23,7 +23,7 @@ import pytest
 import scipy.io
 import yaml
 
-from dropo_torch import cli
+from dropo_torch.commands import cli
 from dropo_torch.config import _Loader, make_config, parse_overrides
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
@@ -225,9 +225,9 @@ def test_readme_config_is_fitted_by_its_command(robot: Path, tmp_path: Path, cap
 
 def test_every_key_is_documented() -> None:
     from dropo_torch.config import KEYS
+    from dropo_torch.data.preprocess import Preprocess
+    from dropo_torch.data.readers import ReadOptions
     from dropo_torch.parameters import _KEYS
-    from dropo_torch.preprocess import Preprocess
-    from dropo_torch.readers import ReadOptions
 
     config, data = ((ROOT / "docs" / name).read_text() for name in ("config.md", "data.md"))
     assert not [key for key in (*KEYS, *_KEYS) if f"`{key}`" not in config]

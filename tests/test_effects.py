@@ -11,10 +11,13 @@ import pytest
 import torch
 import yaml
 from conftest import HOPPER
+from dropo_sims.hopper import SIM
 
 from dropo_torch.certify import certify
-from dropo_torch.cli import main
+from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config, make_config
+from dropo_torch.data.observation import generic_observation, parse_observation
+from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.export import search_box, write_config, write_model
@@ -22,12 +25,9 @@ from dropo_torch.effects.placing import lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
-from dropo_torch.observation import generic_observation, parse_observation
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
 from dropo_torch.simulators import MujocoSimulator, make_simulator
-from dropo_torch.trajectory import Trajectories, make_transitions
-from sims.hopper import SIM
 
 #: A chain of two links, a free ball on a floor, a slide without friction.
 RIG = """

@@ -9,12 +9,12 @@ import mujoco
 import numpy as np
 import pytest
 from arm import Folder
+from dropo_sims.hopper import SIM
 
-from dropo_torch.cli import main
+from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
-from dropo_torch.export import export_model
+from dropo_torch.models.export import export_model
 from dropo_torch.parameters import ParameterSpace, read_field
-from sims.hopper import SIM
 
 #: A sledge on the floor, pulled by a geared motor, with an arm that a position servo holds.
 SLEDGE = """

@@ -24,11 +24,11 @@ import dropo_torch as dropo
 import dropo_torch.gap as gap_package
 from benchmarks.hidden.systems import CART_POLE, TORQUE_ARM
 from benchmarks.hidden.truths import Case, Effect, simulate_truth
-from dropo_torch.cli import main
+from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
-from dropo_torch.files import plain_numbers
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
 from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Starts, cost_of, robust_factors
 from dropo_torch.gap.intervals import deviations
@@ -41,8 +41,8 @@ from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
-from dropo_torch.observation import parse_observation
 from dropo_torch.problem import Problem, make_problem
+from dropo_torch.support.files import plain_numbers
 
 #: The vocabulary of searches that are not about the whole of it.
 FEW = (

@@ -23,6 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from dropo_torch.data.observation import generic_observation, parse_observation
 from dropo_torch.errors import InputError
 from dropo_torch.likelihood import (
     DIVERGENCE_PENALTY,
@@ -33,7 +34,6 @@ from dropo_torch.likelihood import (
     rotation_vector,
 )
 from dropo_torch.objective import Objective, draw_uniforms, no_effect
-from dropo_torch.observation import generic_observation, parse_observation
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator
 

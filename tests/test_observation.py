@@ -7,8 +7,8 @@ from conftest import ARM_XML, BOX_XML, TENDON_XML, compiled, random_states
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.errors import InputError
-from dropo_torch.observation import parse_observation
 
 ARM = compiled(ARM_XML)  # qpos: shoulder, elbow, wrist; qvel the same
 BOX = compiled(BOX_XML)  # qpos: root (7), hang; qvel: root (6), hang

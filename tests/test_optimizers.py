@@ -19,11 +19,11 @@ from conftest import (
     windows,
 )
 
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.distribution import coordinate_limits, to_values, truncated_interval, truncated_moments
 from dropo_torch.fit import fit
 from dropo_torch.likelihood import LOST_TRANSITION
 from dropo_torch.objective import Objective, draw_uniforms
-from dropo_torch.observation import parse_observation
 from dropo_torch.optimizers import CMAOptimizer, FisherOptimizer, Optimizer
 from dropo_torch.optimizers.fisher import ScoringStage
 from dropo_torch.optimizers.gauss_newton import MeansStage

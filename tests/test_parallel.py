@@ -10,13 +10,13 @@ from pathlib import Path
 
 import pytest
 
-from dropo_torch.parallel import in_parallel, processors
+from dropo_torch.support.parallel import in_parallel, processors
 
 #: A parent whose workers write their process numbers into a folder and sleep.
 PARENT = """
 import sys
 from test_parallel import sleep_long
-from dropo_torch.parallel import in_parallel
+from dropo_torch.support.parallel import in_parallel
 
 if __name__ == "__main__":
     try:

@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from dropo_torch.data.preprocess import Preprocess, estimate_delay, preprocess, signal_delays
+from dropo_torch.data.readers import read_trajectories
+from dropo_torch.data.recording import Recording
 from dropo_torch.errors import InputError
-from dropo_torch.preprocess import Preprocess, estimate_delay, preprocess, signal_delays
-from dropo_torch.readers import read_trajectories
-from dropo_torch.recording import Recording
 
 
 def recording(time, observations, actions=None, episodes=None):

@@ -13,9 +13,9 @@ import pandas as pd
 import pytest
 import scipy.io
 
+from dropo_torch.data.readers import read_recording, read_trajectories
+from dropo_torch.data.recording import Recording
 from dropo_torch.errors import InputError
-from dropo_torch.readers import read_recording, read_trajectories
-from dropo_torch.recording import Recording
 
 DT = 0.05
 RNG = np.random.default_rng(0)

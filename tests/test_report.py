@@ -12,7 +12,7 @@ from dropo_torch.distribution import Distribution
 from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.report import figures, words, write_fit_report, write_sweep_report
 from dropo_torch.report.html import shown_columns, worst_stretch
-from dropo_torch.sweep import Sweep, SweepPoint
+from dropo_torch.studies.sweep import Sweep, SweepPoint
 
 NAMES = ("torso", "damping", "foot")
 

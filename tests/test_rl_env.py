@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 import torch
 from cartpole import CART_POLE, CartPole
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.task import HopperTask
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torchrl.envs.utils import check_env_specs
 
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.distribution import Distribution
 from dropo_torch.effects import VOCABULARY, find_effect, register
 from dropo_torch.effects.actuator import ActuatorDeadband
@@ -25,7 +28,6 @@ from dropo_torch.effects.placing import EffectSet, place_effects, plain_setting
 from dropo_torch.effects.sensor import SensorBias
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.errors import InputError
-from dropo_torch.observation import parse_observation
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl import (
     ParameterSource,
@@ -37,8 +39,6 @@ from dropo_torch.rl import (
     load_task,
 )
 from dropo_torch.simulators import make_simulator
-from sims.hopper import SIM
-from sims.hopper.task import HopperTask
 
 MASSES = ParameterSpace(SIM.model, SIM.parameters)
 CART = {
@@ -425,7 +425,7 @@ def test_a_source_must_be_the_spaces() -> None:
 
 def test_tasks_are_found(tmp_path: Path) -> None:
     assert isinstance(load_task("hopper"), HopperTask)
-    assert isinstance(load_task("sims.hopper.task:HopperTask"), HopperTask)
+    assert isinstance(load_task("dropo_sims.hopper.task:HopperTask"), HopperTask)
     code = (Path(__file__).parent / "cartpole.py").read_text()
     (tmp_path / "pole.py").write_text(code)
     assert load_task("pole.py:CartPole", base=tmp_path).name == "cartpole"

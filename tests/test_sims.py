@@ -8,12 +8,12 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import HOPPER
+from dropo_sims.hopper import LINKS, SIM
+from dropo_sims.hopper.record import HOLD, NOISE_VARIANCE, SPREAD, VARIANTS, main, nominal_masses, record
 
-from dropo_torch.bundled import bundled_sim
+from dropo_torch.data.readers import read_trajectories
 from dropo_torch.errors import InputError
-from dropo_torch.readers import read_trajectories
-from sims.hopper import LINKS, SIM
-from sims.hopper.record import HOLD, NOISE_VARIANCE, SPREAD, VARIANTS, main, nominal_masses, record
+from dropo_torch.models.bundled import bundled_sim
 
 #: What fields start with that are seen, or are names, files and bookkeeping, but no physics.
 NO_PHYSICS = (

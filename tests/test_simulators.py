@@ -27,7 +27,7 @@ from conftest import (
 )
 
 from dropo_torch.errors import InputError
-from dropo_torch.model import unsimplify
+from dropo_torch.models.load import unsimplify
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.stepper import make_stepper
 from dropo_torch.simulators import GymnasiumSimulator, MujocoEnvAdapter, MujocoSimulator, Simulator, make_simulator

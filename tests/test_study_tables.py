@@ -6,10 +6,10 @@ from dataclasses import asdict
 from typing import Any
 
 import pytest
+from dropo_sims.hopper.study import Cell
+from dropo_sims.hopper.study_tables import all_findings, sections, size_rows, sweep_rows, table_rows
 
 from dropo_torch.distribution import DRAWN_STD
-from sims.hopper.study import Cell
-from sims.hopper.study_tables import all_findings, sections, size_rows, sweep_rows, table_rows
 
 
 def result(cell: Cell, mean: float, std: float, *, truth: float = 4.0, **about: Any) -> dict[str, Any]:

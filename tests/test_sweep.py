@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import Folder
+from dropo_sims.hopper.record import record
 
-from dropo_torch.cli import main
+from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
-from dropo_torch.sweep import SweepPoint, default_epsilons, elbow, epsilon_keys, likeliest, sweep_epsilon
-from sims.hopper.record import record
+from dropo_torch.studies.sweep import SweepPoint, default_epsilons, elbow, epsilon_keys, likeliest, sweep_epsilon
 
 EPSILONS = [1e-8, 1e-7, 1e-6, 1e-5, 1e-4]
 

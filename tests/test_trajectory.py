@@ -6,9 +6,9 @@ from conftest import SLIDE_XML, compiled
 from hypothesis import given
 from hypothesis import strategies as st
 
+from dropo_torch.data.observation import generic_observation, parse_observation
+from dropo_torch.data.trajectory import Trajectories, concatenate, make_transitions
 from dropo_torch.errors import InputError
-from dropo_torch.observation import generic_observation, parse_observation
-from dropo_torch.trajectory import Trajectories, concatenate, make_transitions
 
 lengths = st.lists(st.integers(1, 9), min_size=1, max_size=6)
 

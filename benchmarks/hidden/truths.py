@@ -19,9 +19,9 @@ import numpy as np
 import yaml
 
 from benchmarks.hidden.systems import DT, System, load
-from dropo_torch.observation import Observation, parse_observation
+from dropo_torch.data.observation import Observation, parse_observation
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.trajectory import Trajectories
 
 #: Logged steps for which an episode runs, at its first command, before the log sets in.
 PREROLL = 5

@@ -24,12 +24,12 @@ from dropo_torch.baselines.settings import (
 from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
 from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.config import Config
+from dropo_torch.data.trajectory import make_replay
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, HistoryEntry, fit
 from dropo_torch.optimizers import Optimizer, Progress
 from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem
-from dropo_torch.trajectory import make_replay
 
 __all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
 

@@ -10,11 +10,11 @@ import torch
 from dropo_torch.baselines.density import fit_mixture, require_sbi, unlikeness
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
+from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
 from dropo_torch.objective import ReplayReduce, derived_seed, draw_uniforms
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.trajectory import Replay
 
 #: Unlikeness above which the network has guessed outside what it was trained on.
 _UNLIKE = 1.5

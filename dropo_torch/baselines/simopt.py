@@ -9,12 +9,12 @@ import scipy.optimize
 import torch
 
 from dropo_torch.baselines.settings import SimOptSettings
+from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.trajectory import Replay
 
 
 def discrepancy(features: torch.Tensor, measured: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:

@@ -32,7 +32,7 @@ from dropo_torch.effects.joint import (
 from dropo_torch.effects.sensor import SensorBias, SensorDelay, SensorScale
 from dropo_torch.effects.world import GravityTilt, GroundSlope, Integration
 from dropo_torch.errors import InputError, choices
-from dropo_torch.usercode import load_callable, user_code
+from dropo_torch.support.usercode import load_callable, user_code
 
 #: Every effect of the package, by name. A user's own joins with :func:`register`.
 VOCABULARY: dict[str, Effect] = {

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, Literal
 import mujoco
 import numpy as np
 
-from dropo_torch.observation import Observation, joint_name
+from dropo_torch.data.observation import Observation, joint_name
 from dropo_torch.parameters import object_names
 
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]

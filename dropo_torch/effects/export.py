@@ -13,16 +13,16 @@ import mujoco.batch
 import numpy as np
 import yaml
 
-from dropo_torch.bundled import bundled_sim
 from dropo_torch.config import Config
 from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.effects.simulator import is_native, is_outer, overlap
 from dropo_torch.errors import InputError
-from dropo_torch.export import read_spec, write_inertials
-from dropo_torch.files import write_atomically
-from dropo_torch.model import quiet_mujoco, unsimplify
+from dropo_torch.models.bundled import bundled_sim
+from dropo_torch.models.export import read_spec, write_inertials
+from dropo_torch.models.load import quiet_mujoco, unsimplify
 from dropo_torch.parameters import ParameterSpace, object_names, read_field, write_field
+from dropo_torch.support.files import write_atomically
 
 #: Intervals of an effect's numbers, by its key and the number's name.
 Intervals = Mapping[tuple[str, str | None], Mapping[str, tuple[float, float]]]

@@ -5,8 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from dropo_torch.data.observation import joint_name
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting
-from dropo_torch.observation import joint_name
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 

@@ -10,9 +10,9 @@ from typing import Any
 import mujoco
 import numpy as np
 
+from dropo_torch.data.observation import Observation
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals
 from dropo_torch.errors import InputError, choices
-from dropo_torch.observation import Observation
 from dropo_torch.parameters import Parameter, ParameterSpace
 
 Find = Callable[[str], Effect]

@@ -14,7 +14,7 @@ import numpy as np
 from dropo_torch.effects.actuator import actuator_number
 from dropo_torch.effects.base import Effect, Path, Placed, Setting
 from dropo_torch.effects.sensor import SensorEffect
-from dropo_torch.model import quiet_mujoco
+from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.mujoco import control_range, default_row, filter_activations

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from dropo_torch.data.observation import Observation
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting, Signals
 from dropo_torch.effects.twin import Windows
 from dropo_torch.objective import masked_columns
-from dropo_torch.observation import Observation
 from dropo_torch.problem import Problem
-from dropo_torch.trajectory import Trajectories
 
 #: Configurations of the log at which the typical forces are computed.
 SAMPLES = 400

@@ -11,11 +11,11 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.errors import InputError
-from dropo_torch.files import write_atomically
 from dropo_torch.gap.evidence import Evidence, caps_of, cost_of
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import Rules, allowance, clears, paired, significant, simplest
 from dropo_torch.gap.screen import Candidate, all_candidates, promising_families, promising_pairs, screen
+from dropo_torch.support.files import write_atomically
 
 
 @dataclass(frozen=True)

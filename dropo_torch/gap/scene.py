@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
@@ -15,7 +16,6 @@ from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.verify import hold_out, spread
 from dropo_torch.problem import Problem
-from dropo_torch.trajectory import Trajectories
 
 #: Logged steps of a window that are tried, the longest first, and the roughness that ends the search.
 LENGTHS = (30, 15, 8, 4)

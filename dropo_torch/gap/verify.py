@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dropo_torch.data.observation import Observation
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Score
-from dropo_torch.observation import Observation
-from dropo_torch.trajectory import Trajectories
 
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)

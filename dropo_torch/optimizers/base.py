@@ -9,10 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
+from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import Distribution
 from dropo_torch.objective import Reduce, ReplayReduce
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.trajectory import Replay
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from dropo_torch.compare import Comparison, Run
-from dropo_torch.files import write_atomically
 from dropo_torch.report import figures, words
 from dropo_torch.report.html import config_yaml, render
+from dropo_torch.studies.compare import Comparison, Run
+from dropo_torch.support.files import write_atomically
 
 _COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#d55e00", "#e69f00", "#cc79a7")
 

@@ -10,10 +10,10 @@ import numpy as np
 from markupsafe import Markup
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.files import write_atomically
 from dropo_torch.gap.result import Gap, NamedEffect, Ranked, Residuals
 from dropo_torch.report import figures, gap_figures, gap_words, words
 from dropo_torch.report.html import config_yaml, nats, render
+from dropo_torch.support.files import write_atomically
 
 #: Rounds of the search that the ranking shows, and candidates in each.
 MAX_ROUNDS = 3

@@ -15,11 +15,11 @@ from markupsafe import Markup
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, to_values
-from dropo_torch.files import write_atomically
 from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report import figures, words
-from dropo_torch.sweep import Sweep
+from dropo_torch.studies.sweep import Sweep
+from dropo_torch.support.files import write_atomically
 
 #: Columns with figures of their own; of more, the worst explained are shown.
 MAX_COLUMNS = 24

@@ -7,8 +7,8 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from dropo_torch.files import write_atomically
 from dropo_torch.report.html import render
+from dropo_torch.support.files import write_atomically
 
 
 def write_study_report(

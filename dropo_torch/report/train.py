@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from dropo_torch.files import write_atomically
 from dropo_torch.report import figures, words
 from dropo_torch.report.html import config_yaml, render
 from dropo_torch.rl.evaluate import Evaluation
 from dropo_torch.rl.train import Training
+from dropo_torch.support.files import write_atomically
 
 WORLDS = {
     "distribution": "the distribution it was trained on",

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.files import write_atomically
+from dropo_torch.support.files import write_atomically
 
 SCHEMA = "dropo-torch/training/1"
 #: A checkpoint may take this share of the time since the last.

@@ -12,8 +12,8 @@ import torch
 from torch import nn
 
 from dropo_torch.errors import InputError
-from dropo_torch.files import write_atomically
 from dropo_torch.rl.networks import Actor, Normalizer
+from dropo_torch.support.files import write_atomically
 
 SCHEMA = "dropo-torch/policy/1"
 

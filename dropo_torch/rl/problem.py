@@ -13,14 +13,14 @@ import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.bundled import BundledSim, bundled_sim
 from dropo_torch.config import Config
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.distribution import Distribution
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.errors import InputError, choices
-from dropo_torch.model import load_model
-from dropo_torch.observation import parse_observation
+from dropo_torch.models.bundled import BundledSim, bundled_sim
+from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.env import RandomizedEnv
 from dropo_torch.rl.sampling import ParameterSource, PointSource, load_source

@@ -12,7 +12,7 @@ import torch
 
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.errors import InputError, choices
-from dropo_torch.model import quiet_mujoco
+from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.rl.inside import Forces, RowModels, inside_model
 from dropo_torch.simulators.base import DIVERGED

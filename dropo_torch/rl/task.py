@@ -12,9 +12,9 @@ import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.bundled import bundled_sim
 from dropo_torch.errors import InputError
-from dropo_torch.usercode import load_callable, user_code
+from dropo_torch.models.bundled import bundled_sim
+from dropo_torch.support.usercode import load_callable, user_code
 
 
 class _FromModel:

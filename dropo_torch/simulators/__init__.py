@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.model import load_model
+from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.simulators.gymnasium import Adapter, GymnasiumSimulator, MujocoEnvAdapter

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.model import quiet_mujoco
+from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED, Simulator
 

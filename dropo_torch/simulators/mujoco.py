@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.model import load_model, quiet_mujoco
+from dropo_torch.models.load import load_model, quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Simulator
 

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 import dropo_torch as dropo
-from dropo_torch import cli
+from dropo_torch.commands import cli
 
 TIMESTEP = 0.02
 LENGTH = 0.5

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from dropo_torch.bundled import BundledSim
+from dropo_torch.models.bundled import BundledSim
 
 _HERE = Path(__file__).parent
 LINKS = ("torso", "thigh", "leg", "foot")
@@ -17,7 +17,7 @@ SIM = BundledSim(
         for link in LINKS
     },
     log=_HERE / "log.npz",
-    study="sims.hopper.study:run_study",
+    study="dropo_sims.hopper.study:run_study",
     truth={"torso_mass": 3.0, "thigh_mass": 4.7, "leg_mass": 2.4, "foot_mass": 4.9},
-    task="sims.hopper.task:HopperTask",
+    task="dropo_sims.hopper.task:HopperTask",
 )

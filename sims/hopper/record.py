@@ -1,4 +1,4 @@
-"""Record logs of a simulated Hopper: ``python -m sims.hopper.record LOG.npz --variant noisy``.
+"""Record logs of a simulated Hopper: ``python -m dropo_sims.hopper.record LOG.npz --variant noisy``.
 
 The policy is scripted: slow random torques (low-pass filtered noise), which make the Hopper jump, fall
 and scramble. No episode ends early. The variants are those of the paper's simulated experiments:
@@ -21,7 +21,8 @@ import numpy as np
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
-from sims.hopper import LINKS, SIM
+
+from . import LINKS, SIM
 
 VARIANTS = ("point", "noisy", "unmodeled", "distribution")
 NOISE_VARIANCE = 1e-5

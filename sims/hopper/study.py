@@ -1,7 +1,7 @@
 """The simulated Hopper experiments of the DROPO paper, redone: ``dropo reproduce hopper``.
 
 Every fit is a *cell* with a file of its own, so that an interrupted study loses at most one of them. The logs are
-recorded here (:mod:`sims.hopper.record`): compare numbers with the paper's in kind, not digit by digit.
+recorded here (:mod:`dropo_sims.hopper.record`): compare numbers with the paper's in kind, not digit by digit.
 """
 
 from __future__ import annotations
@@ -21,13 +21,14 @@ from dropo_torch.baselines import fit_problem
 from dropo_torch.baselines.density import require_sbi
 from dropo_torch.config import make_config
 from dropo_torch.errors import InputError
-from dropo_torch.files import write_atomically
-from dropo_torch.parallel import in_parallel
 from dropo_torch.problem import Problem, make_problem
-from dropo_torch.sweep import NEGLIGIBLE, robust_log_likelihood
-from sims.hopper import SIM
-from sims.hopper.record import HopperLog, record
-from sims.hopper.study_tables import write_results
+from dropo_torch.studies.sweep import NEGLIGIBLE, robust_log_likelihood
+from dropo_torch.support.files import write_atomically
+from dropo_torch.support.parallel import in_parallel
+
+from . import SIM
+from .record import HopperLog, record
+from .study_tables import write_results
 
 SCHEMA = "dropo-torch/study/1"
 #: Methods of Table 1, with BayesSim's features.

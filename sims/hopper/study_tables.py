@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from dropo_torch.files import write_atomically, write_json
+from dropo_torch.commands.runs import versions
 from dropo_torch.report import write_study_report
 from dropo_torch.report.figures import to_svg
-from dropo_torch.runs import versions
-from dropo_torch.sweep import elbow, likeliest
-from sims.hopper.study_figures import Result, draw_all, drawn_std, label
+from dropo_torch.studies.sweep import elbow, likeliest
+from dropo_torch.support.files import write_atomically, write_json
+
+from .study_figures import Result, draw_all, drawn_std, label
 
 SCHEMA = "dropo-torch/study/1"
 #: A deviation below this share of the search box has collapsed to a point; one above the other is wide.

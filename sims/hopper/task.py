@@ -6,9 +6,10 @@ import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.model import load_model
+from dropo_torch.models.load import load_model
 from dropo_torch.rl.task import Task
-from sims.hopper import SIM
+
+from . import SIM
 
 
 class HopperTask(Task):

@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.files import write_atomically
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective, draw_uniforms
+from dropo_torch.support.files import write_atomically
 
 SCHEMA = "dropo-torch/compare/1"
 #: optimizer-backend pairs that are compared.

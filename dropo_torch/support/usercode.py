@@ -27,7 +27,7 @@ def user_code(key: str, name: str) -> Iterator[None]:
     except InputError:
         raise
     except (Exception, SystemExit) as error:
-        ours = str(Path(__file__).parent)
+        ours = str(Path(__file__).parents[1])
         frames = [f for f in traceback.extract_tb(error.__traceback__) if not f.filename.startswith((ours, "<"))]
         place = f", {frames[-1].filename} line {frames[-1].lineno}" if frames else ""
         raise InputError(f"{key}: {name} fails{place}: {type(error).__name__}: {error}") from error

@@ -11,15 +11,15 @@ from rich.console import Console
 from rich.table import Table
 from torchrl.record.loggers import TensorboardLogger
 
+from dropo_torch.commands.progress import TrainProgress
+from dropo_torch.commands.runs import check_log_option, prepare_folder, versions
 from dropo_torch.config import Config
 from dropo_torch.errors import InputError
-from dropo_torch.files import write_json
-from dropo_torch.progress import TrainProgress
 from dropo_torch.report.train import WORLDS, evaluations, write_train_report
 from dropo_torch.rl.problem import TrainingProblem, make_training
 from dropo_torch.rl.train import Progress, TrainEntry, Training, check_training, train
 from dropo_torch.rl.video import chosen_frames, draw, record
-from dropo_torch.runs import check_log_option, prepare_folder, versions
+from dropo_torch.support.files import write_json
 
 #: The learning curves on TensorBoard have about this many points.
 POINTS = 1000

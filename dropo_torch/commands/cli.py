@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
-from dropo_torch.claim import claimed
+from dropo_torch.commands.claim import claimed
 from dropo_torch.errors import InputError, choices
 
 COMMANDS = ("fit", "gap", "train", "sweep-epsilon", "certify", "compare", "reproduce", "demo")
@@ -76,10 +76,10 @@ def _run(parsed: argparse.Namespace, rest: Sequence[str]) -> None:
     """Run the command that was given; ``rest`` are overrides of its config."""
     from rich.console import Console
 
-    from dropo_torch import runs
-    from dropo_torch.compare import METHODS
+    from dropo_torch.commands import runs
     from dropo_torch.config import load_config, parse_overrides
-    from dropo_torch.parallel import processors
+    from dropo_torch.studies.compare import METHODS
+    from dropo_torch.support.parallel import processors
 
     class Output(Console):
         def on_broken_pipe(self) -> None:
@@ -105,7 +105,7 @@ def _run(parsed: argparse.Namespace, rest: Sequence[str]) -> None:
     elif parsed.command == "gap":
         runs.run_gap(config, parsed.out, console=console, source=parsed.config, resume=parsed.resume)
     elif parsed.command == "train":
-        from dropo_torch.training import run_train  # TorchRL takes seconds to import
+        from dropo_torch.commands.training import run_train  # TorchRL takes seconds to import
 
         run_train(config, parsed.out, console=console, resume=parsed.resume, log=parsed.log)
     elif parsed.command == "certify":

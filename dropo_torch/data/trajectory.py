@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dropo_torch.data.observation import Observation
 from dropo_torch.errors import InputError
-from dropo_torch.observation import Observation
 
 
 @dataclass(frozen=True)

@@ -18,22 +18,21 @@ from rich.console import Console
 from rich.table import Table
 
 from dropo_torch.baselines import fit_problem, make_search
-from dropo_torch.bundled import bundled_sim, bundled_study
 from dropo_torch.certify import Certificate, certify
-from dropo_torch.compare import Comparison, Run, compare
+from dropo_torch.commands.progress import FitProgress, StageProgress
 from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
 from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
-from dropo_torch.export import export_model
-from dropo_torch.files import write_atomically, write_json
 from dropo_torch.fit import Fit, refuse_dead_parameters
 from dropo_torch.gap import Gap, add, find_gap, prepare
+from dropo_torch.models.bundled import bundled_sim, bundled_study
+from dropo_torch.models.export import export_model
 from dropo_torch.objective import Objective
 from dropo_torch.problem import Problem, make_problem
-from dropo_torch.progress import FitProgress, StageProgress
 from dropo_torch.report.gap_words import answer
-from dropo_torch.sweep import (
+from dropo_torch.studies.compare import Comparison, Run, compare
+from dropo_torch.studies.sweep import (
     Sweep,
     SweepPoint,
     default_epsilons,
@@ -43,6 +42,7 @@ from dropo_torch.sweep import (
     robust_log_likelihood,
     sweep_epsilon,
 )
+from dropo_torch.support.files import write_atomically, write_json
 
 #: What runs write to their folder; an earlier run's are moved aside together.
 _RESULTS = (

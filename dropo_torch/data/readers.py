@@ -1,4 +1,4 @@
-"""Read a robot's log, in any of the formats listed here, into :class:`~dropo_torch.trajectory.Trajectories`.
+"""Read a robot's log, in any of the formats listed here, into :class:`~dropo_torch.data.trajectory.Trajectories`.
 
 =================================  ===============================================================
 ``.npz``                           arrays ``observations``, ``next_observations``, ``actions``, ``terminals``
@@ -9,7 +9,7 @@ folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_act
 ``minari:ID``, a Minari folder     a local Minari dataset
 =================================  ===============================================================
 
-The column map is described in :mod:`dropo_torch.tables`. Where a log has no next observations, they
+The column map is described in :mod:`dropo_torch.data.tables`. Where a log has no next observations, they
 are the observations of the next row of the same episode.
 """
 
@@ -25,11 +25,11 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from dropo_torch.data.preprocess import Preprocess, preprocess
+from dropo_torch.data.recording import TOLERANCE, Recording, check_values, checked_time, sampling_interval
+from dropo_torch.data.tables import ColumnMap, Table, flatten, missing_file, open_tables, parse_columns, reading
+from dropo_torch.data.trajectory import Trajectories, concatenate
 from dropo_torch.errors import InputError, choices
-from dropo_torch.preprocess import Preprocess, preprocess
-from dropo_torch.recording import TOLERANCE, Recording, check_values, checked_time, sampling_interval
-from dropo_torch.tables import ColumnMap, Table, flatten, missing_file, open_tables, parse_columns, reading
-from dropo_torch.trajectory import Trajectories, concatenate
 
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
 
@@ -111,7 +111,7 @@ def read_trajectories(
         tolerance: fraction by which the spacing of time stamps may differ from its median.
         group: pattern of HDF5 groups with an episode each, such as ``data/demo_*``.
         separator: what separates the columns of a text file.
-        preprocess: how to synchronise, filter and resample; see :class:`~dropo_torch.preprocess.Preprocess`.
+        preprocess: how to synchronise, filter and resample; see :class:`~dropo_torch.data.preprocess.Preprocess`.
         base: folder from which relative paths start, by default the current one.
 
     Raises:

@@ -21,10 +21,10 @@ import scipy.special
 import torch
 
 from dropo_torch.baselines import Mixture, fit_problem
+from dropo_torch.data.trajectory import make_transitions
 from dropo_torch.distribution import SearchBox, to_values
 from dropo_torch.fit import Fit
 from dropo_torch.problem import Problem
-from dropo_torch.trajectory import make_transitions
 
 Kind = Literal["fixed", "varying"]
 KINDS: tuple[Kind, ...] = ("fixed", "varying")

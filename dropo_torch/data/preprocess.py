@@ -21,9 +21,9 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 from scipy.signal import butter, sosfiltfilt
 
+from dropo_torch.data.recording import Recording, check_values, resolve_names
+from dropo_torch.data.trajectory import Trajectories, concatenate
 from dropo_torch.errors import InputError, choices
-from dropo_torch.recording import Recording, check_values, resolve_names
-from dropo_torch.trajectory import Trajectories, concatenate
 
 Actions = Literal["hold", "mean", "position", "velocity"]
 

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.errors import InputError, choices
-from dropo_torch.trajectory import Trajectories
 
 TOLERANCE = 0.05
 """Fraction by which the spacing of regular time stamps may differ from its median."""

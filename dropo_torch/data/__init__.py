@@ -1,0 +1,1 @@
+"""Logs: file formats, preprocessing, what the columns are, and the trajectories and transitions they become."""
