@@ -13,7 +13,6 @@ import pydantic
 import yaml
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.models.load import CENTRES
 
 
 class Config(pydantic.BaseModel):
@@ -103,6 +102,8 @@ class Config(pydantic.BaseModel):
     @property
     def moves_centres(self) -> bool:
         """Whether bodies' centres of mass or their axes may move: by effects, or as parameters."""
+        from dropo_torch.models.load import CENTRES  # imports MuJoCo
+
         fields = (str(p.get("field", "")) for p in (self.parameters or {}).values())
         return self.has_effects or any(field.startswith(CENTRES) for field in fields)
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import mujoco
 import numpy as np
 
@@ -28,6 +27,7 @@ from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import Adapter, MujocoEnvAdapter, Simulator, make_simulator
+from dropo_torch.support.extras import extra
 from dropo_torch.support.usercode import load_callable, user_code
 
 #: Relative difference between the log's time step and the simulator's that is still called equal.
@@ -189,6 +189,8 @@ def _gymnasium_source(config: Config, sim: BundledSim | None) -> tuple[Path | No
     if re.search(r"-v\d+$", name):
         if config.model is not None:
             raise InputError(f"config: both model and environment {name} are given; the environment has its own model")
+        with extra("gymnasium", f"environment: {name}"):
+            import gymnasium
         try:
             with warnings.catch_warnings(action="ignore"):  # an outdated version says so on several lines
                 environment = gymnasium.make(name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
@@ -13,8 +14,8 @@ import pytest
 import torch
 import yaml
 from conftest import LinearSimulator, generic_observation, linear_objective, space_of
-from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
+from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
 from dropo_torch.baselines.density import fit_mixture, unlikeness
@@ -300,7 +301,7 @@ def test_training_the_network_leaves_nothing_behind(
 
 
 def test_bayessim_without_sbi_says_how_to_get_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
+    monkeypatch.setitem(sys.modules, "sbi", None)
     with pytest.raises(InputError, match=r"pip install 'dropo_torch\[baselines\]'"):
         make_search(problem(folder, "bayessim"))
 

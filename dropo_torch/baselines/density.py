@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import io
 import math
 import warnings
@@ -18,6 +17,7 @@ from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.errors import InputError
 from dropo_torch.objective import single_thread
+from dropo_torch.support.extras import require
 
 if TYPE_CHECKING:
     from sbi.neural_nets.estimators.mixture_density_estimator import MixtureDensityEstimator
@@ -49,8 +49,7 @@ def require_sbi() -> None:
     Raises:
         InputError: it is not.
     """
-    if importlib.util.find_spec("sbi") is None:
-        raise InputError("method: bayessim needs the package sbi: pip install 'dropo_torch[baselines]'")
+    require("baselines", "method: bayessim")
 
 
 class FourierFeatures(nn.Module):

@@ -23,13 +23,22 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from dropo_torch.data.preprocess import Preprocess, preprocess
 from dropo_torch.data.recording import TOLERANCE, Recording, check_values, checked_time, sampling_interval
-from dropo_torch.data.tables import ColumnMap, Table, flatten, missing_file, open_tables, parse_columns, reading
+from dropo_torch.data.tables import (
+    ColumnMap,
+    Table,
+    flatten,
+    missing,
+    missing_file,
+    open_tables,
+    parse_columns,
+    reading,
+)
 from dropo_torch.data.trajectory import Trajectories, concatenate
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.extras import extra
 
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
 
@@ -305,8 +314,8 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
     if options.episode is not None:
         label = table.array(options.episode, "episode").reshape(-1)
         _check_rows(table, options.episode, len(label), rows)
-        if pd.isna(label).any():
-            row = np.flatnonzero(pd.isna(label))[0]
+        if missing(label).any():
+            row = np.flatnonzero(missing(label))[0]
             raise InputError(f"{table.source}: {options.episode} has no value at row {row} (counted from 0)")
         start[1:] |= label[1:] != label[:-1]
     return np.cumsum(start)
@@ -335,12 +344,18 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
 
 def _are_dates(stamps: np.ndarray) -> bool:
     """Whether a column holds dates, or text that does not start with a number."""
-    if stamps.ndim != 1 or pd.api.types.infer_dtype(stamps) not in _DATES:
+    if stamps.ndim != 1 or stamps.dtype.kind in "biuf":
+        return False
+    with extra("formats", "a column that holds no plain numbers"):
+        import pandas as pd
+    if pd.api.types.infer_dtype(stamps) not in _DATES:
         return False
     return stamps.dtype.kind == "M" or bool(np.isnan(pd.to_numeric(stamps[:1], errors="coerce"))[0])
 
 
 def _since_first(stamps: np.ndarray, where: str) -> np.ndarray:
+    import pandas as pd
+
     with reading(where, "dates such as 2024-05-01T12:00:00.125"):
         dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
     return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
@@ -405,12 +420,8 @@ def _minari_episode(episode: Any, source: str, options: ReadOptions) -> Trajecto
 
 
 def _minari() -> ModuleType:
-    try:
+    with extra("minari", "reading a Minari dataset"):
         import minari
-    except ImportError:
-        raise InputError(
-            "reading a Minari dataset needs the package minari: pip install 'dropo_torch[minari]'"
-        ) from None
     return minari
 
 

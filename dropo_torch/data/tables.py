@@ -21,14 +21,16 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
 from pathlib import Path, PurePosixPath
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import h5py
 import numpy as np
-import pandas as pd
 import scipy.io
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.extras import extra
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 ColumnMap = str | int | Mapping[str, Any] | Sequence[Any]
 
@@ -185,12 +187,23 @@ def numbers(array: np.ndarray, where: str) -> np.ndarray:
         except (TypeError, ValueError) as error:
             raise InputError(f"{where} is not a list of numbers of one length in every row ({error})") from None
     if array.dtype.kind in "OUS" and array.ndim == 1:
+        with extra("formats", where):
+            import pandas as pd
         values = np.asarray(pd.to_numeric(pd.Series(array), errors="coerce"), dtype=np.float64)
-        bad = np.flatnonzero(np.isnan(values) & ~np.asarray(pd.isna(array)))
+        bad = np.flatnonzero(np.isnan(values) & ~missing(array))
         if bad.size == 0:
             return values
         raise InputError(f"{where} is {str(array[bad[0]])!r} at row {bad[0]} (counted from 0); a number is expected")
     raise InputError(f"{where} holds {array.dtype} values of shape {array.shape}; numbers are expected")
+
+
+def missing(array: np.ndarray) -> np.ndarray:
+    """Return where a column has no value."""
+    if array.dtype.kind in "biufUS":
+        return array != array
+    with extra("formats", "a column that holds no plain numbers"):
+        import pandas as pd
+    return np.asarray(pd.isna(array))
 
 
 def open_tables(path: Path, *, group: str | None = None, separator: str | None = None) -> list[Table]:
@@ -221,6 +234,9 @@ def open_tables(path: Path, *, group: str | None = None, separator: str | None =
     if suffix in (".csv", ".tsv", ".txt"):
         return [_open_text(path, separator or ("\t" if suffix == ".tsv" else ","))]
     if suffix in (".parquet", ".pq"):
+        with extra("formats", str(path)):
+            import pandas as pd
+            import pyarrow  # noqa: F401  # what pandas reads it with
         with reading(path, "Parquet"):
             return [_frame_table(path, pd.read_parquet(path, engine="pyarrow"))]
     if suffix in (".h5", ".hdf5"):
@@ -296,6 +312,8 @@ def _single_log(folder: Path) -> Path:
 
 
 def _open_text(path: Path, separator: str) -> Table:
+    with extra("formats", str(path)):
+        import pandas as pd
     with (
         reading(path, "a table of text"),
         warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
@@ -317,6 +335,8 @@ def _frame_table(path: Path, frame: pd.DataFrame) -> Table:
 
 
 def _open_hdf5(path: Path, group: str | None) -> list[Table]:
+    with extra("formats", str(path)):
+        import h5py
     groups: list[str] = []
     datasets: list[str] = []
 
@@ -336,6 +356,8 @@ def _open_hdf5(path: Path, group: str | None) -> list[Table]:
 
 
 def _hdf5_table(path: Path, prefix: str, datasets: list[str]) -> Table:
+    import h5py
+
     def read(name: str) -> np.ndarray:
         with reading(f"{path}: {name}", "an HDF5 data set"), h5py.File(path, "r") as file:
             return np.asarray(file[prefix + name][()])
@@ -346,7 +368,9 @@ def _hdf5_table(path: Path, prefix: str, datasets: list[str]) -> Table:
 
 def _open_mat(path: Path) -> Table:
     """A MATLAB file; the fields of a struct ``log`` are called ``log.q``, vectors are ``(N,)``."""
-    if h5py.is_hdf5(path):
+    with path.open("rb") as file:
+        head = file.read(520)
+    if b"\x89HDF\r\n\x1a\n" in (head[:8], head[512:]):  # version 7.3 is HDF5, behind a block of MATLAB's own
         return _open_mat73(path)
     with reading(path, "a MATLAB file"):
         arrays = flatten(scipy.io.loadmat(path, simplify_cells=True), ".")

@@ -3,38 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-import ctypes
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
 
 import mujoco
 
 from dropo_torch.errors import InputError
-
-
-class _LogConfig(ctypes.Structure):
-    """MuJoCo's ``mjLogConfig``."""
-
-    _fields_ = (
-        ("console", ctypes.c_bool),
-        ("file", ctypes.c_bool),
-        ("path", ctypes.c_char * 1024),
-        ("topics", ctypes.c_int),
-    )
-
-
-@cache
-def _library() -> ctypes.CDLL | None:
-    """MuJoCo's C library, which is already loaded; ``None`` where it is not found under its usual name."""
-    for path in sorted(Path(mujoco.__file__).parent.glob("*mujoco*")):
-        if path.suffix in (".dll", ".dylib") or ".so." in path.name:
-            library = ctypes.CDLL(str(path))
-            library.mju_getLogConfig.restype = _LogConfig
-            library.mju_setLogConfig.argtypes = [_LogConfig]
-            library.mju_setLogConfig.restype = None
-            return library
-    return None
 
 
 @contextlib.contextmanager
@@ -43,16 +17,13 @@ def quiet_mujoco() -> Iterator[None]:
 
     A simulation that diverges under an unlikely parameter is no news: its result says so.
     """
-    library = _library()
-    if library is None:
-        yield
-        return
-    before = library.mju_getLogConfig()
-    library.mju_setLogConfig(_LogConfig(False, False, before.path, before.topics))
+    before, quiet = mujoco.MjLogConfig.get(), mujoco.MjLogConfig.get()
+    quiet.logto_console = quiet.logto_file = False
+    quiet.set()
     try:
         yield
     finally:
-        library.mju_setLogConfig(before)
+        before.set()
 
 
 #: Fields of bodies that MuJoCo takes for granted where it has compiled the body as simple.

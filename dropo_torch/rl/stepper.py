@@ -17,6 +17,7 @@ from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.rl.inside import Forces, RowModels, inside_model
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.mujoco import default_row
+from dropo_torch.support.extras import extra
 
 BACKENDS = ("mujoco", "warp")
 
@@ -242,12 +243,8 @@ def make_stepper(
     if backend == "mujoco":
         return MujocoStepper(space, num_envs, frame_skip=frame_skip, effects=effects, num_threads=num_threads)
     if backend == "warp":
-        try:
+        with extra("warp", "backend: warp"):
             from dropo_torch.rl.warp_stepper import WarpStepper
-        except ImportError as error:
-            if error.name != "warp":
-                raise
-            raise InputError("backend: warp-lang is not installed; pip install warp-lang") from None
         return WarpStepper(
             space, num_envs, frame_skip=frame_skip, effects=effects, num_threads=num_threads, device=device
         )

@@ -45,23 +45,12 @@ def make_simulator(
         return MujocoSimulator(
             model, parameters=parameters, frame_skip=frame_skip, num_threads=num_threads, chunk_size=chunk_size
         )
-    if backend == "warp":
-        return _warp_simulator(model, parameters, frame_skip, num_threads, chunk_size, device)
     if backend == "gymnasium":
         return GymnasiumSimulator(model, parameters=parameters, frame_skip=frame_skip)
-    raise InputError(f"backend: unknown {backend!r}" + choices(backend, BACKENDS))
+    if backend != "warp":
+        raise InputError(f"backend: unknown {backend!r}" + choices(backend, BACKENDS))
+    from dropo_torch.simulators.warp import WarpSimulator
 
-
-def _warp_simulator(
-    model: Any, parameters: ParameterSpace, frame_skip: int, num_threads: int, chunk_size: int, device: str
-) -> Simulator:
-    """The Warp backend, imported only where it is asked for."""
-    try:
-        from dropo_torch.simulators.warp import WarpSimulator
-    except ImportError as error:
-        if error.name != "warp":
-            raise
-        raise InputError("backend: warp-lang is not installed; pip install warp-lang") from None
     return WarpSimulator(
         load_model(model),
         parameters=parameters,

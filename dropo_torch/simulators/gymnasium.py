@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
-import gymnasium
 import mujoco
 import numpy as np
 import torch
@@ -15,6 +14,9 @@ from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED, Simulator
+
+if TYPE_CHECKING:
+    import gymnasium
 
 
 class Adapter(Protocol):

@@ -12,8 +12,6 @@ from multiprocessing.connection import wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
-import torch
-
 Task = TypeVar("Task")
 Result = TypeVar("Result")
 
@@ -62,6 +60,8 @@ def processors() -> int:
 
 def _serve(threads: int) -> None:
     """Leave Ctrl-C to the parent, and end when it is gone."""
+    import torch  # the parent may have no use for it yet
+
     torch.set_num_threads(threads)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent: Any = multiprocessing.parent_process()

@@ -11,6 +11,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+from dropo_torch.support.extras import extra
+
 if TYPE_CHECKING:
     from dropo_torch.simulators.warp.simulator import WarpSimulator
 
@@ -20,7 +22,7 @@ __all__ = ["WarpSimulator"]
 def __getattr__(name: str) -> Any:
     """Import the simulator, and Warp with it, on first use."""
     if name == "WarpSimulator":
-        from dropo_torch.simulators.warp.simulator import WarpSimulator
-
+        with extra("warp", "backend: warp"):
+            from dropo_torch.simulators.warp.simulator import WarpSimulator
         return WarpSimulator
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
