@@ -30,7 +30,7 @@ from rich.table import Table
 
 import dropo_torch as dropo
 from dropo_sims.hopper import SIM
-from dropo_torch.commands.runs import versions
+from dropo_torch.commands.folder import versions
 from dropo_torch.optimizers import AdamSettings
 from dropo_torch.report import write_compare_report
 from dropo_torch.studies.compare import Comparison, Run, compare

@@ -18,7 +18,8 @@ import yaml
 from rich.console import Console
 
 import dropo_torch as dropo
-from dropo_torch.commands.runs import run_fit, run_gap
+from dropo_torch.commands.fit import run_fit
+from dropo_torch.commands.gap import run_gap
 from dropo_torch.effects import Quantity, Setting
 from dropo_torch.effects.joint import JointEffect
 

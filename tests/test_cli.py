@@ -422,7 +422,7 @@ def test_simulations_that_diverge_are_counted_and_penalised(
 
 
 def test_every_key_of_the_config_is_in_the_help(capsys: pytest.CaptureFixture[str]) -> None:
-    for command in COMMANDS[:2]:
+    for command in list(COMMANDS)[:2]:
         with pytest.raises(SystemExit) as stop:
             main([command, "--help"])
         assert stop.value.code == 0

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dropo_torch.commands.runs import versions
+from dropo_torch.commands.folder import versions
 from dropo_torch.report import write_study_report
 from dropo_torch.report.figures import to_svg
 from dropo_torch.studies.sweep import elbow, likeliest

@@ -1,49 +1,53 @@
-"""What ``dropo train`` does: a config and a folder in; a policy, its report and its numbers out."""
+"""``dropo train``: a config and a folder in; a policy, its report and its numbers out."""
 
 from __future__ import annotations
 
+import argparse
 import logging
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
-from rich.table import Table
-from torchrl.record.loggers import TensorboardLogger
-
-from dropo_torch.commands.progress import TrainProgress
-from dropo_torch.commands.runs import check_log_option, prepare_folder, versions
-from dropo_torch.config import Config
+from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.options import add_config, add_log
 from dropo_torch.errors import InputError
-from dropo_torch.report.train import WORLDS, evaluations, write_train_report
-from dropo_torch.rl.problem import TrainingProblem, make_training
-from dropo_torch.rl.train import Progress, TrainEntry, Training, check_training, train
-from dropo_torch.rl.video import chosen_frames, draw, record
-from dropo_torch.support.files import write_json
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from dropo_torch.rl.problem import TrainingProblem
+    from dropo_torch.rl.train import Progress, TrainEntry, Training
 
 #: The learning curves on TensorBoard have about this many points.
 POINTS = 1000
 
 
-def run_train(config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None) -> Training:
-    """Train, and write ``policy.pt``, ``train.json`` and ``report.html`` to ``out``.
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``dropo train``."""
+    add_config(parser)
+    add_log(parser, "the learning curves")
 
-    Args:
-        config: the config.
-        out: the folder; results of an earlier run there are moved aside, never overwritten.
-        console: where progress and results are shown.
-        resume: continue an interrupted run in ``out``.
-        log: ``"tensorboard"`` writes the learning curves as TensorBoard events too, while it trains.
-    """
+
+def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
+    """Run ``dropo train``, which writes ``policy.pt``, ``train.json`` and ``report.html``."""
+    from dropo_torch.commands.progress import TrainProgress
+    from dropo_torch.config import load_config
+    from dropo_torch.rl.problem import make_training
+    from dropo_torch.rl.train import check_training, train
+    from dropo_torch.support.extras import require
+
+    out = given.out
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells every storage it allocates
-    check_log_option(log)
-    problem = make_training(config)
+    if given.log is not None:
+        require("tensorboard", f"--log {given.log}")
+    problem = make_training(load_config(given.config, overrides))
     checkpoint = out / "train-progress.pt"
-    continued = resume and checkpoint.exists()
+    continued = given.resume and checkpoint.exists()
     _keep_distribution(problem, out, continued)
     check_training(problem)  # before an earlier run is moved aside
     prepare_folder(out, problem.model_path, resume=continued)
-    curves = _Curves(out / "tensorboard", problem.settings.steps) if log == "tensorboard" else None
+    curves = None if given.log is None else _Curves(out / "tensorboard", problem.settings.steps)
     with TrainProgress(console, problem.settings.steps) as progress:
 
         def show(entry: TrainEntry, evaluation: Progress | None) -> None:
@@ -52,12 +56,11 @@ def run_train(config: Config, out: Path, *, console: Console, resume: bool = Fal
                 curves.add(entry, evaluation)
 
         result = train(
-            problem, checkpoint=checkpoint, resume=resume, on_progress=show,
+            problem, checkpoint=checkpoint, resume=given.resume, on_progress=show,
             on_start=None if curves is None else curves.begin,
         )  # fmt: skip
     _write(problem, result, out)
     _show(result, out, console)
-    return result
 
 
 def _keep_distribution(problem: TrainingProblem, out: Path, continued: bool) -> None:
@@ -68,6 +71,10 @@ def _keep_distribution(problem: TrainingProblem, out: Path, continued: bool) -> 
 
 
 def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
+    from dropo_torch.report.train import write_train_report
+    from dropo_torch.rl.video import chosen_frames, draw, record
+    from dropo_torch.support.files import write_json
+
     result.policy.save(out / "policy.pt")
     world = problem.target or problem.nominal or problem.training
     env = problem.env(world, 1, problem.config.seed)
@@ -84,6 +91,10 @@ def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
 
 
 def _show(result: Training, out: Path, console: Console) -> None:
+    from rich.table import Table
+
+    from dropo_torch.report.train import WORLDS, evaluations
+
     table = Table("evaluated in", "mean return", "standard error", "mean length")
     for name, e in evaluations(result).items():
         length = sum(e.lengths) / len(e.lengths)
@@ -105,12 +116,13 @@ class _Curves:
 
     def __init__(self, folder: Path, steps: int) -> None:
         self._folder, self._every, self._next = folder, max(1, steps // POINTS), 0
-        self._logger: TensorboardLogger | None = None
 
     def begin(self, history: Sequence[TrainEntry], evaluated: Sequence[Progress]) -> None:
         """Start afresh with what an interrupted run had done."""
+        from torch.utils.tensorboard import SummaryWriter
+
         shutil.rmtree(self._folder, ignore_errors=True)
-        self._logger = TensorboardLogger(exp_name=self._folder.name, log_dir=str(self._folder.parent))
+        self._writer = SummaryWriter(str(self._folder))
         for entry in history:
             self.add(entry, None)
         for evaluation in evaluated:
@@ -118,7 +130,6 @@ class _Curves:
 
     def add(self, entry: TrainEntry, evaluation: Progress | None) -> None:
         """Write an entry, unless one has just been written, and an evaluation."""
-        assert self._logger is not None
         if evaluation is not None:
             self._evaluation(evaluation)
         if entry.steps < self._next:
@@ -126,8 +137,7 @@ class _Curves:
         self._next = entry.steps + self._every
         scalars = {"return": entry.mean_return, "length": entry.mean_length, "diverged": float(entry.diverged)}
         for name, value in {**scalars, **entry.scalars}.items():
-            self._logger.log_scalar(f"train/{name}", value, step=entry.steps)
+            self._writer.add_scalar(f"train/{name}", value, entry.steps)
 
     def _evaluation(self, evaluation: Progress) -> None:
-        assert self._logger is not None
-        self._logger.log_scalar("evaluation/return", evaluation.mean, step=evaluation.steps)
+        self._writer.add_scalar("evaluation/return", evaluation.mean, evaluation.steps)

@@ -1,0 +1,68 @@
+"""``dropo compare``: fits by several optimizers and backends, side by side."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from dropo_torch.commands.fit import show_report
+from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.options import add_config, count
+from dropo_torch.commands.sweep import only_dropo
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from dropo_torch.fit import Fit
+    from dropo_torch.objective import Objective
+    from dropo_torch.studies.compare import Run
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``dropo compare``."""
+    add_config(parser)
+    parser.add_argument("--methods", metavar="fisher-warp,...", help="optimizer-backend pairs, all by default")
+    parser.add_argument("--seeds", type=count, metavar="N", default=3, help="seeds of each (default 3)")
+
+
+def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
+    """Run ``dropo compare``, which writes ``compare.json`` and ``report.html``."""
+    from dropo_torch.commands.progress import fit_shown
+    from dropo_torch.config import load_config
+    from dropo_torch.models.bundled import bundled_sim
+    from dropo_torch.problem import make_problem
+    from dropo_torch.report import write_compare_report
+    from dropo_torch.studies.compare import METHODS, compare
+    from dropo_torch.support.files import write_json
+
+    config, out = load_config(given.config, overrides), given.out
+    only_dropo(config, "compare runs the optimizers of DROPO")
+    problem = make_problem(config)
+    store = out / "compare-progress.json"
+    prepare_folder(out, problem.model_path, resume=given.resume and store.exists())
+
+    def fit_with(optimizer: str, backend: str, seed: int) -> tuple[Fit, Objective]:
+        part = make_problem(config.model_copy(update={"optimizer": optimizer, "backend": backend, "seed": seed}))
+        return fit_shown(part, console, f"{optimizer} on {backend}, seed {seed}"), part.objective
+
+    def show(run: Run) -> None:
+        console.print(
+            f"{run.method}, seed {run.seed}: log-likelihood {run.log_likelihood:.1f}, "
+            f"{run.simulated_transitions} simulated transitions, {run.seconds:.1f} s",
+            highlight=False,
+        )
+
+    truth = bundled_sim(config.sim).truth if config.sim and config.data is None else {}
+    comparison = compare(
+        fit_with,
+        methods=METHODS if given.methods is None else [m.strip() for m in given.methods.split(",")],
+        seeds=range(config.seed, config.seed + given.seeds),
+        reference={n: truth[n] for n in problem.space.names} if truth else None,
+        store=store,
+        fingerprint=problem.fingerprint,
+        on_run=show,
+    )
+    write_json(out / "compare.json", comparison.document())
+    write_compare_report(out / "report.html", comparison, config=config.document(), versions=versions())
+    show_report(out, console)

@@ -1,0 +1,97 @@
+"""``dropo gap``: what the model lacks, named, and the model and config with it."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.options import add_config as add_arguments
+from dropo_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+    from dropo_torch.config import Config
+    from dropo_torch.gap import Gap
+
+__all__ = ["add_arguments", "run", "run_gap"]
+
+
+def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
+    """Run ``dropo gap``."""
+    from dropo_torch.config import load_config
+
+    if given.config.resolve() == (given.out / "config.yaml").resolve():
+        raise InputError(
+            f"--out: {given.config} is the config of this run, which would replace it; name another folder"
+        )
+    run_gap(load_config(given.config, overrides), given.out, console=console, resume=given.resume)
+
+
+def run_gap(config: Config, out: Path, *, console: Console, resume: bool = False) -> Gap:
+    """Find what the model lacks, and write ``gap.json``, ``report.html``, ``model.xml`` and ``config.yaml`` to ``out``.
+
+    Args:
+        config: the config.
+        out: the folder; results of an earlier run there are moved aside, never overwritten.
+        console: where progress and results are shown.
+        resume: continue an interrupted run in ``out``.
+    """
+    from dataclasses import replace
+
+    from dropo_torch.commands.progress import StageProgress
+    from dropo_torch.gap import add, find_gap, prepare
+    from dropo_torch.problem import make_problem
+    from dropo_torch.report import write_gap_report
+    from dropo_torch.support.files import write_json
+
+    problem = make_problem(config, general=True)
+    written = out / "config.yaml"
+    if written.exists() and not (out / "gap.json").exists():
+        raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
+    store = out / "gap-progress.pkl"
+    with StageProgress(console, "gap") as progress:
+        progress.update("preparing", 0.0)
+        scene = prepare(problem)  # before an earlier run is moved aside
+        prepare_folder(out, problem.model_path, resume=resume and store.exists())
+        gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update, scene=scene)
+    notes = add(problem, gap, out)
+    gap = replace(gap, notes=(*gap.notes, *notes))
+    write_json(out / "gap.json", gap.document())
+    write_gap_report(
+        out / "report.html", gap, config=config.document(), versions=versions(),
+        title=f"What {config.sim or config.model or 'model'} lacks", model_note=" ".join(notes),
+        has_config=written.exists(),
+    )  # fmt: skip
+    _show(gap, out, console)
+    return gap
+
+
+def _show(gap: Gap, out: Path, console: Console) -> None:
+    from rich.table import Table
+
+    from dropo_torch.report.gap_words import answer
+
+    headline, items = answer(gap)
+    for line in (headline, *(f"  - {item}" for item in items)):
+        console.print(line, highlight=False, markup=False)
+    table = Table("held-out data", "before", "after", "noise alone")
+    rows = (
+        ("one-step mean squared error", "mse", "{:.3g}"),
+        ("log-likelihood", "log_likelihood", "{:.1f}"),
+        (f"open-loop error over {gap.rollout_seconds:g} s", "rollout_rmse", "{:.3g}"),
+    )
+    for words, key, form in rows:
+        table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
+    console.print(table)
+    for line in (*([gap.next_experiment] if gap.next_experiment else []), *gap.notes):
+        console.print(line, highlight=False, markup=False)
+    console.print(
+        f"{gap.simulated_transitions} simulated transitions, {gap.seconds:.1f} s; report: {out / 'report.html'}",
+        soft_wrap=True, highlight=False, markup=False,
+    )  # fmt: skip
+    if (out / "config.yaml").exists():
+        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True, markup=False)

@@ -1,0 +1,38 @@
+"""``dropo reproduce``: the published study of a bundled simulation, redone."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+from dropo_torch.commands.options import add_folder, count
+from dropo_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``dropo reproduce``."""
+    parser.add_argument("study", metavar="STUDY", help="hopper, the simulated experiments of the DROPO paper")
+    add_folder(parser)
+    parser.add_argument("--reduced", action="store_true", help="short logs and few seeds: minutes instead of hours")
+    parser.add_argument("--workers", type=count, metavar="N", help="fits side by side (default: one a processor)")
+
+
+def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
+    """Run ``dropo reproduce``; print what it found."""
+    from dropo_torch.commands.progress import StageProgress
+    from dropo_torch.models.bundled import bundled_study
+    from dropo_torch.support.parallel import processors
+
+    for key in overrides:
+        raise InputError(f"reproduce: --{key} is not understood; it takes --out, --resume, --reduced and --workers")
+    study, out = bundled_study(given.study), given.out
+    workers = processors() if given.workers is None else given.workers
+    with StageProgress(console, f"reproduce {given.study}") as progress:
+        found = study(out, reduced=given.reduced, resume=given.resume, report=progress.update, workers=workers)
+    lines = [*(f"  - {line}" for line in found), f"tables: {out / 'tables.md'}; report: {out / 'report.html'}"]
+    for line in lines:
+        console.print(line, highlight=False, markup=False, soft_wrap=True)
