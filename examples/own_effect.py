@@ -15,11 +15,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import yaml
-from rich.console import Console
 
-import dropo_torch as dropo
-from dropo_torch.commands.fit import run_fit
-from dropo_torch.commands.gap import run_gap
+from dropo_torch.commands.cli import main as command
 from dropo_torch.effects import Quantity, Setting
 from dropo_torch.effects.joint import JointEffect
 
@@ -99,9 +96,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     config = given.out / "door.yaml"
     config.write_text(yaml.safe_dump(document, sort_keys=False))
-    console = Console()
-    run_gap(dropo.load_config(config), given.out / "gap", console=console)
-    run_fit(dropo.load_config(given.out / "gap" / "config.yaml", {"epsilon": 1e-8}), given.out / "fit", console=console)
+    command(["gap", str(config), "--out", str(given.out / "gap")])
+    command(["fit", str(given.out / "gap" / "config.yaml"), "--epsilon", "1e-8", "--out", str(given.out / "fit")])
     print("recorded with:", ", ".join(f"{name} {value:g}" for name, value in TRUTH.items()))
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
 
 from dropo_torch.commands.folder import prepare_folder
 from dropo_torch.commands.options import add_config as add_arguments
-
-if TYPE_CHECKING:
-    from rich.console import Console
+from dropo_torch.config import load_config
+from dropo_torch.support.files import write_json
 
 __all__ = ["add_arguments", "run"]
 
@@ -21,12 +23,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     Raises:
         InputError: a gradient that is dead or wrong; the certificate is written all the same.
     """
-    from rich.table import Table
-
     from dropo_torch.certify import certify
-    from dropo_torch.config import load_config
     from dropo_torch.problem import make_problem
-    from dropo_torch.support.files import write_json
 
     config = load_config(given.config, overrides)
     problem = make_problem(config.model_copy(update={"backend": "warp"}))

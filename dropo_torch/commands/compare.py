@@ -6,14 +6,18 @@ import argparse
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+
 from dropo_torch.commands.fit import show_report
 from dropo_torch.commands.folder import prepare_folder, versions
 from dropo_torch.commands.options import add_config, count
+from dropo_torch.commands.progress import fit_shown
 from dropo_torch.commands.sweep import only_dropo
+from dropo_torch.config import load_config
+from dropo_torch.models.bundled import bundled_sim
+from dropo_torch.support.files import write_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from dropo_torch.fit import Fit
     from dropo_torch.objective import Objective
     from dropo_torch.studies.compare import Run
@@ -28,13 +32,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo compare``, which writes ``compare.json`` and ``report.html``."""
-    from dropo_torch.commands.progress import fit_shown
-    from dropo_torch.config import load_config
-    from dropo_torch.models.bundled import bundled_sim
     from dropo_torch.problem import make_problem
     from dropo_torch.report import write_compare_report
     from dropo_torch.studies.compare import METHODS, compare
-    from dropo_torch.support.files import write_json
 
     config, out = load_config(given.config, overrides), given.out
     only_dropo(config, "compare runs the optimizers of DROPO")

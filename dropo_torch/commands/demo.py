@@ -5,13 +5,15 @@ from __future__ import annotations
 import argparse
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
 
 from dropo_torch.commands.fit import run_fit
 from dropo_torch.commands.options import add_folder
-
-if TYPE_CHECKING:
-    from rich.console import Console
+from dropo_torch.config import make_config
+from dropo_torch.models.bundled import bundled_sim
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,10 +23,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo demo``."""
-    from rich.table import Table
-
-    from dropo_torch.config import make_config
-    from dropo_torch.models.bundled import bundled_sim
 
     config = make_config({"sim": "hopper"}, overrides)
     truth = bundled_sim(str(config.sim)).truth

@@ -7,14 +7,19 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import yaml
+from rich.console import Console
+from rich.table import Table
+
 from dropo_torch.commands.folder import prepare_folder, versions
 from dropo_torch.commands.options import add_config, add_log
+from dropo_torch.commands.progress import fit_shown
+from dropo_torch.config import Config, load_config
 from dropo_torch.errors import InputError
+from dropo_torch.support.extras import require
+from dropo_torch.support.files import write_atomically
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from dropo_torch.config import Config
     from dropo_torch.fit import Fit
     from dropo_torch.problem import Problem
 
@@ -27,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo fit``."""
-    from dropo_torch.config import load_config
 
     run_fit(load_config(given.config, overrides), given.out, console=console, resume=given.resume, log=given.log)
 
@@ -43,10 +47,8 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         log: ``"tensorboard"`` writes the history as TensorBoard events too.
     """
     from dropo_torch.baselines import make_search
-    from dropo_torch.commands.progress import fit_shown
     from dropo_torch.fit import refuse_dead_parameters
     from dropo_torch.problem import make_problem
-    from dropo_torch.support.extras import require
 
     if log is not None:
         require("tensorboard", f"--log {log}")
@@ -70,11 +72,8 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
 
 
 def _write(problem: Problem, result: Fit, out: Path) -> None:
-    import yaml
-
     from dropo_torch.diagnostics import diagnose
     from dropo_torch.report import write_fit_report
-    from dropo_torch.support.files import write_atomically
 
     config = problem.config
     result.save(out / "fit.json")
@@ -126,8 +125,6 @@ def _write_events(result: Fit, folder: Path) -> None:
 
 
 def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
-    from rich.table import Table
-
     table = Table("parameter", "mean", "std", "unit", "search box")
     for name, entry in result.distribution.summary().items():
         box = f"\\[{entry['low']:g}, {entry['high']:g}]"

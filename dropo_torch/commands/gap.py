@@ -4,60 +4,47 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+from rich.table import Table
+
 from dropo_torch.commands.folder import prepare_folder, versions
 from dropo_torch.commands.options import add_config as add_arguments
+from dropo_torch.commands.progress import StageProgress
+from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
+from dropo_torch.support.files import write_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from dropo_torch.config import Config
     from dropo_torch.gap import Gap
 
-__all__ = ["add_arguments", "run", "run_gap"]
+__all__ = ["add_arguments", "run"]
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
-    """Run ``dropo gap``."""
-    from dropo_torch.config import load_config
-
-    if given.config.resolve() == (given.out / "config.yaml").resolve():
-        raise InputError(
-            f"--out: {given.config} is the config of this run, which would replace it; name another folder"
-        )
-    run_gap(load_config(given.config, overrides), given.out, console=console, resume=given.resume)
-
-
-def run_gap(config: Config, out: Path, *, console: Console, resume: bool = False) -> Gap:
-    """Find what the model lacks, and write ``gap.json``, ``report.html``, ``model.xml`` and ``config.yaml`` to ``out``.
-
-    Args:
-        config: the config.
-        out: the folder; results of an earlier run there are moved aside, never overwritten.
-        console: where progress and results are shown.
-        resume: continue an interrupted run in ``out``.
-    """
-    from dataclasses import replace
-
-    from dropo_torch.commands.progress import StageProgress
+    """Run ``dropo gap``, which writes ``gap.json``, ``report.html``, and the model and config with what was missing."""
     from dropo_torch.gap import add, find_gap, prepare
     from dropo_torch.problem import make_problem
     from dropo_torch.report import write_gap_report
-    from dropo_torch.support.files import write_json
 
-    problem = make_problem(config, general=True)
+    config, out = load_config(given.config, overrides), given.out
     written = out / "config.yaml"
+    if given.config.resolve() == written.resolve():
+        raise InputError(
+            f"--out: {given.config} is the config of this run, which would replace it; name another folder"
+        )
     if written.exists() and not (out / "gap.json").exists():
         raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
+    problem = make_problem(config, general=True)
     store = out / "gap-progress.pkl"
     with StageProgress(console, "gap") as progress:
-        progress.update("preparing", 0.0)
+        progress.show("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside
-        prepare_folder(out, problem.model_path, resume=resume and store.exists())
-        gap = find_gap(problem, checkpoint=store, resume=resume, report=progress.update, scene=scene)
+        prepare_folder(out, problem.model_path, resume=given.resume and store.exists())
+        gap = find_gap(problem, checkpoint=store, resume=given.resume, report=progress.show, scene=scene)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
     write_json(out / "gap.json", gap.document())
@@ -67,12 +54,9 @@ def run_gap(config: Config, out: Path, *, console: Console, resume: bool = False
         has_config=written.exists(),
     )  # fmt: skip
     _show(gap, out, console)
-    return gap
 
 
 def _show(gap: Gap, out: Path, console: Console) -> None:
-    from rich.table import Table
-
     from dropo_torch.report.gap_words import answer
 
     headline, items = answer(gap)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -20,39 +19,30 @@ if TYPE_CHECKING:
 INTERVAL = 10.0
 
 
-class _Live:
+class _Live(Progress):
     """A bar with a status while it is entered: redrawn in place on a terminal, a line every ten seconds elsewhere."""
 
     def __init__(self, console: Console, label: str) -> None:
-        self._console, self._label, self._last = console, label, time.monotonic()
-        self._bar = Progress(
+        super().__init__(
             SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=20),
             TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
-        self._task = self._bar.add_task(label, total=1.0, status="simulating")
-
-    def __enter__(self) -> Self:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._bar.stop()
+        self._label, self._last = label, time.monotonic()
+        self._bar = self.add_task(label, total=1.0, status="simulating")
 
     def _show(self, status: str, share: float, interval: float = INTERVAL) -> None:
-        self._bar.update(self._task, completed=share, status=status)
+        self.update(self._bar, completed=share, status=status)
         now = time.monotonic()
-        if not self._console.is_terminal and now - self._last > interval:
+        if not self.console.is_terminal and now - self._last > interval:
             self._last = now
-            self._console.print(f"{self._label}: {status}", soft_wrap=True)
+            self.console.print(f"{self._label}: {status}", soft_wrap=True)
 
 
 class FitProgress(_Live):
     """A fit's stage, evaluations, best log-likelihood, time spent and left."""
 
-    def update(self, entry: HistoryEntry, progress: OptimizerProgress) -> None:
+    def show(self, entry: HistoryEntry, progress: OptimizerProgress) -> None:
         """Show the state after a batch."""
         best = "" if math.isnan(entry.log_likelihood) else f", best log-likelihood {entry.log_likelihood:.1f}"
         left = entry.seconds * (1 - progress.fraction) / max(progress.fraction, 0.05)
@@ -65,7 +55,7 @@ class StageProgress(_Live):
 
     _stage = ""
 
-    def update(self, stage: str, share: float) -> None:
+    def show(self, stage: str, share: float) -> None:
         """Show a stage and how much of it is done."""
         self._show(stage, share, interval=math.inf if stage == self._stage else -math.inf)
         self._stage = stage
@@ -79,7 +69,7 @@ class TrainProgress(_Live):
         self._steps = steps
         self._first: tuple[int, float] | None = None
 
-    def update(self, steps: int, mean_return: float) -> None:
+    def show(self, steps: int, mean_return: float) -> None:
         """Show how many steps are done, and the return of the episodes that ended last."""
         now = time.monotonic()
         first_steps, first_time = self._first = self._first or (steps, now)
@@ -96,7 +86,7 @@ def fit_shown(
     from dropo_torch.baselines import fit_problem
 
     with FitProgress(console, label) as progress:
-        return fit_problem(problem, checkpoint=checkpoint, resume=resume, on_progress=progress.update)
+        return fit_problem(problem, checkpoint=checkpoint, resume=resume, on_progress=progress.show)
 
 
 def _duration(seconds: float) -> str:

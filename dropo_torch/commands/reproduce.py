@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+from rich.console import Console
 
 from dropo_torch.commands.options import add_folder, count
+from dropo_torch.commands.progress import StageProgress
 from dropo_torch.errors import InputError
-
-if TYPE_CHECKING:
-    from rich.console import Console
+from dropo_torch.models.bundled import bundled_study
+from dropo_torch.support.parallel import processors
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -23,16 +25,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo reproduce``; print what it found."""
-    from dropo_torch.commands.progress import StageProgress
-    from dropo_torch.models.bundled import bundled_study
-    from dropo_torch.support.parallel import processors
 
     for key in overrides:
         raise InputError(f"reproduce: --{key} is not understood; it takes --out, --resume, --reduced and --workers")
     study, out = bundled_study(given.study), given.out
     workers = processors() if given.workers is None else given.workers
     with StageProgress(console, f"reproduce {given.study}") as progress:
-        found = study(out, reduced=given.reduced, resume=given.resume, report=progress.update, workers=workers)
+        found = study(out, reduced=given.reduced, resume=given.resume, report=progress.show, workers=workers)
     lines = [*(f"  - {line}" for line in found), f"tables: {out / 'tables.md'}; report: {out / 'report.html'}"]
     for line in lines:
         console.print(line, highlight=False, markup=False, soft_wrap=True)

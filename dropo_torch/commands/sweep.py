@@ -6,15 +6,19 @@ import argparse
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import yaml
+from rich.console import Console
+from rich.table import Table
+
 from dropo_torch.commands.fit import show_report
 from dropo_torch.commands.folder import prepare_folder, versions
 from dropo_torch.commands.options import add_config
+from dropo_torch.commands.progress import fit_shown
+from dropo_torch.config import Config, load_config
 from dropo_torch.errors import InputError
+from dropo_torch.support.files import write_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from dropo_torch.config import Config
     from dropo_torch.studies.sweep import Sweep, SweepPoint
 
 
@@ -33,13 +37,10 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
 
     Where the config has an ε for every column, the values to try are the geometric mean of the columns'.
     """
-    from dropo_torch.commands.progress import fit_shown
-    from dropo_torch.config import load_config
     from dropo_torch.fit import refuse_dead_parameters
     from dropo_torch.problem import make_problem
     from dropo_torch.report import write_sweep_report
     from dropo_torch.studies import sweep as study
-    from dropo_torch.support.files import write_json
 
     config, out, noisy_starts = load_config(given.config, overrides), given.out, given.noisy_starts
     _check(config, noisy_starts)
@@ -90,9 +91,6 @@ def _check(config: Config, noisy_starts: bool) -> None:
 
 
 def _show(sweep: Sweep, chosen: Mapping[str, Any], names: Sequence[str], console: Console) -> None:
-    import yaml
-    from rich.table import Table
-
     heads = ("variance of the noise", "robust log-likelihood") if sweep.noisy_starts else ("ε", "log-likelihood")
     table = Table(heads[0], "mean squared error", heads[1], *names)
     for p in sweep.points:

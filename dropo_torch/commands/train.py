@@ -9,13 +9,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rich.console import Console
+from rich.table import Table
+
 from dropo_torch.commands.folder import prepare_folder, versions
 from dropo_torch.commands.options import add_config, add_log
+from dropo_torch.commands.progress import TrainProgress
+from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
+from dropo_torch.support.extras import require
+from dropo_torch.support.files import write_json
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from dropo_torch.rl.problem import TrainingProblem
     from dropo_torch.rl.train import Progress, TrainEntry, Training
 
@@ -31,11 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo train``, which writes ``policy.pt``, ``train.json`` and ``report.html``."""
-    from dropo_torch.commands.progress import TrainProgress
-    from dropo_torch.config import load_config
     from dropo_torch.rl.problem import make_training
     from dropo_torch.rl.train import check_training, train
-    from dropo_torch.support.extras import require
 
     out = given.out
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells every storage it allocates
@@ -51,7 +53,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     with TrainProgress(console, problem.settings.steps) as progress:
 
         def show(entry: TrainEntry, evaluation: Progress | None) -> None:
-            progress.update(entry.steps, entry.mean_return)
+            progress.show(entry.steps, entry.mean_return)
             if curves is not None:
                 curves.add(entry, evaluation)
 
@@ -73,7 +75,6 @@ def _keep_distribution(problem: TrainingProblem, out: Path, continued: bool) -> 
 def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
     from dropo_torch.report.train import write_train_report
     from dropo_torch.rl.video import chosen_frames, draw, record
-    from dropo_torch.support.files import write_json
 
     result.policy.save(out / "policy.pt")
     world = problem.target or problem.nominal or problem.training
@@ -91,8 +92,6 @@ def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
 
 
 def _show(result: Training, out: Path, console: Console) -> None:
-    from rich.table import Table
-
     from dropo_torch.report.train import WORLDS, evaluations
 
     table = Table("evaluated in", "mean return", "standard error", "mean length")
