@@ -5,7 +5,7 @@ A package offers one by an entry point of the group ``dropo_torch.sims`` that is
 
 from __future__ import annotations
 
-import importlib
+import pkgutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
@@ -53,32 +53,28 @@ class Study(Protocol):
         """Run it by so many processes; return what it found, in sentences."""
 
 
+def bundled_sim(name: str, *, key: str = "sim") -> BundledSim:
+    """Return a bundled simulation; ``key`` is the config's key, or the command, that names it.
+
+    Raises:
+        InputError: an unknown name.
+    """
+    found = entry_points(group=GROUP)
+    if name not in found.names:
+        raise InputError(f"{key}: no bundled simulation {name!r}" + choices(name, sorted(found.names)))
+    sim = found[name].load()
+    if not isinstance(sim, BundledSim):
+        raise InputError(f"{key}: {found[name].value} is no BundledSim")
+    return sim
+
+
 def bundled_study(name: str) -> Study:
     """Return the study of a bundled simulation.
 
     Raises:
         InputError: an unknown name, or a simulation without a study.
     """
-    found = {e.name: e for e in entry_points(group=GROUP)}
-    if name not in found:
-        raise InputError(f"reproduce: no study {name!r}" + choices(name, sorted(found)))
-    given = bundled_sim(name).study
-    if given is None:
+    study = bundled_sim(name, key="reproduce").study
+    if study is None:
         raise InputError(f"reproduce: {name} has no study")
-    module, _, function = given.partition(":")
-    return cast(Study, getattr(importlib.import_module(module), function))
-
-
-def bundled_sim(name: str, *, key: str = "sim") -> BundledSim:
-    """Return a bundled simulation; ``key`` is the config's key that names it.
-
-    Raises:
-        InputError: an unknown name.
-    """
-    found = {e.name: e for e in entry_points(group=GROUP)}
-    if name not in found:
-        raise InputError(f"{key}: no bundled simulation {name!r}" + choices(name, sorted(found)))
-    sim = found[name].load()
-    if not isinstance(sim, BundledSim):
-        raise InputError(f"{key}: {found[name].value} is no BundledSim")
-    return sim
+    return cast(Study, pkgutil.resolve_name(study))

@@ -62,3 +62,9 @@ def unsimplify(spec: mujoco.MjSpec) -> None:
     """Let every body's centre and axes move after compilation."""
     for body in spec.bodies[1:]:
         body.simple = 0
+
+
+def show_divergence(model: mujoco.MjModel) -> mujoco.MjModel:
+    """Let a simulation that diverges stay so, rather than begin anew; return the model, which is changed."""
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model

@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from typing import ClassVar
 
+import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
@@ -39,18 +40,18 @@ class Simulator(abc.ABC):
     num_controls: int
     timestep: float | None
 
-    @abc.abstractmethod
     def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return the states after ``lag`` transitions.
+        """Return the states after ``lag`` transitions, the last of :meth:`rollout`.
 
         Args:
-            states: start states, ``(T, num_states)``, float64.
+            states: initial states, ``(T, num_states)``, float64.
             controls: the controls of each transition, ``(T, lag, num_controls)``.
             values: parameter vectors in their units, ``(K, d)``.
 
         Returns:
             ``(T, K, num_states)``, float64. A simulation that diverges is NaN throughout.
         """
+        return self.rollout(states, controls, values)[:, :, -1]
 
     @abc.abstractmethod
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -58,6 +59,14 @@ class Simulator(abc.ABC):
 
         The arguments are those of :meth:`simulate`, whose result is the last of these.
         """
+
+    def arrays(
+        self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the arguments as float64 arrays, once :meth:`check_arguments` finds that they fit."""
+        self.check_arguments(states, controls, values)
+        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+        return start, control, vectors
 
     def check_arguments(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> None:
         """Raise an :class:`InputError` for arguments whose shapes do not fit."""

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.models.load import quiet_mujoco
+from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED, Simulator
 
@@ -60,7 +60,7 @@ class MujocoEnvAdapter:
                 "set_parameters, set_state and step, and name it as file.py:function"
             )
         self._env.reset(seed=0)
-        self._env.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
+        show_divergence(self._env.model)
         self._parameters = parameters
         self._data = mujoco.MjData(self._env.model)
         self.num_states = int(self._env.model.nq + self._env.model.nv)
@@ -69,9 +69,7 @@ class MujocoEnvAdapter:
 
     def use_model(self, model: mujoco.MjModel) -> None:
         """Let the environment simulate another model of the same robot."""
-        model = copy.copy(model)
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._env.model = model
+        self._env.model = show_divergence(copy.copy(model))
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
         """Write the parameters into the environment's model, and everything derived from them."""
@@ -128,23 +126,18 @@ class GymnasiumSimulator(Simulator):
         step = getattr(self._adapter, "timestep", None)
         self.timestep = None if step is None else float(step) * frame_skip
 
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
-        return self.rollout(states, controls, values)[:, :, -1]
-
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
-        self.check_arguments(states, controls, values)
-        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+        start, control, vectors = self.arrays(states, controls, values)
         out = np.empty((len(start), len(vectors), control.shape[1], self.num_states))
         for k, vector in enumerate(vectors):
             self._adapter.set_parameters(self.parameters.named(vector))
             for t in range(len(start)):
-                out[t, k] = self._one(start[t], control[t])
+                out[t, k] = self._transition(start[t], control[t])
         return torch.from_numpy(out)
 
-    def _one(self, state: np.ndarray, controls: np.ndarray) -> np.ndarray:
-        """One transition, ``(lag, num_states)``; NaN where the simulator fails."""
+    def _transition(self, state: np.ndarray, controls: np.ndarray) -> np.ndarray:
+        """States of one transition, ``(lag, num_states)``; NaN where the simulator fails."""
         after = np.full((len(controls), self.num_states), np.nan)
         self._adapter.set_state(state)
         for step, control in enumerate(controls):

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.models.load import load_model, quiet_mujoco
+from dropo_torch.models.load import load_model, quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Simulator
 
@@ -49,8 +49,7 @@ class MujocoSimulator(Simulator):
         model = load_model(model)
         if frame_skip < 1 or chunk_size < 1:
             raise InputError(f"frame_skip {frame_skip}, chunk_size {chunk_size}: both must be 1 or more")
-        self.model = copy.copy(model)
-        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
+        self.model = show_divergence(copy.copy(model))
         unmark_frames(self.model, parameters)
         self.parameters = parameters
         self.frame_skip = int(frame_skip)
@@ -67,26 +66,23 @@ class MujocoSimulator(Simulator):
 
     def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
-        return self._run(states, controls, values, every_step=False)[:, :, 0]
+        return self._run(states, controls, values, slice(-1, None))[:, :, 0]
 
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
-        return self._run(states, controls, values, every_step=True)
+        return self._run(states, controls, values, slice(None))
 
-    def _run(
-        self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, *, every_step: bool
-    ) -> torch.Tensor:
-        self.check_arguments(states, controls, values)
-        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+    def _run(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, kept: slice) -> torch.Tensor:
+        start, control, vectors = self.arrays(states, controls, values)
         num_t, num_k, lag = len(start), len(vectors), control.shape[1]
-        out = np.empty((num_t, num_k, lag if every_step else 1, self.num_states))
+        out = np.empty((num_t, num_k, len(range(lag)[kept]), self.num_states))
         for k in range(0, num_k, self._chunk_size):
             part = vectors[k : k + self._chunk_size]
             rows = max(1, min(num_t, self._chunk_size // len(part)))
             failed = self._set_parameters(part, rows)
             for t in range(0, num_t, rows):
-                block = slice(t, min(t + rows, num_t))
-                out[block, k : k + len(part)] = self._step(start[block], control[block], len(part), every_step)
+                block = slice(t, t + rows)
+                out[block, k : k + len(part)] = self._step(start[block], control[block], len(part))[:, :, kept]
             out[:, k : k + len(part)][:, failed] = np.nan
         return torch.from_numpy(out)
 
@@ -102,7 +98,7 @@ class MujocoSimulator(Simulator):
         if self._constants is None or self._constants.nsim != len(vectors):
             self._constants = mujoco.batch.Batch(self.model, len(vectors), self._num_threads)
         constants = self._constants
-        for field in _derived_fields(constants):  # whatever an earlier call derived starts afresh
+        for field in _own_values(constants):  # whatever an earlier call derived starts afresh
             constants.expand(field)[:] = read_field(self.model, field)
         self.parameters.write({f: constants.expand(f) for f in self.parameters.fields}, vectors)
         try:
@@ -111,33 +107,32 @@ class MujocoSimulator(Simulator):
         except mujoco.batch.SimulationError as error:
             failed[error.ids] = True
         self._tiled = None if failed.any() else (vectors.copy(), repeats)
-        for field in _derived_fields(constants):
-            own = constants.expanded(field)
-            if own is None:
-                continue
+        for field, own in _own_values(constants).items():
             shared = read_field(self.model, field)
-            if self._batch.expanded(field) is not None or not np.array_equal(own, np.broadcast_to(shared, own.shape)):
+            if self._batch.expanded(field) is not None or (own != shared).any():
                 rows = self._batch.expand(field)[:num_rows]
                 rows.reshape(repeats, len(vectors), *shared.shape)[:] = own.reshape(len(vectors), *shared.shape)
         return failed
 
-    def _step(self, start: np.ndarray, control: np.ndarray, num_k: int, every_step: bool) -> np.ndarray:
-        """Simulate ``len(start)`` transitions under each of the parameter vectors that the batch holds."""
+    def _step(self, start: np.ndarray, control: np.ndarray, num_k: int) -> np.ndarray:
+        """Simulate ``len(start)`` transitions under each of the ``num_k`` parameter vectors that the batch holds."""
         batch = self._batch
         assert batch is not None
         model, num_rows, lag = self.model, len(start) * num_k, control.shape[1]
+
+        def field(name: str) -> np.ndarray:
+            return batch.bind(name)[:num_rows]
+
         ids = np.arange(num_rows, dtype=np.int32)
-        rows = batch.state[:num_rows]
-        rows[:] = self._row
-        qpos, qvel = batch.bind("qpos")[:num_rows], batch.bind("qvel")[:num_rows]
+        batch.state[:num_rows] = self._row
+        qpos, qvel, ctrl = field("qpos"), field("qvel"), field("ctrl")
         qpos[:] = np.repeat(start[:, : model.nq], num_k, axis=0)
         qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
         if self._filters:
             activation, source = (list(x) for x in zip(*self._filters, strict=True))
             settled = np.clip(control[:, 0], *control_range(model))[:, source]
-            batch.bind("act")[:num_rows, activation] = np.repeat(settled, num_k, axis=0)
-        ctrl = batch.bind("ctrl")[:num_rows]
-        out = np.empty((num_rows, lag if every_step else 1, self.num_states))
+            field("act")[:, activation] = np.repeat(settled, num_k, axis=0)
+        out = np.empty((num_rows, lag, self.num_states))
         failed = np.zeros(num_rows, dtype=bool)
         for step in range(lag):
             ctrl[:] = np.repeat(control[:, step], num_k, axis=0)
@@ -146,22 +141,17 @@ class MujocoSimulator(Simulator):
                     batch.step(ids, nstep=self.frame_skip)
             except mujoco.batch.SimulationError as error:
                 failed[error.ids] = True
-            if every_step or step == lag - 1:
-                record = out[:, step if every_step else 0]
-                record[:, : model.nq], record[:, model.nq :] = qpos, qvel
+            out[:, step, : model.nq], out[:, step, model.nq :] = qpos, qvel
         with np.errstate(invalid="ignore"):
             failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
         out[failed] = np.nan
         return out.reshape(len(start), num_k, *out.shape[1:])
 
 
-def _derived_fields(batch: mujoco.batch.Batch) -> list[str]:
-    """Real-valued model fields that hold a value per simulation in this batch."""
-    return [
-        f
-        for f in sorted(mujoco.batch.MODEL_FIELDS)
-        if batch.expanded(f) is not None and read_field(batch.model, f).dtype.kind == "f"
-    ]
+def _own_values(batch: mujoco.batch.Batch) -> dict[str, np.ndarray]:
+    """Real-valued model fields that hold a value per simulation in this batch, ``(nsim, ...)``."""
+    found = {field: batch.expanded(field) for field in sorted(mujoco.batch.MODEL_FIELDS)}
+    return {field: own for field, own in found.items() if own is not None and own.dtype.kind == "f"}
 
 
 def default_row(model: mujoco.MjModel) -> np.ndarray:
