@@ -39,9 +39,8 @@ from dropo_torch.simulators.warp.types import (
     MINVAL,
     ONE,
     ZERO,
-    Reals,
-    Scratch,
     Tables,
+    World,
     f64,
     mat33,
     vec3,
@@ -50,45 +49,45 @@ from dropo_torch.simulators.warp.types import (
 
 
 @wp.func(inline=True)
-def geom_centre(m: Tables, s: Scratch, t: int, g: int) -> vec3:
+def geom_centre(m: Tables, w: World, g: int) -> vec3:
     """Centre of a geom, from the origin of the sweep."""
     b = m.geom_body[g]
-    return s.xpos[t, b] + s.xmat[t, b] * m.geom_pos[g]
+    return w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
 
 
 @wp.func(inline=True)
-def geom_rotation(m: Tables, s: Scratch, t: int, g: int) -> mat33:
+def geom_rotation(m: Tables, w: World, g: int) -> mat33:
     """Rotation of a geom."""
-    return s.xmat[t, m.geom_body[g]] * m.geom_mat[g]
+    return w.xmat[w.t, m.geom_body[g]] * m.geom_mat[g]
 
 
 @wp.func(inline=True)
-def geom_axis(m: Tables, s: Scratch, t: int, g: int) -> vec3:
+def geom_axis(m: Tables, w: World, g: int) -> vec3:
     """Third axis of a geom: a plane's normal, the axis of a capsule."""
-    return s.xmat[t, m.geom_body[g]] * column(m.geom_mat[g], 2)
+    return w.xmat[w.t, m.geom_body[g]] * column(m.geom_mat[g], 2)
 
 
 @wp.func(inline=True)
-def _add(s: Scratch, t: int, n: int, k: int, which: int, x: vec7, hint: vec3):
+def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
     """Write contact ``n`` with its frame; the first tangent is along the hint, or along y or z without one."""
-    s.con_pair[t, n] = k
-    s.con_which[t, n] = which
-    s.con_dist[t, n] = x[0]
-    s.con_point[t, n] = vec3(x[1], x[2], x[3])
+    w.con_pair[w.t, n] = k
+    w.con_which[w.t, n] = which
+    w.con_dist[w.t, n] = x[0]
+    w.con_point[w.t, n] = vec3(x[1], x[2], x[3])
     normal = vec3(x[4], x[5], x[6])
     y = hint
     if wp.dot(hint, hint) < f64(0.25):
         y = vec3(ZERO, ONE, ZERO)
         if normal[1] >= HALF or normal[1] <= -HALF:
             y = vec3(ZERO, ZERO, ONE)
-    s.con_hint[t, n] = y
+    w.con_hint[w.t, n] = y
     y = y - normal * wp.dot(normal, y)
     length = wp.length(y)
     t1 = vec3(ONE, ZERO, ZERO)
     if length > MINVAL:
         t1 = y / length
     t2 = wp.cross(normal, t1)
-    s.con_frame[t, n] = mat33(normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2])
+    w.con_frame[w.t, n] = mat33(normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2])
 
 
 @wp.func(inline=True)
@@ -106,41 +105,41 @@ def pair_count(m: Tables, k: int, parallel: bool) -> int:
 
 
 @wp.func(inline=True)
-def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
+def find_contacts(m: Tables, w: World) -> int:
     """List the contacts of a configuration and return their number."""
     n = int(0)
     for k in range(m.npair):
         kind = m.pair_kind[k]
         g1 = m.pair_geom1[k]
         g2 = m.pair_geom2[k]
-        margin = th[m.o_pair_margin + k]
-        c1 = geom_centre(m, s, t, g1)
-        c2 = geom_centre(m, s, t, g2)
+        margin = w.th[m.o_pair_margin + k]
+        c1 = geom_centre(m, w, g1)
+        c2 = geom_centre(m, w, g2)
         reach = margin + m.pair_bound[k]
         normal = vec3()
         near = bool(False)
         if kind <= PLANE_ELLIPSOID:
-            normal = geom_axis(m, s, t, g1)
+            normal = geom_axis(m, w, g1)
             near = wp.dot(normal, c2 - c1) < reach
         else:
             near = wp.length_sq(c2 - c1) < reach * reach
         if near:
             size1 = m.geom_size[g1]
             size2 = m.geom_size[g2]
-            axis = geom_axis(m, s, t, g2)
+            axis = geom_axis(m, w, g2)
             a1 = vec3()
             a2 = axis * size2[1]
             parallel = bool(False)
             rot = mat33()
             if kind == ROUND:
-                a1 = geom_axis(m, s, t, g1) * size1[1]
+                a1 = geom_axis(m, w, g1) * size1[1]
                 parallel = are_parallel(a1, a2)
             elif kind > PLANE_CAPSULE:
-                rot = geom_rotation(m, s, t, g2)
+                rot = geom_rotation(m, w, g2)
             first = int(-1)
             second = int(-1)
             if kind == CAPSULE_BOX:
-                a1 = geom_axis(m, s, t, g1) * size1[1]
+                a1 = geom_axis(m, w, g1) * size1[1]
                 back = wp.transpose(rot)
                 limit = margin + f64(2.0) * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
                 first, second = capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
@@ -179,15 +178,15 @@ def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
                         which = overlap_end(c1, a1, c2, a2, i)
                     x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
                 if possible and x[0] < margin:
-                    _add(s, t, n, k, which, x, hint)
+                    _add(w, n, k, which, x, hint)
                     n += 1
     return n
 
 
 @wp.func(inline=True)
-def half_axis(m: Tables, s: Scratch, t: int, g: int) -> vec3:
+def half_axis(m: Tables, w: World, g: int) -> vec3:
     """Half-axis of a capsule, zero for a sphere (whose second size is zero)."""
-    return geom_axis(m, s, t, g) * m.geom_size[g][1]
+    return geom_axis(m, w, g) * m.geom_size[g][1]
 
 
 @wp.func
@@ -199,26 +198,26 @@ def in_frame(frame: mat33, x: vec6, p: vec3) -> vec6:
 
 
 @wp.func(inline=True)
-def fills_in(m: Tables, s: Scratch, t: int, ncon: int) -> int:
+def fills_in(m: Tables, w: World, ncon: int) -> int:
     """1 if H has entries beyond the tree's, because a contact joins two branches."""
     dense = m.always_dense
     for c in range(ncon):
-        if m.pair_dense[s.con_pair[t, c]] != 0:
+        if m.pair_dense[w.con_pair[w.t, c]] != 0:
             dense = 1
     return dense
 
 
 @wp.func(inline=True)
-def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
+def make_contacts(m: Tables, w: World, ncon: int):
     """Jacobian, reference acceleration and D of each contact."""
     for c in range(ncon):
-        k = s.con_pair[t, c]
+        k = w.con_pair[w.t, c]
         b1 = m.pair_body1[k]
         b2 = m.pair_body2[k]
         for i in range(m.nv):
-            s.con_jac[t, c * m.nv + i] = vec6()
-        p = s.con_point[t, c]
-        frame = s.con_frame[t, c]
+            w.con_jac[w.t, c * m.nv + i] = vec6()
+        p = w.con_point[w.t, c]
+        frame = w.con_frame[w.t, c]
         for side in range(2):
             sign = -ONE
             i = m.body_lastdof[b1]
@@ -226,14 +225,14 @@ def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
                 sign = ONE
                 i = m.body_lastdof[b2]
             while i >= 0:
-                column_i = in_frame(frame, s.motion[t, i], p) * sign
-                s.con_jac[t, c * m.nv + i] = s.con_jac[t, c * m.nv + i] + column_i
+                column_i = in_frame(frame, w.motion[w.t, i], p) * sign
+                w.con_jac[w.t, c * m.nv + i] = w.con_jac[w.t, c * m.nv + i] + column_i
                 i = m.dof_parent[0, i]
-        v = in_frame(frame, s.velocity[t, b2] - s.velocity[t, b1], p)
-        solref = theta_vec2(th, m.o_pair_solref + 2 * k)
-        friction_ref = theta_vec2(th, m.o_pair_solreffriction + 2 * k)
-        solimp = theta_vec5(th, m.o_pair_solimp + 5 * k)
-        x = s.con_dist[t, c] - th[m.o_pair_margin + k]
+        v = in_frame(frame, w.velocity[w.t, b2] - w.velocity[w.t, b1], p)
+        solref = theta_vec2(w.th, m.o_pair_solref + 2 * k)
+        friction_ref = theta_vec2(w.th, m.o_pair_solreffriction + 2 * k)
+        solimp = theta_vec5(w.th, m.o_pair_solimp + 5 * k)
+        x = w.con_dist[w.t, c] - w.th[m.o_pair_margin + k]
         imp = impedance_slope(x, solimp)[0]
         b = damping(solref, solimp, m.h, m.refsafe)
         bf = b
@@ -241,8 +240,8 @@ def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
             bf = damping(friction_ref, solimp, m.h, m.refsafe)
         aref = v * -bf
         aref[0] = -b * v[0] - stiffness(solref, solimp, m.h, m.refsafe) * imp * x
-        s.con_aref[t, c] = aref
-        mu = th[m.o_pair_friction + 5 * k]
-        s.con_d[t, c] = normal_d(
-            m.pair_dim[k], m.elliptic, regularisation(imp, ONE), th[m.o_pair_invweight + k], mu, m.impratio
+        w.con_aref[w.t, c] = aref
+        mu = w.th[m.o_pair_friction + 5 * k]
+        w.con_d[w.t, c] = normal_d(
+            m.pair_dim[k], m.elliptic, regularisation(imp, ONE), w.th[m.o_pair_invweight + k], mu, m.impratio
         )

@@ -10,7 +10,7 @@ import warp as wp
 
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import collide
-from dropo_torch.simulators.warp.fields import Layout
+from dropo_torch.simulators.warp.layout import Layout
 from dropo_torch.simulators.warp.pairs import condim, joins_branches
 from dropo_torch.simulators.warp.types import Tables, mat33, vec3
 
@@ -128,9 +128,9 @@ def _links(model: mujoco.MjModel) -> dict[str, Any]:
                 break
     kinds, joints, dofs, qs = (np.array([r[i] for r in rows], dtype=int) for i in range(4))
     return {
-        "nlink": len(rows), "has_ball": int(bool(np.any(kinds == 3))),
-        "body_link": first, "body_nlink": count, "link_kind": kinds, "link_dof": dofs,
-        "link_qpos": qs, "link_jnt": joints, "link_body": model.jnt_bodyid[joints] if len(rows) else joints,
+        "nlink": len(rows), "has_ball": int(bool(np.any(kinds == 3))), "body_link": first, "body_nlink": count,
+        "link_kind": kinds, "link_dof": dofs, "link_ndof": np.where(kinds < 2, 1, 3), "link_qpos": qs,
+        "link_jnt": joints, "link_body": model.jnt_bodyid[joints] if len(rows) else joints,
         "link_frclimited": model.jnt_actfrclimited[joints].astype(int) if len(rows) else joints,
         "link_axis": np.array([r[4] for r in rows]).reshape(-1, 3),
         "link_pos": np.array([r[5] for r in rows]).reshape(-1, 3),
