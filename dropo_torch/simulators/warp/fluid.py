@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import ang, at, join, wrench
+from dropo_torch.simulators.warp.spatial import ang, at, join, theta_vec3, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 PI = wp.constant(wp.float64(wp.pi))
@@ -72,8 +72,7 @@ def inertial_frame(m: Tables, w: World, b: int) -> mat33:
 @wp.func(inline=True)
 def centre_of_mass(m: Tables, w: World, b: int) -> vec3:
     """Centre of mass of a body, from the origin of the sweep."""
-    i = m.o_ipos + 3 * b
-    return w.xpos[w.t, b] + w.xmat[w.t, b] * vec3(w.th[i], w.th[i + 1], w.th[i + 2])
+    return w.xpos[w.t, b] + w.xmat[w.t, b] * theta_vec3(w.th, m.o_ipos + 3 * b)
 
 
 @wp.func(inline=True)
@@ -81,11 +80,10 @@ def fluid_wrench(m: Tables, w: World, b: int) -> vec6:
     """The drag on a body as a spatial force."""
     rot = inertial_frame(m, w, b)
     c = centre_of_mass(m, w, b)
-    wind = vec3(w.th[m.o_wind], w.th[m.o_wind + 1], w.th[m.o_wind + 2])
+    wind = theta_vec3(w.th, m.o_wind)
     vel = w.velocity[w.t, b]
     back = wp.transpose(rot)
-    i = m.o_inertia + 3 * b
-    x = vec3(w.th[i], w.th[i + 1], w.th[i + 2])
+    x = theta_vec3(w.th, m.o_inertia + 3 * b)
     mass = w.th[m.o_mass + b]
     f = rot * box_force(back * (at(vel, c) - wind), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
     n = rot * box_torque(back * ang(vel), x, mass, w.th[m.o_density], w.th[m.o_viscosity])

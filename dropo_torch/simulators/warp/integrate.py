@@ -110,9 +110,11 @@ def chart_rates_adjoint(m: Tables, w: World, r: int, c: f64, o: int):
 def good(m: Tables, w: World, r: int) -> int:
     """1 while every number of a state is finite and below MuJoCo's limit."""
     ok = int(1)
-    for i in range(m.nq + m.nv):
-        x = w.qpos[r, i] if i < m.nq else w.qvel[r, i - m.nq]
-        if not (wp.abs(x) < LARGE):
+    for i in range(m.nq):
+        if not (wp.abs(w.qpos[r, i]) < LARGE):
+            ok = 0
+    for i in range(m.nv):
+        if not (wp.abs(w.qvel[r, i]) < LARGE):
             ok = 0
     return ok
 

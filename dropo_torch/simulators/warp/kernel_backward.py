@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.collide import box_dual, capsule_box_dual, cylinder_dual, ellipsoid_dual, round_dual
+from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, support_dual
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
@@ -101,9 +101,7 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array
     y[8] = contact_scalars(3, s, s, s, v2, v5, s, s, s, 1, s, s, s)
     y[2] = box_power(v, v, v, v, v, s, s, s)
     y[3] = round_dual(v, v, s, v, v, s, 0, s, v, v)
-    y[4] = cylinder_dual(v, v, r[0], v, 0, v)
-    y[5] = ellipsoid_dual(v, v, r[0], v, v)
-    y[6] = box_dual(v, r[0], v, v, s, s, v, v)
+    y[4] = support_dual(3, v, v, r[0], v, 0, v)
     y[0] = capsule_box_dual(v, v, s, v, r[0], v, 0, s, v, v)
     y[7] = chart_rate_dual(v, v, v)
 

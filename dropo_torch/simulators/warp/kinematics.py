@@ -20,6 +20,7 @@ from dropo_torch.simulators.warp.spatial import (
     join,
     quat_matrix,
     rotation,
+    theta_vec3,
     vec3_at,
     vec4_at,
 )
@@ -29,19 +30,12 @@ from dropo_torch.simulators.warp.types import (
     SLIDE,
     TRANSLATION,
     ZERO,
-    Reals,
     Tables,
     World,
     vec3,
     vec6,
     vec10,
 )
-
-
-@wp.func
-def theta_vec3(th: Reals, i: int) -> vec3:
-    """Three consecutive numbers of θ."""
-    return vec3(th[i], th[i + 1], th[i + 2])
 
 
 @wp.func

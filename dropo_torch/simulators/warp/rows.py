@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.cone import contact_scalars
-from dropo_torch.simulators.warp.impedance import damping, impedance_slope, regularisation, stiffness
+from dropo_torch.simulators.warp.impedance import regularisation
+from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
 from dropo_torch.simulators.warp.spatial import add_vec3, inverse_right_jacobian_t, nothing, quat_log, vec3_at, vec4_at
 from dropo_torch.simulators.warp.types import (
     BALL,
@@ -25,30 +25,15 @@ from dropo_torch.simulators.warp.types import (
     THREE,
     TWO,
     ZERO,
-    Reals,
     Reals2,
     Tables,
     World,
     f64,
-    vec2,
     vec3,
     vec3i,
-    vec5,
 )
 
 FOUR = wp.constant(wp.float64(4.0))
-
-
-@wp.func
-def theta_vec2(th: Reals, i: int) -> vec2:
-    """Two consecutive numbers of θ."""
-    return vec2(th[i], th[i + 1])
-
-
-@wp.func
-def theta_vec5(th: Reals, i: int) -> vec5:
-    """Five consecutive numbers of θ."""
-    return vec5(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4])
 
 
 @wp.func
@@ -96,25 +81,36 @@ def equality_position(m: Tables, w: World, r: int, e: int) -> vec3:
 def row_dot(w: World, n: int, x: Reals2, r: int) -> f64:
     """J x of row ``n``."""
     c = w.row_coef[w.t, n]
-    y = c[0] * x[r, w.row_dof[w.t, n][0]]
-    d = w.row_dof[w.t, n][1]
-    if d >= 0:
-        y += c[1] * x[r, d]
-        d = w.row_dof[w.t, n][2]
-        if d >= 0:
-            y += c[2] * x[r, d]
+    d = w.row_dof[w.t, n]
+    y = c[0] * x[r, d[0]]
+    if d[1] >= 0:
+        y += c[1] * x[r, d[1]]
+        if d[2] >= 0:
+            y += c[2] * x[r, d[2]]
     return y
 
 
 @wp.func(inline=True)
-def _row_softness(m: Tables, w: World, n: int):
-    """Places of solref and solimp of row ``n`` in θ, and its approximate inverse inertia."""
+def row_add(w: World, n: int, y: f64, x: Reals2, r: int):
+    """x += Jᵀ y of row ``n``."""
+    c = w.row_coef[w.t, n]
+    d = w.row_dof[w.t, n]
+    x[r, d[0]] += c[0] * y
+    if d[1] >= 0:
+        x[r, d[1]] += c[1] * y
+        if d[2] >= 0:
+            x[r, d[2]] += c[2] * y
+
+
+@wp.func(inline=True)
+def row_softness(m: Tables, w: World, n: int) -> Soft:
+    """The softness of row ``n``; a friction loss has no stiffness."""
     kind = w.row_kind[w.t, n]
     index = w.row_index[w.t, n]
-    d = w.row_dof[w.t, n][0]
-    o_ref = m.o_dof_solref + 2 * d
-    o_imp = m.o_dof_solimp + 5 * d
-    weight = w.th[m.o_dof_invweight + d]
+    d = w.row_dof[w.t, n]
+    o_ref = m.o_dof_solref + 2 * d[0]
+    o_imp = m.o_dof_solimp + 5 * d[0]
+    weight = w.th[m.o_dof_invweight + d[0]]
     if kind == ROW_LIMIT:
         j = m.link_jnt[m.limit_link[index]]
         o_ref = m.o_jnt_solref + 2 * j
@@ -122,25 +118,12 @@ def _row_softness(m: Tables, w: World, n: int):
     elif kind == ROW_EQUALITY:
         o_ref = m.o_eq_solref + 2 * m.eq_id[index]
         o_imp = m.o_eq_solimp + 5 * m.eq_id[index]
-        d2 = w.row_dof[w.t, n][1]
-        if d2 >= 0:
-            weight += w.th[m.o_dof_invweight + d2]
-    return o_ref, o_imp, weight
-
-
-@wp.func(inline=True)
-def _weigh_row(m: Tables, w: World, r: int, n: int):
-    """Reference acceleration and D of row ``n``."""
-    o_ref, o_imp, weight = _row_softness(m, w, n)
-    solref = theta_vec2(w.th, o_ref)
-    solimp = theta_vec5(w.th, o_imp)
-    x = w.row_x[w.t, n]
-    imp = impedance_slope(x, solimp)[0]
-    aref = -damping(solref, solimp, m.h, m.refsafe) * row_dot(w, n, w.qvel, r)
-    if w.row_kind[w.t, n] != ROW_FRICTION:
-        aref -= stiffness(solref, solimp, m.h, m.refsafe) * imp * x
-    w.row_aref[w.t, n] = aref
-    w.row_d[w.t, n] = ONE / regularisation(imp, weight)
+        if d[1] >= 0:
+            weight += w.th[m.o_dof_invweight + d[1]]
+    soft = softness(m, w, o_ref, o_imp, weight, w.row_x[w.t, n])
+    if kind == ROW_FRICTION:
+        soft.k = ZERO
+    return soft
 
 
 @wp.func(inline=True)
@@ -202,69 +185,11 @@ def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
             w.row_x[w.t, n] = x
             w.row_loss[w.t, n] = loss
             if weighed != 0:
-                _weigh_row(m, w, r, n)
+                soft = row_softness(m, w, n)
+                w.row_aref[w.t, n] = -soft.b * row_dot(w, n, w.qvel, r) - soft.k * soft.imp * x
+                w.row_d[w.t, n] = ONE / regularisation(soft.imp, soft.weight)
             n += 1
     return n
-
-
-@wp.func(inline=True)
-def row_add(w: World, n: int, y: f64, x: Reals2, r: int):
-    """x += Jᵀ y of row ``n``."""
-    c = w.row_coef[w.t, n]
-    x[r, w.row_dof[w.t, n][0]] += c[0] * y
-    d = w.row_dof[w.t, n][1]
-    if d >= 0:
-        x[r, d] += c[1] * y
-        d = w.row_dof[w.t, n][2]
-        if d >= 0:
-            x[r, d] += c[2] * y
-
-
-@wp.func(inline=True)
-def soft_adjoint(
-    m: Tables,
-    w: World,
-    o_ref: int,
-    o_imp: int,
-    dim: int,
-    x: f64,
-    mu: f64,
-    solref: vec2,
-    solimp: vec5,
-    weight: f64,
-    imp: f64,
-    slope: f64,
-    stiff: f64,
-    d: f64,
-    dbar: f64,
-    bbar: f64,
-    sbar: f64,
-):
-    """Adjoints of a constraint's position, inverse inertia and first friction; adds those of solref and solimp.
-
-    ⟨D, D̄⟩ + ⟨B, B̄⟩ + ⟨K d(x) x, s̄⟩ is the number; ``imp`` and ``slope`` are d(x) and d'(x), ``stiff`` is K.
-    """
-    _late = wp.grad(nothing)(ONE)
-    # D is inverse to R = (1 − d)/d · A, of a pyramid to 2 μ² (1 + μ²) R
-    xbar = sbar * stiff * (imp + slope * x)
-    weightbar = ZERO
-    mubar = ZERO
-    if dim > 1:
-        mubar = -TWO * dbar * d / mu
-    if (ONE - imp) * weight > MINVAL * imp:
-        xbar += dbar * d * slope / (imp * (ONE - imp))
-        weightbar = -dbar * d / weight
-        if dim > 1:
-            mubar -= TWO * dbar * d * mu / (ONE + mu * mu)
-    if m.want_soft != 0:
-        _d, _x, _margin, _mu, refbar, impbar, _w, _r, _h, _s, _1, _2, _3 = wp.grad(contact_scalars)(
-            dim, x, ZERO, mu, solref, solimp, weight, m.impratio, m.h, m.refsafe, dbar, bbar, sbar
-        )
-        for i in range(2):
-            w.grad[w.t, o_ref + i] += refbar[i]
-        for i in range(5):
-            w.grad[w.t, o_imp + i] += impbar[i]
-    return xbar, weightbar, mubar
 
 
 @wp.func(inline=True)
@@ -273,38 +198,28 @@ def rows_adjoint(m: Tables, w: World, r: int, nrow: int):
     _late = wp.grad(nothing)(ONE)
     for n in range(nrow):
         kind = w.row_kind[w.t, n]
-        o_ref, o_imp, weight = _row_softness(m, w, n)
-        solref = theta_vec2(w.th, o_ref)
-        solimp = theta_vec5(w.th, o_imp)
-        x = w.row_x[w.t, n]
+        soft = row_softness(m, w, n)
         loss = w.row_loss[w.t, n]
-        imp = impedance_slope(x, solimp)
-        b = damping(solref, solimp, m.h, m.refsafe)
-        stiff = ZERO
-        if kind != ROW_FRICTION:
-            stiff = stiffness(solref, solimp, m.h, m.refsafe)
         v = row_dot(w, n, w.qvel, r)
-        jar = row_dot(w, n, w.acc, r) + b * v + stiff * imp[0] * x
-        d = ONE / regularisation(imp[0], weight)
+        jar = row_dot(w, n, w.acc, r) + soft.b * v + soft.k * soft.imp * soft.x
+        d = ONE / regularisation(soft.imp, soft.weight)
         state = row_state(kind, jar, d, loss)
         if state != 0:
             jl = row_dot(w, n, w.lam, w.t)
             dof = w.row_dof[w.t, n][0]
             if state == 1:
                 ubar = d * jl
-                xbar, weightbar, _mubar = soft_adjoint(
-                    m, w, o_ref, o_imp, 1, x, ONE, solref, solimp, weight, imp[0], imp[1], stiff, d, jar * jl,
-                    v * ubar, wp.where(kind == ROW_FRICTION, ZERO, ubar),
-                )  # fmt: skip
-                row_add(w, n, b * ubar, w.vel_bar, w.t)
+                sbar = wp.where(kind == ROW_FRICTION, ZERO, ubar)
+                xbar, weightbar, _mubar = soft_adjoint(m, w, soft, 1, ONE, d, jar * jl, v * ubar, sbar)
+                row_add(w, n, soft.b * ubar, w.vel_bar, w.t)
                 w.grad[w.t, m.o_dof_invweight + dof] += weightbar
                 lbar = d * jar
                 if kind == ROW_LIMIT:
-                    _limit_adjoint(m, w, r, n, xbar, ubar, b * ubar, lbar)
+                    _limit_adjoint(m, w, r, n, xbar, ubar, soft.b * ubar, lbar)
                 elif kind == ROW_EQUALITY:
                     if w.row_dof[w.t, n][1] >= 0:
                         w.grad[w.t, m.o_dof_invweight + w.row_dof[w.t, n][1]] += weightbar
-                    _equality_adjoint(m, w, r, n, xbar, ubar, b * ubar, lbar)
+                    _equality_adjoint(m, w, r, n, xbar, ubar, soft.b * ubar, lbar)
             elif state == 2:
                 w.grad[w.t, m.o_frictionloss + dof] -= jl
             else:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_piece
+from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_of, cone_piece
 from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.rows import row_add, row_dot, row_force, row_state
 from dropo_torch.simulators.warp.types import ONE, ZERO, Reals2, Tables, World, f64, mat33, vec3, vec6
@@ -90,7 +90,7 @@ def contact_dot(m: Tables, w: World, c: int, x: Reals2, r: int) -> vec6:
 
 
 @wp.func(inline=True)
-def _add_contact_hessian(m: Tables, w: World, dense: int, c: int, ll: mat33, la: mat33, aa: mat33, dim: int, r: int):
+def _add_contact_hessian(m: Tables, w: World, dense: int, c: int, ll: mat33, la: mat33, aa: mat33, r: int):
     """H += Jᵀ C J of one contact."""
     base = c * m.nv
     k = w.con_pair[w.t, c]
@@ -107,7 +107,7 @@ def _add_contact_hessian(m: Tables, w: World, dense: int, c: int, ll: mat33, la:
         ji = w.con_jac[w.t, base + i]
         jl = vec3(ji[0], ji[1], ji[2])
         cl = ll * jl
-        if dim > 3:
+        if m.pair_dim[k] > 3:
             ja = vec3(ji[3], ji[4], ji[5])
             cl += la * ja
             ca = wp.transpose(la) * jl + aa * ja
@@ -154,19 +154,18 @@ def assemble(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
             _add_row_hessian(m, w, n, r)
     for c in range(ncon):
         k = w.con_pair[w.t, c]
-        dim = m.pair_dim[k]
+        cone = cone_of(m, w, k, w.con_d[w.t, c])
         jar6 = w.con_jar[w.t, c]
-        o_mu = m.o_pair_friction + 5 * k
-        if cone_piece(dim, m.elliptic, w.th, o_mu, m.impratio, jar6) != 0:
-            f = cone_force(dim, m.elliptic, w.con_d[w.t, c], w.th, o_mu, m.impratio, jar6)
+        if cone_piece(cone, jar6) != 0:
+            f = cone_force(cone, jar6)
             base = c * m.nv
             for i in range(m.nv):
                 w.step[w.t, i] += wp.dot(w.con_jac[w.t, base + i], f)
-            ll, la, aa = cone_hessian(dim, m.elliptic, w.con_d[w.t, c], w.th, o_mu, m.impratio, jar6)
-            _add_contact_hessian(m, w, dense, c, ll, la, aa, dim, r)
+            ll, la, aa = cone_hessian(cone, jar6)
+            _add_contact_hessian(m, w, dense, c, ll, la, aa, r)
 
 
-@wp.func
+@wp.func(inline=True)
 def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, quad: f64):
     """φ'(α) and φ''(α) of the cost along the step."""
     d1 = linear + alpha * quad
@@ -180,21 +179,19 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
         if row_state(kind, jar, d, w.row_loss[w.t, n]) == 1:
             d2 += d * y * y
     for c in range(ncon):
-        k = w.con_pair[w.t, c]
-        dim = m.pair_dim[k]
+        cone = cone_of(m, w, w.con_pair[w.t, c], w.con_d[w.t, c])
         dw = w.con_dir[w.t, c]
         jar6 = w.con_jar[w.t, c] + dw * alpha
-        o_mu = m.o_pair_friction + 5 * k
-        if cone_piece(dim, m.elliptic, w.th, o_mu, m.impratio, jar6) != 0:
-            d1 -= wp.dot(cone_force(dim, m.elliptic, w.con_d[w.t, c], w.th, o_mu, m.impratio, jar6), dw)
-            ll, la, aa = cone_hessian(dim, m.elliptic, w.con_d[w.t, c], w.th, o_mu, m.impratio, jar6)
+        if cone_piece(cone, jar6) != 0:
+            d1 -= wp.dot(cone_force(cone, jar6), dw)
+            ll, la, aa = cone_hessian(cone, jar6)
             yl = vec3(dw[0], dw[1], dw[2])
             ya = vec3(dw[3], dw[4], dw[5])
             d2 += wp.dot(yl, ll * yl) + f64(2.0) * wp.dot(yl, la * ya) + wp.dot(ya, aa * ya)
     return d1, d2
 
 
-@wp.func
+@wp.func(inline=True)
 def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
     """The root of φ' along the step: Newton's iteration kept in a bracket."""
     mass_mul(m, w, w.step, w.t, w.work, w.t)
@@ -225,15 +222,21 @@ def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
 
 
 @wp.func(inline=True)
+def _unconstrained_gradient(m: Tables, w: World, r: int):
+    """M a + c − τ, into ``w.product``."""
+    mass_mul(m, w, w.acc, r, w.product, w.t)
+    for i in range(m.nv):
+        w.product[w.t, i] += w.load[w.t, i]
+
+
+@wp.func(inline=True)
 def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
     """Solve for ``w.acc[r]`` from the guess it holds; leave the factor of H at the solution in ``w.hess[r]``."""
     for n in range(nrow):
         w.row_jar[w.t, n] = row_dot(w, n, w.acc, r) - w.row_aref[w.t, n]
     for c in range(ncon):
         w.con_jar[w.t, c] = contact_dot(m, w, c, w.acc, r) - w.con_aref[w.t, c]
-    mass_mul(m, w, w.acc, r, w.product, w.t)
-    for i in range(m.nv):
-        w.product[w.t, i] += w.load[w.t, i]
+    _unconstrained_gradient(m, w, r)
     done = int(0)
     for _k in range(ITERATIONS):
         assemble(m, w, nrow, ncon, dense, r)
@@ -255,15 +258,12 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
         for c in range(ncon):
             y6 = contact_dot(m, w, c, w.step, w.t)
             w.con_dir[w.t, c] = y6
-            k = w.con_pair[w.t, c]
-            dim = m.pair_dim[k]
-            o_mu = m.o_pair_friction + 5 * k
+            cone = cone_of(m, w, w.con_pair[w.t, c], w.con_d[w.t, c])
             jar6 = w.con_jar[w.t, c]
-            before = cone_piece(dim, m.elliptic, w.th, o_mu, m.impratio, jar6)
-            after = cone_piece(dim, m.elliptic, w.th, o_mu, m.impratio, jar6 + y6)
-            if before != after:
+            after = cone_piece(cone, jar6 + y6)
+            if cone_piece(cone, jar6) != after:
                 same = 0
-            elif m.elliptic != 0 and dim > 1 and after == CURVED:
+            elif cone.elliptic != 0 and cone.dim > 1 and after == CURVED:
                 curved = 1
         if same != 0 and curved == 0:
             for i in range(m.nv):
@@ -286,9 +286,7 @@ def _advance(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, r: int):
     """Move ``alpha`` steps."""
     for i in range(m.nv):
         w.acc[r, i] += alpha * w.step[w.t, i]
-    mass_mul(m, w, w.acc, r, w.product, w.t)
-    for i in range(m.nv):
-        w.product[w.t, i] += w.load[w.t, i]
+    _unconstrained_gradient(m, w, r)
     for n in range(nrow):
         w.row_jar[w.t, n] += alpha * w.row_dir[w.t, n]
     for c in range(ncon):

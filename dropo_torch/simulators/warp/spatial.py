@@ -7,7 +7,41 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Reals2, f64, mat33, vec3, vec4, vec6, vec10
+from dropo_torch.simulators.warp.types import (
+    HALF,
+    MINVAL,
+    ONE,
+    TWO,
+    ZERO,
+    Reals,
+    Reals2,
+    f64,
+    mat33,
+    vec2,
+    vec3,
+    vec4,
+    vec5,
+    vec6,
+    vec10,
+)
+
+
+@wp.func
+def theta_vec2(th: Reals, i: int) -> vec2:
+    """Two consecutive numbers of θ."""
+    return vec2(th[i], th[i + 1])
+
+
+@wp.func
+def theta_vec3(th: Reals, i: int) -> vec3:
+    """Three consecutive numbers of θ."""
+    return vec3(th[i], th[i + 1], th[i + 2])
+
+
+@wp.func
+def theta_vec5(th: Reals, i: int) -> vec5:
+    """Five consecutive numbers of θ."""
+    return vec5(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4])
 
 
 @wp.func(inline=True)

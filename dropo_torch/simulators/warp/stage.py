@@ -13,8 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.contact import fills_in, find_contacts, make_contacts
-from dropo_torch.simulators.warp.contact_adjoint import contacts_adjoint
+from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make_contacts
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
 from dropo_torch.simulators.warp.forces import (
     actuators_adjoint,
@@ -24,7 +23,7 @@ from dropo_torch.simulators.warp.forces import (
     dampers_adjoint,
     springs_adjoint,
 )
-from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out, theta_vec3
+from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.solver import factor, newton, solve
 from dropo_torch.simulators.warp.spatial import (
@@ -36,8 +35,10 @@ from dropo_torch.simulators.warp.spatial import (
     inertia_mul,
     join,
     nothing,
+    theta_vec3,
     wrench,
 )
+from dropo_torch.simulators.warp.touch import find_contacts
 from dropo_torch.simulators.warp.types import (
     MINVAL,
     ONE,
