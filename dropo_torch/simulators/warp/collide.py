@@ -27,8 +27,7 @@ PLANE_BOX = wp.constant(2)
 PLANE_CYLINDER = wp.constant(3)
 PLANE_ELLIPSOID = wp.constant(4)
 ROUND = wp.constant(5)  # spheres and capsules among themselves
-SPHERE_BOX = wp.constant(6)
-CAPSULE_BOX = wp.constant(7)
+CAPSULE_BOX = wp.constant(6)  # a sphere too
 
 #: Where on its axis a capsule touches a box: one of its ends, where it passes a corner, where it passes an edge.
 END = wp.constant(0)  # the end at −1; 1 is that at +1
@@ -99,6 +98,14 @@ def ellipsoid_point(n: vec3, c: vec3, rot: mat33, size: vec3) -> vec3:
     """The point of an ellipsoid farthest along −n."""
     y = wp.cw_mul(wp.transpose(rot) * n, size)
     return c - rot * (wp.cw_mul(y, size) / wp.length(y))
+
+
+@wp.func
+def support_point(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3:
+    """The point of a cylinder or an ellipsoid that a plane with normal ``n`` touches."""
+    if kind == PLANE_CYLINDER:
+        return cylinder_point(n, c, rot, size, which)
+    return ellipsoid_point(n, c, rot, size)
 
 
 @wp.func
@@ -225,15 +232,9 @@ def round_dual(
 
 
 @wp.func
-def cylinder_dual(n: vec3, c: vec3, rot: mat33, size: vec3, which: int, xbar: vec3) -> f64:
-    """Leaf: the adjoint of :func:`cylinder_point` is its gradient."""
-    return wp.dot(cylinder_point(n, c, rot, size, which), xbar)
-
-
-@wp.func
-def ellipsoid_dual(n: vec3, c: vec3, rot: mat33, size: vec3, xbar: vec3) -> f64:
-    """Leaf: the adjoint of :func:`ellipsoid_point` is its gradient."""
-    return wp.dot(ellipsoid_point(n, c, rot, size), xbar)
+def support_dual(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int, xbar: vec3) -> f64:
+    """Leaf: the adjoint of :func:`support_point` is its gradient."""
+    return wp.dot(support_point(kind, n, c, rot, size, which), xbar)
 
 
 @wp.func
@@ -281,12 +282,6 @@ def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
     p = c + rot * point
     nw = rot * n
     return vec7(d, p[0], p[1], p[2], nw[0], nw[1], nw[2])
-
-
-@wp.func
-def box_dual(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64, dbar: f64, pbar: vec3, nbar: vec3) -> f64:
-    """Leaf: the adjoint of :func:`box_closest` is its gradient."""
-    return pair7(box_closest(c, rot, size, x, radius), dbar, pbar, nbar)
 
 
 @wp.func

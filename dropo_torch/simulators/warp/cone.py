@@ -12,7 +12,8 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
-from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Reals, f64, mat33, vec2, vec5, vec6
+from dropo_torch.simulators.warp.spatial import theta_vec5
+from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec2, vec5, vec6
 
 #: Piece number of the curved part of an elliptic cone, where the cost is not quadratic.
 CURVED = wp.constant(2)
@@ -28,29 +29,58 @@ def normal_d(dim: int, elliptic: int, r: f64, invweight: f64, mu: f64, impratio:
     return d
 
 
+@wp.struct
+class Cone:
+    """A friction cone: its dimension, kind, D, and the friction along each tangent and about each axis."""
+
+    dim: wp.int32
+    elliptic: wp.int32
+    impratio: wp.float64
+    d: wp.float64
+    mu: vec5
+
+
+@wp.func(inline=True)
+def cone_of(m: Tables, w: World, k: int, d: f64) -> Cone:
+    """The cone of pair ``k``."""
+    cone = Cone()
+    cone.dim = m.pair_dim[k]
+    cone.elliptic = m.elliptic
+    cone.impratio = m.impratio
+    cone.d = d
+    cone.mu = theta_vec5(w.th, m.o_pair_friction + 5 * k)
+    return cone
+
+
 @wp.func
-def cone_piece(dim: int, elliptic: int, th: Reals, o_mu: int, impratio: f64, w: vec6) -> int:
+def _tangential(cone: Cone, w: vec6) -> f64:
+    """T: length of all but the normal, each scaled with its friction."""
+    tt = ZERO
+    for k in range(1, cone.dim):
+        y = cone.mu[k - 1] * w[k]
+        tt += y * y
+    return wp.sqrt(tt)
+
+
+@wp.func
+def cone_piece(cone: Cone, w: vec6) -> int:
     """Which piece of the cost ``w`` is on; equal numbers mean one quadratic, save :data:`CURVED`."""
     piece = int(0)
-    if dim == 1:
+    if cone.dim == 1:
         if w[0] < ZERO:
             piece = int(1)
-    elif elliptic == 0:
+    elif cone.elliptic == 0:
         bit = int(1)
-        for k in range(1, dim):
-            y = th[o_mu + k - 1] * w[k]
+        for k in range(1, cone.dim):
+            y = cone.mu[k - 1] * w[k]
             if w[0] + y < ZERO:
                 piece += bit
             if w[0] - y < ZERO:
                 piece += 2 * bit
             bit = 4 * bit
     else:
-        mu = th[o_mu] / wp.sqrt(impratio)
-        tt = ZERO
-        for k in range(1, dim):
-            y = th[o_mu + k - 1] * w[k]
-            tt += y * y
-        tan = wp.sqrt(tt)
+        mu = cone.mu[0] / wp.sqrt(cone.impratio)
+        tan = _tangential(cone, w)
         n = w[0] * mu
         if n >= mu * tan or (tan <= ZERO and n >= ZERO):
             piece = int(0)
@@ -62,61 +92,55 @@ def cone_piece(dim: int, elliptic: int, th: Reals, o_mu: int, impratio: f64, w: 
 
 
 @wp.func
-def cone_force(dim: int, elliptic: int, d: f64, th: Reals, o_mu: int, impratio: f64, w: vec6) -> vec6:
+def cone_force(cone: Cone, w: vec6) -> vec6:
     """Contact force −∂s/∂w."""
     f = vec6()
-    if dim == 1:
+    d = cone.d
+    if cone.dim == 1:
         f[0] = wp.max(ZERO, -d * w[0])
-    elif elliptic == 0:
-        for k in range(1, dim):
-            mu = th[o_mu + k - 1]
+    elif cone.elliptic == 0:
+        for k in range(1, cone.dim):
+            mu = cone.mu[k - 1]
             plus = d * wp.max(ZERO, -(w[0] + mu * w[k]))
             minus = d * wp.max(ZERO, -(w[0] - mu * w[k]))
             f[0] += plus + minus
             f[k] = mu * (plus - minus)
     else:
-        piece = cone_piece(dim, elliptic, th, o_mu, impratio, w)
-        mu1 = th[o_mu]
+        piece = cone_piece(cone, w)
+        mu1 = cone.mu[0]
         if piece == 1:
             f[0] = -d * w[0]
-            for k in range(1, dim):
-                mu = th[o_mu + k - 1]
-                f[k] = -d * impratio * mu * mu / (mu1 * mu1) * w[k]
+            for k in range(1, cone.dim):
+                mu = cone.mu[k - 1]
+                f[k] = -d * cone.impratio * mu * mu / (mu1 * mu1) * w[k]
         elif piece == CURVED:
-            reg = mu1 / wp.sqrt(impratio)
-            tt = ZERO
-            for k in range(1, dim):
-                y = th[o_mu + k - 1] * w[k]
-                tt += y * y
-            tan = wp.sqrt(tt)
+            reg = mu1 / wp.sqrt(cone.impratio)
+            tan = _tangential(cone, w)
             dm = d / (reg * reg * (ONE + reg * reg))
             e = w[0] * reg - reg * tan
             f[0] = -dm * e * reg
-            for k in range(1, dim):
-                mu = th[o_mu + k - 1]
+            for k in range(1, cone.dim):
+                mu = cone.mu[k - 1]
                 f[k] = -f[0] / tan * mu * mu * w[k]
     return f
 
 
 @wp.func
-def cone_hessian(dim: int, elliptic: int, d: f64, th: Reals, o_mu: int, impratio: f64, w: vec6):
+def cone_hessian(cone: Cone, w: vec6):
     """Hessian of the cost: blocks (directions, directions), (directions, rotations), (rotations, rotations)."""
     ll = mat33()
     la = mat33()
     aa = mat33()
-    piece = cone_piece(dim, elliptic, th, o_mu, impratio, w)
-    if dim == 1:
+    d = cone.d
+    piece = cone_piece(cone, w)
+    if cone.dim == 1:
         if piece == 1:
             ll[0, 0] = d
-    elif elliptic == 0:
-        for k in range(1, dim):
-            mu = th[o_mu + k - 1]
-            plus = ZERO
-            minus = ZERO
-            if piece % 2 == 1:
-                plus = d
-            if (piece // 2) % 2 == 1:
-                minus = d
+    elif cone.elliptic == 0:
+        for k in range(1, cone.dim):
+            mu = cone.mu[k - 1]
+            plus = d * f64(piece % 2)
+            minus = d * f64((piece // 2) % 2)
             piece = piece // 4
             ll[0, 0] += plus + minus
             off = mu * (plus - minus)
@@ -129,39 +153,35 @@ def cone_hessian(dim: int, elliptic: int, d: f64, th: Reals, o_mu: int, impratio
                 la[0, k - 3] = off
                 aa[k - 3, k - 3] = diag
     else:
-        mu1 = th[o_mu]
+        mu1 = cone.mu[0]
         if piece == 1:
             ll[0, 0] = d
-            for k in range(1, dim):
-                mu = th[o_mu + k - 1]
-                diag = d * impratio * mu * mu / (mu1 * mu1)
+            for k in range(1, cone.dim):
+                mu = cone.mu[k - 1]
+                diag = d * cone.impratio * mu * mu / (mu1 * mu1)
                 if k < 3:
                     ll[k, k] = diag
                 else:
                     aa[k - 3, k - 3] = diag
         elif piece == CURVED:
-            reg = mu1 / wp.sqrt(impratio)
-            u = vec6()
-            tt = ZERO
-            for k in range(1, dim):
-                u[k] = th[o_mu + k - 1] * w[k]
-                tt += u[k] * u[k]
-            tan = wp.sqrt(tt)
+            reg = mu1 / wp.sqrt(cone.impratio)
+            tan = _tangential(cone, w)
             n = w[0] * reg
             dm = d / (reg * reg * (ONE + reg * reg))
             # in cone coordinates: first row (1, −μ/T U), block μN/T³ U Uᵀ + (μ² − μN/T) I
             ll[0, 0] = dm * reg * reg
-            for i in range(1, dim):
-                ci = th[o_mu + i - 1]
-                off = -dm * reg * ci * reg / tan * u[i]
+            for i in range(1, cone.dim):
+                ci = cone.mu[i - 1]
+                ui = ci * w[i]
+                off = -dm * reg * ci * reg / tan * ui
                 if i < 3:
                     ll[0, i] = off
                     ll[i, 0] = off
                 else:
                     la[0, i - 3] = off
-                for j in range(1, dim):
-                    cj = th[o_mu + j - 1]
-                    y = reg * n / (tan * tan * tan) * u[i] * u[j]
+                for j in range(1, cone.dim):
+                    cj = cone.mu[j - 1]
+                    y = reg * n / (tan * tan * tan) * ui * (cj * w[j])
                     if i == j:
                         y += reg * reg - reg * n / tan
                     y = y * dm * ci * cj

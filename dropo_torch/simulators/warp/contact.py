@@ -1,193 +1,23 @@
-"""Contacts: finding them, their Jacobians, the friction cone's force, and the adjoint of all three."""
+"""Contacts: their Jacobians and softness, and the adjoint of −f Jλ in the two bodies' motions, their poses, and θ.
+
+A leaf gives the gradient in J a, J q̇, Jλ and the distance; what follows is how these and the contact's point and
+frame hang on the bodies. A quantity fixed in the world (Y, ``f_pose``) takes X ×* F_X for every F_X it gave, so that
+the sweep inwards can treat all bodies beyond a joint as displaced together.
+"""
 
 # mypy: ignore-errors
-# ruff: noqa: UP018, RUF046
-# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+# kernel code: Warp reads these functions with types of its own
 
 from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.collide import (
-    CAPSULE_BOX,
-    PLANE_BOX,
-    PLANE_CAPSULE,
-    PLANE_CYLINDER,
-    PLANE_ELLIPSOID,
-    PLANE_SPHERE,
-    ROUND,
-    SPHERE_BOX,
-    are_parallel,
-    box_closest,
-    capsule_box_codes,
-    capsule_box_contact,
-    column,
-    corner,
-    cylinder_point,
-    ellipsoid_point,
-    overlap_end,
-    plane_point,
-    round_contact,
-    vec7,
-)
-from dropo_torch.simulators.warp.cone import normal_d
-from dropo_torch.simulators.warp.impedance import damping, impedance_slope, regularisation, stiffness
-from dropo_torch.simulators.warp.rows import theta_vec2, theta_vec5
-from dropo_torch.simulators.warp.spatial import ang, at
-from dropo_torch.simulators.warp.types import (
-    HALF,
-    MINVAL,
-    ONE,
-    ZERO,
-    Reals,
-    Scratch,
-    Tables,
-    f64,
-    mat33,
-    vec3,
-    vec6,
-)
-
-
-@wp.func(inline=True)
-def geom_centre(m: Tables, s: Scratch, t: int, g: int) -> vec3:
-    """Centre of a geom, from the origin of the sweep."""
-    b = m.geom_body[g]
-    return s.xpos[t, b] + s.xmat[t, b] * m.geom_pos[g]
-
-
-@wp.func(inline=True)
-def geom_rotation(m: Tables, s: Scratch, t: int, g: int) -> mat33:
-    """Rotation of a geom."""
-    return s.xmat[t, m.geom_body[g]] * m.geom_mat[g]
-
-
-@wp.func(inline=True)
-def geom_axis(m: Tables, s: Scratch, t: int, g: int) -> vec3:
-    """Third axis of a geom: a plane's normal, the axis of a capsule."""
-    return s.xmat[t, m.geom_body[g]] * column(m.geom_mat[g], 2)
-
-
-@wp.func(inline=True)
-def _add(s: Scratch, t: int, n: int, k: int, which: int, x: vec7, hint: vec3):
-    """Write contact ``n`` with its frame; the first tangent is along the hint, or along y or z without one."""
-    s.con_pair[t, n] = k
-    s.con_which[t, n] = which
-    s.con_dist[t, n] = x[0]
-    s.con_point[t, n] = vec3(x[1], x[2], x[3])
-    normal = vec3(x[4], x[5], x[6])
-    y = hint
-    if wp.dot(hint, hint) < f64(0.25):
-        y = vec3(ZERO, ONE, ZERO)
-        if normal[1] >= HALF or normal[1] <= -HALF:
-            y = vec3(ZERO, ZERO, ONE)
-    s.con_hint[t, n] = y
-    y = y - normal * wp.dot(normal, y)
-    length = wp.length(y)
-    t1 = vec3(ONE, ZERO, ZERO)
-    if length > MINVAL:
-        t1 = y / length
-    t2 = wp.cross(normal, t1)
-    s.con_frame[t, n] = mat33(normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2])
-
-
-@wp.func(inline=True)
-def pair_count(m: Tables, k: int, parallel: bool) -> int:
-    """How many points of a pair may touch."""
-    kind = m.pair_kind[k]
-    n = int(wp.where(kind == CAPSULE_BOX, 2, 1))
-    if kind == PLANE_CAPSULE or (kind == ROUND and parallel):
-        n = 2
-    elif kind == PLANE_BOX:
-        n = 8
-    elif kind == PLANE_CYLINDER:
-        n = 4
-    return n
-
-
-@wp.func(inline=True)
-def find_contacts(m: Tables, s: Scratch, t: int, th: Reals) -> int:
-    """List the contacts of a configuration and return their number."""
-    n = int(0)
-    for k in range(m.npair):
-        kind = m.pair_kind[k]
-        g1 = m.pair_geom1[k]
-        g2 = m.pair_geom2[k]
-        margin = th[m.o_pair_margin + k]
-        c1 = geom_centre(m, s, t, g1)
-        c2 = geom_centre(m, s, t, g2)
-        reach = margin + m.pair_bound[k]
-        normal = vec3()
-        near = bool(False)
-        if kind <= PLANE_ELLIPSOID:
-            normal = geom_axis(m, s, t, g1)
-            near = wp.dot(normal, c2 - c1) < reach
-        else:
-            near = wp.length_sq(c2 - c1) < reach * reach
-        if near:
-            size1 = m.geom_size[g1]
-            size2 = m.geom_size[g2]
-            axis = geom_axis(m, s, t, g2)
-            a1 = vec3()
-            a2 = axis * size2[1]
-            parallel = bool(False)
-            rot = mat33()
-            if kind == ROUND:
-                a1 = geom_axis(m, s, t, g1) * size1[1]
-                parallel = are_parallel(a1, a2)
-            elif kind > PLANE_CAPSULE:
-                rot = geom_rotation(m, s, t, g2)
-            first = int(-1)
-            second = int(-1)
-            if kind == CAPSULE_BOX:
-                a1 = geom_axis(m, s, t, g1) * size1[1]
-                back = wp.transpose(rot)
-                limit = margin + f64(2.0) * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
-                first, second = capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
-            start = n
-            for i in range(pair_count(m, k, parallel)):
-                possible = bool(True)
-                which = i
-                hint = vec3()
-                x = vec7()
-                if kind == PLANE_SPHERE:
-                    x = plane_point(normal, c1, c2, size2[0])
-                elif kind == PLANE_CAPSULE:
-                    hint = axis
-                    x = plane_point(normal, c1, c2 + a2 * (ONE - f64(2.0) * f64(float(i))), size2[0])
-                elif kind == PLANE_BOX:
-                    # the first four corners on the plane's side of the centre
-                    y = rot * corner(i, size2)
-                    possible = wp.dot(normal, y) <= ZERO and n - start < 4
-                    x = plane_point(normal, c1, c2 + y, ZERO)
-                elif kind == PLANE_CYLINDER:
-                    # the near rim, then the far rim and two points of the near disk
-                    possible = i == 0 or n > start
-                    x = plane_point(normal, c1, cylinder_point(normal, c2, rot, size2, i), ZERO)
-                elif kind == PLANE_ELLIPSOID:
-                    x = plane_point(normal, c1, ellipsoid_point(normal, c2, rot, size2), ZERO)
-                elif kind == SPHERE_BOX:
-                    x = box_closest(c2, rot, size2, c1, size1[0])
-                elif kind == CAPSULE_BOX:
-                    which = wp.where(i == 0, first, second)
-                    possible = which >= 0
-                    if possible:
-                        x = capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
-                else:
-                    which = int(0)
-                    if parallel:
-                        which = overlap_end(c1, a1, c2, a2, i)
-                    x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
-                if possible and x[0] < margin:
-                    _add(s, t, n, k, which, x, hint)
-                    n += 1
-    return n
-
-
-@wp.func(inline=True)
-def half_axis(m: Tables, s: Scratch, t: int, g: int) -> vec3:
-    """Half-axis of a capsule, zero for a sphere (whose second size is zero)."""
-    return geom_axis(m, s, t, g) * m.geom_size[g][1]
+from dropo_torch.simulators.warp.cone import cone_force, cone_of, cone_piece, elliptic_power, normal_d
+from dropo_torch.simulators.warp.impedance import damping, regularisation
+from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
+from dropo_torch.simulators.warp.spatial import ang, at, cross_force, join, nothing, theta_vec2, theta_vec5, wrench
+from dropo_torch.simulators.warp.touch import geometry_adjoint
+from dropo_torch.simulators.warp.types import ONE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 
 @wp.func
@@ -199,26 +29,34 @@ def in_frame(frame: mat33, x: vec6, p: vec3) -> vec6:
 
 
 @wp.func(inline=True)
-def fills_in(m: Tables, s: Scratch, t: int, ncon: int) -> int:
+def fills_in(m: Tables, w: World, ncon: int) -> int:
     """1 if H has entries beyond the tree's, because a contact joins two branches."""
     dense = m.always_dense
     for c in range(ncon):
-        if m.pair_dense[s.con_pair[t, c]] != 0:
+        if m.pair_dense[w.con_pair[w.t, c]] != 0:
             dense = 1
     return dense
 
 
 @wp.func(inline=True)
-def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
+def contact_softness(m: Tables, w: World, c: int) -> Soft:
+    """The softness of a contact along its normal."""
+    k = w.con_pair[w.t, c]
+    x = w.con_dist[w.t, c] - w.th[m.o_pair_margin + k]
+    return softness(m, w, m.o_pair_solref + 2 * k, m.o_pair_solimp + 5 * k, w.th[m.o_pair_invweight + k], x)
+
+
+@wp.func(inline=True)
+def make_contacts(m: Tables, w: World, ncon: int):
     """Jacobian, reference acceleration and D of each contact."""
     for c in range(ncon):
-        k = s.con_pair[t, c]
+        k = w.con_pair[w.t, c]
         b1 = m.pair_body1[k]
         b2 = m.pair_body2[k]
         for i in range(m.nv):
-            s.con_jac[t, c * m.nv + i] = vec6()
-        p = s.con_point[t, c]
-        frame = s.con_frame[t, c]
+            w.con_jac[w.t, c * m.nv + i] = vec6()
+        p = w.con_point[w.t, c]
+        frame = w.con_frame[w.t, c]
         for side in range(2):
             sign = -ONE
             i = m.body_lastdof[b1]
@@ -226,23 +64,158 @@ def make_contacts(m: Tables, s: Scratch, t: int, th: Reals, ncon: int):
                 sign = ONE
                 i = m.body_lastdof[b2]
             while i >= 0:
-                column_i = in_frame(frame, s.motion[t, i], p) * sign
-                s.con_jac[t, c * m.nv + i] = s.con_jac[t, c * m.nv + i] + column_i
+                column_i = in_frame(frame, w.motion[w.t, i], p) * sign
+                w.con_jac[w.t, c * m.nv + i] = w.con_jac[w.t, c * m.nv + i] + column_i
                 i = m.dof_parent[0, i]
-        v = in_frame(frame, s.velocity[t, b2] - s.velocity[t, b1], p)
-        solref = theta_vec2(th, m.o_pair_solref + 2 * k)
-        friction_ref = theta_vec2(th, m.o_pair_solreffriction + 2 * k)
-        solimp = theta_vec5(th, m.o_pair_solimp + 5 * k)
-        x = s.con_dist[t, c] - th[m.o_pair_margin + k]
-        imp = impedance_slope(x, solimp)[0]
-        b = damping(solref, solimp, m.h, m.refsafe)
-        bf = b
+        v = in_frame(frame, w.velocity[w.t, b2] - w.velocity[w.t, b1], p)
+        soft = contact_softness(m, w, c)
+        friction_ref = theta_vec2(w.th, m.o_pair_solreffriction + 2 * k)
+        bf = soft.b
         if m.elliptic != 0 and (friction_ref[0] != ZERO or friction_ref[1] != ZERO):
-            bf = damping(friction_ref, solimp, m.h, m.refsafe)
+            bf = damping(friction_ref, theta_vec5(w.th, soft.o_imp), m.h, m.refsafe)
         aref = v * -bf
-        aref[0] = -b * v[0] - stiffness(solref, solimp, m.h, m.refsafe) * imp * x
-        s.con_aref[t, c] = aref
-        mu = th[m.o_pair_friction + 5 * k]
-        s.con_d[t, c] = normal_d(
-            m.pair_dim[k], m.elliptic, regularisation(imp, ONE), th[m.o_pair_invweight + k], mu, m.impratio
+        aref[0] = -soft.b * v[0] - soft.k * soft.imp * soft.x
+        w.con_aref[w.t, c] = aref
+        mu = w.th[m.o_pair_friction + 5 * k]
+        w.con_d[w.t, c] = normal_d(
+            m.pair_dim[k], m.elliptic, regularisation(soft.imp, ONE), soft.weight, mu, m.impratio
         )
+
+
+@wp.func(inline=True)
+def contacts_adjoint(m: Tables, w: World, ncon: int):
+    """Add the gradient of Σ −f Jλ over the contacts to the bodies' F and Y and to θ."""
+    _late = wp.grad(nothing)(ONE)
+    for c in range(ncon):
+        k = w.con_pair[w.t, c]
+        frame = w.con_frame[w.t, c]
+        p = w.con_point[w.t, c]
+        b1 = m.pair_body1[k]
+        b2 = m.pair_body2[k]
+        u = w.total[w.t, b2] - w.total[w.t, b1]
+        v = w.velocity[w.t, b2] - w.velocity[w.t, b1]
+        dual = w.dual[w.t, b2] - w.dual[w.t, b1]
+        ju = in_frame(frame, u, p)
+        jv = in_frame(frame, v, p)
+        jl = in_frame(frame, dual, p)
+        ub = vec6()
+        vb = vec6()
+        lb = vec6()
+        distbar = f64(0.0)
+        if m.elliptic != 0 and m.pair_dim[k] > 1:
+            ub, vb, lb, distbar = _elliptic_adjoint(m, w, c, ju, jv, jl)
+        else:
+            ub, vb, lb, distbar = _pyramid_adjoint(m, w, c, ju, jv, jl)
+        if wp.length_sq(ub) > ZERO or wp.length_sq(lb) > ZERO:
+            _hang(m, w, c, u, v, dual, ub, vb, lb, distbar)
+
+
+@wp.func(inline=True)
+def _elliptic_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
+    """Adjoints of J a, J q̇, Jλ and the distance of a contact with an elliptic cone; adds that of θ."""
+    _late = wp.grad(nothing)(ONE)
+    k = w.con_pair[w.t, c]
+    o_mu = m.o_pair_friction + 5 * k
+    o_ref = m.o_pair_solref + 2 * k
+    o_fref = m.o_pair_solreffriction + 2 * k
+    o_imp = m.o_pair_solimp + 5 * k
+    _d, ub, vb, lb, distbar, marginbar, mubar, refbar, frefbar, impbar, wbar, _r, _h, _s = wp.grad(elliptic_power)(
+        m.pair_dim[k], ju, jv, jl, w.con_dist[w.t, c], w.th[m.o_pair_margin + k], theta_vec5(w.th, o_mu),
+        theta_vec2(w.th, o_ref), theta_vec2(w.th, o_fref), theta_vec5(w.th, o_imp), w.th[m.o_pair_invweight + k],
+        m.impratio, m.h, m.refsafe,
+    )  # fmt: skip
+    w.grad[w.t, m.o_pair_margin + k] += marginbar
+    w.grad[w.t, m.o_pair_invweight + k] += wbar
+    for i in range(2):
+        w.grad[w.t, o_ref + i] += refbar[i]
+        w.grad[w.t, o_fref + i] += frefbar[i]
+    for i in range(5):
+        w.grad[w.t, o_mu + i] += mubar[i]
+        w.grad[w.t, o_imp + i] += impbar[i]
+    return ub, vb, lb, distbar
+
+
+@wp.func(inline=True)
+def _pyramid_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
+    """Adjoints of J a, J q̇, Jλ and the distance of a contact with a pyramid, or without friction; adds that of θ.
+
+    With the force f and the Hessian C of the cost at jar6 = J a − aref, −f Jλ has the gradient C Jλ in jar6.
+    """
+    _late = wp.grad(nothing)(ONE)
+    k = w.con_pair[w.t, c]
+    o_mu = m.o_pair_friction + 5 * k
+    soft = contact_softness(m, w, c)
+    jar6 = ju + jv * soft.b
+    jar6[0] += soft.k * soft.imp * soft.x
+    dim = m.pair_dim[k]
+    d = normal_d(dim, 0, regularisation(soft.imp, ONE), soft.weight, w.th[o_mu], m.impratio)
+    cone = cone_of(m, w, k, d)
+    wbar = vec6()
+    lbar = vec6()
+    distbar = f64(0.0)
+    if cone_piece(cone, jar6) != 0:
+        f = cone_force(cone, jar6)
+        lbar = -f
+        if dim == 1:
+            wbar[0] = d * jl[0]
+        for i in range(1, dim):
+            mu = cone.mu[i - 1]
+            for sign in range(2):
+                e = mu * f64(1.0 - 2.0 * float(sign))
+                jar = jar6[0] + e * jar6[i]
+                if jar < ZERO:
+                    slope = d * (jl[0] + e * jl[i])
+                    wbar[0] += slope
+                    wbar[i] += e * slope
+                    w.grad[w.t, o_mu + i - 1] += (e / mu) * (jar6[i] * slope + jl[i] * d * jar)
+        distbar, weightbar, mubar = soft_adjoint(
+            m, w, soft, dim, cone.mu[0], d, -wp.dot(f, jl) / d, wp.dot(jv, wbar), wbar[0]
+        )
+        w.grad[w.t, m.o_pair_margin + k] -= distbar
+        w.grad[w.t, m.o_pair_invweight + k] += weightbar
+        w.grad[w.t, o_mu] += mubar
+    return wbar, wbar * soft.b, lbar, distbar
+
+
+@wp.func(inline=True)
+def _hang(m: Tables, w: World, c: int, u: vec6, v: vec6, dual: vec6, ub: vec6, vb: vec6, lb: vec6, distbar: f64):
+    """Hang the adjoints of J a, J q̇, Jλ and the distance on the two bodies: F_U, F_V, F_Λ and Y."""
+    _late = wp.grad(nothing)(ONE)
+    k = w.con_pair[w.t, c]
+    p = w.con_point[w.t, c]
+    back = wp.transpose(w.con_frame[w.t, c])
+    # p enters J x through x_lin + x_ang × p
+    pbar = (
+        wp.cross(back * vec3(ub[0], ub[1], ub[2]), ang(u))
+        + wp.cross(back * vec3(vb[0], vb[1], vb[2]), ang(v))
+        + wp.cross(back * vec3(lb[0], lb[1], lb[2]), ang(dual))
+    )
+    xu = at(u, p)
+    xv = at(v, p)
+    xl = at(dual, p)
+    nbar = xu * ub[0] + xv * vb[0] + xl * lb[0] + ang(u) * ub[3] + ang(v) * vb[3] + ang(dual) * lb[3]
+    t1bar = xu * ub[1] + xv * vb[1] + xl * lb[1] + ang(u) * ub[4] + ang(v) * vb[4] + ang(dual) * lb[4]
+    t2bar = xu * ub[2] + xv * vb[2] + xl * lb[2] + ang(u) * ub[5] + ang(v) * vb[5] + ang(dual) * lb[5]
+    y1, y2 = geometry_adjoint(m, w, c, distbar, pbar, nbar, t1bar, t2bar)
+    fu = _spread(back, ub, p)
+    fv = _spread(back, vb, p)
+    fl = _spread(back, lb, p)
+    _hang_on(w, m.pair_body1[k], y1, -fu, -fv, -fl)
+    _hang_on(w, m.pair_body2[k], y2, fu, fv, fl)
+
+
+@wp.func(inline=True)
+def _hang_on(w: World, b: int, y: vec6, fu: vec6, fv: vec6, fl: vec6):
+    """Add to F_U, F_V, F_Λ and Y of a body."""
+    if b > 0:
+        pose = y + (cross_force(w.total[w.t, b], fu) + cross_force(w.velocity[w.t, b], fv))
+        w.f_total[w.t, b] = w.f_total[w.t, b] + fu
+        w.f_velocity[w.t, b] = w.f_velocity[w.t, b] + fv
+        w.f_dual[w.t, b] = w.f_dual[w.t, b] + fl
+        w.f_pose[w.t, b] = w.f_pose[w.t, b] + (pose + cross_force(w.dual[w.t, b], fl))
+
+
+@wp.func
+def _spread(back: mat33, x: vec6, p: vec3) -> vec6:
+    """Adjoint of :func:`in_frame` in its motion."""
+    return wrench(back * vec3(x[0], x[1], x[2]), p) + join(back * vec3(x[3], x[4], x[5]), vec3())

@@ -6,50 +6,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import mujoco
 import numpy as np
 import torch
 
 from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.simulators.warp.layout import DIRECT, MIXED, PAIR, Layout
 from dropo_torch.simulators.warp.pairs import mixing
 
-#: Sections of θ that are fields of MjModel: name in the tables, field, columns kept of each row (0: all).
-DIRECT = (
-    ("gravity", "opt.gravity", 0), ("density", "opt.density", 0), ("viscosity", "opt.viscosity", 0),
-    ("wind", "opt.wind", 0), ("mass", "body_mass", 0), ("inertia", "body_inertia", 0), ("ipos", "body_ipos", 0),
-    ("gravcomp", "body_gravcomp", 0), ("stiffness", "jnt_stiffness", 0), ("stiffnesspoly", "jnt_stiffnesspoly", 0),
-    ("spring", "qpos_spring", 0), ("range", "jnt_range", 0), ("jnt_margin", "jnt_margin", 0),
-    ("jnt_solref", "jnt_solref", 0), ("jnt_solimp", "jnt_solimp", 0), ("actfrcrange", "jnt_actfrcrange", 0),
-    ("damping", "dof_damping", 0), ("dampingpoly", "dof_dampingpoly", 0), ("armature", "dof_armature", 0),
-    ("frictionloss", "dof_frictionloss", 0), ("dof_solref", "dof_solref", 0), ("dof_solimp", "dof_solimp", 0),
-    ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 1),
-    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 5),
-    ("eq_solref", "eq_solref", 0), ("eq_solimp", "eq_solimp", 0),
-)  # fmt: skip
-#: Fields from which the contact parameters of a pair are mixed.
-MIXED = (
-    "geom_friction", "geom_solref", "geom_solimp", "geom_margin", "pair_friction", "pair_solref",
-    "pair_solreffriction", "pair_solimp", "pair_margin",
-)  # fmt: skip
-_WIDTHS = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 1}
 _INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature"})
 _MINVAL = 1e-15
 _MINMU = 1e-5
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where θ's sections start: name → (offset, size), and the length of θ."""
-
-    sections: dict[str, tuple[int, int]]
-    size: int
-
-    def columns(self, name: str) -> np.ndarray:
-        """Columns of a section."""
-        start, size = self.sections[name]
-        return np.arange(start, start + size)
 
 
 class Fields:
@@ -79,8 +46,8 @@ class Fields:
             self._raw[:3] = 0.0
         own = {name: sections[name] for name, _f, _k in DIRECT}
         start = self._direct
-        for name, width in (*((f"pair_{n}", w) for n, w in _WIDTHS.items()), ("pair_invweight", 1)):
-            own[name] = (start, width * len(pairs))
+        for name, width in PAIR.items():
+            own[f"pair_{name}"] = (start, width * len(pairs))
             start += width * len(pairs)
         own["dof_invweight"] = (start, model.nv)
         self.layout = Layout(own, start + model.nv)
@@ -102,7 +69,7 @@ class Fields:
         self._weighs = bool(fields & _INERTIAL)
         wanted = [c for c in written if c < self._direct]
         if self._mixes:
-            wanted += [int(c) for n in _WIDTHS for c in self.layout.columns(f"pair_{n}")]
+            wanted += [int(c) for n in list(PAIR)[:-1] for c in self.layout.columns(f"pair_{n}")]
         if self._weighs:
             wanted += [int(c) for n in ("pair_invweight", "dof_invweight") for c in self.layout.columns(n)]
         self.wanted = np.array(sorted(set(wanted)), dtype=np.int32)

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import ang, at, join, wrench
-from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Reals, Scratch, Tables, f64, mat33, vec3, vec6
+from dropo_torch.simulators.warp.spatial import ang, at, join, theta_vec3, wrench
+from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 PI = wp.constant(wp.float64(wp.pi))
 
@@ -64,29 +64,27 @@ def box_power(w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density:
 
 
 @wp.func(inline=True)
-def inertial_frame(m: Tables, s: Scratch, t: int, b: int) -> mat33:
+def inertial_frame(m: Tables, w: World, b: int) -> mat33:
     """Rotation of the inertial frame of a body."""
-    return s.xmat[t, b] * m.body_imat[b]
+    return w.xmat[w.t, b] * m.body_imat[b]
 
 
 @wp.func(inline=True)
-def centre_of_mass(m: Tables, s: Scratch, t: int, th: Reals, b: int) -> vec3:
+def centre_of_mass(m: Tables, w: World, b: int) -> vec3:
     """Centre of mass of a body, from the origin of the sweep."""
-    i = m.o_ipos + 3 * b
-    return s.xpos[t, b] + s.xmat[t, b] * vec3(th[i], th[i + 1], th[i + 2])
+    return w.xpos[w.t, b] + w.xmat[w.t, b] * theta_vec3(w.th, m.o_ipos + 3 * b)
 
 
 @wp.func(inline=True)
-def fluid_wrench(m: Tables, s: Scratch, t: int, th: Reals, b: int) -> vec6:
+def fluid_wrench(m: Tables, w: World, b: int) -> vec6:
     """The drag on a body as a spatial force."""
-    rot = inertial_frame(m, s, t, b)
-    c = centre_of_mass(m, s, t, th, b)
-    wind = vec3(th[m.o_wind], th[m.o_wind + 1], th[m.o_wind + 2])
-    vel = s.velocity[t, b]
+    rot = inertial_frame(m, w, b)
+    c = centre_of_mass(m, w, b)
+    wind = theta_vec3(w.th, m.o_wind)
+    vel = w.velocity[w.t, b]
     back = wp.transpose(rot)
-    i = m.o_inertia + 3 * b
-    x = vec3(th[i], th[i + 1], th[i + 2])
-    mass = th[m.o_mass + b]
-    f = rot * box_force(back * (at(vel, c) - wind), x, mass, th[m.o_density], th[m.o_viscosity])
-    n = rot * box_torque(back * ang(vel), x, mass, th[m.o_density], th[m.o_viscosity])
+    x = theta_vec3(w.th, m.o_inertia + 3 * b)
+    mass = w.th[m.o_mass + b]
+    f = rot * box_force(back * (at(vel, c) - wind), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
+    n = rot * box_torque(back * ang(vel), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
     return wrench(f, c) + join(n, vec3())

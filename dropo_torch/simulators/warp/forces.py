@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import inverse_right_jacobian_t, quat_log, quat_mul
+from dropo_torch.simulators.warp.spatial import add_vec3, inverse_right_jacobian_t, quat_log, quat_mul, vec3_at, vec4_at
 from dropo_torch.simulators.warp.types import (
     BALL,
     MINVAL,
@@ -20,10 +20,8 @@ from dropo_torch.simulators.warp.types import (
     TRANSLATION,
     TWO,
     ZERO,
-    Reals,
-    Reals2,
-    Scratch,
     Tables,
+    World,
     f64,
     vec3,
     vec4,
@@ -31,259 +29,277 @@ from dropo_torch.simulators.warp.types import (
 
 
 @wp.func(inline=True)
-def spring_deflection(m: Tables, th: Reals, qpos: Reals2, r: int, k: int) -> vec3:
+def spring_deflection(m: Tables, w: World, r: int, k: int) -> vec3:
     """Deflection of spring ``k`` (a joint, or a half of a free joint): x, or a vector of three."""
     iq = m.link_qpos[k]
     o = m.o_spring + iq
     kind = m.link_kind[k]
     if kind == BALL:
-        q = vec4(qpos[r, iq], qpos[r, iq + 1], qpos[r, iq + 2], qpos[r, iq + 3])
-        ref = vec4(th[o], -th[o + 1], -th[o + 2], -th[o + 3])
+        q = vec4_at(w.qpos, r, iq)
+        ref = vec4(w.th[o], -w.th[o + 1], -w.th[o + 2], -w.th[o + 3])
         return quat_log(quat_mul(ref, q / wp.length(q)))
     if kind == TRANSLATION:
-        return vec3(qpos[r, iq] - th[o], qpos[r, iq + 1] - th[o + 1], qpos[r, iq + 2] - th[o + 2])
-    return vec3(qpos[r, iq] - th[o], ZERO, ZERO)
+        return vec3(w.qpos[r, iq] - w.th[o], w.qpos[r, iq + 1] - w.th[o + 1], w.qpos[r, iq + 2] - w.th[o + 2])
+    return vec3(w.qpos[r, iq] - w.th[o], ZERO, ZERO)
 
 
 @wp.func(inline=True)
-def add_springs(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: int):
+def add_springs(m: Tables, w: World, r: int):
     """Load from springs: F = −x (k + p0 |x| + p1 |x|²); a hinge's or slide's |x| is signed."""
     for k in range(m.nlink):
         j = m.link_jnt[k]
-        stiff = th[m.o_stiffness + j]
-        p0 = th[m.o_stiffnesspoly + 2 * j]
-        p1 = th[m.o_stiffnesspoly + 2 * j + 1]
+        stiff = w.th[m.o_stiffness + j]
+        p0 = w.th[m.o_stiffnesspoly + 2 * j]
+        p1 = w.th[m.o_stiffnesspoly + 2 * j + 1]
         if stiff != ZERO or p0 != ZERO or p1 != ZERO:
             d = m.link_dof[k]
-            x = spring_deflection(m, th, qpos, r, k)
+            x = spring_deflection(m, w, r, k)
             kind = m.link_kind[k]
             if kind <= SLIDE:
-                s.load[t, d] += x[0] * (stiff + x[0] * (p0 + x[0] * p1))
+                w.load[w.t, d] += x[0] * (stiff + x[0] * (p0 + x[0] * p1))
             else:
                 n = wp.length(x)
                 f = x * (stiff + n * (p0 + n * p1))
-                for i in range(3):
-                    s.load[t, d + i] += f[i]
+                add_vec3(w.load, w.t, d, f)
 
 
 @wp.func(inline=True)
-def springs_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, r: int):
+def springs_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_springs`."""
     for k in range(m.nlink):
         j = m.link_jnt[k]
         ip = m.o_stiffnesspoly + 2 * j
-        stiff = th[m.o_stiffness + j]
-        p0 = th[ip]
-        p1 = th[ip + 1]
+        stiff = w.th[m.o_stiffness + j]
+        p0 = w.th[ip]
+        p1 = w.th[ip + 1]
         d = m.link_dof[k]
-        x = spring_deflection(m, th, qpos, r, k)
+        x = spring_deflection(m, w, r, k)
         kind = m.link_kind[k]
         if kind <= SLIDE:
             y = x[0]
-            jl = s.lam[t, d]
+            jl = w.lam[w.t, d]
             slope = jl * (stiff + y * (TWO * p0 + y * THREE * p1))
-            s.tangent[t, d] += slope
-            s.grad[t, m.o_spring + m.link_qpos[k]] -= slope
-            s.grad[t, m.o_stiffness + j] += jl * y
-            s.grad[t, ip] += jl * y * y
-            s.grad[t, ip + 1] += jl * y * y * y
+            w.tangent[w.t, d] += slope
+            w.grad[w.t, m.o_spring + m.link_qpos[k]] -= slope
+            w.grad[w.t, m.o_stiffness + j] += jl * y
+            w.grad[w.t, ip] += jl * y * y
+            w.grad[w.t, ip + 1] += jl * y * y * y
         else:
-            lam = vec3(s.lam[t, d], s.lam[t, d + 1], s.lam[t, d + 2])
+            lam = vec3_at(w.lam, w.t, d)
             n = wp.length(x)
             lx = wp.dot(lam, x)
-            s.grad[t, m.o_stiffness + j] += lx
-            s.grad[t, ip] += lx * n
-            s.grad[t, ip + 1] += lx * n * n
+            w.grad[w.t, m.o_stiffness + j] += lx
+            w.grad[w.t, ip] += lx * n
+            w.grad[w.t, ip + 1] += lx * n * n
             g = lam * (stiff + n * (p0 + n * p1))
             if n > MINVAL:
                 g += x * (lx * (p0 + TWO * n * p1) / n)
             if kind == TRANSLATION:
-                for i in range(3):
-                    s.tangent[t, d + i] += g[i]
-                    s.grad[t, m.o_spring + m.link_qpos[k] + i] -= g[i]
+                add_vec3(w.tangent, w.t, d, g)
+                add_vec3(w.grad, w.t, m.o_spring + m.link_qpos[k], -g)
             else:
                 g = inverse_right_jacobian_t(x, g)
-                for i in range(3):
-                    s.tangent[t, d + i] += g[i]
+                add_vec3(w.tangent, w.t, d, g)
 
 
 @wp.func(inline=True)
-def add_dampers(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int):
+def add_dampers(m: Tables, w: World, r: int):
     """Load from dampers: F = −v (b + p0 |v| + p1 v²)."""
     for i in range(m.nv):
-        v = qvel[r, i]
+        v = w.qvel[r, i]
         n = wp.abs(v)
         ip = m.o_dampingpoly + 2 * i
-        s.load[t, i] += v * (th[m.o_damping + i] + n * (th[ip] + n * th[ip + 1]))
+        w.load[w.t, i] += v * (w.th[m.o_damping + i] + n * (w.th[ip] + n * w.th[ip + 1]))
 
 
 @wp.func(inline=True)
-def damping_slope(m: Tables, th: Reals, v: f64, i: int) -> f64:
+def damping_slope(m: Tables, w: World, v: f64, i: int) -> f64:
     """B = b + 2 p0 |v| + 3 p1 v²: what the implicit integrators take of the damper."""
     n = wp.abs(v)
     ip = m.o_dampingpoly + 2 * i
-    return th[m.o_damping + i] + n * (TWO * th[ip] + THREE * n * th[ip + 1])
+    return w.th[m.o_damping + i] + n * (TWO * w.th[ip] + THREE * n * w.th[ip + 1])
 
 
 @wp.func(inline=True)
-def dampers_adjoint(m: Tables, s: Scratch, t: int, th: Reals, qvel: Reals2, r: int):
+def dampers_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_dampers`."""
     for i in range(m.nv):
-        v = qvel[r, i]
+        v = w.qvel[r, i]
         n = wp.abs(v)
-        jl = s.lam[t, i]
+        jl = w.lam[w.t, i]
         ip = m.o_dampingpoly + 2 * i
-        s.vel_bar[t, i] += jl * damping_slope(m, th, v, i)
-        s.grad[t, m.o_damping + i] += jl * v
-        s.grad[t, ip] += jl * v * n
-        s.grad[t, ip + 1] += jl * v * n * n
+        w.vel_bar[w.t, i] += jl * damping_slope(m, w, v, i)
+        w.grad[w.t, m.o_damping + i] += jl * v
+        w.grad[w.t, ip] += jl * v * n
+        w.grad[w.t, ip + 1] += jl * v * n * n
 
 
 @wp.func(inline=True)
-def control(m: Tables, th: Reals, ctrl: Reals2, w: int, i: int) -> f64:
+def clamp(w: World, o: int, x: f64) -> f64:
+    """x within the range that stands at ``o`` in θ."""
+    return wp.min(wp.max(x, w.th[o]), w.th[o + 1])
+
+
+@wp.func(inline=True)
+def clamp_adjoint(w: World, o: int, x: f64, bar: f64) -> f64:
+    """Adjoint of x before :func:`clamp`: where it is clamped its end of the range has it."""
+    out = bar
+    if x < w.th[o]:
+        w.grad[w.t, o] += bar
+        out = ZERO
+    elif x > w.th[o + 1]:
+        w.grad[w.t, o + 1] += bar
+        out = ZERO
+    return out
+
+
+@wp.func(inline=True)
+def control(m: Tables, w: World, i: int) -> f64:
     """Control of an actuator, clamped to its range."""
-    u = ctrl[w, i]
+    u = w.ctrl[w.rc, i]
     if m.clampctrl != 0 and m.act_ctrllimited[i] != 0:
-        o = m.o_ctrlrange + 2 * i
-        u = wp.min(wp.max(u, th[o]), th[o + 1])
+        u = clamp(w, m.o_ctrlrange + 2 * i, u)
     return u
 
 
 @wp.func(inline=True)
-def actuator_force(m: Tables, th: Reals, i: int, u: f64, length: f64, rate: f64) -> f64:
-    """gain(jl, jl̇) u + bias(jl, jl̇), before the force range."""
+def control_adjoint(m: Tables, w: World, i: int, bar: f64):
+    """Adjoint of :func:`control`."""
+    ubar = bar
+    if m.clampctrl != 0 and m.act_ctrllimited[i] != 0:
+        ubar = clamp_adjoint(w, m.o_ctrlrange + 2 * i, w.ctrl[w.rc, i], bar)
+    w.ctrl_bar[w.rb, i] += ubar
+
+
+@wp.func(inline=True)
+def actuator_force(m: Tables, w: World, r: int, i: int) -> f64:
+    """gain(jl, jl̇) u + bias(jl, jl̇) with the gear's jl and jl̇, before the force range."""
+    gear = w.th[m.o_gear + i]
+    length = gear * w.qpos[r, m.act_qpos[i]]
+    rate = gear * w.qvel[r, m.act_dof[i]]
     og = m.o_gain + 3 * i
     ob = m.o_bias + 3 * i
-    gain = th[og]
+    gain = w.th[og]
     if m.act_affine_gain[i] != 0:
-        gain += th[og + 1] * length + th[og + 2] * rate
-    force = gain * u
+        gain += w.th[og + 1] * length + w.th[og + 2] * rate
+    force = gain * control(m, w, i)
     if m.act_affine_bias[i] != 0:
-        force += th[ob] + th[ob + 1] * length + th[ob + 2] * rate
+        force += w.th[ob] + w.th[ob + 1] * length + w.th[ob + 2] * rate
     return force
 
 
 @wp.func(inline=True)
-def add_actuators(m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, w: int):
-    """Load from actuators: τ = gear · force, clamped per joint where the joint says so."""
-    if m.has_frclimit != 0:
-        for i in range(m.nv):
-            s.work[t, i] = ZERO
-    for i in range(m.nu):
-        d = m.act_dof[i]
-        gear = th[m.o_gear + i]
-        f = actuator_force(m, th, i, control(m, th, ctrl, w, i), gear * qpos[r, m.act_qpos[i]], gear * qvel[r, d])
-        if m.act_frclimited[i] != 0:
-            o = m.o_forcerange + 2 * i
-            f = wp.min(wp.max(f, th[o]), th[o + 1])
-        if m.has_frclimit != 0:
-            s.work[t, d] += gear * f
-        else:
-            s.load[t, d] -= gear * f
-    if m.has_frclimit != 0:
-        for j in range(m.nlink):
-            if m.link_kind[j] <= SLIDE:
-                d = m.link_dof[j]
-                f = s.work[t, d]
-                if m.link_frclimited[j] != 0:
-                    o = m.o_actfrcrange + 2 * m.link_jnt[j]
-                    f = wp.min(wp.max(f, th[o]), th[o + 1])
-                s.load[t, d] -= f
+def joint_force(m: Tables, w: World, r: int, i: int) -> f64:
+    """What an actuator exerts on its joint: gear · force, within the force range."""
+    f = actuator_force(m, w, r, i)
+    if m.act_frclimited[i] != 0:
+        f = clamp(w, m.o_forcerange + 2 * i, f)
+    return w.th[m.o_gear + i] * f
 
 
 @wp.func(inline=True)
-def actuators_adjoint(
-    m: Tables,
-    s: Scratch,
-    t: int,
-    th: Reals,
-    qpos: Reals2,
-    qvel: Reals2,
-    r: int,
-    ctrl: Reals2,
-    w: int,
-    ctrl_bar: Reals2,
-    wb: int,
-):
-    """Adjoint of :func:`add_actuators`; ``s.work`` holds ∂(−λτ)/∂τ after the joints' clamps."""
+def sum_forces(m: Tables, w: World, r: int):
+    """What all actuators exert on each dof, before the joints' own ranges, into ``w.work``."""
     for i in range(m.nv):
-        s.work[t, i] = -s.lam[t, i]
+        w.work[w.t, i] = ZERO
+    for i in range(m.nu):
+        w.work[w.t, m.act_dof[i]] += joint_force(m, w, r, i)
+
+
+@wp.func(inline=True)
+def add_actuators(m: Tables, w: World, r: int):
+    """Load from actuators, clamped per joint where the joint says so."""
+    if m.has_frclimit == 0:
+        for i in range(m.nu):
+            w.load[w.t, m.act_dof[i]] -= joint_force(m, w, r, i)
+    else:
+        sum_forces(m, w, r)
+        for j in range(m.nlink):
+            if m.link_kind[j] <= SLIDE:
+                d = m.link_dof[j]
+                f = w.work[w.t, d]
+                if m.link_frclimited[j] != 0:
+                    f = clamp(w, m.o_actfrcrange + 2 * m.link_jnt[j], f)
+                w.load[w.t, d] -= f
+
+
+@wp.func(inline=True)
+def actuators_adjoint(m: Tables, w: World, r: int):
+    """Adjoint of :func:`add_actuators`; ``w.work`` comes to hold ∂(−λτ)/∂τ before the joints' ranges."""
     if m.has_frclimit != 0:
-        _frclimit_adjoint(m, s, t, th, qpos, qvel, r, ctrl, w)
+        sum_forces(m, w, r)
+        for j in range(m.nlink):
+            d = m.link_dof[j]
+            if m.link_frclimited[j] != 0:
+                w.work[w.t, d] = clamp_adjoint(w, m.o_actfrcrange + 2 * m.link_jnt[j], w.work[w.t, d], -w.lam[w.t, d])
+            elif m.link_kind[j] <= SLIDE:
+                w.work[w.t, d] = -w.lam[w.t, d]
+    else:
+        for i in range(m.nv):
+            w.work[w.t, i] = -w.lam[w.t, i]
     for i in range(m.nu):
         d = m.act_dof[i]
         og = m.o_gain + 3 * i
         ob = m.o_bias + 3 * i
-        q = qpos[r, m.act_qpos[i]]
-        v = qvel[r, d]
-        gear = th[m.o_gear + i]
-        u = control(m, th, ctrl, w, i)
-        f = actuator_force(m, th, i, u, gear * q, gear * v)
-        fbar = gear * s.work[t, d]  # ∂/∂force
+        q = w.qpos[r, m.act_qpos[i]]
+        v = w.qvel[r, d]
+        gear = w.th[m.o_gear + i]
+        u = control(m, w, i)
+        f = actuator_force(m, w, r, i)
+        fbar = gear * w.work[w.t, d]  # ∂/∂force
         if m.act_frclimited[i] != 0:
-            o = m.o_forcerange + 2 * i
-            if f < th[o]:
-                s.grad[t, o] += fbar
-                f = th[o]
-                fbar = ZERO
-            elif f > th[o + 1]:
-                s.grad[t, o + 1] += fbar
-                f = th[o + 1]
-                fbar = ZERO
-        s.grad[t, m.o_gear + i] += f * s.work[t, d]
-        gain = th[og]
+            fbar = clamp_adjoint(w, m.o_forcerange + 2 * i, f, fbar)
+            f = clamp(w, m.o_forcerange + 2 * i, f)
+        w.grad[w.t, m.o_gear + i] += f * w.work[w.t, d]
+        gain = w.th[og]
         slope_l = ZERO
         slope_v = ZERO
-        s.grad[t, og] += fbar * u
+        w.grad[w.t, og] += fbar * u
         if m.act_affine_gain[i] != 0:
-            gain += th[og + 1] * gear * q + th[og + 2] * gear * v
-            slope_l += th[og + 1] * u
-            slope_v += th[og + 2] * u
-            s.grad[t, og + 1] += fbar * u * gear * q
-            s.grad[t, og + 2] += fbar * u * gear * v
+            gain += w.th[og + 1] * gear * q + w.th[og + 2] * gear * v
+            slope_l += w.th[og + 1] * u
+            slope_v += w.th[og + 2] * u
+            w.grad[w.t, og + 1] += fbar * u * gear * q
+            w.grad[w.t, og + 2] += fbar * u * gear * v
         if m.act_affine_bias[i] != 0:
-            slope_l += th[ob + 1]
-            slope_v += th[ob + 2]
-            s.grad[t, ob] += fbar
-            s.grad[t, ob + 1] += fbar * gear * q
-            s.grad[t, ob + 2] += fbar * gear * v
-        s.tangent[t, d] += fbar * slope_l * gear
-        s.vel_bar[t, d] += fbar * slope_v * gear
-        s.grad[t, m.o_gear + i] += fbar * (slope_l * q + slope_v * v)
-        ubar = fbar * gain
-        if m.clampctrl != 0 and m.act_ctrllimited[i] != 0:
-            o = m.o_ctrlrange + 2 * i
-            if ctrl[w, i] < th[o]:
-                s.grad[t, o] += ubar
-                ubar = ZERO
-            elif ctrl[w, i] > th[o + 1]:
-                s.grad[t, o + 1] += ubar
-                ubar = ZERO
-        ctrl_bar[wb, i] += ubar
+            slope_l += w.th[ob + 1]
+            slope_v += w.th[ob + 2]
+            w.grad[w.t, ob] += fbar
+            w.grad[w.t, ob + 1] += fbar * gear * q
+            w.grad[w.t, ob + 2] += fbar * gear * v
+        w.tangent[w.t, d] += fbar * slope_l * gear
+        w.vel_bar[w.t, d] += fbar * slope_v * gear
+        w.grad[w.t, m.o_gear + i] += fbar * (slope_l * q + slope_v * v)
+        control_adjoint(m, w, i, fbar * gain)
 
 
 @wp.func(inline=True)
-def _frclimit_adjoint(
-    m: Tables, s: Scratch, t: int, th: Reals, qpos: Reals2, qvel: Reals2, r: int, ctrl: Reals2, w: int
-):
-    """Zero ``s.work`` of the dofs whose total actuator force is clamped, passing it to the range."""
-    for j in range(m.nlink):
-        if m.link_frclimited[j] != 0:
-            d = m.link_dof[j]
-            total = ZERO
-            for i in range(m.nu):
-                if m.act_dof[i] == d:
-                    gear = th[m.o_gear + i]
-                    u = control(m, th, ctrl, w, i)
-                    f = actuator_force(m, th, i, u, gear * qpos[r, m.act_qpos[i]], gear * qvel[r, d])
-                    if m.act_frclimited[i] != 0:
-                        o = m.o_forcerange + 2 * i
-                        f = wp.min(wp.max(f, th[o]), th[o + 1])
-                    total += gear * f
-            o = m.o_actfrcrange + 2 * m.link_jnt[j]
-            if total < th[o]:
-                s.grad[t, o] += s.work[t, d]
-                s.work[t, d] = ZERO
-            elif total > th[o + 1]:
-                s.grad[t, o + 1] += s.work[t, d]
-                s.work[t, d] = ZERO
+def actuator_slope(m: Tables, w: World, r: int, a: int) -> f64:
+    """gear² (bias_v + gain_v u): ∂τ/∂q̇ of an actuator, or zero where the force is clamped."""
+    gear = w.th[m.o_gear + a]
+    y = ZERO
+    if m.act_affine_bias[a] != 0:
+        y += w.th[m.o_bias + 3 * a + 2]
+    if m.act_affine_gain[a] != 0:
+        y += w.th[m.o_gain + 3 * a + 2] * control(m, w, a)
+    if m.act_frclimited[a] != 0:
+        f = actuator_force(m, w, r, a)
+        o = m.o_forcerange + 2 * a
+        if f <= w.th[o] or f >= w.th[o + 1]:
+            y = ZERO
+    return gear * gear * y
+
+
+@wp.func(inline=True)
+def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
+    """Adjoint of :func:`actuator_slope` (which does not see the position)."""
+    slope = actuator_slope(m, w, r, a)
+    if slope != ZERO:
+        gear = w.th[m.o_gear + a]
+        w.grad[w.t, m.o_gear + a] += bar * TWO * slope / gear
+        if m.act_affine_bias[a] != 0:
+            w.grad[w.t, m.o_bias + 3 * a + 2] += bar * gear * gear
+        if m.act_affine_gain[a] != 0:
+            o = m.o_gain + 3 * a + 2
+            w.grad[w.t, o] += bar * gear * gear * control(m, w, a)
+            control_adjoint(m, w, a, bar * gear * gear * w.th[o])

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.collide import box_dual, capsule_box_dual, cylinder_dual, ellipsoid_dual, round_dual
+from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, support_dual
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
 from dropo_torch.simulators.warp.spatial import chart_rate_dual
 from dropo_torch.simulators.warp.types import (
     ZERO,
+    Chunk,
     Ints,
     Reals2,
-    Rows,
-    Scratch,
     Tables,
+    World,
     f64,
     mat33,
     vec2,
@@ -33,75 +33,56 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 
 @wp.kernel(enable_backward=False)
 def adjoint_kernel(
-    m: Tables,
-    s: Scratch,
-    rows: Rows,
-    theta: Reals2,
-    controls: Reals2,
-    alive: Ints,
-    columns: Ints,
-    out_bar: Reals2,
-    state_bar: Reals2,
-    control_bar: Reals2,
-    theta_bar: Reals2,
-    first: int,
-    local: int,
-    nparam: int,
-    lag: int,
-    skip: int,
-    period: int,
-    slot: int,
-    slot_stride: int,
-):
-    """Adjoints of start state, controls and the θ ``columns`` of one world, from that of its output."""
+    m: Tables, w: World, chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints, out_bar: Reals2,
+    state_bar: Reals2, control_bar: Reals2, theta_bar: Reals2,
+):  # fmt: skip
+    """Adjoints of initial state, controls and the θ ``columns`` of each world, from that of its output."""
     tid = wp.tid()
-    world = first + tid
-    i = local + tid
-    tr = world // nparam
-    th = theta[world % nparam]
-    t = slot + tid * slot_stride
-    base = i * period * m.nstage
+    world = chunk.first + tid
+    i = chunk.local + tid
+    tr = world // chunk.nparam
+    w.th = theta[world % chunk.nparam]
+    w.ctrl = controls
+    w.ctrl_bar = control_bar
+    w.t = chunk.slot + tid * chunk.slot_stride
+    base = i * chunk.period * m.nstage
     for j in range(columns.shape[0]):  # whatever else is added up is never read
-        s.grad[t, columns[j]] = ZERO
+        w.grad[w.t, columns[j]] = ZERO
     for j in range(m.nv):
-        s.pos_bar[t, j] = ZERO
-        s.rate_bar[t, j] = ZERO
-    for j in range(lag):
-        for k in range(m.nu):
-            control_bar[i * lag + j, k] = ZERO
+        w.pos_bar[w.t, j] = ZERO
+        w.rate_bar[w.t, j] = ZERO
     seen = ZERO
-    for j in range(lag):
+    for row in range(i * chunk.lag, (i + 1) * chunk.lag):
+        for k in range(m.nu):
+            control_bar[row, k] = ZERO
         for k in range(m.nq + m.nv):
-            seen += wp.abs(out_bar[i * lag + j, k])
+            seen += wp.abs(out_bar[row, k])
     if alive[i] != 0 and seen != ZERO:
-        for back in range(lag):
-            logged = lag - 1 - back
-            row = i * lag + logged
-            end = base + (logged + 1) * skip * m.nstage
-            to_tangent(m, rows.qpos, end, out_bar, row, s.pos_bar, t)
+        for back in range(chunk.lag):
+            logged = chunk.lag - 1 - back
+            w.rc = tr * chunk.lag + logged
+            w.rb = i * chunk.lag + logged
+            end = base + (logged + 1) * chunk.skip * m.nstage
+            to_tangent(m, w, end, out_bar, w.rb)
             for j in range(m.nv):
-                s.rate_bar[t, j] += out_bar[row, m.nq + j]
-            for k in range(skip):
+                w.rate_bar[w.t, j] += out_bar[w.rb, m.nq + j]
+            for k in range(chunk.skip):
                 r = end - (k + 1) * m.nstage
-                step_adjoint(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess,
-                    rows.soft_hess, rows.held, r,
-                    r + m.nstage, controls, tr * lag + logged, control_bar, row,
-                )  # fmt: skip
-    from_tangent(m, rows.qpos, base, s.pos_bar, t, state_bar, i)
+                step_adjoint(m, w, r, r + m.nstage)
+    from_tangent(m, w, base, state_bar, i)
     for j in range(m.nv):
-        state_bar[i, m.nq + j] = s.rate_bar[t, j]
+        state_bar[i, m.nq + j] = w.rate_bar[w.t, j]
     for j in range(columns.shape[0]):
-        theta_bar[i, j] = s.grad[t, columns[j]]
+        theta_bar[i, j] = w.grad[w.t, columns[j]]
     if alive[i] == 0 and seen != ZERO:
         nan = f64(wp.nan)
         for j in range(m.nq + m.nv):
             state_bar[i, j] = nan
         for j in range(columns.shape[0]):
             theta_bar[i, j] = nan
-        for j in range(lag):
+        for row in range(i * chunk.lag, (i + 1) * chunk.lag):
             for k in range(m.nu):
-                control_bar[i * lag + j, k] = nan
+                control_bar[row, k] = nan
 
 
 @wp.kernel(enable_backward=True)
@@ -120,9 +101,7 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array
     y[8] = contact_scalars(3, s, s, s, v2, v5, s, s, s, 1, s, s, s)
     y[2] = box_power(v, v, v, v, v, s, s, s)
     y[3] = round_dual(v, v, s, v, v, s, 0, s, v, v)
-    y[4] = cylinder_dual(v, v, r[0], v, 0, v)
-    y[5] = ellipsoid_dual(v, v, r[0], v, v)
-    y[6] = box_dual(v, r[0], v, v, s, s, v, v)
+    y[4] = support_dual(3, v, v, r[0], v, 0, v)
     y[0] = capsule_box_dual(v, v, s, v, r[0], v, 0, s, v, v)
     y[7] = chart_rate_dual(v, v, v)
 

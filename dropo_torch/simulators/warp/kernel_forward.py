@@ -9,69 +9,45 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.integrate import good, step
-from dropo_torch.simulators.warp.types import ZERO, Ints, Reals2, Rows, Scratch, Tables, f64
+from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals2, Tables, World, f64
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.kernel(enable_backward=False)
 def simulate_kernel(
-    m: Tables,
-    s: Scratch,
-    rows: Rows,
-    theta: Reals2,
-    states: Reals2,
-    controls: Reals2,
-    out: Reals2,
-    alive: Ints,
-    first: int,
-    local: int,
-    nparam: int,
-    each: int,
-    lag: int,
-    skip: int,
-    period: int,
-    slot: int,
-    slot_stride: int,
-    keep: int,
+    m: Tables, w: World, chunk: Chunk, theta: Reals2, states: Reals2, controls: Reals2, alive: Ints, out: Reals2
 ):
-    """Simulate world ``first + tid``: transition ``world // each`` under parameter vector ``world % nparam``.
-
-    ``out`` has a row per logged step; ``rows`` keeps every stage (``keep`` 1) or the last two steps.
-    """
+    """Simulate the worlds of a chunk; ``out`` has a row per logged step."""
     tid = wp.tid()
-    world = first + tid
-    i = local + tid
-    tr = world // each
-    th = theta[world % nparam]
-    t = slot + tid * slot_stride
-    base = t * period * m.nstage
-    if keep != 0:
-        base = i * period * m.nstage
+    world = chunk.first + tid
+    i = chunk.local + tid
+    tr = world // chunk.each
+    w.th = theta[world % chunk.nparam]
+    w.ctrl = controls
+    w.t = chunk.slot + tid * chunk.slot_stride
+    base = w.t * chunk.period * m.nstage
+    if chunk.keep != 0:
+        base = i * chunk.period * m.nstage
     for j in range(m.nq):
-        rows.qpos[base, j] = states[tr, j]
+        w.qpos[base, j] = states[tr, j]
     for j in range(m.nv):
-        rows.qvel[base, j] = states[tr, m.nq + j]
-        rows.acc[base, j] = ZERO
+        w.qvel[base, j] = states[tr, m.nq + j]
+        w.acc[base, j] = ZERO
     ok = int(1)
     n = int(0)
-    for step_of in range(lag):
-        for _k in range(skip):
-            r = base + (n % period) * m.nstage
-            nxt = base + ((n + 1) % period) * m.nstage
+    for logged in range(chunk.lag):
+        w.rc = tr * chunk.lag + logged
+        for _k in range(chunk.skip):
             if ok != 0:
-                ok = step(
-                    m, s, t, th, rows.qpos, rows.qvel, rows.rate, rows.acc, rows.soft, rows.hess,
-                    rows.soft_hess, rows.held, r, nxt,
-                    controls, tr * lag + step_of,
-                )  # fmt: skip
+                ok = step(m, w, base + (n % chunk.period) * m.nstage, base + ((n + 1) % chunk.period) * m.nstage)
             n += 1
-        r = base + (n % period) * m.nstage
+        r = base + (n % chunk.period) * m.nstage
         if ok != 0:
-            ok = good(m, rows.qpos, rows.qvel, r)
+            ok = good(m, w, r)
         for j in range(m.nq + m.nv):
             y = f64(wp.nan)
             if ok != 0:
-                y = rows.qpos[r, j] if j < m.nq else rows.qvel[r, j - m.nq]
-            out[i * lag + step_of, j] = y
+                y = w.qpos[r, j] if j < m.nq else w.qvel[r, j - m.nq]
+            out[i * chunk.lag + logged, j] = y
     alive[i] = ok

@@ -14,7 +14,7 @@ import warp as wp
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
-from dropo_torch.simulators.warp.engine import Engine, Problem, Simulate
+from dropo_torch.simulators.warp.engine import Batch, Engine, Simulate
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
 from dropo_torch.simulators.warp.start import start_warp
@@ -28,7 +28,7 @@ LOADING = threading.Lock()
 class WarpSimulator(Simulator):
     """Simulates transitions with MuJoCo's own physics, written as NVIDIA Warp kernels in float64.
 
-    The constraint problem of every step is solved to convergence, and the gradient is exact at that solution. A
+    The constraint batch of every step is solved to convergence, and the gradient is exact at that solution. A
     parameter vector means a copy of the model with the numbers written and ``mj_setConst`` run, as for the
     MuJoCo backend; the gradient includes what that derives.
 
@@ -115,9 +115,9 @@ class WarpSimulator(Simulator):
         rows = torch.eye(width, dtype=torch.float64) if directions is None else directions
         theta, slope = self._fields.with_derivative(values.detach().to("cpu", torch.float64))
         start, inputs = (x.detach().to(self._device, torch.float64).contiguous() for x in (states, controls))
-        problem = Problem(len(states), num_values, controls.shape[1], self.frame_skip)
+        batch = Batch(len(states), num_values, controls.shape[1], self.frame_skip)
         moved = [x.to(self._device).contiguous() for x in (theta, rows)]
-        after, by_theta, by_state = self._engine.per_world(problem, moved[0], start, inputs, moved[1])
+        after, by_theta, by_state = self._engine.per_world(batch, moved[0], start, inputs, moved[1])
         shape = (len(states), num_values)
         by_values = torch.einsum("tkjw,kwd->tkjd", by_theta.cpu().unflatten(0, shape), slope)
         return after.cpu().unflatten(0, shape), by_values, by_state.cpu().unflatten(0, shape)

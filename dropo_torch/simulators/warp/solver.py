@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_piece
+from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_of, cone_piece
 from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.rows import row_add, row_dot, row_force, row_state
-from dropo_torch.simulators.warp.types import ONE, ZERO, Reals, Reals2, Scratch, Tables, f64, mat33, vec3, vec6
+from dropo_torch.simulators.warp.types import ONE, ZERO, Reals2, Tables, World, f64, mat33, vec3, vec6
 
 ITERATIONS = wp.constant(60)
 LINE_STEPS = wp.constant(50)
@@ -62,17 +62,17 @@ def solve(m: Tables, dense: int, hess: Reals2, r: int, x: Reals2, rx: int):
 
 
 @wp.func(inline=True)
-def mass_mul(m: Tables, s: Scratch, t: int, x: Reals2, rx: int, y: Reals2, ry: int):
+def mass_mul(m: Tables, w: World, x: Reals2, rx: int, y: Reals2, ry: int):
     """y ← M x."""
     for i in range(m.nv):
         y[ry, i] = ZERO
     for i in range(m.nv):
         ri = packed(i, 0)
         xi = x[rx, i]
-        yi = s.mass[t, ri + i] * xi
+        yi = w.mass[w.t, ri + i] * xi
         j = m.dof_parent[0, i]
         while j >= 0:
-            mij = s.mass[t, ri + j]
+            mij = w.mass[w.t, ri + j]
             yi += mij * x[rx, j]
             y[ry, j] += mij * xi
             j = m.dof_parent[0, j]
@@ -80,21 +80,20 @@ def mass_mul(m: Tables, s: Scratch, t: int, x: Reals2, rx: int, y: Reals2, ry: i
 
 
 @wp.func(inline=True)
-def contact_dot(m: Tables, s: Scratch, t: int, c: int, x: Reals2, r: int) -> vec6:
+def contact_dot(m: Tables, w: World, c: int, x: Reals2, r: int) -> vec6:
     """J x of contact ``c``."""
     y = vec6()
     base = c * m.nv
     for i in range(m.nv):
-        y += s.con_jac[t, base + i] * x[r, i]
+        y += w.con_jac[w.t, base + i] * x[r, i]
     return y
 
 
 @wp.func(inline=True)
-def _add_contact_hessian(m: Tables, s: Scratch, t: int, dense: int, c: int, ll: mat33, la: mat33, aa: mat33,
-                         dim: int, hess: Reals2, r: int):  # fmt: skip
+def _add_contact_hessian(m: Tables, w: World, dense: int, c: int, ll: mat33, la: mat33, aa: mat33, r: int):
     """H += Jᵀ C J of one contact."""
     base = c * m.nv
-    k = s.con_pair[t, c]
+    k = w.con_pair[w.t, c]
     one_sided = int(0)
     i = m.nv - 1
     if m.pair_dense[k] == 0 and dense == 0:
@@ -105,111 +104,108 @@ def _add_contact_hessian(m: Tables, s: Scratch, t: int, dense: int, c: int, ll: 
     which = 1 - one_sided
     while i >= 0:
         ri = packed(i, 0)
-        ji = s.con_jac[t, base + i]
+        ji = w.con_jac[w.t, base + i]
         jl = vec3(ji[0], ji[1], ji[2])
         cl = ll * jl
-        if dim > 3:
+        if m.pair_dim[k] > 3:
             ja = vec3(ji[3], ji[4], ji[5])
             cl += la * ja
             ca = wp.transpose(la) * jl + aa * ja
             j = i
             while j >= 0:
-                x = s.con_jac[t, base + j]
-                hess[r, ri + j] += wp.dot(cl, vec3(x[0], x[1], x[2])) + wp.dot(ca, vec3(x[3], x[4], x[5]))
+                x = w.con_jac[w.t, base + j]
+                w.hess[r, ri + j] += wp.dot(cl, vec3(x[0], x[1], x[2])) + wp.dot(ca, vec3(x[3], x[4], x[5]))
                 j = m.dof_parent[which, j]
         else:
             j = i
             while j >= 0:
-                x = s.con_jac[t, base + j]
-                hess[r, ri + j] += cl[0] * x[0] + cl[1] * x[1] + cl[2] * x[2]
+                x = w.con_jac[w.t, base + j]
+                w.hess[r, ri + j] += cl[0] * x[0] + cl[1] * x[1] + cl[2] * x[2]
                 j = m.dof_parent[which, j]
         i = m.dof_parent[which, i]
 
 
 @wp.func(inline=True)
-def _add_row_hessian(m: Tables, s: Scratch, t: int, n: int, hess: Reals2, r: int):
+def _add_row_hessian(m: Tables, w: World, n: int, r: int):
     """H += Jᵀ D J of one scalar row."""
-    d = s.row_d[t, n]
-    c = s.row_coef[t, n]
+    d = w.row_d[w.t, n]
+    c = w.row_coef[w.t, n]
     for a in range(3):
-        i = s.row_dof[t, 3 * n + a]
+        i = w.row_dof[w.t, n][a]
         if i >= 0:
             for b in range(3):
-                j = s.row_dof[t, 3 * n + b]
+                j = w.row_dof[w.t, n][b]
                 if j >= 0 and j <= i:
-                    hess[r, packed(i, 0) + j] += d * c[a] * c[b]
+                    w.hess[r, packed(i, 0) + j] += d * c[a] * c[b]
 
 
 @wp.func(inline=True)
-def assemble(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int, dense: int, hess: Reals2, r: int):
-    """H = M + Jᵀ C J and the gradient M a + c − τ − Jᵀ f at the current J a − aref, into ``s.step``."""
+def assemble(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
+    """H = M + Jᵀ C J and the gradient M a + c − τ − Jᵀ f at the current J a − aref, into ``w.step``."""
     for i in range(m.nh):
-        hess[r, i] = s.mass[t, i]
+        w.hess[r, i] = w.mass[w.t, i]
     for i in range(m.nv):
-        s.step[t, i] = -s.product[t, i]
+        w.step[w.t, i] = -w.product[w.t, i]
     for n in range(nrow):
-        kind = s.row_kind[t, n]
-        jar = s.row_jar[t, n]
-        row_add(s, t, n, row_force(kind, jar, s.row_d[t, n], s.row_loss[t, n]), s.step, t)
-        if row_state(kind, jar, s.row_d[t, n], s.row_loss[t, n]) == 1:
-            _add_row_hessian(m, s, t, n, hess, r)
+        kind = w.row_kind[w.t, n]
+        jar = w.row_jar[w.t, n]
+        row_add(w, n, row_force(kind, jar, w.row_d[w.t, n], w.row_loss[w.t, n]), w.step, w.t)
+        if row_state(kind, jar, w.row_d[w.t, n], w.row_loss[w.t, n]) == 1:
+            _add_row_hessian(m, w, n, r)
     for c in range(ncon):
-        k = s.con_pair[t, c]
-        dim = m.pair_dim[k]
-        w = s.con_jar[t, c]
-        o_mu = m.o_pair_friction + 5 * k
-        if cone_piece(dim, m.elliptic, th, o_mu, m.impratio, w) != 0:
-            f = cone_force(dim, m.elliptic, s.con_d[t, c], th, o_mu, m.impratio, w)
+        k = w.con_pair[w.t, c]
+        cone = cone_of(m, w, k, w.con_d[w.t, c])
+        jar6 = w.con_jar[w.t, c]
+        if cone_piece(cone, jar6) != 0:
+            f = cone_force(cone, jar6)
             base = c * m.nv
             for i in range(m.nv):
-                s.step[t, i] += wp.dot(s.con_jac[t, base + i], f)
-            ll, la, aa = cone_hessian(dim, m.elliptic, s.con_d[t, c], th, o_mu, m.impratio, w)
-            _add_contact_hessian(m, s, t, dense, c, ll, la, aa, dim, hess, r)
+                w.step[w.t, i] += wp.dot(w.con_jac[w.t, base + i], f)
+            ll, la, aa = cone_hessian(cone, jar6)
+            _add_contact_hessian(m, w, dense, c, ll, la, aa, r)
 
 
-@wp.func
-def _slopes(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int, alpha: f64, linear: f64, quad: f64):
+@wp.func(inline=True)
+def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, quad: f64):
     """φ'(α) and φ''(α) of the cost along the step."""
     d1 = linear + alpha * quad
     d2 = quad
     for n in range(nrow):
-        kind = s.row_kind[t, n]
-        y = s.row_dir[t, n]
-        jar = s.row_jar[t, n] + alpha * y
-        d = s.row_d[t, n]
-        d1 -= row_force(kind, jar, d, s.row_loss[t, n]) * y
-        if row_state(kind, jar, d, s.row_loss[t, n]) == 1:
+        kind = w.row_kind[w.t, n]
+        y = w.row_dir[w.t, n]
+        jar = w.row_jar[w.t, n] + alpha * y
+        d = w.row_d[w.t, n]
+        d1 -= row_force(kind, jar, d, w.row_loss[w.t, n]) * y
+        if row_state(kind, jar, d, w.row_loss[w.t, n]) == 1:
             d2 += d * y * y
     for c in range(ncon):
-        k = s.con_pair[t, c]
-        dim = m.pair_dim[k]
-        dw = s.con_dir[t, c]
-        w = s.con_jar[t, c] + dw * alpha
-        o_mu = m.o_pair_friction + 5 * k
-        if cone_piece(dim, m.elliptic, th, o_mu, m.impratio, w) != 0:
-            d1 -= wp.dot(cone_force(dim, m.elliptic, s.con_d[t, c], th, o_mu, m.impratio, w), dw)
-            ll, la, aa = cone_hessian(dim, m.elliptic, s.con_d[t, c], th, o_mu, m.impratio, w)
+        cone = cone_of(m, w, w.con_pair[w.t, c], w.con_d[w.t, c])
+        dw = w.con_dir[w.t, c]
+        jar6 = w.con_jar[w.t, c] + dw * alpha
+        if cone_piece(cone, jar6) != 0:
+            d1 -= wp.dot(cone_force(cone, jar6), dw)
+            ll, la, aa = cone_hessian(cone, jar6)
             yl = vec3(dw[0], dw[1], dw[2])
             ya = vec3(dw[3], dw[4], dw[5])
             d2 += wp.dot(yl, ll * yl) + f64(2.0) * wp.dot(yl, la * ya) + wp.dot(ya, aa * ya)
     return d1, d2
 
 
-@wp.func
-def _line_search(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int, acc: Reals2, r: int) -> f64:
+@wp.func(inline=True)
+def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
     """The root of φ' along the step: Newton's iteration kept in a bracket."""
-    mass_mul(m, s, t, s.step, t, s.work, t)
+    mass_mul(m, w, w.step, w.t, w.work, w.t)
     linear = ZERO
     quad = ZERO
     for i in range(m.nv):
-        linear += s.product[t, i] * s.step[t, i]
-        quad += s.work[t, i] * s.step[t, i]
-    start, _curve = _slopes(m, s, t, th, nrow, ncon, ZERO, linear, quad)
+        linear += w.product[w.t, i] * w.step[w.t, i]
+        quad += w.work[w.t, i] * w.step[w.t, i]
+    start, _curve = _slopes(m, w, nrow, ncon, ZERO, linear, quad)
     low = ZERO
     high = f64(-1.0)
     alpha = ONE
     for _k in range(LINE_STEPS):
-        d1, d2 = _slopes(m, s, t, th, nrow, ncon, alpha, linear, quad)
+        d1, d2 = _slopes(m, w, nrow, ncon, alpha, linear, quad)
         if wp.abs(d1) <= f64(1.0e-15) * wp.abs(start):
             break
         if d1 < ZERO:
@@ -226,73 +222,72 @@ def _line_search(m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int,
 
 
 @wp.func(inline=True)
-def newton(
-    m: Tables, s: Scratch, t: int, th: Reals, nrow: int, ncon: int, dense: int, acc: Reals2, hess: Reals2, r: int
-):
-    """Solve for ``acc[r]`` from the guess it holds; leave the factor of H at the solution in ``hess[r]``."""
-    for n in range(nrow):
-        s.row_jar[t, n] = row_dot(s, t, n, acc, r) - s.row_aref[t, n]
-    for c in range(ncon):
-        s.con_jar[t, c] = contact_dot(m, s, t, c, acc, r) - s.con_aref[t, c]
-    mass_mul(m, s, t, acc, r, s.product, t)
+def _unconstrained_gradient(m: Tables, w: World, r: int):
+    """M a + c − τ, into ``w.product``."""
+    mass_mul(m, w, w.acc, r, w.product, w.t)
     for i in range(m.nv):
-        s.product[t, i] += s.load[t, i]
+        w.product[w.t, i] += w.load[w.t, i]
+
+
+@wp.func(inline=True)
+def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
+    """Solve for ``w.acc[r]`` from the guess it holds; leave the factor of H at the solution in ``w.hess[r]``."""
+    for n in range(nrow):
+        w.row_jar[w.t, n] = row_dot(w, n, w.acc, r) - w.row_aref[w.t, n]
+    for c in range(ncon):
+        w.con_jar[w.t, c] = contact_dot(m, w, c, w.acc, r) - w.con_aref[w.t, c]
+    _unconstrained_gradient(m, w, r)
     done = int(0)
     for _k in range(ITERATIONS):
-        assemble(m, s, t, th, nrow, ncon, dense, hess, r)
-        factor(m, dense, hess, r)
+        assemble(m, w, nrow, ncon, dense, r)
+        factor(m, dense, w.hess, r)
         if done != 0:
             break
-        solve(m, dense, hess, r, s.step, t)
+        solve(m, dense, w.hess, r, w.step, w.t)
         same = int(1)
         curved = int(0)
         for n in range(nrow):
-            y = row_dot(s, t, n, s.step, t)
-            s.row_dir[t, n] = y
-            kind = s.row_kind[t, n]
-            jar = s.row_jar[t, n]
-            d = s.row_d[t, n]
-            loss = s.row_loss[t, n]
+            y = row_dot(w, n, w.step, w.t)
+            w.row_dir[w.t, n] = y
+            kind = w.row_kind[w.t, n]
+            jar = w.row_jar[w.t, n]
+            d = w.row_d[w.t, n]
+            loss = w.row_loss[w.t, n]
             if row_state(kind, jar, d, loss) != row_state(kind, jar + y, d, loss):
                 same = 0
         for c in range(ncon):
-            y6 = contact_dot(m, s, t, c, s.step, t)
-            s.con_dir[t, c] = y6
-            k = s.con_pair[t, c]
-            dim = m.pair_dim[k]
-            o_mu = m.o_pair_friction + 5 * k
-            w = s.con_jar[t, c]
-            before = cone_piece(dim, m.elliptic, th, o_mu, m.impratio, w)
-            after = cone_piece(dim, m.elliptic, th, o_mu, m.impratio, w + y6)
-            if before != after:
+            y6 = contact_dot(m, w, c, w.step, w.t)
+            w.con_dir[w.t, c] = y6
+            cone = cone_of(m, w, w.con_pair[w.t, c], w.con_d[w.t, c])
+            jar6 = w.con_jar[w.t, c]
+            after = cone_piece(cone, jar6 + y6)
+            if cone_piece(cone, jar6) != after:
                 same = 0
-            elif m.elliptic != 0 and dim > 1 and after == CURVED:
+            elif cone.elliptic != 0 and cone.dim > 1 and after == CURVED:
                 curved = 1
         if same != 0 and curved == 0:
             for i in range(m.nv):
-                acc[r, i] += s.step[t, i]
+                w.acc[r, i] += w.step[w.t, i]
             break
         alpha = ONE
         small = int(1)
         for i in range(m.nv):
-            if wp.abs(s.step[t, i]) > f64(1.0e-11) * (ONE + wp.abs(acc[r, i])):
+            if wp.abs(w.step[w.t, i]) > f64(1.0e-11) * (ONE + wp.abs(w.acc[r, i])):
                 small = 0
         if small == 0:
-            alpha = _line_search(m, s, t, th, nrow, ncon, acc, r)
+            alpha = _line_search(m, w, nrow, ncon, r)
         else:
             done = 1  # one more factor at the solution, for the adjoint
-        _advance(m, s, t, nrow, ncon, alpha, acc, r)
+        _advance(m, w, nrow, ncon, alpha, r)
 
 
 @wp.func(inline=True)
-def _advance(m: Tables, s: Scratch, t: int, nrow: int, ncon: int, alpha: f64, acc: Reals2, r: int):
+def _advance(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, r: int):
     """Move ``alpha`` steps."""
     for i in range(m.nv):
-        acc[r, i] += alpha * s.step[t, i]
-    mass_mul(m, s, t, acc, r, s.product, t)
-    for i in range(m.nv):
-        s.product[t, i] += s.load[t, i]
+        w.acc[r, i] += alpha * w.step[w.t, i]
+    _unconstrained_gradient(m, w, r)
     for n in range(nrow):
-        s.row_jar[t, n] += alpha * s.row_dir[t, n]
+        w.row_jar[w.t, n] += alpha * w.row_dir[w.t, n]
     for c in range(ncon):
-        s.con_jar[t, c] = s.con_jar[t, c] + s.con_dir[t, c] * alpha
+        w.con_jar[w.t, c] = w.con_jar[w.t, c] + w.con_dir[w.t, c] * alpha

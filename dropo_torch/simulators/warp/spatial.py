@@ -7,7 +7,60 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, f64, mat33, vec3, vec4, vec6, vec10
+from dropo_torch.simulators.warp.types import (
+    HALF,
+    MINVAL,
+    ONE,
+    TWO,
+    ZERO,
+    Reals,
+    Reals2,
+    f64,
+    mat33,
+    vec2,
+    vec3,
+    vec4,
+    vec5,
+    vec6,
+    vec10,
+)
+
+
+@wp.func
+def theta_vec2(th: Reals, i: int) -> vec2:
+    """Two consecutive numbers of θ."""
+    return vec2(th[i], th[i + 1])
+
+
+@wp.func
+def theta_vec3(th: Reals, i: int) -> vec3:
+    """Three consecutive numbers of θ."""
+    return vec3(th[i], th[i + 1], th[i + 2])
+
+
+@wp.func
+def theta_vec5(th: Reals, i: int) -> vec5:
+    """Five consecutive numbers of θ."""
+    return vec5(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4])
+
+
+@wp.func(inline=True)
+def vec3_at(x: Reals2, r: int, i: int) -> vec3:
+    """Three consecutive numbers of a row."""
+    return vec3(x[r, i], x[r, i + 1], x[r, i + 2])
+
+
+@wp.func(inline=True)
+def vec4_at(x: Reals2, r: int, i: int) -> vec4:
+    """Four consecutive numbers of a row."""
+    return vec4(x[r, i], x[r, i + 1], x[r, i + 2], x[r, i + 3])
+
+
+@wp.func(inline=True)
+def add_vec3(x: Reals2, r: int, i: int, y: vec3):
+    """Add to three consecutive numbers of a row."""
+    for k in range(3):
+        x[r, i + k] += y[k]
 
 
 @wp.func
@@ -148,6 +201,12 @@ def quat_mul(a: vec4, b: vec4) -> vec4:
         a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
         a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
     )
+
+
+@wp.func
+def quat_conj(q: vec4) -> vec4:
+    """q*: the inverse of a unit quaternion."""
+    return vec4(q[0], -q[1], -q[2], -q[3])
 
 
 @wp.func

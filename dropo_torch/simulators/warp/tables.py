@@ -10,7 +10,7 @@ import warp as wp
 
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import collide
-from dropo_torch.simulators.warp.fields import Layout
+from dropo_torch.simulators.warp.layout import Layout
 from dropo_torch.simulators.warp.pairs import condim, joins_branches
 from dropo_torch.simulators.warp.types import Tables, mat33, vec3
 
@@ -23,17 +23,18 @@ SOFT = (
     "jnt_solref", "jnt_solimp", "dof_solref", "dof_solimp", "eq_solref", "eq_solimp", "geom_solref", "geom_solimp",
     "pair_solref", "pair_solreffriction", "pair_solimp",
 )  # fmt: skip
-_KINDS = {
-    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE): (collide.PLANE_SPHERE, 1),
-    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CAPSULE): (collide.PLANE_CAPSULE, 2),
-    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_BOX): (collide.PLANE_BOX, 4),
-    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CYLINDER): (collide.PLANE_CYLINDER, 4),
-    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_ELLIPSOID): (collide.PLANE_ELLIPSOID, 1),
-    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_SPHERE): (collide.ROUND, 1),
-    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 1),
-    (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 2),
-    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_BOX): (collide.SPHERE_BOX, 1),
-    (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 2),
+#: Kinds of pairs by the geoms' types, the smaller first: constant of the kernels, points that may touch, most contacts.
+KINDS = {
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE): (collide.PLANE_SPHERE, 1, 1),
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CAPSULE): (collide.PLANE_CAPSULE, 2, 2),
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_BOX): (collide.PLANE_BOX, 8, 4),
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CYLINDER): (collide.PLANE_CYLINDER, 4, 4),
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_ELLIPSOID): (collide.PLANE_ELLIPSOID, 1, 1),
+    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_SPHERE): (collide.ROUND, 1, 1),
+    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 1, 1),
+    (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 2, 2),
+    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 1, 1),
+    (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 2, 2),
 }  # fmt: skip
 
 
@@ -128,9 +129,9 @@ def _links(model: mujoco.MjModel) -> dict[str, Any]:
                 break
     kinds, joints, dofs, qs = (np.array([r[i] for r in rows], dtype=int) for i in range(4))
     return {
-        "nlink": len(rows), "has_ball": int(bool(np.any(kinds == 3))),
-        "body_link": first, "body_nlink": count, "link_kind": kinds, "link_dof": dofs,
-        "link_qpos": qs, "link_jnt": joints, "link_body": model.jnt_bodyid[joints] if len(rows) else joints,
+        "nlink": len(rows), "has_ball": int(bool(np.any(kinds == 3))), "body_link": first, "body_nlink": count,
+        "link_kind": kinds, "link_dof": dofs, "link_ndof": np.where(kinds < 2, 1, 3), "link_qpos": qs,
+        "link_jnt": joints, "link_body": model.jnt_bodyid[joints] if len(rows) else joints,
         "link_frclimited": model.jnt_actfrclimited[joints].astype(int) if len(rows) else joints,
         "link_axis": np.array([r[4] for r in rows]).reshape(-1, 3),
         "link_pos": np.array([r[5] for r in rows]).reshape(-1, 3),
@@ -186,18 +187,15 @@ def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]
 
 
 def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str, Any]:
-    kinds, bounds, most = [], [], 0
-    for g1, g2, _pair in pairs:
-        kind, number = _KINDS[_GEOM(model.geom_type[g1]), _GEOM(model.geom_type[g2])]
-        kinds.append(int(kind))
-        bounds.append(float(model.geom_rbound[g2] + model.geom_rbound[g1]) * (1 + 1e-9))
-        most += number
     table = np.array(pairs, dtype=int).reshape(-1, 3)
+    kinds = [KINDS[_GEOM(model.geom_type[g1]), _GEOM(model.geom_type[g2])] for g1, g2, _pair in pairs]
+    kind, points, most = (np.array([int(k[i]) for k in kinds], dtype=int) for i in range(3))
     bodies = model.geom_bodyid[table[:, :2]]
     size = model.geom_size.copy()
     size[model.geom_type == _GEOM.mjGEOM_SPHERE, 1:] = 0.0
     return {
-        "npair": len(pairs), "maxcon": most, "pair_kind": np.array(kinds, dtype=int), "pair_bound": np.array(bounds),
+        "npair": len(pairs), "maxcon": int(most.sum()), "pair_kind": kind, "pair_points": points,
+        "pair_bound": (model.geom_rbound[table[:, 1]] + model.geom_rbound[table[:, 0]]) * (1 + 1e-9),
         "pair_body1": bodies[:, 0], "pair_body2": bodies[:, 1], "pair_geom1": table[:, 0], "pair_geom2": table[:, 1],
         "pair_dim": np.array([condim(model, *p) for p in pairs], dtype=int),
         "pair_dense": np.array([joins_branches(model, int(a), int(b)) for a, b in bodies], dtype=int),

@@ -1,7 +1,8 @@
-"""Warp types that every kernel of the backend shares: float64 vectors, the model tables, the scratch memory.
+"""Warp types that every kernel of the backend shares: float64 vectors, the tables of a model, the memory of a world.
 
-A model is two things: integer tables and fixed geometry (:class:`Tables`, shared by all worlds), and one flat
-vector θ of real parameters per world, whose sections start at the ``o_...`` offsets in the tables.
+A model is two things: integer tables and fixed geometry (:data:`Tables`, shared by all worlds), and one flat
+vector θ of real parameters per world, whose sections start at the ``o_...`` offsets in the tables. What a thread
+works on is a :data:`World`. Their fields are listed here once: the structs and the memory are made from these lists.
 """
 
 # mypy: ignore-errors
@@ -13,12 +14,15 @@ from typing import Any
 
 import warp as wp
 
+from dropo_torch.simulators.warp.layout import SECTIONS
+
 wp.config.log_level = max(wp.config.log_level, wp.LOG_WARNING)  # no banner and no notice of each module
 
 f64 = wp.float64
 vec2 = wp.vec2d
 vec3 = wp.vec3d
 vec4 = wp.vec4d
+vec3i = wp.vec3i
 mat33 = wp.mat33d
 vec5 = wp.types.vector(5, wp.float64)
 #: Spatial vectors (motions and forces): angular part first, about the world's origin of the sweep.
@@ -57,216 +61,114 @@ Reals: Any = wp.array(dtype=wp.float64)
 Reals2: Any = wp.array2d(dtype=wp.float64)
 Vec3s: Any = wp.array(dtype=vec3)
 Mats: Any = wp.array(dtype=mat33)
-Vec3s2: Any = wp.array2d(dtype=vec3)
-Mats2: Any = wp.array2d(dtype=mat33)
-Vec6s2: Any = wp.array2d(dtype=vec6)
-Vec10s2: Any = wp.array2d(dtype=vec10)
 
 
-@wp.struct
-class Tables:
-    """Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, θ offsets."""
-
-    nb: wp.int32
-    nv: wp.int32
-    nq: wp.int32
-    nu: wp.int32
-    nlink: wp.int32
-    npair: wp.int32
-    nfriction: wp.int32
-    nlimit: wp.int32
-    neq: wp.int32
-    norigin: wp.int32
-    nh: wp.int32
-    integrator: wp.int32
-    nstage: wp.int32
-    h: wp.float64
-    impratio: wp.float64
-    elliptic: wp.int32
-    refsafe: wp.int32
-    clampctrl: wp.int32
-    implicit: wp.int32
-    implicit_actuators: wp.int32
-    has_ball: wp.int32
-    has_spring: wp.int32
-    has_damper: wp.int32
-    always_dense: wp.int32
-    has_gravcomp: wp.int32
-    has_fluid: wp.int32
-    has_frclimit: wp.int32
-    want_inertial: wp.int32  # gradients wanted of mass, body_inertia or body_ipos; of the second; of the third
-    want_inertia: wp.int32
-    want_ipos: wp.int32
-    want_soft: wp.int32  # gradients wanted of some solref or solimp
-    maxcon: wp.int32
-    maxrow: wp.int32
-    # bodies
-    body_parent: Ints
-    body_link: Ints
-    body_nlink: Ints
-    body_dof: Ints
-    body_ndof: Ints
-    body_lastdof: Ints
-    body_massive: Ints
-    body_pos: Vec3s
-    body_mat: Mats
-    body_imat: Mats
-    # links
-    link_kind: Ints
-    link_body: Ints
-    link_dof: Ints
-    link_qpos: Ints
-    link_axis: Vec3s
-    link_pos: Vec3s
-    link_ref: Reals
-    # origin of the sweep: q indices and world directions of the root's translations
-    origin_qpos: Ints
-    origin_axis: Vec3s
-    origin_base: vec3
-    # dofs: row 0 the parent in the tree, row 1 the previous dof (dense elimination)
-    dof_parent: Ints2
-    dof_body: Ints
-    link_jnt: Ints
-    link_frclimited: Ints
-    # actuators
-    act_dof: Ints
-    act_qpos: Ints
-    act_affine_gain: Ints
-    act_affine_bias: Ints
-    act_ctrllimited: Ints
-    act_frclimited: Ints
-    # scalar constraints
-    friction_dof: Ints
-    limit_link: Ints
-    eq_id: Ints
-    eq_dof: Ints  # two per equality, the second −1 where there is one joint only
-    eq_qpos: Ints
-    eq_ref: Reals
-    # contact candidates: geom poses in their bodies
-    pair_kind: Ints
-    pair_body1: Ints
-    pair_body2: Ints
-    pair_geom1: Ints
-    pair_geom2: Ints
-    pair_dim: Ints
-    pair_dense: Ints
-    pair_bound: Reals
-    geom_body: Ints
-    geom_pos: Vec3s
-    geom_mat: Mats
-    geom_size: Vec3s
-    # offsets of the sections of θ
-    o_gravity: wp.int32
-    o_density: wp.int32
-    o_viscosity: wp.int32
-    o_wind: wp.int32
-    o_mass: wp.int32
-    o_inertia: wp.int32
-    o_ipos: wp.int32
-    o_gravcomp: wp.int32
-    o_stiffness: wp.int32
-    o_stiffnesspoly: wp.int32
-    o_spring: wp.int32
-    o_range: wp.int32
-    o_jnt_margin: wp.int32
-    o_jnt_solref: wp.int32
-    o_jnt_solimp: wp.int32
-    o_actfrcrange: wp.int32
-    o_damping: wp.int32
-    o_dampingpoly: wp.int32
-    o_armature: wp.int32
-    o_frictionloss: wp.int32
-    o_dof_invweight: wp.int32
-    o_dof_solref: wp.int32
-    o_dof_solimp: wp.int32
-    o_gain: wp.int32
-    o_bias: wp.int32
-    o_gear: wp.int32
-    o_forcerange: wp.int32
-    o_ctrlrange: wp.int32
-    o_eq_data: wp.int32
-    o_eq_solref: wp.int32
-    o_eq_solimp: wp.int32
-    o_pair_friction: wp.int32
-    o_pair_solref: wp.int32
-    o_pair_solreffriction: wp.int32
-    o_pair_solimp: wp.int32
-    o_pair_margin: wp.int32
-    o_pair_invweight: wp.int32
+def _struct(name: str, fields: dict[str, Any]) -> Any:
+    """The Warp struct with these fields."""
+    return wp.struct(type(name, (), {"__module__": __name__, "__annotations__": fields}))
 
 
-@wp.struct
-class Scratch:
-    """Working memory, one row per slot; a slot serves one world at a time."""
+#: Numbers of things, switches of what a model has, and what gradients are wanted of.
+_COUNTS = (
+    "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "norigin", "nh", "maxcon", "maxrow",
+    "integrator", "nstage", "elliptic", "refsafe", "clampctrl", "implicit", "implicit_actuators",
+    "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense",
+    "want_inertial", "want_inertia", "want_ipos", "want_soft",
+)  # fmt: skip
+#: Of bodies, links (the joints, a free joint as two), dofs, actuators, scalar constraints and pairs of geoms.
+_INDICES = (
+    "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive",
+    "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
+    "dof_body",
+    "act_dof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
+    "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
+    "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
+    "geom_body",
+)  # fmt: skip
+_VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size")
+_ROTATIONS = ("body_mat", "body_imat", "geom_mat")
 
-    xpos: Vec3s2
-    xmat: Mats2
-    motion: Vec6s2  # s: motion axis of each dof
-    velocity: Vec6s2  # V
-    bias: Vec6s2  # A with zero joint acceleration, gravity in the root
-    inertia: Vec10s2  # I of each body
-    composite: Vec10s2  # I of each subtree
-    force: Vec6s2  # F: inertial force, then summed over the subtree
-    mass: Reals2  # M, packed lower triangle
-    load: Reals2  # c − τ
-    step: Reals2  # Newton direction
-    product: Reals2  # M·a + c − τ
+#: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
+Tables: Any = _struct(
+    "Tables",
+    {
+        **dict.fromkeys((*_COUNTS, *(f"o_{name}" for name in SECTIONS)), wp.int32),
+        **dict.fromkeys(_INDICES, Ints),
+        **dict.fromkeys(_VECTORS, Vec3s),
+        **dict.fromkeys(_ROTATIONS, Mats),
+        "dof_parent": Ints2,  # row 0 the parent in the tree, row 1 the previous dof (dense elimination)
+        "origin_base": vec3,  # of the sweep, which travels along origin_axis with the root's translations
+        **dict.fromkeys(("link_ref", "eq_ref", "pair_bound"), Reals),
+        **dict.fromkeys(("h", "impratio"), wp.float64),
+    },
+)
+
+#: Memory of a trajectory, one row per stage of a step: name → (type, numbers in a row).
+TRAJECTORY: dict[str, tuple[Any, str]] = {
+    "qpos": (f64, "qpos"), "qvel": (f64, "dof"), "acc": (f64, "dof"),
+    "rate": (f64, "dof"),  # RK4: rate of the position in the chart at the start of the step
+    "hess": (f64, "triangle"),  # factor of H
+}  # fmt: skip
+#: What the implicit integrators add: a', and the factor of M + h B.
+IMPLICIT: dict[str, tuple[Any, str]] = {"soft": (f64, "dof"), "soft_hess": (f64, "triangle")}
+#: Working memory, one row per slot; a slot serves one world at a time.
+SCRATCH: dict[str, tuple[Any, str]] = {
+    "xpos": (vec3, "body"), "xmat": (mat33, "body"),
+    "motion": (vec6, "dof"),  # s: motion axis of each dof
+    "velocity": (vec6, "body"),  # V
+    "bias": (vec6, "body"),  # A with zero joint acceleration, gravity in the root
+    "inertia": (vec10, "body"), "composite": (vec10, "body"),  # I of each body, and of each subtree
+    "force": (vec6, "body"),  # F: inertial force, then summed over the subtree
+    "mass": (f64, "triangle"),  # M, packed lower triangle
+    "load": (f64, "dof"),  # c − τ
+    "step": (f64, "dof"),  # Newton direction
+    "product": (f64, "dof"),  # M·a + c − τ
+    "work": (f64, "dof"),
     # scalar constraint rows
-    row_kind: Ints2
-    row_index: Ints2
-    row_dof: Ints2  # three per row, −1 where unused
-    row_coef: Vec3s2  # J at those dofs
-    row_x: Reals2  # position less margin
-    row_aref: Reals2
-    row_d: Reals2  # D = 1/R
-    row_loss: Reals2
-    row_jar: Reals2  # J a − aref
-    row_dir: Reals2  # J step
-    # contacts
-    con_pair: Ints2
-    con_which: Ints2
-    con_dist: Reals2
-    con_point: Vec3s2
-    con_frame: Mats2  # rows n, t1, t2
-    con_hint: Vec3s2
-    con_d: Reals2  # D of the normal (elliptic) or of every edge (pyramidal)
-    con_aref: Vec6s2
-    con_jar: Vec6s2  # J a − aref: along n, t1, t2, then about them
-    con_dir: Vec6s2  # J step
-    con_jac: Vec6s2  # columns of J, (contact, dof)
-    # adjoint
-    total: Vec6s2  # U: Σ s a
-    dual: Vec6s2  # Λ: Σ s λ
-    f_velocity: Vec6s2
-    f_accel: Vec6s2
-    f_total: Vec6s2
-    f_dual: Vec6s2
-    f_pose: Vec6s2
-    lam: Reals2
-    qacc: Reals2
-    qd: Reals2
-    tangent: Reals2  # adjoint of a stage's position, in the tangent space
-    vel_bar: Reals2  # adjoint of a stage's velocity
-    acc_bar: Reals2  # adjoint of a stage's acceleration
-    work: Reals2
-    stage_vel_bar: Reals2  # of all stages of a step
-    stage_acc_bar: Reals2
-    stage_rate_bar: Reals2
-    pos_bar: Reals2  # adjoint of the state at the end of a step
-    rate_bar: Reals2
-    pos_bar0: Reals2  # adjoint of the state at its start
-    grad: Reals2  # adjoint of θ of this world
+    "row_kind": (wp.int32, "row"), "row_index": (wp.int32, "row"),
+    "row_dof": (vec3i, "row"), "row_coef": (vec3, "row"),  # dofs, −1 where unused, and J at them
+    "row_x": (f64, "row"),  # position less margin
+    "row_aref": (f64, "row"), "row_d": (f64, "row"), "row_loss": (f64, "row"),  # D = 1/R
+    "row_jar": (f64, "row"), "row_dir": (f64, "row"),  # J a − aref, J step
+    # contacts; the frame has rows n, t1, t2, and what is along J stands along these, then about them
+    "con_pair": (wp.int32, "contact"), "con_which": (wp.int32, "contact"), "con_dist": (f64, "contact"),
+    "con_point": (vec3, "contact"), "con_frame": (mat33, "contact"), "con_hint": (vec3, "contact"),
+    "con_d": (f64, "contact"),  # D of the normal (elliptic) or of every edge (pyramidal)
+    "con_aref": (vec6, "contact"), "con_jar": (vec6, "contact"), "con_dir": (vec6, "contact"),
+    "con_jac": (vec6, "jacobian"),  # columns of J, (contact, dof)
+}  # fmt: skip
+#: Working memory of the adjoint.
+ADJOINT: dict[str, tuple[Any, str]] = {
+    "total": (vec6, "body"), "dual": (vec6, "body"),  # U: Σ s a, Λ: Σ s λ
+    "f_velocity": (vec6, "body"), "f_accel": (vec6, "body"), "f_total": (vec6, "body"), "f_dual": (vec6, "body"),
+    "f_pose": (vec6, "body"),
+    "lam": (f64, "dof"), "qacc": (f64, "dof"), "qd": (f64, "dof"),
+    "tangent": (f64, "dof"),  # adjoint of a stage's position, in the tangent space; of its velocity and acceleration
+    "vel_bar": (f64, "dof"), "acc_bar": (f64, "dof"),
+    "stage_vel_bar": (f64, "dof"), "stage_acc_bar": (f64, "stage"), "stage_rate_bar": (f64, "stage"),  # of all stages
+    "pos_bar": (f64, "dof"), "rate_bar": (f64, "dof"),  # adjoint of the state at the end of a step
+    "pos_bar0": (f64, "dof"),  # and of the position at its start
+    "grad": (f64, "theta"),
+}  # fmt: skip
 
+#: What a thread works on: the memory, the world's θ and controls, its slot and the rows of its controls.
+World: Any = _struct(
+    "World",
+    {
+        **{name: wp.array2d(dtype=dtype) for name, (dtype, _) in (TRAJECTORY | IMPLICIT | SCRATCH | ADJOINT).items()},
+        "held": Ints,  # of a stage: 1 if it has scalar rows, plus 2 if it has contacts
+        "th": Reals,
+        "ctrl": Reals2,
+        "ctrl_bar": Reals2,
+        **dict.fromkeys(("t", "rc", "rb"), wp.int32),
+    },
+)
 
-@wp.struct
-class Rows:
-    """Memory of the trajectories, one row per stage of a step."""
-
-    qpos: Reals2
-    qvel: Reals2
-    rate: Reals2  # RK4: rate of the position in the chart at the start of the step
-    acc: Reals2
-    soft: Reals2  # a' of the implicit integrators
-    hess: Reals2  # factor of H
-    soft_hess: Reals2  # factor of M + h B
-    held: Ints  # of a stage: 1 if it has scalar rows, plus 2 if it has contacts
+#: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each`` and parameter
+#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``.
+Chunk: Any = _struct(
+    "Chunk",
+    dict.fromkeys(
+        ("first", "local", "nparam", "each", "lag", "skip", "period", "slot", "slot_stride", "keep"), wp.int32
+    ),
+)

@@ -12,8 +12,9 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import DIVERGED
-from dropo_torch.simulators.warp.engine import Engine, Problem
-from dropo_torch.simulators.warp.fields import DIRECT, MIXED, Fields
+from dropo_torch.simulators.warp.engine import Batch, Engine
+from dropo_torch.simulators.warp.fields import Fields
+from dropo_torch.simulators.warp.layout import DIRECT, MIXED
 from dropo_torch.simulators.warp.pairs import candidate_pairs
 from dropo_torch.simulators.warp.simulator import LOADING
 from dropo_torch.simulators.warp.start import start_warp
@@ -66,9 +67,9 @@ class Variants:
             return None
         pairs = candidate_pairs(model)
         theta = Fields(model, self._space, pairs).constant()
-        problem = Problem(len(starts), 1, controls.shape[1], 1)
+        batch = Batch(len(starts), 1, controls.shape[1], 1)
         inputs = [torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, starts, controls)]
-        flat, _ = engine.simulate(problem, inputs[0], inputs[1], inputs[2], keep=False)
+        flat, _ = engine.simulate(batch, inputs[0], inputs[1], inputs[2], keep=False)
         out = flat.numpy().reshape(len(starts), controls.shape[1], starts.shape[1])
         with np.errstate(invalid="ignore"):
             out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan

@@ -1,0 +1,43 @@
+"""What θ consists of: the fields of a model that stand in it, and the numbers that are derived from them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Sections of θ that are fields of MjModel: name in the tables, field, columns kept of each row (0: all).
+DIRECT = (
+    ("gravity", "opt.gravity", 0), ("density", "opt.density", 0), ("viscosity", "opt.viscosity", 0),
+    ("wind", "opt.wind", 0), ("mass", "body_mass", 0), ("inertia", "body_inertia", 0), ("ipos", "body_ipos", 0),
+    ("gravcomp", "body_gravcomp", 0), ("stiffness", "jnt_stiffness", 0), ("stiffnesspoly", "jnt_stiffnesspoly", 0),
+    ("spring", "qpos_spring", 0), ("range", "jnt_range", 0), ("jnt_margin", "jnt_margin", 0),
+    ("jnt_solref", "jnt_solref", 0), ("jnt_solimp", "jnt_solimp", 0), ("actfrcrange", "jnt_actfrcrange", 0),
+    ("damping", "dof_damping", 0), ("dampingpoly", "dof_dampingpoly", 0), ("armature", "dof_armature", 0),
+    ("frictionloss", "dof_frictionloss", 0), ("dof_solref", "dof_solref", 0), ("dof_solimp", "dof_solimp", 0),
+    ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 1),
+    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 5),
+    ("eq_solref", "eq_solref", 0), ("eq_solimp", "eq_solimp", 0),
+)  # fmt: skip
+#: Fields from which the contact parameters of a pair are mixed.
+MIXED = (
+    "geom_friction", "geom_solref", "geom_solimp", "geom_margin", "pair_friction", "pair_solref",
+    "pair_solreffriction", "pair_solimp", "pair_margin",
+)  # fmt: skip
+#: Numbers of a pair of geoms: what is mixed, and the sum of the two bodies' inverse weights.
+PAIR = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 1, "invweight": 1}
+#: All sections of θ, in order.
+SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight")
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Where θ's sections start: name → (offset, size), and the length of θ."""
+
+    sections: dict[str, tuple[int, int]]
+    size: int
+
+    def columns(self, name: str) -> np.ndarray:
+        """Columns of a section."""
+        start, size = self.sections[name]
+        return np.arange(start, start + size)

@@ -1,0 +1,254 @@
+"""Which geoms touch and where, and what adjoints of distance, point and frame mean for the two geoms.
+
+A kind of pair takes a constant in ``collide``, a line in ``tables``, a branch in :func:`find_contacts` and one in
+:func:`geometry_adjoint`.
+"""
+
+# mypy: ignore-errors
+# ruff: noqa: UP018, RUF046
+# kernel code: Warp reads these functions with types of its own, and a variable of a loop wants int(0)
+
+from __future__ import annotations
+
+import warp as wp
+
+from dropo_torch.simulators.warp.collide import (
+    CAPSULE_BOX,
+    PLANE_BOX,
+    PLANE_CAPSULE,
+    PLANE_CYLINDER,
+    PLANE_ELLIPSOID,
+    PLANE_SPHERE,
+    ROUND,
+    are_parallel,
+    capsule_box_codes,
+    capsule_box_contact,
+    capsule_box_dual,
+    column,
+    corner,
+    overlap_end,
+    plane_point,
+    round_contact,
+    round_dual,
+    support_dual,
+    support_point,
+    vec7,
+)
+from dropo_torch.simulators.warp.spatial import join, nothing, wrench
+from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
+
+
+@wp.func(inline=True)
+def geom_centre(m: Tables, w: World, g: int) -> vec3:
+    """Centre of a geom, from the origin of the sweep."""
+    b = m.geom_body[g]
+    return w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
+
+
+@wp.func(inline=True)
+def geom_rotation(m: Tables, w: World, g: int) -> mat33:
+    """Rotation of a geom."""
+    return w.xmat[w.t, m.geom_body[g]] * m.geom_mat[g]
+
+
+@wp.func(inline=True)
+def geom_axis(m: Tables, w: World, g: int) -> vec3:
+    """Third axis of a geom: a plane's normal, the axis of a capsule."""
+    return w.xmat[w.t, m.geom_body[g]] * column(m.geom_mat[g], 2)
+
+
+@wp.func(inline=True)
+def half_axis(m: Tables, w: World, g: int) -> vec3:
+    """Half-axis of a capsule, zero for a sphere (whose second size is zero)."""
+    return geom_axis(m, w, g) * m.geom_size[g][1]
+
+
+@wp.func(inline=True)
+def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
+    """Write contact ``n`` with its frame; the first tangent is along the hint, or along y or z without one."""
+    w.con_pair[w.t, n] = k
+    w.con_which[w.t, n] = which
+    w.con_dist[w.t, n] = x[0]
+    w.con_point[w.t, n] = vec3(x[1], x[2], x[3])
+    normal = vec3(x[4], x[5], x[6])
+    y = hint
+    if wp.dot(hint, hint) < f64(0.25):
+        y = vec3(ZERO, ONE, ZERO)
+        if normal[1] >= HALF or normal[1] <= -HALF:
+            y = vec3(ZERO, ZERO, ONE)
+    w.con_hint[w.t, n] = y
+    y = y - normal * wp.dot(normal, y)
+    length = wp.length(y)
+    t1 = vec3(ONE, ZERO, ZERO)
+    if length > MINVAL:
+        t1 = y / length
+    t2 = wp.cross(normal, t1)
+    w.con_frame[w.t, n] = mat33(normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2])
+
+
+@wp.func(inline=True)
+def _towards_plane(kind: int, n: vec3, c: vec3, axis: vec3, rot: mat33, size: vec3, which: int) -> vec3:
+    """The point of a geom that may touch a plane with normal ``n``; ``which`` numbers them."""
+    x = c
+    if kind == PLANE_CAPSULE:
+        x = c + axis * (size[1] * (ONE - TWO * f64(which)))
+    elif kind == PLANE_BOX:
+        x = c + rot * corner(which, size)
+    elif kind > PLANE_BOX:
+        x = support_point(kind, n, c, rot, size, which)
+    return x
+
+
+@wp.func(inline=True)
+def find_contacts(m: Tables, w: World) -> int:
+    """List the contacts of a configuration and return their number."""
+    n = int(0)
+    for k in range(m.npair):
+        kind = m.pair_kind[k]
+        g1 = m.pair_geom1[k]
+        g2 = m.pair_geom2[k]
+        margin = w.th[m.o_pair_margin + k]
+        c1 = geom_centre(m, w, g1)
+        c2 = geom_centre(m, w, g2)
+        reach = margin + m.pair_bound[k]
+        normal = vec3()
+        near = bool(False)
+        if kind <= PLANE_ELLIPSOID:
+            normal = geom_axis(m, w, g1)
+            near = wp.dot(normal, c2 - c1) < reach
+        else:
+            near = wp.length_sq(c2 - c1) < reach * reach
+        if near:
+            size1 = m.geom_size[g1]
+            size2 = m.geom_size[g2]
+            axis = geom_axis(m, w, g2)
+            a1 = vec3()
+            a2 = axis * size2[1]
+            rot = mat33()
+            parallel = bool(False)
+            first = int(0)
+            second = int(0)
+            if kind == ROUND:
+                a1 = half_axis(m, w, g1)
+                parallel = are_parallel(a1, a2)
+            elif kind > PLANE_CAPSULE:
+                rot = geom_rotation(m, w, g2)
+            if kind == CAPSULE_BOX and size1[1] > ZERO:  # a sphere has only the place 0
+                a1 = half_axis(m, w, g1)
+                back = wp.transpose(rot)
+                limit = margin + TWO * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
+                first, second = capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
+            start = n
+            for i in range(m.pair_points[k]):
+                possible = bool(True)
+                which = i
+                hint = vec3()
+                x = vec7()
+                if kind <= PLANE_ELLIPSOID:
+                    radius = ZERO
+                    if kind <= PLANE_CAPSULE:
+                        radius = size2[0]
+                    if kind == PLANE_CAPSULE:
+                        hint = axis
+                    elif kind == PLANE_BOX:  # the first four corners on the plane's side of the centre
+                        possible = wp.dot(normal, rot * corner(i, size2)) <= ZERO and n - start < 4
+                    elif kind == PLANE_CYLINDER:  # the near rim, then the far rim and two points of the near disk
+                        possible = i == 0 or n > start
+                    x = plane_point(normal, c1, _towards_plane(kind, normal, c2, axis, rot, size2, i), radius)
+                elif kind == ROUND:
+                    which = int(0)
+                    possible = i == 0 or parallel
+                    if parallel:
+                        which = overlap_end(c1, a1, c2, a2, i)
+                    x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
+                else:
+                    which = wp.where(i == 0, first, second)
+                    possible = which >= 0
+                    if possible:
+                        x = capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
+                if possible and x[0] < margin:
+                    _add(w, n, k, which, x, hint)
+                    n += 1
+    return n
+
+
+@wp.func
+def _turned(r: mat33, rbar: mat33) -> vec3:
+    """Torque that a rotation's adjoint is: Σ columns r × r̄."""
+    return (
+        wp.cross(column(r, 0), column(rbar, 0))
+        + wp.cross(column(r, 1), column(rbar, 1))
+        + wp.cross(column(r, 2), column(rbar, 2))
+    )
+
+
+@wp.func
+def _pull(f: vec3, p: vec3, torque: vec3) -> vec6:
+    """The spatial force of ``f`` at ``p`` and a torque."""
+    return wrench(f, p) + join(torque, vec3())
+
+
+@wp.func(inline=True)
+def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar0: vec3, t1bar0: vec3, t2bar: vec3):
+    """From the adjoints of distance, point and frame to spatial forces on the two geoms' bodies."""
+    _late = wp.grad(nothing)(ONE)
+    k = w.con_pair[w.t, c]
+    which = w.con_which[w.t, c]
+    kind = m.pair_kind[k]
+    g1 = m.pair_geom1[k]
+    g2 = m.pair_geom2[k]
+    frame = w.con_frame[w.t, c]
+    n = vec3(frame[0, 0], frame[0, 1], frame[0, 2])
+    t1 = vec3(frame[1, 0], frame[1, 1], frame[1, 2])
+    hint = w.con_hint[w.t, c]
+    # t2 = n × t1, t1 = (hint − n n·hint) / |...|
+    nbar = nbar0 + wp.cross(t1, t2bar)
+    t1bar = t1bar0 + wp.cross(t2bar, n)
+    along = wp.dot(n, hint)
+    length = wp.length(hint - n * along)
+    ybar = vec3()
+    if length > MINVAL:
+        ybar = (t1bar - t1 * wp.dot(t1, t1bar)) / length
+    nbar = nbar - ybar * along - hint * wp.dot(n, ybar)
+    c1 = geom_centre(m, w, g1)
+    c2 = geom_centre(m, w, g2)
+    size = m.geom_size[g2]
+    rot = mat33()
+    if kind != ROUND and kind != PLANE_SPHERE:
+        rot = geom_rotation(m, w, g2)
+    y1 = vec6()
+    y2 = vec6()
+    if kind <= PLANE_ELLIPSOID:
+        # dist = n·(x − c1) − r, p = x − n (r + dist/2), x a point of the second geom
+        radius = ZERO
+        if kind <= PLANE_CAPSULE:
+            radius = size[0]
+        x = _towards_plane(kind, n, c2, hint, rot, size, which)
+        slope = distbar - HALF * wp.dot(pbar, n)
+        xbar = pbar + n * slope
+        nbar = nbar + (x - c1) * slope - pbar * (radius + HALF * w.con_dist[w.t, c])
+        if kind >= PLANE_CYLINDER:
+            _k, nb, cb, rb, _sb, _w, _x = wp.grad(support_dual)(kind, n, c2, rot, size, which, xbar)
+            nbar = nbar + nb
+            y2 = _pull(cb, c2, _turned(rot, rb))
+        elif kind == PLANE_CAPSULE:  # its axis is the hint
+            y2 = _pull(xbar, x, wp.cross(hint, ybar - n * wp.dot(n, ybar)))
+        else:
+            y2 = wrench(xbar, x)
+        y1 = _pull(n * -slope, c1, wp.cross(n, nbar))
+    elif kind == ROUND:
+        a1 = half_axis(m, w, g1)
+        a2 = half_axis(m, w, g2)
+        c1b, a1b, _r1, c2b, a2b, _r2, _w, _d, _p, _n = wp.grad(round_dual)(
+            c1, a1, m.geom_size[g1][0], c2, a2, size[0], which, distbar, pbar, nbar
+        )
+        y1 = _pull(c1b, c1, wp.cross(a1, a1b))
+        y2 = _pull(c2b, c2, wp.cross(a2, a2b))
+    else:
+        a1 = half_axis(m, w, g1)
+        c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(capsule_box_dual)(
+            c1, a1, m.geom_size[g1][0], c2, rot, size, which, distbar, pbar, nbar
+        )
+        y1 = _pull(c1b, c1, wp.cross(a1, a1b))
+        y2 = _pull(cb, c2, _turned(rot, rb))
+    return y1, y2
