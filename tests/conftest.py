@@ -232,12 +232,6 @@ def answered(objective: Objective, request: Request) -> torch.Tensor:
     return objective.map(request.values, request.reduce, initial=initial).total
 
 
-def simulated_columns(objective: Objective, values: torch.Tensor) -> torch.Tensor:
-    """The observed columns ``(T, P, n)`` that the simulator gives for values ``(P, d)``, in units."""
-    run = objective.evaluator
-    return run.simulator.simulate(run.states, run.controls, values)[..., run.observation.index]
-
-
 def numerical_gradient(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-5) -> np.ndarray:
     """Central differences of a scalar function, ``(d,)``."""
     eye = step * np.eye(len(at))
