@@ -26,6 +26,7 @@ from .fit import fit as fit
 from .likelihood import log_likelihood as log_likelihood
 from .models.export import export_model as export_model
 from .objective import Objective as Objective
+from .optimizers import FitSettings as FitSettings
 from .parameters import Parameter as Parameter
 from .parameters import ParameterSpace as ParameterSpace
 from .problem import Problem as Problem

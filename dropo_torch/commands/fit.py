@@ -47,7 +47,7 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         log: ``"tensorboard"`` writes the history as TensorBoard events too.
     """
     from dropo_torch.baselines import make_search
-    from dropo_torch.fit import refuse_dead_parameters
+    from dropo_torch.excitation import refuse_dead_parameters
     from dropo_torch.problem import make_problem
 
     if log is not None:

@@ -37,7 +37,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
 
     Where the config has an ε for every column, the values to try are the geometric mean of the columns'.
     """
-    from dropo_torch.fit import refuse_dead_parameters
+    from dropo_torch.excitation import refuse_dead_parameters
     from dropo_torch.problem import make_problem
     from dropo_torch.report import write_sweep_report
     from dropo_torch.studies import sweep as study
