@@ -13,7 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dropo_torch.effects.twin import Twin, Variant, Windows
+from dropo_torch.effects.engine import Variant
+from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.gap.log import Chart
 
 #: Antithetic pairs of start noise by which rough windows are linearised, and their seed.
