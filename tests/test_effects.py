@@ -334,7 +334,7 @@ def test_coupling_is_a_spring_between_neighbours() -> None:
     setting = setting_of(model)
     states = some_states(model).numpy()
     found = find_effect("joint_coupling").force(
-        setting, "elbow", np.array([2.0]), states[:, : model.nq], states[:, model.nq :]
+        setting, "elbow", np.array([[2.0]]), states[:, : model.nq], states[:, model.nq :]
     )
     assert found is not None
     stretch = states[:, 1] - states[:, 0]

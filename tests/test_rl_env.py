@@ -496,14 +496,19 @@ def test_a_task_is_of_its_model() -> None:
 # effects
 
 
-class Reversed(ActuatorDeadband):
-    """An effect of a user's own, which only the general way can simulate: the mean of the last three commands."""
+class Mean(ActuatorDeadband):
+    """An effect of a user's own: the mean of the last three commands, times a number."""
 
     name = "own_command_test"
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        at = np.arange(signal.shape[1])
-        return sum(signal[:, np.maximum(at - k, 0)] for k in range(3)) * (values[0] / 3)
+    def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:
+        return command.expand(-1, 2)
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        known = torch.cat([state, signal], 1)
+        return known.unfold(1, 3, 1).sum(-1) * (values[:, :1] / 3), known[:, -2:]
 
     def memory(self, values: np.ndarray) -> float:
         return 0.02
@@ -560,7 +565,7 @@ CASES: dict[str, tuple[list[dict], Mapping[str, Mapping[str, Any]]]] = {
 
 @pytest.fixture(autouse=True, scope="module")
 def own_effects() -> None:
-    for effect in (Reversed(), Offset()):
+    for effect in (Mean(), Offset()):
         if effect.name not in VOCABULARY:
             register(effect)
 
