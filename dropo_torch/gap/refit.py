@@ -9,10 +9,13 @@ import numpy as np
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.twin import Variant
 from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of, robust_factors
+from dropo_torch.optimizers.least_squares import bounded_step
 from dropo_torch.parameters import ParameterSpace
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.
 STEP, LEAST_MOVE = 1e-3, 2e-5
+#: Ridge of a step, and its longest move relative to a parameter's scale.
+RIDGE, LONGEST = 1e-12, 5.0
 #: Move, relative to a parameter's scale, after which the starts are linearised again.
 FAR = 0.03
 
@@ -190,29 +193,10 @@ def _loss(residual: np.ndarray, fixed: np.ndarray, tail: float | None) -> tuple[
 
 
 def _step(residual: np.ndarray, slope: np.ndarray, vector: np.ndarray, limits: Limits, damping: float) -> np.ndarray:
-    """Return the damped step in units of the scales; numbers at a bound that it would cross stay there."""
+    """Return the damped step in units of the scales."""
     if not len(slope):
         return np.zeros(0)
     flat = slope.reshape(len(slope), -1)
-    normal, gradient = flat @ flat.T, -(flat @ residual.ravel())
-    free = np.ones(len(vector), dtype=bool)
-    move = np.zeros(len(vector))
-    for _ in range(len(vector)):
-        index = np.flatnonzero(free)
-        if not index.size:
-            break
-        part = normal[np.ix_(index, index)]
-        diagonal = np.diag(part).copy()
-        diagonal[diagonal <= 0] = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)
-        move[:] = 0.0
-        ridge = np.diag(damping * diagonal + 1e-12 * diagonal.max())
-        move[index] = np.linalg.lstsq(part + ridge, gradient[index], rcond=None)[0]
-        after = vector + move * limits.scale
-        tight = 1e-12 * limits.scale
-        below = (after < limits.low) & (vector <= limits.low + tight)
-        above = (after > limits.high) & (vector >= limits.high - tight)
-        stuck = free & (below | above)
-        if not stuck.any():
-            break
-        free &= ~stuck
-    return np.clip(move, -5.0, 5.0)
+    low, high = (limits.low - vector) / limits.scale, (limits.high - vector) / limits.scale
+    step = bounded_step(flat @ flat.T, -(flat @ residual.ravel()), low, high, damping, RIDGE)
+    return np.clip(step, -LONGEST, LONGEST)

@@ -16,11 +16,14 @@ import numpy as np
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.refit import Hypothesis, Limits, Refit, limits_of
+from dropo_torch.optimizers.least_squares import damped_step
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
 #: A candidate that moves the screened windows by fewer standard deviations of the noise cannot be judged by them.
 DEAD = 1.5
+#: Damping and ridge of the predicted moves.
+DAMPING, RIDGE = 1e-6, 1e-10
 #: Candidates that one batch of simulations holds.
 BATCH = 24
 
@@ -123,7 +126,8 @@ def _predict(
         dead = bool(np.linalg.norm(residual - origin) < DEAD and lengths.max(initial=0.0) < DEAD)
         columns = np.concatenate([shared, slope])
         start = np.array(placed.values)
-        move = _bounded(columns, residual, len(shared), start[moving], limits)
+        low, high = (limits.low - start[moving]) / limits.scale, (limits.high - start[moving]) / limits.scale
+        move = _move(columns, residual, len(shared), low, high)
         left = residual + move @ columns
         values = start.copy()
         values[moving] += move[len(shared) :] * limits.scale
@@ -138,23 +142,16 @@ def _moved(placed: Placed, first: int) -> list[int]:
     return [first + i for i in (range(len(placed.values)) if chosen is None else chosen)]
 
 
-def _bounded(
-    columns: np.ndarray, residual: np.ndarray, num_shared: int, values: np.ndarray, limits: Limits
-) -> np.ndarray:
-    """Least-squares move whose candidate part stays inside its bounds."""
-    size = len(values)
-    normal, gradient = columns @ columns.T, -(columns @ residual)
-    ridge = 1e-10 * np.diag(normal).max(initial=1e-300) * np.eye(len(normal)) + 1e-6 * np.diag(np.diag(normal))
-    move = np.linalg.solve(normal + ridge, gradient)
-    scale = limits.scale[-size:] if size else np.zeros(0)
-    low = (limits.low[-size:] - values) / scale if size else np.zeros(0)
-    high = (limits.high[-size:] - values) / scale if size else np.zeros(0)
+def _move(columns: np.ndarray, residual: np.ndarray, num_shared: int, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """Least-squares move whose last entries, the candidate's own, stay between ``low`` and ``high``."""
+    normal, force = columns @ columns.T, -(columns @ residual)
+    free = np.ones(len(force), dtype=bool)
+    move = damped_step(normal, force, free, DAMPING, RIDGE)
     own = np.clip(move[num_shared:], low, high)
-    if size and not np.array_equal(own, move[num_shared:]) and num_shared:
-        rest = residual + own @ columns[num_shared:]
-        part = normal[:num_shared, :num_shared] + ridge[:num_shared, :num_shared]
-        move[:num_shared] = np.linalg.solve(part, -(columns[:num_shared] @ rest))
-    move[num_shared:] = own
+    if not np.array_equal(own, move[num_shared:]):
+        free[num_shared:] = False
+        move = damped_step(normal, force - normal[:, num_shared:] @ own, free, DAMPING, RIDGE)
+        move[num_shared:] = own
     return move
 
 
@@ -184,11 +181,9 @@ def promising_families(base: Refit, caps: np.ndarray, candidates: Sequence[Candi
 
 def _left(origin: np.ndarray, columns: np.ndarray) -> float:
     """χ² that is left of residuals beside columns."""
-    norm = np.sqrt((columns**2).sum(1))
-    columns = columns[norm > 0] / norm[norm > 0, None]
     gradient = columns @ origin
-    normal = columns @ columns.T + 1e-9 * np.eye(len(columns))
-    return float(origin @ origin - gradient @ np.linalg.solve(normal, gradient))
+    free = np.ones(len(columns), dtype=bool)
+    return float(origin @ origin - gradient @ damped_step(columns @ columns.T, gradient, free, 1e-9))
 
 
 def promising_pairs(

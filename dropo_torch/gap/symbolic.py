@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
-
 import mujoco
 import numpy as np
 
@@ -11,8 +9,8 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.gap.locate import dof_names, setting_states
 from dropo_torch.gap.noise import FreeForces
 
-#: Terms are kept whose share of the force's deviation is at least this.
-THRESHOLD = 0.15
+#: Terms are kept whose share of the force's root mean square is at least this; ridge of the fits that drop the others.
+THRESHOLD, RIDGE = 0.15, 1e-6
 #: Share of the variance below which no formula is worth offering, and the most terms that one may have.
 WORTH, TERMS = 0.5, 5
 
@@ -20,7 +18,7 @@ WORTH, TERMS = 0.5, 5
 def describe(setting: Setting, free: FreeForces, dof: int) -> str:
     """Return a formula for the missing force at a degree of freedom, or nothing if none describes it.
 
-    Sequentially thresholded least squares (SINDy; Brunton, Proctor, Kutz 2016) over positions, velocities, their signs
+    Sparse regression over positions, velocities, their signs
     and squares, and commands, at the middle of short windows.
     """
     library = _library(setting, free, dof)
@@ -37,7 +35,7 @@ def describe(setting: Setting, free: FreeForces, dof: int) -> str:
     table, sizes = table[:, keep] / sizes[keep], sizes[keep]
     if size <= 0:
         return ""
-    weights = _sparse(table, force / size)
+    weights = sparse_regression(table, force / size)
     explained = 1 - float(((force / size - table @ weights) ** 2).sum() / ((force / size) ** 2).sum())
     chosen = np.flatnonzero(weights)
     if explained < WORTH or not 0 < len(chosen) <= TERMS:
@@ -50,14 +48,27 @@ def describe(setting: Setting, free: FreeForces, dof: int) -> str:
     return f"force at {place} ≈ {terms} ({100 * explained:.0f} % of its variance)"
 
 
-def _sparse(table: np.ndarray, force: np.ndarray) -> np.ndarray:
-    """Coefficients ``(p,)``, most of them zero."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        from pysindy.optimizers import STLSQ
+def sparse_regression(table: np.ndarray, force: np.ndarray) -> np.ndarray:
+    """Return coefficients ``(p,)``, most of them zero: sequentially thresholded least squares.
 
-        found = STLSQ(threshold=THRESHOLD, alpha=1e-6, max_iter=50).fit(table, force[:, None])
-    return np.asarray(found.coef_).reshape(-1)
+    Terms whose coefficient is below the threshold are dropped and the others fitted anew, until none is dropped
+    (Brunton, Proctor, Kutz 2016, doi:10.1073/pnas.1517384113); a ridge keeps terms that are alike from growing against
+    each other meanwhile.
+
+    Args:
+        table: the terms, of root mean square 1, ``(W, p)``.
+        force: of root mean square 1, ``(W,)``.
+    """
+    kept = np.arange(table.shape[1])
+    while True:
+        part = table[:, kept]
+        large = np.abs(np.linalg.solve(part.T @ part + RIDGE * np.eye(len(kept)), part.T @ force)) >= THRESHOLD
+        if large.all():
+            break
+        kept = kept[large]
+    weights = np.zeros(table.shape[1])
+    weights[kept] = np.linalg.lstsq(part, force, rcond=None)[0]
+    return weights
 
 
 def _library(setting: Setting, free: FreeForces, dof: int) -> dict[str, np.ndarray]:

@@ -16,7 +16,7 @@ import torch
 from dropo_torch.distribution import SearchBox, truncated_normal_icdf
 from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density, sample_moments
 from dropo_torch.objective import Reduce
-from dropo_torch.optimizers.gauss_newton import damped_step
+from dropo_torch.optimizers.least_squares import damped_step
 
 MAX_ITERATIONS = 25
 #: The stage stops after two accepted steps in a row that each gain less than this, in nats.
