@@ -139,8 +139,7 @@ def cut_windows(log: Trajectories, observation: Observation, length: int, *, str
     gives none.
     """
     bounds = episode_bounds(log)
-    longest = max(b - a for a, b in bounds)
-    commands = np.zeros((len(bounds), longest + 1, log.actions.shape[1]))
+    commands = np.zeros((len(bounds), longest_episode(log) + 1, log.actions.shape[1]))
     observed, following = observation.observed(log.observations), observation.observed(log.next_observations)
     measured, rates, episodes, steps = [], [], [], []
     for e, (a, b) in enumerate(bounds):
@@ -161,6 +160,29 @@ def cut_windows(log: Trajectories, observation: Observation, length: int, *, str
         np.array(steps, dtype=int),
         commands,
     )
+
+
+def longest_episode(log: Trajectories) -> int:
+    """Return the logged steps of the longest episode."""
+    return max(b - a for a, b in episode_bounds(log))
+
+
+def feature_sizes(setting: Setting, columns: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of each feature ``(m,)`` over observed columns ``(..., n)``."""
+    columns = columns.reshape(-1, columns.shape[-1])
+    return Chart.of(setting.observation).difference(columns, columns[:1]).std(0)
+
+
+def spread(windows: Windows, most: int) -> Windows:
+    """Return at most so many windows, evenly spread."""
+    if len(windows) <= most:
+        return windows
+    return windows.select(np.unique(np.linspace(0, len(windows) - 1, most).astype(int)))
+
+
+def blocks_of(episodes: np.ndarray, least: int) -> np.ndarray:
+    """Return blocks of windows ``(W,)`` that count as independent: episodes if there are enough, else tenths."""
+    return episodes if len(np.unique(episodes)) >= least else np.arange(len(episodes)) * 10 // max(len(episodes), 1)
 
 
 def make_setting(problem: Problem, log: Trajectories) -> Setting:

@@ -11,10 +11,18 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import Chart, cut_windows, make_setting, start_values
+from dropo_torch.gap.log import (
+    Chart,
+    cut_windows,
+    feature_sizes,
+    longest_episode,
+    make_setting,
+    spread,
+    start_values,
+)
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
-from dropo_torch.gap.verify import hold_out, spread
+from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
 
 #: Logged steps of a window that are tried, the longest first, and the roughness that ends the search.
@@ -23,7 +31,7 @@ ROUGH = 0.03
 #: Roughness from which on windows are linearised statistically.
 BENT = 0.001
 #: Typical error at a window's end, relative to the motion, from which on contacts come at other times than measured.
-FAR_OFF = 0.08
+ASTRAY = 0.08
 #: Windows of the last fit, at most, and short ones for the noise.
 MOST, SHORT = 120, 160
 
@@ -75,7 +83,7 @@ def prepare(problem: Problem) -> Scene:
 
 
 def _check_observed(problem: Problem) -> None:
-    """A window needs its start: where a position is observed, its velocity must be, too."""
+    """A window needs its initial state: where a position is observed, its velocity must be, too."""
     if blind := problem.observation.at_rest:
         raise InputError(
             f"gap: the velocity of {blind[0]} is not observed; derive velocities from positions "
@@ -123,8 +131,8 @@ def contact_windows(scene: Scene) -> Evidence | None:
 
 
 def _choose_window(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray) -> tuple[int, bool]:
-    """The longest window over which the simulation is still nearly linear in its start, and whether it is rough."""
-    longest = int(np.diff(np.append(-1, np.flatnonzero(train.terminals))).max())
+    """The longest window in whose initial state the simulation is still nearly linear, and whether it is rough."""
+    longest = longest_episode(train)
     touches = bool(twin.setting.signals.contacts.any())
     for length in LENGTHS:
         if length > longest:
@@ -132,15 +140,14 @@ def _choose_window(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np
         windows = spread(cut_windows(train, twin.setting.observation, length), 24)
         evidence = Evidence(twin, windows, noise, rough=True)
         rough = evidence.linearise(begin.variant).roughness
-        if rough < ROUGH and (not touches or _end_error(evidence, begin) < FAR_OFF):
+        if rough < ROUGH and (not touches or _end_error(evidence, begin) < ASTRAY):
             return length, rough > BENT
     return min(LENGTHS[-1], longest), True
 
 
 def _end_error(evidence: Evidence, begin: Hypothesis) -> float:
-    """Typical error at the windows' ends, relative to the motion's own deviation; the median over features."""
+    """Typical error at the windows' ends, relative to the motion's own standard deviation; the median over features."""
     found, _ = evidence.residuals([begin.variant])
     end = found[0, :, -evidence.chart.size :] * evidence.noise
-    measured = evidence.windows.measured
-    size = evidence.chart.difference(measured[:, 0], np.broadcast_to(measured[:1, 0], measured[:, 0].shape)).std(0)
+    size = feature_sizes(evidence.twin.setting, evidence.windows.measured[:, 0])
     return float(np.median(np.nanmedian(np.abs(end), axis=0) / np.maximum(size, 1e-12)))

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.effects.base import Setting
-from dropo_torch.gap.locate import dof_names, setting_states
+from dropo_torch.gap.locate import dof_names, middles
 from dropo_torch.gap.noise import FreeForces
 
 #: Terms are kept whose share of the force's root mean square is at least this; ridge of the fits that drop the others.
@@ -73,11 +73,9 @@ def sparse_regression(table: np.ndarray, force: np.ndarray) -> np.ndarray:
 
 def _library(setting: Setting, free: FreeForces, dof: int) -> dict[str, np.ndarray]:
     """Terms of the formula by name, ``(W,)`` each."""
-    model, windows = setting.model, free.windows
-    middle = setting_states(setting, windows.measured[:, windows.length // 2])
-    position, velocity = middle[:, : model.nq], middle[:, model.nq :]
-    names = dof_names(model)
-    found = {"1": np.ones(len(middle))}
+    model, names = setting.model, dof_names(setting.model)
+    position, velocity, command = middles(setting, free.windows)
+    found = {"1": np.ones(len(velocity))}
     for d in range(model.nv):
         v, speed = velocity[:, d], f"v({names[d]})"
         found[speed] = v
@@ -90,9 +88,6 @@ def _library(setting: Setting, free: FreeForces, dof: int) -> dict[str, np.ndarr
             found[place] = q
             if d == dof and model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE:
                 found[f"sin {place}"], found[f"cos {place}"] = np.sin(q), np.cos(q)
-    at = windows.steps + windows.length // 2
-    for i in range(windows.commands.shape[2]):
-        found[f"u({setting.names('actuator')[i] if i < model.nactuator else i})"] = windows.commands[
-            windows.episodes, at, i
-        ]
+    for i in range(command.shape[1]):
+        found[f"u({setting.names('actuator')[i] if i < model.nactuator else i})"] = command[:, i]
     return found
