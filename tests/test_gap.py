@@ -363,7 +363,7 @@ def test_given_noise_is_used() -> None:
 def test_free_forces_are_those_that_are_missing() -> None:
     scene = scene_of("joint_damping")
     variant = dataclasses.replace(true(hidden("joint_damping")), placed=()).variant
-    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), variant, scene.noise)
+    free = free_forces(scene.twin, short_windows(scene.setting, scene.train), variant, scene.noise)
     speed = free.windows.measured[:, :, 3].mean(1)
     slope = (free.forces[:, 1] * speed).sum() / (speed**2).sum()
     assert slope == pytest.approx(-0.02, rel=0.05)
@@ -528,7 +528,7 @@ def test_last_quarter_is_held_out(episodes: int) -> None:
 def test_scores_order_by_how_wrong_a_model_is() -> None:
     scene, case = scene_of("joint_damping"), hidden("joint_damping")
     right = true(case)
-    held = cut_held(scene.twin, scene.held, scene.problem.observation, right, scene.noise, 0.01)
+    held = cut_held(scene.evidence, scene.held, right)
     models = [right.at(np.array([right.declared[0], d])) for d in (0.02, 0.03, 0.05)]
     best, worse, worst = (score(scene.evidence, held, m) for m in models)
     floor = floor_score(scene.evidence, held, right)
@@ -541,7 +541,7 @@ def test_scores_order_by_how_wrong_a_model_is() -> None:
 
 def test_open_loop_floor_is_that_of_many_draws() -> None:
     scene = scene_of()
-    held = cut_held(scene.twin, scene.held, scene.problem.observation, scene.begin, scene.noise, 0.01)
+    held = cut_held(scene.evidence, scene.held, scene.begin)
     evidence = scene.evidence.on(held.rollouts)
     shape = (400, len(held.rollouts), evidence.chart.size)
     draws = np.concatenate([np.zeros((1, *shape[1:])), np.random.default_rng(0).standard_normal(shape)])
@@ -563,7 +563,7 @@ def test_open_loop_floor_is_that_of_many_draws() -> None:
 def test_regime_is_told(name: str, dof: int, words: str) -> None:
     scene = scene_of(name)
     base = refit(scene.evidence, scene.begin).hypothesis
-    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), base.variant, scene.noise)
+    free = free_forces(scene.twin, short_windows(scene.setting, scene.train), base.variant, scene.noise)
     assert guilty(free) == dof
     assert regime(scene.setting, free, dof).words == words
 

@@ -37,7 +37,8 @@ def add(ground: Ground, state: State) -> State:
         return replace(state, done=True)
     best = simplest(singles)
     if best.cost.excess / current.cost.excess > 1 - rules.most:
-        several = {"pairs": _pairs(ground, current, alive), "families": _families(ground, current, alive)}
+        families = promising_families(ground.focus(current), alive)
+        several = {"pairs": _pairs(ground, current, alive), "families": families}
         for words, groups in several.items():
             tried, state = ground.refits(state, current, groups, f"refitting {words}")
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
@@ -53,10 +54,6 @@ def _pairs(ground: Ground, current: Refit, alive: Sequence[Candidate]) -> list[l
     """Pairs of promising candidates, screened again from where they promise the most, on more windows."""
     focus = ground.focus(current, 2 * FEWER)
     return promising_pairs(focus, screen(focus, [c.placed for c in alive[:16]]), 5)
-
-
-def _families(ground: Ground, current: Refit, alive: Sequence[Candidate]) -> list[list[Placed]]:
-    return promising_families(ground.focus(current), alive)
 
 
 def swap(ground: Ground, state: State) -> State:

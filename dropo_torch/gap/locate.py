@@ -40,23 +40,24 @@ class Regressor:
     shown: np.ndarray
 
 
+def _joint_of(model: mujoco.MjModel, dof: int) -> tuple[int, int]:
+    """The joint of a degree of freedom, and which of its directions that is."""
+    joint = int(model.dof_jntid[dof])
+    return joint, dof - int(model.jnt_dofadr[joint])
+
+
 def dof_names(model: mujoco.MjModel) -> list[str]:
     """Return the joint of every degree of freedom, with its direction where it has several."""
-    names = []
-    for dof in range(model.nv):
-        joint = int(model.dof_jntid[dof])
-        offset = dof - int(model.jnt_dofadr[joint])
-        width = {0: 6, 1: 3}.get(int(model.jnt_type[joint]), 1)
-        names.append(joint_name(model, joint) + (f"[{offset}]" if width > 1 else ""))
-    return names
+    directions = np.bincount(model.dof_jntid, minlength=model.njnt)
+    joints = (_joint_of(model, dof) for dof in range(model.nv))
+    return [joint_name(model, j) + (f"[{offset}]" if directions[j] > 1 else "") for j, offset in joints]
 
 
 def force_unit(model: mujoco.MjModel, dof: int) -> str:
     """Return the unit of the generalised force on a degree of freedom."""
-    joint = int(model.dof_jntid[dof])
-    kind, offset = int(model.jnt_type[joint]), dof - int(model.jnt_dofadr[joint])
-    slides = kind == int(mujoco.mjtJoint.mjJNT_SLIDE) or (kind == int(mujoco.mjtJoint.mjJNT_FREE) and offset < 3)
-    return "N" if slides else "N·m"
+    (joint, offset), kinds = _joint_of(model, dof), mujoco.mjtJoint
+    kind = int(model.jnt_type[joint])
+    return "N" if kind == int(kinds.mjJNT_SLIDE) or (kind == int(kinds.mjJNT_FREE) and offset < 3) else "N·m"
 
 
 def middles(setting: Setting, windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

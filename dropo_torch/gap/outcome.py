@@ -40,10 +40,10 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
     noise = evidence.noise
     final, weighted = _last_fit(evidence, naming.final.hypothesis) if naming.named else (naming.final, evidence)
-    short, base, best = short_windows(problem, scene.train), naming.base.hypothesis, final.hypothesis
+    short, base, best = short_windows(setting, scene.train), naming.base.hypothesis, final.hypothesis
     before = free_forces(twin, short, base.variant, noise)
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
-    held = cut_held(twin, scene.held, problem.observation, best, noise, setting.signals.timestep)
+    held = cut_held(evidence, scene.held, best)
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
         shown = _named(setting, naming, final, weighted) if naming.named else (_unnamed(setting, before),)

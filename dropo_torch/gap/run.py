@@ -44,10 +44,10 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
     state = start(ground, scene.begin)
     if state.done:
         return ()
-    free = free_forces(
-        scene.twin, short_windows(scene.problem, scene.train), state.base.hypothesis.variant, scene.noise
-    )  # fmt: skip
-    return places(scene.setting, free, state.first)
+    short = short_windows(scene.setting, scene.train)
+    return places(
+        scene.setting, free_forces(scene.twin, short, state.base.hypothesis.variant, scene.noise), state.first
+    )
 
 
 def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> Naming:
@@ -68,8 +68,7 @@ def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
         scene: of :func:`prepare`.
         hypothesis: such as ``name(scene).base.hypothesis`` and ``.final.hypothesis``.
     """
-    step = scene.setting.signals.timestep
-    held = cut_held(scene.twin, scene.held, scene.problem.observation, hypothesis, scene.noise, step)
+    held = cut_held(scene.evidence, scene.held, hypothesis)
     return score(scene.evidence, held, hypothesis), floor_score(scene.evidence, held, hypothesis)
 
 

@@ -21,31 +21,24 @@ def describe(setting: Setting, free: FreeForces, dof: int) -> str:
     Sparse regression over positions, velocities, their signs
     and squares, and commands, at the middle of short windows.
     """
-    library = _library(setting, free, dof)
-    force = free.forces[:, dof]
+    library, force = _library(setting, free, dof), free.forces[:, dof]
     table = np.stack(list(library.values()), axis=1)
     usable = np.isfinite(force) & np.isfinite(table).all(1)
-    if usable.sum() < 5 * len(library):
-        return ""
     table, force = table[usable], force[usable]
-    sizes = np.sqrt((table**2).mean(0))
-    size = float(np.sqrt((force**2).mean()))
-    keep = sizes > 1e-12
-    names = [n for n, k in zip(library, keep, strict=True) if k]
-    table, sizes = table[:, keep] / sizes[keep], sizes[keep]
-    if size <= 0:
+    if len(force) < 5 * len(library) or not force.any():
         return ""
-    weights = sparse_regression(table, force / size)
-    explained = 1 - float(((force / size - table @ weights) ** 2).sum() / ((force / size) ** 2).sum())
+    sizes, size = np.sqrt((table**2).mean(0)), float(np.sqrt((force**2).mean()))
+    moving, weights = sizes > 1e-12, np.zeros(len(sizes))
+    weights[moving] = sparse_regression(table[:, moving] / sizes[moving], force / size)
+    coefficients = weights * size / np.where(moving, sizes, 1.0)
+    explained = 1 - float(((force - table @ coefficients) ** 2).sum() / (force**2).sum())
     chosen = np.flatnonzero(weights)
     if explained < WORTH or not 0 < len(chosen) <= TERMS:
         return ""
-    order = chosen[np.argsort(-np.abs(weights[chosen]))]
-    signs = ["+" if weights[i] > 0 else "−" for i in order]
-    numbers = [f"{abs(weights[i]) * size / sizes[i]:.3g}·{names[i]}" for i in order]
-    terms = " ".join(f"{s} {n}" for s, n in zip(signs, numbers, strict=True)).removeprefix("+ ")
-    place = dof_names(setting.model)[dof]
-    return f"force at {place} ≈ {terms} ({100 * explained:.0f} % of its variance)"
+    names, order = list(library), chosen[np.argsort(-np.abs(weights[chosen]))]
+    terms = [f"{'+' if weights[i] > 0 else '−'} {abs(coefficients[i]):.3g}·{names[i]}" for i in order]
+    formula = " ".join(terms).removeprefix("+ ")
+    return f"force at {dof_names(setting.model)[dof]} ≈ {formula} ({100 * explained:.0f} % of its variance)"
 
 
 def sparse_regression(table: np.ndarray, force: np.ndarray) -> np.ndarray:

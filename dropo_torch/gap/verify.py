@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dropo_torch.data.observation import Observation
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting
-from dropo_torch.effects.twin import Twin, Windows
+from dropo_torch.effects.twin import Windows
 from dropo_torch.gap.evidence import LOST, Evidence
 from dropo_torch.gap.log import Chart, cut_windows, feature_sizes, longest_episode, spread
 from dropo_torch.gap.refit import Hypothesis
@@ -49,13 +48,13 @@ def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
     return log.select(slice(0, cut)), log.select(slice(cut, len(log)))
 
 
-def cut_held(
-    twin: Twin, log: Trajectories, observation: Observation, hypothesis: Hypothesis, noise: np.ndarray, timestep: float
-) -> Held:
+def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> Held:
     """Cut held-out data into single steps, and into stretches over which noise at the start does not take over."""
+    setting = evidence.twin.setting
+    observation, timestep = setting.observation, setting.signals.timestep
     steps = spread(cut_windows(log, observation, 1, stride=1), MOST)
-    evidence, positions = Evidence(twin, steps, noise, rough=False), position_features(twin.setting)
-    largest = GROWTH * _rms(feature_sizes(twin.setting, steps.measured[:, 0])[positions])
+    positions = position_features(setting)
+    largest = GROWTH * _rms(feature_sizes(setting, steps.measured[:, 0])[positions])
     chosen, seconds = steps, timestep
     for wanted in SECONDS:
         length = min(max(1, round(wanted / timestep)), longest_episode(log))
