@@ -43,7 +43,7 @@ UNSCORED = {"poles", "phase", "reference", "velocity", "damping_ratio"}
 def run_case(case: Case, backend: str, threads: int = 0) -> dict[str, Any]:
     """Return the answer of the workflow to a case, the document of its gap.json; what Warp refuses runs on MuJoCo."""
     from dropo_torch.config import load_config
-    from dropo_torch.errors import InputError
+    from dropo_torch.errors import UnsupportedModel
     from dropo_torch.gap import find_gap
     from dropo_torch.problem import make_problem
 
@@ -51,9 +51,7 @@ def run_case(case: Case, backend: str, threads: int = 0) -> dict[str, Any]:
         path = case.write(folder)
         try:
             problem = make_problem(load_config(path, {"backend": backend, "threads": threads}), general=True)
-        except InputError as error:
-            if "does not simulate" not in str(error):
-                raise
+        except UnsupportedModel:
             problem = make_problem(load_config(path, {"backend": "mujoco", "threads": threads}), general=True)
         return find_gap(problem).document()
 
@@ -91,10 +89,10 @@ def _names(entry: Mapping[str, Any]) -> set[Pair]:
 def _matches(case: Case, entries: Sequence[Mapping[str, Any]]) -> dict[int, int]:
     """Which entry names each hidden effect: an effect's own name first, then its equivalents."""
     found: dict[int, int] = {}
-    for hidden, (effect, twins) in enumerate(zip(case.effects, case.equivalents, strict=True)):
+    for hidden, (effect, equals) in enumerate(zip(case.effects, case.equivalents, strict=True)):
         own = (effect.name, effect.target)
         for accepted in (lambda e, own=own: own == (e["effect"], e.get("target")),
-                         lambda e, own=own, twins=twins: bool(_names(e) & {own, *twins})):  # fmt: skip
+                         lambda e, own=own, equals=equals: bool(_names(e) & {own, *equals})):  # fmt: skip
             free = [n for n, e in enumerate(entries) if n not in found.values() and accepted(e)]
             if free and hidden not in found:
                 found[hidden] = free[0]

@@ -17,6 +17,10 @@ class InputError(ValueError):
         super().__init__(" ".join(str(message).split()))
 
 
+class UnsupportedModel(InputError):
+    """A model that the chosen backend does not simulate; another one may."""
+
+
 def choices(name: object, available: Iterable[object]) -> str:
     """Return ``"; did you mean 'x'? (there are: x, y, z)"`` for an unknown ``name``."""
     names = [str(a) for a in available]

@@ -28,8 +28,8 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
-from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Starts, cost_of, robust_factors
-from dropo_torch.gap.intervals import deviations
+from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Linearisation, cost_of, robust_factors
+from dropo_torch.gap.intervals import standard_errors
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import free_forces
@@ -37,7 +37,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
 from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
-from dropo_torch.gap.screen import all_candidates, screen
+from dropo_torch.gap.screen import Focus, all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.support.files import plain_numbers
@@ -321,7 +321,7 @@ def test_given_noise_is_used() -> None:
 def test_free_forces_are_those_that_are_missing() -> None:
     scene = scene_of("joint_damping")
     variant = dataclasses.replace(true(hidden("joint_damping")), placed=()).variant
-    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), variant, scene.noise)
+    free = free_forces(scene.twin, short_windows(scene.setting, scene.train), variant, scene.noise)
     speed = free.windows.measured[:, :, 3].mean(1)
     slope = (free.forces[:, 1] * speed).sum() / (speed**2).sum()
     assert slope == pytest.approx(-0.02, rel=0.05)
@@ -380,11 +380,8 @@ def test_refit_stays_in_bounds(begin: tuple[float, float]) -> None:
     parameters = {"pole_mass": {**CART_POLE.declared["pole_mass"], "bounds": [0.3, 0.4]}}
     scene = prepare(load(hidden(), parameters=parameters))
     hypothesis = Hypothesis(begin[:1], (Placed(find_effect("joint_friction"), "rail", begin[1:]),))
-    limits, starts = (
-        limits_of(hypothesis, scene.problem.space, scene.setting),
-        scene.evidence.linearise(scene.begin.variant),
-    )
-    fitted = refit(scene.evidence, hypothesis, starts=starts)
+    limits, linear = limits_of(hypothesis, scene.twin), scene.evidence.linearise(scene.begin.variant)
+    fitted = refit(scene.evidence, hypothesis, linear=linear)
     assert fitted.hypothesis.vector[0] == pytest.approx(0.4, rel=1e-9)
     assert np.all((limits.low <= fitted.hypothesis.vector) & (fitted.hypothesis.vector <= limits.high))
 
@@ -398,7 +395,7 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     scene, (truth,) = scene_of(name), hidden(name).effects
     base = refit(scene.evidence, scene.begin)
     candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
-    ranked = screen(scene.evidence, base, candidates, caps=np.ones(len(scene.evidence.windows)))
+    ranked = screen(Focus(scene.evidence, base, np.ones(len(scene.evidence.windows))), candidates)
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
 
@@ -410,14 +407,14 @@ def spoilt(size: float, share: float, windows: int = 40, rows: int = 12) -> Refi
     """A fit that leaves noise in its windows, and residuals of ``size`` in a share of them."""
     residual = np.random.default_rng(0).standard_normal((windows, rows))
     residual[: round(share * windows)] *= size
-    starts = Starts(np.zeros((windows, rows, 0)), np.ones((windows, rows)), np.zeros((windows, rows)), 0.0)
+    starts = Linearisation(np.zeros((windows, rows, 0)), np.ones((windows, rows)), np.zeros((windows, rows)), 0.0)
     cost = cost_of(residual, starts, windows * rows, tail=TAIL * rows)
     return Refit(Hypothesis(()), cost, residual, residual[None], starts, np.ones(1), True, np.ones(windows))
 
 
 def test_robust_cost_is_that_of_noise_for_noise_and_a_logarithm_far_off() -> None:
     rows = 12
-    starts = Starts(np.zeros((1, rows, 0)), np.ones((1, rows)), np.zeros((1, rows)), 0.0)
+    starts = Linearisation(np.zeros((1, rows, 0)), np.ones((1, rows)), np.zeros((1, rows)), 0.0)
     costs = [cost_of(np.full((1, rows), a), starts, rows, tail=TAIL * rows).chi2 for a in (1.0, 1e4, 1e5, 1e6)]
     assert costs[0] == pytest.approx(rows)
     assert costs[3] - costs[2] == pytest.approx(costs[2] - costs[1], rel=1e-3)
@@ -451,7 +448,7 @@ def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
     values = np.linalg.solve(flat @ flat.T, flat @ error.ravel())
     residual = error - np.einsum("q,qwn->wn", values, slope)
     cost = Cost((residual**2).sum(1), np.zeros(W), W * N - Q)
-    starts = Starts(np.zeros((W, N, 0)), np.ones((W, N)), np.zeros((W, N)), 0.0)
+    starts = Linearisation(np.zeros((W, N, 0)), np.ones((W, N)), np.zeros((W, N)), 0.0)
     return Refit(Hypothesis(tuple(values)), cost, residual, slope, starts, np.ones(Q), True, np.ones(W))
 
 
@@ -459,14 +456,14 @@ def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
 def test_intervals_cover_as_often_as_they_say(shared: float) -> None:
     rng, blocks = np.random.default_rng(0), np.repeat(np.arange(W // 3), 3)
     fits = [linear_fit(rng, shared) for _ in range(300)]
-    inside = [np.abs(f.hypothesis.vector) < 1.6449 * deviations(f, blocks) for f in fits]
+    inside = [np.abs(f.hypothesis.vector) < 1.6449 * standard_errors(f, blocks) for f in fits]
     assert 0.84 < np.mean(inside) < 0.97
 
 
 def test_number_without_influence_is_not_known() -> None:
     fitted = linear_fit(np.random.default_rng(0))
     silent = dataclasses.replace(fitted, slope=fitted.slope * np.array([1.0, 0.0, 1.0])[:, None, None])
-    errors = deviations(silent, np.arange(W))
+    errors = standard_errors(silent, np.arange(W))
     assert np.isinf(errors[1])
     assert np.isfinite(errors[[0, 2]]).all()
 
@@ -489,7 +486,7 @@ def test_last_quarter_is_held_out(episodes: int) -> None:
 def test_scores_order_by_how_wrong_a_model_is() -> None:
     scene, case = scene_of("joint_damping"), hidden("joint_damping")
     right = true(case)
-    held = cut_held(scene.twin, scene.held, scene.problem.observation, right, scene.noise, 0.01)
+    held = cut_held(scene.evidence, scene.held, right)
     models = [right.at(np.array([right.declared[0], d])) for d in (0.02, 0.03, 0.05)]
     best, worse, worst = (score(scene.evidence, held, m) for m in models)
     floor = floor_score(scene.evidence, held, right)
@@ -502,7 +499,7 @@ def test_scores_order_by_how_wrong_a_model_is() -> None:
 
 def test_open_loop_floor_is_that_of_many_draws() -> None:
     scene = scene_of()
-    held = cut_held(scene.twin, scene.held, scene.problem.observation, scene.begin, scene.noise, 0.01)
+    held = cut_held(scene.evidence, scene.held, scene.begin)
     evidence = scene.evidence.on(held.rollouts)
     shape = (400, len(held.rollouts), evidence.chart.size)
     draws = np.concatenate([np.zeros((1, *shape[1:])), np.random.default_rng(0).standard_normal(shape)])
@@ -524,9 +521,9 @@ def test_open_loop_floor_is_that_of_many_draws() -> None:
 def test_regime_is_told(name: str, dof: int, words: str) -> None:
     scene = scene_of(name)
     base = refit(scene.evidence, scene.begin).hypothesis
-    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), base.variant, scene.noise)
+    free = free_forces(scene.twin, short_windows(scene.setting, scene.train), base.variant, scene.noise)
     assert guilty(free) == dof
-    assert regime(scene.setting, free, dof)[0] == words
+    assert regime(scene.setting, free, dof).words == words
 
 
 def test_place_is_told() -> None:
@@ -550,7 +547,7 @@ def test_interrupted_search_goes_on_to_the_same_result(tmp_path: Path) -> None:
     store = tmp_path / "gap-progress.pkl"
 
     def stop(stage: str, _share: float) -> None:
-        if store.exists() and pickle.loads(store.read_bytes())["stage"].number == 1:
+        if store.exists() and pickle.loads(store.read_bytes())["state"].number == 1:
             raise Stopped(stage)
 
     with pytest.raises(Stopped):

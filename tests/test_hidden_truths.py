@@ -15,7 +15,7 @@ from benchmarks.hidden_effects import judge, reductions
 from dropo_torch.config import load_config
 from dropo_torch.problem import make_problem
 
-SMOOTH = [s for s in SYSTEMS if not s.startswith("coarse_")]
+SMOOTH = [s for s in SYSTEMS if not SYSTEMS[s].coarse]
 
 
 def short(system: System, *effects: Effect, seed: int = 3, transitions: int = 40, **given) -> truths.Case:
@@ -284,14 +284,14 @@ def test_a_case_has_the_gap_that_was_asked_for() -> None:
     assert case.name == "push"
 
 
-def answer(*effects: tuple, twins: tuple = ()) -> dict:
+def answer(*effects: tuple, equivalents: tuple = ()) -> dict:
     return {
         "effects": [
             {
                 "effect": e,
                 "target": t,
                 "parameters": {k: {"value": v, "low": 0.9 * v, "high": 1.1 * v} for k, v in p.items()},
-                "indistinguishable_from": [{"effect": a, "target": b} for a, b in twins],
+                "indistinguishable_from": [{"effect": a, "target": b} for a, b in equivalents],
             }
             for e, t, p in effects
         ],
@@ -311,8 +311,8 @@ def test_judging() -> None:
     assert right["covered"] == [True]
     assert right["reduction"] == pytest.approx({"mse": 0.995, "rollout_rmse": 0.75}, abs=1e-3)
     assert judge(case, answer(("actuator_damping", "leg_motor", {"damping": 0.1})))["right"]
-    named_as_twin = answer(("joint_friction", "leg_joint", {}), twins=(("joint_damping", "leg_joint"),))
-    assert judge(case, named_as_twin)["right"]
+    named_as_equivalent = answer(("joint_friction", "leg_joint", {}), equivalents=(("joint_damping", "leg_joint"),))
+    assert judge(case, named_as_equivalent)["right"]
     assert not judge(case, answer(("joint_damping", "foot_joint", {"damping": 2.0})))["right"]
     assert not judge(case, answer(("joint_damping", "leg_joint", {}), ("armature", "leg_joint", {})))["right"]
     assert not judge(case, answer())["right"]

@@ -83,7 +83,7 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     },
     "gravity_tilt": dict.fromkeys(("torque_arm", "servo_arm", "cart_pole", "furuta", "puck", "hopper"), (None,)),
     "ground_slope": {"puck": (None,), "hopper": (None,)},
-    "integration": {s: (None,) for s in SYSTEMS if s.startswith("coarse_")},
+    "integration": {s: (None,) for s in SYSTEMS if SYSTEMS[s].coarse},
     "actuator_gain": _MOTORS,
     "actuator_bias": _ACTUATORS,
     "actuator_damping": _ACTUATORS,
@@ -169,7 +169,7 @@ def cases(seed: int, which: str = "all") -> list[CaseSpec]:
         return [*chosen, _spec("double", *_pair(DOUBLES[0]), seed)]
     if which != "all":
         raise ValueError(f"which is {which!r}; expected all or small")
-    systems = [s for s in SYSTEMS if not s.startswith("coarse_")]
+    systems = [s for s in SYSTEMS if not SYSTEMS[s].coarse]
     found = [_spec("null", s, (), seed, n) for s in systems for n in range(2)]
     found += [s for e in VOCABULARY for s in _spread(e, seed, 2)]
     found += [_spec("double", *_pair(d), seed) for d in DOUBLES]

@@ -58,11 +58,12 @@ class System:
         start: joint → half width of the positions, half width of the velocities at the start.
         start_mean: joint → what the start's positions are centred on, where that is not ``qpos0``.
         scales: joint → typical sizes.
-        twins: groups of (effect, target) that are the same thing here, by construction of the mechanism.
+        equivalents: groups of (effect, target) that are the same thing here, by construction of the mechanism.
         observation: what the log's columns are.
         episodes, transitions: size of the log; the length of an episode is drawn from a range.
         free: the name of a free joint which starts with random velocities on a table.
         substeps: steps of the truth in one logged transition.
+        coarse: whether the user's model takes steps too large to be right.
     """
 
     name: str
@@ -72,12 +73,13 @@ class System:
     start: Mapping[str, tuple[float, float]]
     scales: Mapping[str, Scale]
     start_mean: Mapping[str, float] = field(default_factory=dict)
-    twins: tuple[frozenset[tuple[str, str | None]], ...] = ()
+    equivalents: tuple[frozenset[tuple[str, str | None]], ...] = ()
     observation: tuple[str, ...] = ("qpos", "qvel")
     episodes: int = 8
     transitions: tuple[int, int] = (300, 450)
     free: str = ""
     substeps: int = 40
+    coarse: bool = False
 
     @property
     def frame_skip(self) -> int:
@@ -99,15 +101,15 @@ def mass(body: str, own: float) -> dict[str, object]:
     }  # fmt: skip
 
 
-def twins(*groups: tuple[tuple[str, str | None], ...]) -> tuple[frozenset[tuple[str, str | None]], ...]:
+def groups(*found: tuple[tuple[str, str | None], ...]) -> tuple[frozenset[tuple[str, str | None]], ...]:
     """Return groups of (effect, target) as sets."""
-    return tuple(frozenset(g) for g in groups)
+    return tuple(frozenset(g) for g in found)
 
 
 def coarse(system: System, timestep: float) -> System:
     """Return the system with a model that a careless user has: Euler's method, a large step."""
     xml = re.sub(r"<option[^>]*?/>|<option[^>]*?>", lambda m: _euler(m[0], timestep), system.xml, count=1)
-    return replace(system, name=f"coarse_{system.name}", xml=xml)
+    return replace(system, name=f"coarse_{system.name}", xml=xml, coarse=True)
 
 
 def _euler(option: str, timestep: float) -> str:
@@ -155,7 +157,7 @@ TORQUE_ARM = System(
         "shoulder": Scale(6.0, 4.0, 0.3),
         "elbow": Scale(2.0, 5.0, 0.04),
     },
-    twins=twins(
+    equivalents=groups(
         (("armature", "yaw"), ("inertia", "turret"), ("payload", "turret"), ("center_of_mass", "turret")),
     ),
 )
@@ -199,7 +201,7 @@ SERVO_ARM = System(
         "elbow": Scale(6.0, 4.0, 0.12),
         "wrist": Scale(0.4, 5.0, 0.003),
     },
-    twins=twins(
+    equivalents=groups(
         (("armature", "shoulder"), ("inertia", "upper")),
         (("fluid_drag", "upper"), ("joint_quadratic_damping", "shoulder")),
         (("armature", "wrist"), ("inertia", "hand")),
@@ -228,7 +230,7 @@ CART_POLE = System(
     commands=(Command(0.9, hold=(0.15, 0.0), joint="rail", band=(0.3, 2.5)),),
     start={"rail": (0.3, 0.5), "hinge": (2.0, 3.0)},
     scales={"rail": Scale(7.0, 1.5, 1.8), "hinge": Scale(0.6, 5.0, 0.06)},
-    twins=twins(
+    equivalents=groups(
         (("actuator_bias", "push"), ("external_force", "cart")),
         (("fluid_drag", "cart"), ("joint_quadratic_damping", "rail")),
         (("armature", "rail"), ("payload", "cart")),
@@ -259,7 +261,7 @@ FURUTA = System(
     commands=(Command(0.9, hold=(0.15, 0.02), joint="turn", band=(0.4, 3.0)),),
     start={"turn": (1.5, 2.0), "swing": (2.0, 3.0)},
     scales={"turn": Scale(0.1, 5.0, 0.006), "swing": Scale(0.15, 7.0, 0.004)},
-    twins=twins(
+    equivalents=groups(
         (("armature", "turn"), ("inertia", "arm"), ("payload", "arm"), ("center_of_mass", "arm")),
         (("fluid_drag", "arm"), ("joint_quadratic_damping", "turn")),
     ),
@@ -289,7 +291,7 @@ PUCK = System(
     commands=(Command(1.0, band=(0.3, 1.5)), Command(1.0, band=(0.3, 1.5))),
     start={"root": (0.0, 1.5)},
     scales={"root": Scale(4.0, 1.0, 1.4)},
-    twins=twins(
+    equivalents=groups(
         (("gravity_tilt", None), ("external_force", "puck")),
         (("contact_friction", "puck"), ("contact_friction", "floor")),
         (("contact_stiffness", "puck"), ("contact_stiffness", "floor")),
@@ -333,7 +335,7 @@ HOPPER = System(
         "rootx": Scale(60.0, 1.0, 15.0), "rootz": Scale(100.0, 1.0, 15.0), "rooty": Scale(40.0, 2.0, 1.0),
         "thigh_joint": Scale(60.0, 3.0, 2.0), "leg_joint": Scale(60.0, 4.0, 1.5), "foot_joint": Scale(40.0, 4.0, 1.2),
     },
-    twins=twins(
+    equivalents=groups(
         (("contact_friction", "foot_geom"), ("contact_friction", "floor")),
         (("contact_stiffness", "foot_geom"), ("contact_stiffness", "floor")),
         (("contact_margin", "foot_geom"), ("contact_margin", "floor"), ("sensor_bias", "rootz.position")),

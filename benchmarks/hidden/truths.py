@@ -336,6 +336,14 @@ def constant_forces(model: mujoco.MjModel, effects: Sequence[Effect]) -> np.ndar
 
 # --- commands and actuators -----------------------------------------------------------------------------------
 
+#: Effects of an actuator, whose force is then computed by hand.
+DRIVE = frozenset({
+    "actuator_gain", "actuator_bias", "actuator_damping", "actuator_saturation", "actuator_delay", "actuator_lag",
+    "actuator_deadband", "actuator_backlash", "dropout", "gain_drift",
+})  # fmt: skip
+#: Effects of a geom's contacts.
+CONTACT = ("contact_friction", "contact_stiffness", "contact_margin")
+
 
 def _held(plant: Plant, actuator: int, delay: float) -> float:
     """The mean of the command, delayed, over the fine step that begins; before the log it is the first one."""
@@ -354,12 +362,11 @@ class CommandPath:
     """From the logged command of one actuator to what drives it: delay, lag, dead band, backlash."""
 
     def __init__(self, plant: Plant, actuator: int, effects: Sequence[Effect]) -> None:
-        given = {k: v for e in effects for k, v in e.parameters.items() if e.name.startswith("actuator_")}
-        widths = {e.name: e.parameters["width"] for e in effects if "width" in e.parameters}
-        self.delay = given.get("delay", 0.0)
-        self.time_constant = given.get("time_constant", 0.0)
-        self.band = widths.get("actuator_deadband", 0.0)
-        self.play = 0.5 * widths.get("actuator_backlash", 0.0)
+        x = {e.name: e.parameters for e in effects}
+        self.delay = x.get("actuator_delay", {}).get("delay", 0.0)
+        self.time_constant = x.get("actuator_lag", {}).get("time_constant", 0.0)
+        self.band = x.get("actuator_deadband", {}).get("width", 0.0)
+        self.play = 0.5 * x.get("actuator_backlash", {}).get("width", 0.0)
         self.actuator, self.plant = actuator, plant
         self.forget()
         plant.memories.append(self.forget)
@@ -531,7 +538,7 @@ def _change_model(model: mujoco.MjModel, e: Effect) -> None:
             own = np.zeros(9)
             mujoco.mju_quat2Mat(own, model.geom_quat[g])
             mujoco.mju_mat2Quat(model.geom_quat[g], (tilt(x["roll"], x["pitch"]) @ own.reshape(3, 3)).reshape(-1))
-    elif e.name.startswith("contact_"):
+    elif e.name in CONTACT:
         _change_contact(model, model.geom(e.target).id, e)
 
 
@@ -572,7 +579,7 @@ def make_plant(system: System, declared: Mapping[str, float], effects: Sequence[
     plant = Plant(model, substeps)
     driven: dict[str, list[Effect]] = {}
     for e in effects:
-        if e.name.startswith("actuator_") or e.name in ("dropout", "gain_drift"):
+        if e.name in DRIVE:
             driven.setdefault(str(e.target), []).append(e)
         elif e.name in JOINT_FORCES and e.name not in DRY:
             plant.forces.append(JOINT_FORCES[e.name](plant, str(e.target), e.parameters))
@@ -785,7 +792,7 @@ def measured(system: System, log: Log, noise: np.ndarray, rng: np.random.Generat
 
 def equivalents(system: System, effect: Effect) -> tuple[tuple[str, str | None], ...]:
     """The (effect, target) pairs that are the same thing as an effect on a system."""
-    found = {p for group in system.twins if (effect.name, effect.target) in group for p in group}
+    found = {p for group in system.equivalents if (effect.name, effect.target) in group for p in group}
     model = load(system.xml)
     for number in range(model.nactuator):
         actuator, trn = model.actuator(number).name, int(model.actuator_trnid[number, 0])

@@ -16,28 +16,21 @@ from dropo_torch.gap.result import FAMILY, Gap
 from dropo_torch.problem import Problem
 
 
-def named(gap: Gap) -> list[Placed]:
-    """Return the named effects with their values, a family's one by one; what has no name is left out."""
-    found = []
-    for e in gap.effects:
-        values = [s.value for s in e.parameters.values()]
-        if e.target == FAMILY:
-            found += [Placed(find_effect(e.effect), t, (v,)) for t, v in zip(e.parameters, values, strict=True)]
-        elif e.effect != "unnamed":
-            found.append(Placed(find_effect(e.effect), e.target, tuple(values)))
-    return found
+def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, float]]]:
+    """Return the named effects with their values and the intervals of these; what has no name is left out.
 
-
-def intervals(gap: Gap, setting: Setting) -> dict[tuple[str, str | None], dict[str, tuple[float, float]]]:
-    """Return the intervals of the numbers of :func:`named`, by effect and target."""
-    found: dict[tuple[str, str | None], dict[str, tuple[float, float]]] = {}
+    A family stands there effect by effect.
+    """
+    found = {}
     for e in gap.effects:
-        for name, s in e.parameters.items():
-            if e.target == FAMILY:
-                (quantity,) = find_effect(e.effect).quantities(setting, name)
-                found[e.effect, name] = {quantity.name: (s.low, s.high)}
-            else:
-                found.setdefault((e.effect, e.target), {})[name] = (s.low, s.high)
+        if e.effect == "unnamed":
+            continue
+        effect, numbers = find_effect(e.effect), e.parameters
+        members = {t: (s,) for t, s in numbers.items()} if e.target == FAMILY else {e.target: tuple(numbers.values())}
+        for target, strengths in members.items():
+            names = [q.name for q in effect.quantities(setting, target)]
+            ranges = {n: (s.low, s.high) for n, s in zip(names, strengths, strict=True)}
+            found[Placed(effect, target, tuple(s.value for s in strengths))] = ranges
     return found
 
 
@@ -55,24 +48,27 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     Returns:
         Remarks for a person: what the model file lacks, or why there is none.
     """
-    placed = named(gap)
-    if not placed or problem.model_path is None:
+    if not gap.effects or problem.model_path is None:
+        return []
+    setting = make_setting(problem, problem.trajectories)
+    found = named(gap, setting)
+    if not found:
         return []
     notes = []
     values = problem.space.vector({n: after for n, (_, _, after) in gap.declared.items()})
     before = () if problem.effects is None else problem.effects.at(values)
     model = folder / "model.xml"
     try:
-        rest = write_model(problem.model_path, [*before, *placed], model, problem.space, values)
+        rest = write_model(problem.model_path, [*before, *found], model, problem.space, values)
         if rest:
             names = ", ".join(f"{p.effect.name} of {p.target}" if p.target else p.effect.name for p in rest)
             notes.append(f"MJCF cannot express {names}: model.xml lacks it, config.yaml has it.")
     except InputError as error:
         notes.append(f"No model.xml was written: {error}.")
-    setting = make_setting(problem, problem.trajectories)
     config = problem.config
     if config.noise is None:
         columns = Features.of(problem.observation).column_noise(np.array(gap.noise))
         config = config.model_copy(update={"noise": [float(f"{v:.3g}") for v in columns]})
-    write_config(config, problem.space, setting, placed, intervals(gap, setting), model, folder / "config.yaml")
+    ranges = {placed.key: intervals for placed, intervals in found.items()}
+    write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml")
     return notes

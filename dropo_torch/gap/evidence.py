@@ -1,15 +1,15 @@
-"""How far hypotheses are from the log: windows with free starts, whitened by the noise.
+"""How far hypotheses are from the log: windows with free initial states, whitened by the noise.
 
-Each window's start is unknown: what was measured there is one more noisy observation. Of the residuals
+Each window's initial state is unknown: what was measured there is one more noisy observation. Of the residuals
 r = [(y₀ − x₀)/σ, (y_k − f_k(x₀, θ))/σ] the part that a change of x₀ explains to first order is projected away, with
 P = I − QQᵀ from the QR factors of ∂r/∂x₀. What is left, P r, is compared between hypotheses.
 """
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -17,7 +17,7 @@ from dropo_torch.data.features import Features
 from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.twin import Twin, Windows
 
-#: Antithetic pairs of start noise by which rough windows are linearised, and their seed.
+#: Antithetic pairs of noise on the initial states by which rough windows are linearised, and their seed.
 PAIRS, SEED = 16, 11
 #: Whitened residual of a window whose simulation diverged.
 LOST = 1e3
@@ -28,14 +28,14 @@ TAIL = 3.0
 
 
 @dataclass(frozen=True)
-class Starts:
-    """The linearisation of a hypothesis by its windows' starts.
+class Linearisation:
+    """A hypothesis to first order in its windows' initial states.
 
     Attributes:
-        basis: orthonormal columns that a change of the starts spans, ``(W, N, m)``; N = (L + 1)·m.
-        weights: factors of the whitened residuals, ``(W, N)``: below 1 where noise at the start bends the simulation,
-            0 where nothing is known.
-        shift: mean residual minus the residual at the measured start, ``(W, N)``.
+        basis: orthonormal columns that a change of the initial states spans, ``(W, N, m)``; N = (L + 1)·m.
+        weights: factors of the whitened residuals, ``(W, N)``: below 1 where noise on the initial state bends the
+            simulation, 0 where nothing is known.
+        shift: mean residual minus the residual at the measured initial state, ``(W, N)``.
         roughness: share of residuals whose variance the linear part does not explain.
     """
 
@@ -44,60 +44,49 @@ class Starts:
     shift: np.ndarray
     roughness: float
 
+    def select(self, rows: np.ndarray) -> Linearisation:
+        """Return that of some of the windows."""
+        return replace(self, basis=self.basis[rows], weights=self.weights[rows], shift=self.shift[rows])
 
+
+@dataclass(frozen=True)
 class Evidence:
     """Residuals of hypotheses on windows of a log.
 
-    Args:
+    Attributes:
         twin: simulates hypotheses.
         windows: the stretches of the log.
         noise: standard deviation of the measurement of each feature, ``(m,)``.
-        rough: linearise statistically, over draws of the start noise, as contacts need it.
-        model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``; 1 by
-            default.
+        rough: linearise statistically, over draws of noise on the initial states, as contacts need it.
+        model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``.
         robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost).
     """
 
-    def __init__(
-        self, twin: Twin, windows: Windows, noise: np.ndarray, *, rough: bool,
-        model_error: np.ndarray | None = None, robust: bool = False,
-    ) -> None:  # fmt: skip
-        self.twin, self.windows, self.noise, self.rough = twin, windows, np.asarray(noise, dtype=float), rough
-        self.chart = Features.of(twin.setting.observation, twin.setting.masked)
-        self.model_error = np.ones(self.num_rows) if model_error is None else model_error
-        self.robust = robust
+    twin: Twin
+    windows: Windows
+    noise: np.ndarray
+    rough: bool
+    model_error: np.ndarray | float = 1.0
+    robust: bool = False
 
     def on(self, windows: Windows) -> Evidence:
         """Return the same over other windows."""
-        other = self._with(windows=windows)
-        return other if windows.length == self.windows.length else other._with(model_error=np.ones(other.num_rows))
+        same = windows.length == self.windows.length
+        return replace(self, windows=windows, model_error=self.model_error if same else 1.0)
 
-    def with_noise(self, noise: np.ndarray) -> Evidence:
-        """Return the same with another noise."""
-        return self._with(noise=np.asarray(noise, dtype=float))
-
-    def with_model_error(self, model_error: np.ndarray) -> Evidence:
-        """Return the same with another weight of each residual."""
-        return self._with(model_error=model_error)
-
-    def with_twin(self, twin: Twin) -> Evidence:
-        """Return the same by another simulation."""
-        return self._with(twin=twin)
-
-    def _with(self, **changes: object) -> Evidence:
-        other = copy.copy(self)
-        for name, value in changes.items():
-            setattr(other, name, value)
-        return other
-
-    def tail(self, starts: Starts) -> float | None:
-        """χ² of a window from which on the cost grows slowly; ``None`` where it never does."""
-        return TAIL * self.degrees(starts) / len(self.windows) if self.robust else None
+    @cached_property
+    def chart(self) -> Features:
+        """The features that are compared."""
+        return Features.of(self.twin.setting.observation, self.twin.setting.masked)
 
     @property
     def num_rows(self) -> int:
         """Residuals of a window."""
         return (self.windows.length + 1) * self.chart.size
+
+    def tail(self, linear: Linearisation) -> float | None:
+        """χ² of a window from which on the cost grows slowly; ``None`` where it never does."""
+        return TAIL * self.degrees(linear) / len(self.windows) if self.robust else None
 
     def residuals(
         self, variants: Sequence[Variant], moved: np.ndarray | None = None, pushes: np.ndarray | None = None
@@ -106,36 +95,33 @@ class Evidence:
 
         Args:
             variants: hypotheses.
-            moved: changes of the starts in units of the noise, ``(K, W, m)`` or ``(K, 1, m)``.
+            moved: changes of the initial states in units of the noise, ``(K, W, m)`` or ``(K, 1, m)``.
             pushes: see :meth:`Twin.predict`.
         """
-        measured = self.windows.measured
-        starts = None
+        measured, shape = self.windows.measured, (len(variants), len(self.windows))
+        initial = None
         if moved is not None:
-            starts = self.chart.move(measured[:, 0], np.broadcast_to(
-                moved * self.noise, (len(variants), len(self.windows), self.chart.size)))  # fmt: skip
-        columns, valid = self.twin.predict(variants, self.windows, starts, pushes)
+            change = np.broadcast_to(moved * self.noise, (*shape, self.chart.size))
+            initial = self.chart.move(measured[:, 0], change)
+        columns, valid = self.twin.predict(variants, self.windows, initial, pushes)
         with np.errstate(invalid="ignore"):
             residual = self.chart.difference(measured, columns) / self.noise
-        shape = (len(variants), len(self.windows), self.num_rows)
-        known = self.chart.known(valid).reshape(shape)
-        return np.where(known, residual.reshape(shape) / self.model_error, 0.0), known
+        known = self.chart.known(valid).reshape(*shape, self.num_rows)
+        return np.where(known, residual.reshape(known.shape) / self.model_error, 0.0), known
 
-    def linearise(self, variant: Variant) -> Starts:
-        """Return how a hypothesis' residuals depend on the starts."""
+    def linearise(self, variant: Variant) -> Linearisation:
+        """Return how a hypothesis' residuals depend on the initial states."""
         return self._statistical(variant) if self.rough else self._differences(variant)
 
-    def _differences(self, variant: Variant) -> Starts:
+    def _differences(self, variant: Variant) -> Linearisation:
         m = self.chart.size
-        moved = np.concatenate([np.zeros((1, m)), np.eye(m)])[:, None]
-        found, known = self.residuals([variant] * (m + 1), moved)
-        slope = np.moveaxis(np.nan_to_num(found[1:] - found[:1]), 0, -1)
-        basis, _ = np.linalg.qr(slope)
+        found, known = self.residuals([variant] * (m + 1), np.eye(m + 1, m, -1)[:, None])
+        basis, _ = np.linalg.qr(np.moveaxis(np.nan_to_num(found[1:] - found[:1]), 0, -1))
         weights = known[0].astype(float)
-        return Starts(basis, weights, np.zeros(weights.shape), 0.0)
+        return Linearisation(basis, weights, np.zeros(weights.shape), 0.0)
 
-    def _statistical(self, variant: Variant) -> Starts:
-        """Regress the residuals on draws of the start noise; what is left over adds to the noise."""
+    def _statistical(self, variant: Variant) -> Linearisation:
+        """Regress the residuals on draws of noise on the initial states; what is left over adds to the noise."""
         m = self.chart.size
         half = np.random.default_rng(SEED).standard_normal((PAIRS, m))
         draws = np.concatenate([half, -half])
@@ -150,32 +136,33 @@ class Evidence:
         weights = known[0] / np.sqrt(1 + 1.5 * variance)
         basis, _ = np.linalg.qr(slope * weights[..., None])
         shift = np.where(variance > 0, center - found[0], 0.0)
-        return Starts(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
+        return Linearisation(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
 
-    def project(self, residuals: np.ndarray, starts: Starts) -> np.ndarray:
-        """Return the part ``(..., W, N)`` of residuals that the starts do not explain; lost ones count as LOST."""
+    def project(self, residuals: np.ndarray, linear: Linearisation) -> np.ndarray:
+        """Return the part ``(..., W, N)`` of residuals that no initial states explain; lost ones count as LOST."""
         lost = ~np.isfinite(residuals)
-        weighted = np.where(lost, LOST, residuals + (starts.shift if not lost.all() else 0.0)) * starts.weights
-        return weighted - _along(starts.basis, weighted)
+        shifted = residuals + (linear.shift if not lost.all() else 0.0)
+        return _beside(linear, np.where(lost, LOST, shifted))
 
-    def project_slope(self, slope: np.ndarray, starts: Starts) -> np.ndarray:
+    def project_slope(self, slope: np.ndarray, linear: Linearisation) -> np.ndarray:
         """Return :meth:`project` of derivatives ``(..., W, N)``."""
-        weighted = np.nan_to_num(slope) * starts.weights
-        return weighted - _along(starts.basis, weighted)
+        return _beside(linear, np.nan_to_num(slope))
 
-    def degrees(self, starts: Starts) -> float:
-        """Return the degrees of freedom that the windows have beside their starts."""
-        return float((starts.weights > 0).sum() - len(self.windows) * self.chart.size)
+    def degrees(self, linear: Linearisation) -> float:
+        """Return the degrees of freedom that the windows have beside their initial states."""
+        return float((linear.weights > 0).sum() - len(self.windows) * self.chart.size)
 
 
-def _along(basis: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Return the part of vectors ``(..., W, N)`` in the span of the basis ``(W, N, m)``."""
-    return np.einsum("wnm,...wm->...wn", basis, np.einsum("wnm,...wn->...wm", basis, vectors))
+def _beside(linear: Linearisation, vectors: np.ndarray) -> np.ndarray:
+    """Return the part of weighted vectors ``(..., W, N)`` outside the span of the basis."""
+    weighted = vectors * linear.weights
+    along = np.einsum("wnm,...wn->...wm", linear.basis, weighted)
+    return weighted - np.einsum("wnm,...wm->...wn", linear.basis, along)
 
 
 @dataclass(frozen=True)
 class Cost:
-    """The misfit of a hypothesis: χ² of each window, with the cost of what the starts' noise left uncertain.
+    """The misfit of a hypothesis: χ² of each window, with the cost of what the initial states left uncertain.
 
     Attributes:
         windows: of each window, ``(W,)``.
@@ -202,27 +189,38 @@ class Cost:
         """χ² per degree of freedom."""
         return self.chi2 / max(self.degrees, 1.0)
 
+    @property
+    def sigma(self) -> float:
+        """Standard deviation of χ² where only noise is left."""
+        return float(np.sqrt(2 * self.degrees))
+
 
 def cost_of(
-    projected: np.ndarray, starts: Starts, degrees: float, caps: np.ndarray | None = None, tail: float | None = None
-) -> Cost:
+    projected: np.ndarray, linear: Linearisation, degrees: float, caps: np.ndarray | None = None,
+    tail: float | None = None,
+) -> Cost:  # fmt: skip
     """Return the cost of projected residuals ``(W, N)``.
 
     Args:
         projected: the residuals.
-        starts: the linearisation by the starts.
+        linear: the linearisation in the initial states.
         degrees: degrees of freedom of all windows.
         caps: factors of the windows' residuals, ``(W,)``.
         tail: of :meth:`Evidence.tail`; then a window with as much as noise makes still costs its degrees of freedom.
     """
     chi2 = (projected**2).sum(-1)
-    weights = starts.weights
+    weights = linear.weights
     penalty = -2 * np.log(np.where(weights > 0, weights, 1.0)).sum(-1)
     if caps is not None:
         chi2, penalty = chi2 * caps**2, penalty * caps**2
     if tail is not None:
-        chi2 = tail * np.log1p(chi2 / tail) / (TAIL * np.log1p(1 / TAIL))
+        chi2 = robust_loss(chi2, tail) / (TAIL * np.log1p(1 / TAIL))
     return Cost(chi2, penalty, degrees)
+
+
+def robust_loss(chi2: np.ndarray, tail: float | None) -> np.ndarray:
+    """Return the windows' Cauchy cost ``(W,)``; χ² itself without a tail."""
+    return chi2 if tail is None else tail * np.log1p(chi2 / tail)
 
 
 def robust_factors(chi2: np.ndarray, tail: float | None) -> np.ndarray:

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import stats
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.log import blocks_of
 from dropo_torch.gap.refit import Refit, refit
 
+#: Half-width of a 90 % interval in standard errors.
+Z90 = 1.6449
 #: χ² per degree of freedom from which on the simulation's own step may bias a fit.
 BIASED = 1.2
 #: An error of first order at a step is twice what halving the step changes.
 FIRST_ORDER = 2.0
 
 
-def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
+def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
     """Return standard errors of all numbers of a fit ``(q,)``, in their units; infinite for those without influence.
 
     The larger of two: by the noise, inflated by χ² per degree of freedom; and by how much the blocks of the log
@@ -24,7 +29,7 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
 
     Args:
         fitted: a fit with its projected residuals and derivatives.
-        blocks: block of each window ``(W,)``: its trajectory.
+        episodes: trajectory of each window, ``(W,)``.
     """
     slope, residual = fitted.slope * fitted.factor[:, None], fitted.residual * fitted.factor[:, None]
     size = len(slope)
@@ -38,14 +43,12 @@ def deviations(fitted: Refit, blocks: np.ndarray) -> np.ndarray:
     shown = np.where(np.outer(known, known), normal / unit, np.eye(size))
     inverse = np.linalg.pinv(shown, rcond=1e-12, hermitian=True) / unit
     plain = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(1.0, fitted.cost.reduced))
+    blocks = blocks_of(episodes, 4)
     names = np.unique(blocks)
-    if len(names) < 4:
-        blocks = (np.arange(len(blocks)) * 10) // max(len(blocks), 1)
-        names = np.unique(blocks)
     scores = np.einsum("awn,wn->wa", slope, residual)
     sums = np.stack([scores[blocks == b].sum(0) for b in names])
     middle = sums.T @ sums * len(names) / max(len(names) - 1, 1)
-    factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / 1.6449
+    factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / Z90
     clustered = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)) * factor
     inflated = fitted.cost.reduced > 1.5
     return np.where(known, np.maximum(plain, clustered) if inflated else plain, np.inf) * fitted.scale
@@ -60,10 +63,10 @@ def step_errors(evidence: Evidence, fitted: Refit) -> np.ndarray:
     """
     vector = fitted.hypothesis.vector
     finer = find_effect("integration")
-    as_noise = fitted.cost.reduced < BIASED and not (evidence.model_error > 1).any()
+    as_noise = fitted.cost.reduced < BIASED and not np.any(evidence.model_error > 1)
     if as_noise or any(p.effect is finer for p in fitted.hypothesis.placed):
         return np.zeros(len(vector))
     step = float(evidence.twin.setting.model.opt.timestep)
-    other = evidence.with_twin(evidence.twin.also(Placed(finer, None, (step / 2,))))
-    again = refit(other, fitted.hypothesis, starts=fitted.starts, iterations=3)
+    other = replace(evidence, twin=evidence.twin.also(Placed(finer, None, (step / 2,))))
+    again = refit(other, fitted.hypothesis, linear=fitted.linear, iterations=3)
     return FIRST_ORDER * np.abs(again.hypothesis.vector - vector)

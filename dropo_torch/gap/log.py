@@ -7,7 +7,7 @@ import copy
 import mujoco
 import numpy as np
 
-from dropo_torch.data.features import masked_columns
+from dropo_torch.data.features import Features, masked_columns
 from dropo_torch.data.observation import Observation
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting, Signals
@@ -30,88 +30,87 @@ def cut_windows(log: Trajectories, observation: Observation, length: int, *, str
     By default no two windows share a measurement. They never cross an episode's end; an episode shorter than a window
     gives none.
     """
-    bounds = episode_bounds(log)
-    longest = max(b - a for a, b in bounds)
-    commands = np.zeros((len(bounds), longest + 1, log.actions.shape[1]))
+    bounds, ahead = episode_bounds(log), np.arange(longest_episode(log) + 1)
+    commands = np.stack([log.actions[np.minimum(a + ahead, b - 1)] for a, b in bounds])
     observed, following = observation.observed(log.observations), observation.observed(log.next_observations)
-    measured, rates, episodes, steps = [], [], [], []
+    found = []
     for e, (a, b) in enumerate(bounds):
-        commands[e, : b - a] = log.actions[a:b]
-        commands[e, b - a :] = log.actions[b - 1]
         path = np.concatenate([observed[a : a + 1], following[a:b]])
-        slope = np.gradient(path, axis=0) if len(path) > 1 else np.zeros_like(path)
-        for start in range(0, b - a - length + 1, stride or length + 1):
-            measured.append(path[start : start + length + 1])
-            rates.append(slope[start])
-            episodes.append(e)
-            steps.append(start)
-    shape = (0, length + 1, observed.shape[1])
+        slope = np.gradient(path, axis=0)
+        starts = range(0, b - a - length + 1, stride or length + 1)
+        found += [(path[s : s + length + 1], slope[s], e, s) for s in starts]
+    measured, rates, episodes, steps = zip(*found, strict=True) if found else ((), (), (), ())
     return Windows(
-        np.stack(measured) if measured else np.zeros(shape),
-        (np.stack(rates) if rates else np.zeros((0, observed.shape[1]))) / (log.dt or 1.0),
-        np.array(episodes, dtype=int),
-        np.array(steps, dtype=int),
-        commands,
-    )
+        np.reshape(measured, (-1, length + 1, observation.size)),
+        np.reshape(rates, (-1, observation.size)) / (log.dt or 1.0),
+        np.array(episodes, dtype=int), np.array(steps, dtype=int), commands,
+    )  # fmt: skip
+
+
+def longest_episode(log: Trajectories) -> int:
+    """Return the logged steps of the longest episode."""
+    return max(b - a for a, b in episode_bounds(log))
+
+
+def feature_sizes(setting: Setting, columns: np.ndarray) -> np.ndarray:
+    """Return the standard deviation of each feature ``(m,)`` over observed columns ``(..., n)``."""
+    columns = columns.reshape(-1, columns.shape[-1])
+    return Features.of(setting.observation).difference(columns, columns[:1]).std(0)
+
+
+def spread(windows: Windows, most: int) -> Windows:
+    """Return at most so many windows, evenly spread."""
+    if len(windows) <= most:
+        return windows
+    return windows.select(np.unique(np.linspace(0, len(windows) - 1, most).astype(int)))
+
+
+def blocks_of(episodes: np.ndarray, least: int) -> np.ndarray:
+    """Return blocks of windows ``(W,)`` that count as independent: episodes if there are enough, else tenths."""
+    return episodes if len(np.unique(episodes)) >= least else np.arange(len(episodes)) * 10 // max(len(episodes), 1)
 
 
 def make_setting(problem: Problem, log: Trajectories) -> Setting:
     """Return where effects are looked for: the model, its columns, and the sizes of the log."""
-    model = copy.copy(problem.space.model)
+    model, observation = copy.copy(problem.space.model), problem.observation
     assert model is not None
-    frame_skip = problem.simulator.frame_skip
-    states = problem.observation.states(log.observations)
-    rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
-    data = mujoco.MjData(model)
-    nv = model.nv
-    inertia, force, speed, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.nbody), np.zeros(model.ngeom, bool)
-    dense = np.zeros((nv, nv))
-    after = problem.observation.states(log.next_observations)
+    frame_skip, nq, nv = problem.simulator.frame_skip, model.nq, model.nv
     step = frame_skip * float(model.opt.timestep)
+    states, after = observation.states(log.observations), observation.states(log.next_observations)
+    rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
+    inertia, force, speed, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.nbody), np.zeros(model.ngeom, bool)
+    data, dense, velocity = mujoco.MjData(model), np.zeros((nv, nv)), np.empty(6)
     for row in rows:
-        data.qpos[:], data.qvel[:] = states[row, : model.nq], states[row, model.nq :]
+        data.qpos[:], data.qvel[:] = states[row, :nq], states[row, nq:]
         data.ctrl[:] = log.actions[row]
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, dense)
         inertia += np.diag(dense)
-        acceleration = (after[row, model.nq :] - states[row, model.nq :]) / step
-        total = np.abs(dense @ acceleration) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator)
-        force += total
+        acceleration = (after[row, nq:] - states[row, nq:]) / step
+        force += np.abs(dense @ acceleration) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator)
         for b in range(model.nbody):
-            speed[b] += float(np.sum(_velocity(model, data, b) ** 2))
+            mujoco.mj_objectVelocity(model, data, int(mujoco.mjtObj.mjOBJ_BODY), b, velocity, 0)
+            speed[b] += float(np.sum(velocity[3:] ** 2))
         for contact in data.contact[: data.ncon]:
             touches[contact.geom[contact.geom >= 0]] = True
-    observed = problem.observation.observed(log.observations)
-    seen = np.isin(np.arange(model.nq), problem.observation.columns)
-    position = np.where(
-        seen[:, None], np.percentile(states[:, : model.nq], [1, 99], axis=0).T, np.nan
-    )  # fmt: skip
-    velocity = np.sqrt(np.mean(states[:, model.nq :] ** 2, axis=0))
+    seen = np.isin(np.arange(nq), observation.columns)
     signals = Signals(
         timestep=step,
-        position=position,
-        speed=velocity,
+        position=np.where(seen[:, None], np.percentile(states[:, :nq], [1, 99], axis=0).T, np.nan),
+        speed=np.sqrt(np.mean(states[:, nq:] ** 2, axis=0)),
         force=np.maximum(force / len(rows), 1e-12),
         inertia=inertia / len(rows),
-        command=np.abs(log.actions).max(0) if log.actions.shape[1] else np.zeros(0),
-        column=observed.std(0),
+        command=np.abs(log.actions).max(0),
+        column=observation.observed(log.observations).std(0),
         linear_speed=np.sqrt(speed / len(rows)),
         contacts=touches,
     )
-    masked = masked_columns(problem.observation, problem.config.mask)
-    return Setting(model, problem.observation, signals, frame_skip, masked)
-
-
-def _velocity(model: mujoco.MjModel, data: mujoco.MjData, body: int) -> np.ndarray:
-    out = np.empty(6)
-    mujoco.mj_objectVelocity(model, data, int(mujoco.mjtObj.mjOBJ_BODY), body, out, 0)
-    return out[3:]
+    masked = masked_columns(observation, problem.config.mask)
+    return Setting(model, observation, signals, frame_skip, masked)
 
 
 def start_values(problem: Problem) -> np.ndarray:
     """Declared parameters to begin with: the model's own where they lie in their box, else its middle."""
-    space = problem.space
-    middle = 0.5 * (space.low + space.high)
-    nominal = space.nominal
-    inside = np.isfinite(nominal) & (nominal >= space.low) & (nominal <= space.high)
-    return np.where(inside, nominal, middle)
+    space, nominal = problem.space, problem.space.nominal
+    inside = (nominal >= space.low) & (nominal <= space.high)  # not where it is NaN
+    return np.where(inside, nominal, 0.5 * (space.low + space.high))

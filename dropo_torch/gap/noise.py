@@ -1,8 +1,8 @@
-"""The noise of the measurement, and where the simulation pushes amiss, from short windows with free forces.
+"""The noise of the measurement, and where the simulated forces are wrong, from short windows with free forces.
 
 Over a few logged steps almost any missing effect looks like a generalised force that changes smoothly. A window is
-fitted with its start and a quadratic force of time for each degree of freedom left free, all to first order. What
-even this cannot explain is noise; the forces that it needed tell where the simulation is wrong, and when.
+fitted with its initial state and a quadratic force of time for each degree of freedom left free, all to first order.
+What even this cannot explain is noise; the forces that it needed tell where the simulation is wrong, and when.
 """
 
 from __future__ import annotations
@@ -14,12 +14,15 @@ import numpy as np
 from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.log import feature_sizes
 
 #: Logged steps of a window, and coefficients of a force in it.
 LENGTH, ORDER = 6, 3
-#: First guess of the noise, and its floor, relative to a feature's deviation.
+#: Size of a trial force, relative to the log's typical one.
+TRIAL = 0.05
+#: First guess of the noise, and its floor, relative to a feature's standard deviation.
 GUESS, FLOOR = 1e-3, 1e-9
-#: Median of χ² of ν degrees over ν, nearly, for the median over windows.
+#: Times that the noise is estimated anew, each feature weighted by the noise before.
 ROUNDS = 8
 
 
@@ -49,68 +52,49 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
         variant: the hypothesis beside which the forces are free.
         noise: the noise where it is known, ``(m,)``.
     """
-    sizes = np.maximum(_deviation(twin, windows), 1e-12)
+    sizes = np.maximum(feature_sizes(twin.setting, windows.measured), 1e-12)
     evidence = Evidence(twin, windows, GUESS * sizes if noise is None else noise, rough=False)
-    m, nv, length = evidence.chart.size, twin.setting.model.nv, windows.length
-    scale = 0.05 * twin.setting.signals.force
+    m, nv, length = len(sizes), twin.setting.model.nv, windows.length
+    scale = TRIAL * twin.setting.signals.force
     time = (np.arange(length) + 0.5) / length - 0.5
     basis = np.stack([np.ones(length), time * 2, (time * 2) ** 2 - 1 / 3])[:ORDER]
     pushes = np.zeros((1 + m + ORDER * nv, length, nv))
     for dof in range(nv):
-        for i in range(ORDER):
-            pushes[1 + m + dof * ORDER + i, :, dof] = basis[i] * scale[dof]
-    moved = np.zeros((len(pushes), 1, m))
-    moved[1 : 1 + m, 0] = np.eye(m)
+        pushes[1 + m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
+    moved = np.eye(len(pushes), m, -1)[:, None]
     found, _ = evidence.residuals([variant] * len(pushes), moved, pushes)
     usable = np.isfinite(found).all((0, 2))
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
-    factor, estimate = _weigh(residual, slope, m, evidence.noise if noise is None else None)
-    coefficients, errors = _solve(residual, slope, m, factor, m + ORDER * nv)
-    at = m + np.arange(nv) * ORDER
-    forces, deviations = np.full((len(windows), nv), np.nan), np.full((len(windows), nv), np.nan)
-    forces[usable], deviations[usable] = coefficients[:, at] * scale, errors[:, at] * scale
-    return FreeForces(
-        np.maximum(estimate if noise is None else noise, FLOOR * sizes), forces, deviations, windows
-    )  # fmt: skip
+    relative = _relative_noise(residual, slope, m) if noise is None else np.ones(m)
+    coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
+    forces, standard_errors = np.full((2, len(windows), nv), np.nan)
+    forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))
+    return FreeForces(np.maximum(evidence.noise * relative, FLOOR * sizes), forces, standard_errors, windows)
 
 
-def _deviation(twin: Twin, windows: Windows) -> np.ndarray:
-    """Deviation of each feature over the windows, ``(m,)``."""
-    evidence = Evidence(twin, windows, np.ones(1), rough=False)
-    first = windows.measured[:1, :1]
-    return evidence.chart.difference(windows.measured, np.broadcast_to(first, windows.measured.shape)).std((0, 1))
-
-
-def _weigh(residual: np.ndarray, slope: np.ndarray, m: int, noise: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Reweighted least squares: factors that whiten the features ``(N,)``, and the noise itself ``(m,)``."""
-    num_rows = residual.shape[1]
-    factor = np.ones(num_rows)
-    if noise is None:
-        return factor, np.ones(m)
-    relative = np.ones(m)
+def _relative_noise(residual: np.ndarray, slope: np.ndarray, m: int) -> np.ndarray:
+    """The noise of each feature relative to the guess ``(m,)``, by reweighted least squares of all windows."""
+    repeats, relative = residual.shape[1] // m, np.ones(m)
     for _ in range(ROUNDS):
-        factor = np.tile(1 / relative, num_rows // m)
+        factor = np.tile(1 / relative, repeats)
         basis, _ = np.linalg.qr(slope * factor[:, None])
         weighted = residual * factor
         left = weighted - np.einsum("wnq,wq->wn", basis, np.einsum("wnq,wn->wq", basis, weighted))
-        free = 1 - (basis**2).sum(-1)
-        by_feature = (left**2).reshape(len(left), -1, m).sum(1)
-        degrees = free.reshape(len(left), -1, m).sum(1)
-        mean_degrees = np.maximum(degrees.mean(0), 1e-9)
-        middle = np.maximum(1 - 2 / (9 * mean_degrees), 0.1) ** 3
-        relative = relative * np.sqrt(np.maximum(np.median(by_feature / np.maximum(degrees, 1e-9), 0) / middle, 1e-16))
+        chi2 = (left**2).reshape(-1, repeats, m).sum(1)
+        degrees = (1 - (basis**2).sum(-1)).reshape(-1, repeats, m).sum(1)
+        # the median of χ² of ν degrees is nearly ν (1 − 2/9ν)³
+        median = np.maximum(1 - 2 / (9 * np.maximum(degrees.mean(0), 1e-9)), 0.1) ** 3
+        relative = relative * np.sqrt(np.maximum(np.median(chi2 / np.maximum(degrees, 1e-9), 0) / median, 1e-16))
         relative = np.clip(relative, 1e-6, 1e4)
-    return np.tile(1 / relative, num_rows // m), noise * relative
+    return relative
 
 
-def _solve(
-    residual: np.ndarray, slope: np.ndarray, m: int, factor: np.ndarray, size: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares of each window: coefficients and their standard errors, ``(W, size)`` each."""
+def _solve(residual: np.ndarray, slope: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares of each window: coefficients and their standard errors, ``(W, q)`` each."""
     weighted = slope * factor[:, None]
     normal = np.einsum("wna,wnb->wab", weighted, weighted)
     diagonal = np.einsum("waa->wa", normal)
     ridge = 1e-9 * np.maximum(diagonal, 1e-12 * diagonal.max(1, keepdims=True))
-    inverse = np.linalg.inv(normal + np.einsum("wa,ab->wab", ridge, np.eye(size)))
+    inverse = np.linalg.inv(normal + ridge[:, :, None] * np.eye(ridge.shape[1]))
     coefficients = -np.einsum("wab,wnb,wn->wa", inverse, weighted, residual * factor)
     return coefficients, np.sqrt(np.maximum(np.einsum("waa->wa", inverse), 0.0))

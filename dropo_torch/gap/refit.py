@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dropo_torch.effects.base import Placed, Setting
+from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of, robust_factors
-from dropo_torch.parameters import ParameterSpace
+from dropo_torch.effects.twin import Twin
+from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors, robust_loss
+from dropo_torch.optimizers.least_squares import bounded_step
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.
 STEP, LEAST_MOVE = 1e-3, 2e-5
-#: Move, relative to a parameter's scale, after which the starts are linearised again.
+#: Ridge of a step, and its longest move relative to a parameter's scale.
+RIDGE, LONGEST = 1e-12, 5.0
+#: Move, relative to a parameter's scale, after which the initial states are linearised again.
 FAR = 0.03
 
 
@@ -41,20 +45,22 @@ class Hypothesis:
 
     def at(self, vector: np.ndarray) -> Hypothesis:
         """Return the same with other numbers."""
-        d = len(self.declared)
-        placed, position = [], d
-        for p in self.placed:
-            placed.append(p.at(vector[position : position + len(p.values)]))
-            position += len(p.values)
-        return Hypothesis(tuple(float(v) for v in vector[:d]), tuple(placed))
+        ends = np.cumsum([len(self.declared), *(len(p.values) for p in self.placed)])
+        declared, *values, _ = np.split(vector, ends)
+        placed = tuple(p.at(v) for p, v in zip(self.placed, values, strict=True))
+        return Hypothesis(tuple(float(v) for v in declared), placed)
 
-    def with_effect(self, placed: Placed) -> Hypothesis:
-        """Return the same with one more effect."""
-        return Hypothesis(self.declared, (*self.placed, placed))
+    def with_effects(self, placed: Sequence[Placed]) -> Hypothesis:
+        """Return the same with more effects."""
+        return replace(self, placed=(*self.placed, *placed))
 
     def without(self, index: int) -> Hypothesis:
         """Return the same without one of its effects."""
-        return Hypothesis(self.declared, self.placed[:index] + self.placed[index + 1 :])
+        return replace(self, placed=self.placed[:index] + self.placed[index + 1 :])
+
+    def instead(self, index: int, placed: Placed) -> Hypothesis:
+        """Return the same with another effect in the place of one."""
+        return replace(self, placed=(*self.placed[:index], placed, *self.placed[index + 1 :]))
 
 
 @dataclass(frozen=True)
@@ -65,21 +71,22 @@ class Limits:
     high: np.ndarray
     scale: np.ndarray
 
+    def moves(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the smallest and the largest move from values within the bounds, in units of the scale."""
+        return (self.low - values) / self.scale, (self.high - values) / self.scale
+
     def of(self, columns: np.ndarray) -> Limits:
         """Return those of some of the numbers."""
         return Limits(self.low[columns], self.high[columns], self.scale[columns])
 
 
-def limits_of(hypothesis: Hypothesis, space: ParameterSpace, setting: Setting) -> Limits:
+def limits_of(hypothesis: Hypothesis, twin: Twin) -> Limits:
     """Return the bounds and sizes of a hypothesis' numbers."""
-    low, high = list(space.low), list(space.high)
-    scale = [0.25 * (h - a) for a, h in zip(low, high, strict=True)]
+    space = twin.space
+    numbers = [(low, high, 0.25 * (high - low)) for low, high in zip(space.low, space.high, strict=True)]
     for p in hypothesis.placed:
-        for q in p.effect.quantities(setting, p.target):
-            low.append(q.low)
-            high.append(q.high)
-            scale.append(q.scale)
-    return Limits(np.array(low), np.array(high), np.array(scale))
+        numbers += [(q.low, q.high, q.scale) for q in p.effect.quantities(twin.setting, p.target)]
+    return Limits(*np.array(numbers).reshape(-1, 3).T)
 
 
 @dataclass(frozen=True)
@@ -91,7 +98,7 @@ class Refit:
         cost: its misfit.
         residual: projected residuals, ``(W, N)``.
         slope: projected derivatives by all numbers, in units of their scale, ``(q, W, N)``.
-        starts: the linearisation by the starts.
+        linear: the linearisation in the initial states.
         scale: the numbers' scales, ``(q,)``.
         converged: whether the moves became small.
         factor: factors of the windows' residuals that the fit ended with, ``(W,)``.
@@ -101,34 +108,51 @@ class Refit:
     cost: Cost
     residual: np.ndarray
     slope: np.ndarray
-    starts: Starts
+    linear: Linearisation
     scale: np.ndarray
     converged: bool
     factor: np.ndarray
 
+    @property
+    def typical(self) -> np.ndarray:
+        """χ² of each window, relative to what noise makes on average, ``(W,)``."""
+        return (self.residual**2).sum(-1) * len(self.residual) / self.cost.degrees
 
-def slopes(
-    evidence: Evidence, hypothesis: Hypothesis, limits: Limits, columns: np.ndarray, step: float = STEP
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return residuals ``(W, N)`` and their derivatives ``(len(columns), W, N)`` by numbers in units of their scale."""
-    vector = hypothesis.vector
-    variants, signs = [hypothesis.variant], []
-    for c in columns:
-        sign = 1.0 if vector[c] + step * limits.scale[c] <= limits.high[c] else -1.0
-        moved = vector.copy()
-        moved[c] += sign * step * limits.scale[c]
-        variants.append(hypothesis.at(moved).variant)
-        signs.append(sign)
-    found, _ = evidence.residuals(variants)
-    change = (found[1:] - found[:1]) / (np.array(signs)[:, None, None] * step)
-    return found[0], change
+
+def beside(
+    hypothesis: Hypothesis, limits: Limits, columns: np.ndarray, step: float
+) -> tuple[list[Hypothesis], np.ndarray]:
+    """Return hypotheses in which one number each is moved, and by how much in units of its scale; within bounds.
+
+    Args:
+        hypothesis: where the differences are taken.
+        limits: its numbers' bounds and scales.
+        columns: which numbers are moved.
+        step: by how much; backwards where the upper bound forbids it forwards.
+    """
+    vector, own = hypothesis.vector, limits.of(columns)
+    steps = np.where(vector[columns] + step * own.scale <= own.high, step, -step)
+    changes = np.zeros((len(columns), len(vector)))
+    changes[np.arange(len(columns)), columns] = steps * own.scale
+    return [hypothesis.at(vector + change) for change in changes], steps
+
+
+@dataclass(frozen=True)
+class _Point:
+    """A hypothesis on the way, with its projected residuals, their slopes, loss, and least-squares factors."""
+
+    hypothesis: Hypothesis
+    residual: np.ndarray
+    slope: np.ndarray
+    loss: float
+    factor: np.ndarray
 
 
 def refit(
     evidence: Evidence,
     hypothesis: Hypothesis,
     *,
-    starts: Starts | None = None,
+    linear: Linearisation | None = None,
     caps: np.ndarray | None = None,
     iterations: int = 12,
 ) -> Refit:
@@ -137,82 +161,59 @@ def refit(
     Args:
         evidence: the windows.
         hypothesis: where to begin.
-        starts: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
+        linear: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
         caps: factors of the windows' residuals.
         iterations: the most of them.
     """
-    space, setting = evidence.twin.space, evidence.twin.setting
-    limits = limits_of(hypothesis, space, setting)
-    columns = np.arange(len(limits.scale))
-    relinearise = starts is None
-    starts = evidence.linearise(hypothesis.variant) if starts is None else starts
-    fixed, tail = np.ones(len(evidence.windows)) if caps is None else caps, evidence.tail(starts)
+    limits = limits_of(hypothesis, evidence.twin)
+    relinearise = linear is None
+    linear = evidence.linearise(hypothesis.variant) if linear is None else linear
+    caps, tail = np.ones(len(evidence.windows)) if caps is None else caps, evidence.tail(linear)
+
+    def at(vector: np.ndarray) -> _Point:
+        there = hypothesis.at(np.clip(vector, limits.low, limits.high))
+        moved, steps = beside(there, limits, np.arange(len(vector)), STEP)
+        found, _ = evidence.residuals([h.variant for h in (there, *moved)])
+        residual = evidence.project(found[0], linear)
+        slope = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
+        chi2 = ((residual * caps[:, None]) ** 2).sum(-1)
+        loss = float(robust_loss(chi2, tail).sum())
+        return _Point(there, residual, slope, loss, caps * robust_factors(chi2, tail))
+
     damping, converged = 1e-3, False
-    current = hypothesis.at(np.clip(hypothesis.vector, limits.low, limits.high))
-    begin = current.vector
-    raw, change = slopes(evidence, current, limits, columns)
-    residual, slope = evidence.project(raw, starts), evidence.project_slope(change, starts)
-    value, factor = _loss(residual, fixed, tail)
+    here = begin = at(hypothesis.vector)
     for _ in range(iterations):
-        move = _step(residual * factor[:, None], slope * factor[:, None], current.vector, limits, damping)
-        trial = current.at(np.clip(current.vector + move * limits.scale, limits.low, limits.high))
-        largest = float(np.abs((trial.vector - current.vector) / limits.scale).max()) if len(move) else 0.0
-        if largest < LEAST_MOVE:
+        trial = here.hypothesis.vector + _move(here, limits, damping) * limits.scale
+        trial = np.clip(trial, limits.low, limits.high)
+        if np.abs((trial - here.hypothesis.vector) / limits.scale).max(initial=0.0) < LEAST_MOVE:
             converged = True
             break
-        raw, change = slopes(evidence, trial, limits, columns)
-        found = evidence.project(raw, starts)
-        after, following = _loss(found, fixed, tail)
-        if after < value:
-            gain, current, residual, factor = value - after, trial, found, following
-            slope, value = evidence.project_slope(change, starts), after
+        there = at(trial)
+        if there.loss < here.loss:
+            gain, here = here.loss - there.loss, there
             damping = max(damping / 8, 1e-9)
-            if gain < 1e-6 * value + 0.01:
+            if gain < 1e-6 * here.loss + 0.01:
                 converged = True
                 break
         else:
             damping *= 6
             if damping > 1e4:
                 break
-    far = np.abs((current.vector - begin) / limits.scale).max(initial=0.0) > FAR
-    if relinearise and far:
-        return refit(evidence, current, starts=evidence.linearise(current.variant), caps=caps, iterations=4)
-    degrees = evidence.degrees(starts) - len(columns)
-    cost = cost_of(residual, starts, degrees, caps, tail)
-    return Refit(current, cost, residual, slope, starts, limits.scale, converged, factor / fixed)
+    moved = np.abs((here.hypothesis.vector - begin.hypothesis.vector) / limits.scale).max(initial=0.0)
+    if relinearise and moved > FAR:
+        again = evidence.linearise(here.hypothesis.variant)
+        return refit(evidence, here.hypothesis, linear=again, caps=caps, iterations=4)
+    degrees = evidence.degrees(linear) - len(limits.scale)
+    cost = cost_of(here.residual, linear, degrees, caps, tail)
+    return Refit(
+        here.hypothesis, cost, here.residual, here.slope, linear, limits.scale, converged, here.factor / caps
+    )  # fmt: skip
 
 
-def _loss(residual: np.ndarray, fixed: np.ndarray, tail: float | None) -> tuple[float, np.ndarray]:
-    """The cost that is minimised, and the factors ``(W,)`` of its least squares."""
-    chi2 = ((residual * fixed[:, None]) ** 2).sum(-1)
-    value = float((chi2 if tail is None else tail * np.log1p(chi2 / tail)).sum())
-    return value, fixed * robust_factors(chi2, tail)
-
-
-def _step(residual: np.ndarray, slope: np.ndarray, vector: np.ndarray, limits: Limits, damping: float) -> np.ndarray:
-    """Return the damped step in units of the scales; numbers at a bound that it would cross stay there."""
-    if not len(slope):
+def _move(here: _Point, limits: Limits, damping: float) -> np.ndarray:
+    """The damped step in units of the scales, ``(q,)``."""
+    if not len(here.slope):
         return np.zeros(0)
-    flat = slope.reshape(len(slope), -1)
-    normal, gradient = flat @ flat.T, -(flat @ residual.ravel())
-    free = np.ones(len(vector), dtype=bool)
-    move = np.zeros(len(vector))
-    for _ in range(len(vector)):
-        index = np.flatnonzero(free)
-        if not index.size:
-            break
-        part = normal[np.ix_(index, index)]
-        diagonal = np.diag(part).copy()
-        diagonal[diagonal <= 0] = 1e-12 * max(float(diagonal.max(initial=0.0)), 1e-300)
-        move[:] = 0.0
-        ridge = np.diag(damping * diagonal + 1e-12 * diagonal.max())
-        move[index] = np.linalg.lstsq(part + ridge, gradient[index], rcond=None)[0]
-        after = vector + move * limits.scale
-        tight = 1e-12 * limits.scale
-        below = (after < limits.low) & (vector <= limits.low + tight)
-        above = (after > limits.high) & (vector >= limits.high - tight)
-        stuck = free & (below | above)
-        if not stuck.any():
-            break
-        free &= ~stuck
-    return np.clip(move, -5.0, 5.0)
+    flat, residual = ((x * here.factor[:, None]).reshape(*x.shape[:-2], -1) for x in (here.slope, here.residual))
+    low, high = limits.moves(here.hypothesis.vector)
+    return np.clip(bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, RIDGE), -LONGEST, LONGEST)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
+
+from dropo_torch.support.files import plain_numbers
 
 SCHEMA = "dropo-torch/gap/1"
 #: Target of an effect that sits at all places of its kind.
@@ -160,50 +161,41 @@ class Gap:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``gap.json``."""
-        return {
+        scores = {"before": self.before, "after": self.after, "noise_floor": self.noise_floor}
+        return plain_numbers({
             "schema": SCHEMA,
-            "where": [{"kind": p.kind, "name": p.name, "share": p.share, "when": p.when} for p in self.where],
+            "where": [asdict(place) for place in self.where],
             "effects": [_effect(e) for e in self.effects],
             "gap": {
-                name: {
-                    "mse": _finite(s.mse), "log_likelihood": _finite(s.log_likelihood),
-                    "rollout_rmse": _finite(s.rollout_rmse),
-                }
-                for name, s in (("before", self.before), ("after", self.after), ("noise_floor", self.noise_floor))
+                name: {k: getattr(found, k) for k in ("mse", "log_likelihood", "rollout_rmse")}
+                for name, found in scores.items()
             },
             "next_experiment": self.next_experiment,
             "declared": {
-                n: {"given": a, "alone": b, "with_effects": c} for n, (a, b, c) in self.declared.items()
+                n: dict(zip(("given", "alone", "with_effects"), values, strict=True))
+                for n, values in self.declared.items()
             },
             "noise": dict(zip(self.labels, self.noise, strict=True)),
-            "chi2_per_degree": {"before": self.reduced[0], "after": self.reduced[1]},
-            "ranking": [
-                {"effect": r.effect, "target": r.target, "values": dict(r.values), "left": r.left, "round": r.round}
-                for r in self.ranking
-            ],
-            "cannot_judge": [{"effect": e, "target": t} for e, t in self.cannot_judge],
+            "chi2_per_degree": dict(zip(("before", "after"), self.reduced, strict=True)),
+            "ranking": [asdict(r) for r in self.ranking],
+            "cannot_judge": [_pair(p) for p in self.cannot_judge],
             "symbolic": self.symbolic or None,
-            "notes": list(self.notes),
+            "notes": self.notes,
             "backend": self.backend,
             "simulated_transitions": self.simulated_transitions,
             "seconds": self.seconds,
             "seed": self.seed,
-        }  # fmt: skip
+        })  # fmt: skip
 
 
-def _finite(value: float) -> float | None:
-    """A number as JSON has it; ``None`` for one that is not finite."""
-    return float(value) if math.isfinite(value) else None
+def _pair(placed: tuple[str, str | None]) -> dict[str, str | None]:
+    return {"effect": placed[0], "target": placed[1]}
 
 
 def _effect(e: NamedEffect) -> dict[str, Any]:
     return {
-        "effect": e.effect,
-        "target": e.target,
-        "parameters": {
-            n: {"value": _finite(s.value), "low": _finite(s.low), "high": _finite(s.high), "unit": s.unit}
-            for n, s in e.parameters.items()
-        },
+        **_pair((e.effect, e.target)),
+        "parameters": {n: asdict(s) for n, s in e.parameters.items()},
         "share_of_gap": e.share_of_gap,
-        "indistinguishable_from": [{"effect": n, "target": t} for n, t in e.indistinguishable_from],
+        "indistinguishable_from": [_pair(p) for p in e.indistinguishable_from],
     }

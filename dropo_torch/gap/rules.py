@@ -10,8 +10,8 @@ import numpy as np
 from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.refit import Hypothesis, Refit
 
-#: χ² per degree of freedom of the typical window that is far off, and of one that is right.
-FAR_OFF, CLEAR = 20.0, 1.5
+#: χ² per degree of freedom from which on a window is wrong, and below which it is right.
+WRONG, RIGHT = 20.0, 1.5
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,12 @@ class Rules:
 
 def significant(cost: Cost, rules: Rules) -> bool:
     """Return whether a misfit is more than noise."""
-    return cost.excess > rules.gate * np.sqrt(2 * cost.degrees) and cost.reduced > rules.least_reduced
+    return cost.excess > rules.gate * cost.sigma and cost.reduced > rules.least_reduced
+
+
+def near(cost: Cost) -> float:
+    """Return how much more excess a hypothesis may have that is about as good."""
+    return max(0.3 * max(cost.excess, 0.0), 4 * cost.sigma)
 
 
 def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
@@ -60,14 +65,11 @@ def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
 
 
 def clears(base: Refit, current: Refit) -> bool:
-    """Whether effects leave no more than noise in most windows of a log that was far off in most of them.
+    """Return whether effects leave no more than noise in most windows of a log of which most were wrong.
 
     What only imitates the truth makes all windows better and none of them right.
     """
-    before, after = (
-        float(np.median((r.residual**2).sum(-1))) * len(r.residual) / r.cost.degrees for r in (base, current)
-    )
-    return before > FAR_OFF and after < CLEAR
+    return bool(np.median(base.typical) > WRONG and np.median(current.typical) < RIGHT)
 
 
 def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
@@ -84,5 +86,5 @@ def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
 def simplest(fitted: Sequence[Refit]) -> Refit:
     """Return, of hypotheses that are about as good as the best, the one with the fewest numbers."""
     best = fitted[0].cost
-    near = best.excess + max(0.3 * max(best.excess, 0.0), 4 * np.sqrt(2 * best.degrees))
-    return min((r for r in fitted if r.cost.excess <= near), key=lambda r: (len(r.hypothesis.vector), r.cost.excess))
+    good = (r for r in fitted if r.cost.excess <= best.excess + near(best))
+    return min(good, key=lambda r: (len(r.hypothesis.vector), r.cost.excess))

@@ -3,20 +3,31 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from dropo_torch.effects import VOCABULARY, Effect
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.naming import Naming, Report, Search
+from dropo_torch.gap.ground import Ground, Report
+from dropo_torch.gap.locate import places
+from dropo_torch.gap.naming import Naming
 from dropo_torch.gap.noise import free_forces
-from dropo_torch.gap.outcome import found_places, make_result
+from dropo_torch.gap.outcome import make_result
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
-from dropo_torch.gap.rules import Rules, significant
+from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.scene import Scene, contact_windows, prepare, short_windows, shorter_windows
+from dropo_torch.gap.search import Checkpoint, search, start
+from dropo_torch.gap.strategy import ContactWindows, Strategy
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
+
+#: The searches in their order: suffix of the checkpoint, the windows (``None`` where the log has none), the strategy.
+SEARCHES: tuple[tuple[str, Callable[[Scene], Evidence | None], Strategy], ...] = (
+    ("", lambda scene: scene.evidence, Strategy()),
+    ("-shorter", shorter_windows, Strategy()),
+    ("-contact", contact_windows, ContactWindows()),
+)
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -29,14 +40,14 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
         effects: the vocabulary; all of the package's by default.
         rules: thresholds.
     """
-    rules = rules or Rules()
-    search = Search(scene.evidence, list(effects or VOCABULARY.values()), rules=rules)
-    base = search.start(scene.begin)
-    if not significant(base.cost, rules):
+    ground = _ground(scene.evidence, Strategy(), effects, rules)
+    state = start(ground, scene.begin)
+    if state.done:
         return ()
-    search.look(base)
-    free = free_forces(scene.twin, short_windows(scene.problem, scene.train), base.hypothesis.variant, scene.noise)
-    return found_places(scene, search, free)
+    short = short_windows(scene.setting, scene.train)
+    return places(
+        scene.setting, free_forces(scene.twin, short, state.base.hypothesis.variant, scene.noise), state.first
+    )
 
 
 def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> Naming:
@@ -47,7 +58,7 @@ def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules 
         effects: the vocabulary; all of the package's by default.
         rules: thresholds.
     """
-    return _name(scene, list(effects or VOCABULARY.values()), rules or Rules(), None, False, _quiet)[1]
+    return _name(scene, effects, rules)
 
 
 def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
@@ -57,8 +68,7 @@ def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
         scene: of :func:`prepare`.
         hypothesis: such as ``name(scene).base.hypothesis`` and ``.final.hypothesis``.
     """
-    step = scene.setting.signals.timestep
-    held = cut_held(scene.twin, scene.held, scene.problem.observation, hypothesis, scene.noise, step)
+    held = cut_held(scene.evidence, scene.held, hypothesis)
     return score(scene.evidence, held, hypothesis), floor_score(scene.evidence, held, hypothesis)
 
 
@@ -90,34 +100,40 @@ def find_gap(
     report = report or _quiet
     report("preparing", 0.0)
     scene = scene or prepare(problem)
-    vocabulary = list(effects or VOCABULARY.values())
-    search, naming = _name(scene, vocabulary, rules or Rules(), checkpoint, resume, report)
+    naming = _name(scene, effects, rules, checkpoint, resume, report)
     report("verifying", 0.0)
-    return make_result(scene, search, naming, started)
+    return make_result(scene, naming, started)
 
 
 def _name(
-    scene: Scene, vocabulary: list[Effect], rules: Rules, checkpoint: Path | None, resume: bool, report: Report
-) -> tuple[Search, Naming]:
+    scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None, checkpoint: Path | None = None,
+    resume: bool = False, report: Report | None = None,
+) -> Naming:  # fmt: skip
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly."""
-    known = f"{scene.problem.fingerprint} {rules} {[e.name for e in vocabulary]}"
-
-    def look(evidence: Evidence, suffix: str) -> tuple[Search, Naming]:
-        store = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
-        search = Search(
-            evidence, vocabulary, rules=rules, report=report, checkpoint=store, resume=resume, fingerprint=known
-        )
-        return search, search.run(scene.begin)
-
-    first = look(scene.evidence, "")
-    for suffix, make in (("-shorter", shorter_windows), ("-contact", contact_windows)):
-        if first[1].named or not first[1].gap:
-            break
+    first = None
+    for suffix, make, strategy in SEARCHES:
         evidence = make(scene)
-        again = None if evidence is None else look(evidence, suffix)
-        if again is not None and again[1].named:
-            return again
+        if evidence is None:
+            continue
+        ground = _ground(evidence, strategy, effects, rules, report)
+        path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
+        known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
+        naming = search(ground, scene.begin, Checkpoint(path, resume, known))
+        if naming.named:
+            return naming
+        first = first or naming
+        if not first.gap:
+            break
+    assert first is not None
     return first
+
+
+def _ground(
+    evidence: Evidence, strategy: Strategy, effects: Sequence[Effect] | None, rules: Rules | None,
+    report: Report | None = None,
+) -> Ground:  # fmt: skip
+    """What a search stands on, by default with the whole vocabulary and the package's thresholds."""
+    return Ground(evidence, tuple(effects or VOCABULARY.values()), rules or Rules(), strategy, report or _quiet)
 
 
 def _quiet(stage: str, share: float) -> None:

@@ -9,20 +9,62 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import combinations
 
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
-from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.refit import Hypothesis, Limits, Refit, limits_of
+from dropo_torch.effects.engine import Variant
+from dropo_torch.gap.evidence import Evidence, cost_of
+from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
+from dropo_torch.optimizers.least_squares import damped_step
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
 #: A candidate that moves the screened windows by fewer standard deviations of the noise cannot be judged by them.
 DEAD = 1.5
+#: Damping and ridge of the predicted moves; damping where only χ² is predicted.
+DAMPING, RIDGE, FAINT = 1e-6, 1e-10, 1e-9
 #: Candidates that one batch of simulations holds.
 BATCH = 24
+
+
+@dataclass(frozen=True)
+class Focus:
+    """A fitted hypothesis on the few windows on which others are compared with it.
+
+    Attributes:
+        evidence: the windows.
+        fitted: the hypothesis there.
+        caps: factors of the windows' residuals, ``(W,)``.
+    """
+
+    evidence: Evidence
+    fitted: Refit
+    caps: np.ndarray
+
+    @cached_property
+    def factor(self) -> np.ndarray:
+        """Factors of the residuals under which least squares is what the fit minimised, ``(W·N,)``."""
+        return np.repeat(self.caps * self.fitted.factor, self.fitted.residual.shape[1])
+
+    @cached_property
+    def residual(self) -> np.ndarray:
+        """Weighted residuals of the fitted hypothesis, ``(W·N,)``."""
+        return self.fitted.residual.ravel() * self.factor
+
+    @cached_property
+    def slope(self) -> np.ndarray:
+        """Their derivatives by its numbers, ``(q, W·N)``."""
+        return self.fitted.slope.reshape(len(self.fitted.slope), -1) * self.factor
+
+    @property
+    def excess(self) -> float:
+        """Excess misfit of the fitted hypothesis."""
+        linear, evidence = self.fitted.linear, self.evidence
+        degrees = evidence.degrees(linear)
+        return cost_of(self.fitted.residual, linear, degrees, self.caps, evidence.tail(linear)).excess
 
 
 @dataclass(frozen=True)
@@ -32,7 +74,6 @@ class Candidate:
     Attributes:
         placed: the effect with the predicted numbers.
         chi2: predicted χ² on the screened windows.
-        windows: predicted χ² of each screened window, ``(W,)``.
         residual: projected residuals at the candidate's start, ``(W·N,)``.
         slope: projected derivatives by its numbers, ``(p, W·N)``.
         dead: whether it changes nothing in these windows.
@@ -40,7 +81,6 @@ class Candidate:
 
     placed: Placed
     chi2: float
-    windows: np.ndarray
     residual: np.ndarray
     slope: np.ndarray
     dead: bool
@@ -60,151 +100,98 @@ def all_candidates(setting: Setting, effects: Sequence[Effect]) -> Iterator[Plac
 
 
 def screen(
-    evidence: Evidence,
-    base: Refit,
-    candidates: Sequence[Placed],
-    *,
-    caps: np.ndarray,
-    on_progress: Callable[[int], None] | None = None,
+    focus: Focus, candidates: Sequence[Placed], on_progress: Callable[[float], None] = lambda share: None
 ) -> list[Candidate]:
     """Return each candidate from its best start, the most promising first.
 
     Args:
-        evidence: the windows to screen on.
-        base: the fitted hypothesis so far, on these windows.
+        focus: the fitted hypothesis so far, on the windows to screen on.
         candidates: effects at their starts.
-        caps: factors of the windows' residuals.
-        on_progress: called with the number of candidates done.
+        on_progress: called with the share of candidates that is done.
     """
-    factor = np.repeat(caps, evidence.num_rows)
-    shared = base.slope.reshape(len(base.slope), -1) * factor
-    origin = base.residual.ravel() * factor
     best: dict[tuple[str, str | None], Candidate] = {}
-    taken = {p.key for p in base.hypothesis.placed}
+    taken = {p.key for p in focus.fitted.hypothesis.placed}
     waiting = [c for c in candidates if c.key not in taken]
     for first in range(0, len(waiting), BATCH):
         part = waiting[first : first + BATCH]
-        for found in _predict(evidence, base, part, shared, origin, factor):
+        for found in _predict(focus, part):
             known = best.get(found.key)
             if known is None or (known.dead, known.chi2) > (found.dead, found.chi2):
                 best[found.key] = found
-        if on_progress is not None:
-            on_progress(first + len(part))
+        on_progress((first + len(part)) / len(candidates))
     return sorted(best.values(), key=lambda c: (c.dead, c.chi2))
 
 
-def _predict(
-    evidence: Evidence, base: Refit, part: Sequence[Placed], shared: np.ndarray, origin: np.ndarray, factor: np.ndarray
-) -> Iterator[Candidate]:
+def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
     """Simulate candidates at their starts and beside them, in one batch, and predict."""
-    hypotheses: list[Hypothesis] = []
-    spans: list[tuple[int, np.ndarray, Limits, np.ndarray]] = []
+    evidence, linear, factor = focus.evidence, focus.fitted.linear, focus.factor
+    variants: list[Variant] = []
+    plans = []
     for placed in part:
-        hypothesis = base.hypothesis.with_effect(placed)
-        limits = limits_of(hypothesis, evidence.twin.space, evidence.twin.setting)
-        size = len(placed.values)
-        vector, begin = hypothesis.vector, len(hypotheses)
-        hypotheses.append(hypothesis)
-        signs = []
-        for c in _moved(placed, len(vector) - size):
-            sign = 1.0 if vector[c] + STEP * limits.scale[c] <= limits.high[c] else -1.0
-            moved = vector.copy()
-            moved[c] += sign * STEP * limits.scale[c]
-            hypotheses.append(hypothesis.at(moved))
-            signs.append(sign)
-        moving = np.array(_moved(placed, 0), dtype=int)
-        spans.append((begin, np.array(signs), limits.of(moving - size), moving))
-    found, _ = evidence.residuals([h.variant for h in hypotheses])
-    for placed, (begin, directions, limits, moving) in zip(part, spans, strict=True):
-        residual = evidence.project(found[begin], base.starts).ravel() * factor
-        change = (found[begin + 1 : begin + 1 + len(moving)] - found[begin]) / (directions[:, None, None] * STEP)
-        slope = evidence.project_slope(change, base.starts).reshape(len(moving), -1) * factor
+        hypothesis = focus.fitted.hypothesis.with_effects([placed])
+        chosen, size = placed.effect.screened(), len(placed.values)
+        moving = np.arange(size) if chosen is None else np.array(chosen, dtype=int)
+        limits, columns = limits_of(hypothesis, evidence.twin), len(hypothesis.vector) - size + moving
+        moved, steps = beside(hypothesis, limits, columns, STEP)
+        plans.append((moving, limits.of(columns), steps, slice(len(variants), len(variants) + 1 + len(moved))))
+        variants += [h.variant for h in (hypothesis, *moved)]
+    found, _ = evidence.residuals(variants)
+    before, shared = focus.residual, focus.slope
+    for placed, (moving, limits, steps, rows) in zip(part, plans, strict=True):
+        begin, beside_it = found[rows][0], found[rows][1:]
+        residual = evidence.project(begin, linear).ravel() * factor
+        change = (beside_it - begin) / steps[:, None, None]
+        slope = evidence.project_slope(change, linear).reshape(len(moving), -1) * factor
         lengths = np.sqrt((slope**2).sum(1))
-        dead = bool(np.linalg.norm(residual - origin) < DEAD and lengths.max(initial=0.0) < DEAD)
-        columns = np.concatenate([shared, slope])
+        dead = bool(np.linalg.norm(residual - before) < DEAD and lengths.max(initial=0.0) < DEAD)
         start = np.array(placed.values)
-        move = _bounded(columns, residual, len(shared), start[moving], limits)
-        left = residual + move @ columns
+        columns = np.concatenate([shared, slope])
+        move = _move(columns, residual, limits, start[moving])
         values = start.copy()
         values[moving] += move[len(shared) :] * limits.scale
-        values = placed.effect.settle(start, values)
-        windows = (left**2).reshape(len(evidence.windows), -1).sum(-1)
-        yield Candidate(placed.at(values), float(windows.sum()), windows, residual, slope, dead)
+        left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
+        yield Candidate(placed.at(placed.effect.settle(start, values)), float(left.sum()), residual, slope, dead)
 
 
-def _moved(placed: Placed, first: int) -> list[int]:
-    """Which of a candidate's numbers are moved, counted from ``first``."""
-    chosen = placed.effect.screened()
-    return [first + i for i in (range(len(placed.values)) if chosen is None else chosen)]
-
-
-def _bounded(
-    columns: np.ndarray, residual: np.ndarray, num_shared: int, values: np.ndarray, limits: Limits
-) -> np.ndarray:
-    """Least-squares move whose candidate part stays inside its bounds."""
-    size = len(values)
-    normal, gradient = columns @ columns.T, -(columns @ residual)
-    ridge = 1e-10 * np.diag(normal).max(initial=1e-300) * np.eye(len(normal)) + 1e-6 * np.diag(np.diag(normal))
-    move = np.linalg.solve(normal + ridge, gradient)
-    scale = limits.scale[-size:] if size else np.zeros(0)
-    low = (limits.low[-size:] - values) / scale if size else np.zeros(0)
-    high = (limits.high[-size:] - values) / scale if size else np.zeros(0)
-    own = np.clip(move[num_shared:], low, high)
-    if size and not np.array_equal(own, move[num_shared:]) and num_shared:
-        rest = residual + own @ columns[num_shared:]
-        part = normal[:num_shared, :num_shared] + ridge[:num_shared, :num_shared]
-        move[:num_shared] = np.linalg.solve(part, -(columns[:num_shared] @ rest))
-    move[num_shared:] = own
+def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:
+    """Least-squares move whose last entries, those of the candidate's own ``values``, stay within bounds."""
+    normal, force = columns @ columns.T, -(columns @ residual)
+    shared = len(force) - len(values)
+    free = np.ones(len(force), dtype=bool)
+    move = damped_step(normal, force, free, DAMPING, RIDGE)
+    own = np.clip(move[shared:], *limits.moves(values))
+    if not np.array_equal(own, move[shared:]):
+        free[shared:] = False
+        move = damped_step(normal, force - normal[:, shared:] @ own, free, DAMPING, RIDGE)
+        move[shared:] = own
     return move
 
 
-def promising_families(base: Refit, caps: np.ndarray, candidates: Sequence[Candidate]) -> list[list[Placed]]:
+def promising_families(focus: Focus, candidates: Sequence[Candidate]) -> list[list[Placed]]:
     """Return the effects of one number that, at all their targets together, predict the least χ²; two at most.
 
     Friction or damping is seldom missing in one joint only. A family is offered where it promises less than half of
     what its best single member leaves.
     """
-    factor = np.repeat(caps, base.residual.shape[1])
-    shared = base.slope.reshape(len(base.slope), -1) * factor
-    origin = base.residual.ravel() * factor
     families: dict[str, list[Candidate]] = {}
     for c in candidates:
         if not c.dead and len(c.placed.values) == 1:
             families.setdefault(c.placed.effect.name, []).append(c)
-    found = []
-    for members in families.values():
-        if len(members) < 2:
-            continue
-        columns = [*shared, *(c.slope[0] for c in members), *(c.residual - origin for c in members)]
-        left = _left(origin, np.stack(columns))
-        if left < 0.5 * min(c.chi2 for c in members):
-            found.append((left, [c.placed for c in members]))
-    return [members for _, members in sorted(found, key=lambda item: item[0])[:2]]
+    found = [(_left(focus, members), members) for members in families.values() if len(members) > 1]
+    found = [(left, members) for left, members in found if left < 0.5 * min(c.chi2 for c in members)]
+    return [[c.placed for c in members] for _, members in sorted(found, key=lambda item: item[0])[:2]]
 
 
-def _left(origin: np.ndarray, columns: np.ndarray) -> float:
-    """χ² that is left of residuals beside columns."""
-    norm = np.sqrt((columns**2).sum(1))
-    columns = columns[norm > 0] / norm[norm > 0, None]
-    gradient = columns @ origin
-    normal = columns @ columns.T + 1e-9 * np.eye(len(columns))
-    return float(origin @ origin - gradient @ np.linalg.solve(normal, gradient))
-
-
-def promising_pairs(
-    base: Refit, candidates: Sequence[Candidate], caps: np.ndarray, count: int
-) -> list[tuple[Placed, Placed]]:
+def promising_pairs(focus: Focus, candidates: Sequence[Candidate], count: int) -> list[list[Placed]]:
     """Return the pairs of candidates that together predict the least χ², the best first."""
-    factor = np.repeat(caps, base.residual.shape[1])
-    shared = base.slope.reshape(len(base.slope), -1) * factor
-    origin = base.residual.ravel() * factor
-    alive = [c for c in candidates if not c.dead]
-    found = []
-    for a, b in combinations(range(len(alive)), 2):
-        first, second = alive[a], alive[b]
-        columns = np.concatenate(
-            [shared, first.slope, second.slope, [first.residual - origin], [second.residual - origin]]
-        )
-        found.append((_left(origin, columns), a, b))
-    found.sort()
-    return [(alive[a].placed, alive[b].placed) for _, a, b in found[:count]]
+    pairs = combinations([c for c in candidates if not c.dead], 2)
+    found = sorted(((_left(focus, pair), pair) for pair in pairs), key=lambda item: item[0])
+    return [[c.placed for c in pair] for _, pair in found[:count]]
+
+
+def _left(focus: Focus, members: Sequence[Candidate]) -> float:
+    """χ² that is left beside the shared numbers, the members' numbers, and the steps to the members' starts."""
+    before = focus.residual
+    columns = np.stack([*focus.slope, *(s for c in members for s in c.slope), *(c.residual - before for c in members)])
+    gradient, free = columns @ before, np.ones(len(columns), dtype=bool)
+    return float(before @ before - gradient @ damped_step(columns @ columns.T, gradient, free, FAINT))

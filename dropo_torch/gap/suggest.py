@@ -10,12 +10,25 @@ import numpy as np
 from dropo_torch.effects.base import Placed
 from dropo_torch.effects.twin import Windows
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.log import spread
 from dropo_torch.gap.refit import Hypothesis
 
 #: Windows of a motion that is tried.
 WINDOWS = 16
 #: Separation, in standard deviations of the noise, from which on a motion is worth recording.
 WORTH = 5.0
+#: What a motion must do to show an effect, by its name or else by its kind; a body or the world just has to move more.
+MOTIONS = {
+    "joint_limit": "reaches the stops",
+    "armature": "accelerates these joints",
+    "joint": "moves these joints further, faster and to and fro",
+    "actuator_saturation": "asks for larger forces",
+    "actuator": "commands these actuators more, and changes the commands faster",
+    "sensor": "moves these columns further",
+    "geom": "slides and presses on these geoms",
+    "ground_slope": "slides and presses on the ground",
+    "fluid_drag": "moves these bodies fast",
+}
 
 
 def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Placed, other: Placed) -> str:
@@ -28,11 +41,9 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     for words, windows in _motions(evidence):
         here = evidence.on(windows)
         residuals, _ = here.residuals([first.variant, second.variant])
-        if not np.isfinite(residuals).all():
-            continue
-        starts = here.linearise(first.variant)
-        apart = here.project_slope(residuals[1] - residuals[0], starts)
-        found.append((float(np.sqrt((apart**2).sum())), words))
+        if np.isfinite(residuals).all():
+            apart = here.project_slope(residuals[1] - residuals[0], here.linearise(first.variant))
+            found.append((float(np.sqrt((apart**2).sum())), words))
     if not found:
         return f"No motion that was tried tells {names}."
     most, words = max(found)
@@ -44,33 +55,19 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     return f"To tell {names}, record {words}: over {WINDOWS} windows it would separate them by {most:.0f} σ."
 
 
-def excite(silent: Sequence[tuple[str, str | None]]) -> str | None:
+def excite(silent: Sequence[Placed]) -> str | None:
     """Return what a log would have to show so that candidates that it cannot judge can be judged."""
     if not silent:
         return None
     wanted: dict[str, list[str]] = {}
-    for name, target in silent:
-        motion = next((words for start, words in _MOTIONS if name.startswith(start)), "moves more")
-        wanted.setdefault(motion, []).append(f"{name} of {target}" if target else name)
+    for placed in silent:
+        motion = MOTIONS.get(placed.effect.name) or MOTIONS.get(placed.effect.kind, "moves more")
+        wanted.setdefault(motion, []).append(_called(placed))
     parts = []
     for motion, names in wanted.items():
         more = " and others" if len(names) > 4 else ""
         parts.append(f"{motion} (for {', '.join(names[:4])}{more})")
     return "To judge what this log cannot, record a motion that " + "; ".join(parts) + "."
-
-
-#: What a motion must do to show effects whose names start so.
-_MOTIONS = (
-    ("joint_limit", "reaches the stops"),
-    ("joint", "moves these joints further, faster and to and fro"),
-    ("armature", "accelerates these joints"),
-    ("actuator_saturation", "asks for larger forces"),
-    ("actuator", "commands these actuators more, and changes the commands faster"),
-    ("sensor", "moves these columns further"),
-    ("contact", "slides and presses on these geoms"),
-    ("ground", "slides and presses on the ground"),
-    ("fluid_drag", "moves these bodies fast"),
-)
 
 
 def _called(placed: Placed) -> str:
@@ -79,27 +76,18 @@ def _called(placed: Placed) -> str:
 
 def _motions(evidence: Evidence) -> list[tuple[str, Windows]]:
     """Motions to try, in words, from the log's own."""
-    windows = evidence.windows
-    rows = np.unique(np.linspace(0, len(windows) - 1, WINDOWS).astype(int))
-    base = windows.select(rows)
-    commands = base.commands
-    model = evidence.twin.setting.model
-    limited = model.actuator_ctrllimited.astype(bool)[: commands.shape[2]] if model.nactuator == model.nu else None
-    low, high = model.actuator_ctrlrange.T if limited is not None else (None, None)
-
-    def clipped(signal: np.ndarray) -> np.ndarray:
-        if limited is None:
-            return signal
-        return np.where(limited, np.clip(signal, low, high), signal)
-
-    half = np.repeat(commands, 2, axis=1)[:, : commands.shape[1]]
-    twice = np.concatenate([commands[:, ::2], commands[:, 1::2]], axis=1)
-    found = [
-        ("the same motion again", commands),
-        ("the same motion with commands half as large", 0.5 * commands),
-        ("the same motion with commands twice as large", clipped(2 * commands)),
-        ("the same motion at half the speed", half),
-        ("the same motion at twice the speed", twice),
-        ("a motion without commands", np.zeros_like(commands)),
-    ]
-    return [(words, replace(base, commands=np.ascontiguousarray(signal))) for words, signal in found]
+    base = spread(evidence.windows, WINDOWS)
+    commands, model = base.commands, evidence.twin.setting.model
+    twice_as_large = 2 * commands
+    if model.nactuator == model.nu:
+        clipped = np.clip(twice_as_large, *model.actuator_ctrlrange.T)
+        twice_as_large = np.where(model.actuator_ctrllimited.astype(bool), clipped, twice_as_large)
+    found = {
+        "the same motion again": commands,
+        "the same motion with commands half as large": 0.5 * commands,
+        "the same motion with commands twice as large": twice_as_large,
+        "the same motion at half the speed": np.repeat(commands, 2, axis=1)[:, : commands.shape[1]],
+        "the same motion at twice the speed": np.concatenate([commands[:, ::2], commands[:, 1::2]], axis=1),
+        "a motion without commands": np.zeros_like(commands),
+    }
+    return [(words, replace(base, commands=np.ascontiguousarray(signal))) for words, signal in found.items()]

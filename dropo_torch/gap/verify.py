@@ -6,22 +6,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dropo_torch.data.observation import Observation
+from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories
-from dropo_torch.effects.twin import Twin, Windows
-from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import cut_windows
+from dropo_torch.effects.base import Setting
+from dropo_torch.effects.twin import Windows
+from dropo_torch.gap.evidence import LOST, Evidence
+from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, spread
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Score
 
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)
-#: Share of the motion's own deviation that noise at the start may grow to in an open-loop prediction.
+#: Share of the motion's own standard deviation that noise at the start may grow to in an open-loop prediction.
 GROWTH = 0.1
-#: Simulations from which the error that noise alone makes is estimated, at least.
-DRAWS = 150
-#: Most windows that are scored.
-MOST = 600
+#: Simulations from which the error that noise alone makes is estimated, at least, and their seed.
+DRAWS, SEED = 150, 5
+#: Most windows that are scored: single steps, and open-loop stretches.
+MOST, MOST_ROLLOUTS = 600, 60
 
 
 @dataclass(frozen=True)
@@ -48,63 +49,58 @@ def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
     return log.select(slice(0, cut)), log.select(slice(cut, len(log)))
 
 
-def cut_held(
-    twin: Twin, log: Trajectories, observation: Observation, hypothesis: Hypothesis, noise: np.ndarray, timestep: float
-) -> Held:
+def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> Held:
     """Cut held-out data into single steps, and into stretches over which noise at the start does not take over."""
-    longest = int(np.diff(np.append(-1, np.flatnonzero(log.terminals))).max())
+    setting = evidence.twin.setting
+    observation, timestep = setting.observation, setting.signals.timestep
     steps = spread(cut_windows(log, observation, 1, stride=1), MOST)
-    evidence = Evidence(twin, steps, noise, rough=False)
-    deviation = evidence.chart.difference(steps.measured[:, 0], steps.measured[:1, 0]).std(0)
-    positions = position_features(evidence)
+    positions = position_features(setting)
+    largest = GROWTH * _rms(feature_sizes(setting, steps.measured[:, 0])[positions])
     chosen, seconds = steps, timestep
     for wanted in SECONDS:
-        length = min(max(1, round(wanted / timestep)), longest)
-        windows = spread(cut_windows(log, observation, length, stride=max(1, length // 3)), 60)
-        if not len(windows):
-            continue
-        chosen, seconds = windows, length * timestep
-        floor = rollout_floor(evidence.on(windows), hypothesis)
-        if float(np.sqrt((floor[positions] ** 2).mean())) < GROWTH * float(np.sqrt((deviation[positions] ** 2).mean())):
-            break
+        length = min(max(1, round(wanted / timestep)), longest_episode(log))
+        windows = spread(cut_windows(log, observation, length, stride=max(1, length // 3)), MOST_ROLLOUTS)
+        if len(windows):
+            chosen, seconds = windows, length * timestep
+            if _rms(rollout_floor(evidence.on(windows), hypothesis)[positions]) < largest:
+                break
     return Held(steps, chosen, seconds)
 
 
-def spread(windows: Windows, most: int) -> Windows:
-    """Return at most so many windows, evenly spread."""
-    if len(windows) <= most:
-        return windows
-    return windows.select(np.unique(np.linspace(0, len(windows) - 1, most).astype(int)))
-
-
-def position_features(evidence: Evidence) -> np.ndarray:
+def position_features(setting: Setting) -> np.ndarray:
     """Return which features are positions, ``(m,)`` bool; all of them where none is."""
-    found = np.array([".velocity" not in label for label in evidence.chart.labels])
+    found = Features.of(setting.observation).known(setting.observation.index < setting.model.nq)
     return found if found.any() else ~found
 
 
 def score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
     """Return the scores of a hypothesis on held-out data."""
     error, covariance = _one_step(evidence.on(held.steps), hypothesis)
-    value = _log_likelihood(error, covariance)
-    rollout = _rollout(evidence.on(held.rollouts), hypothesis)
-    positions = position_features(evidence)
-    return Score(
-        float(np.mean(error**2)), value, float(np.sqrt(np.mean(rollout[positions] ** 2))),
-        tuple(rollout.tolist()),
-    )  # fmt: skip
+    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+    likelihood = _log_likelihood(covariance, (error * solved).sum(1))
+    return _score(evidence, float(np.mean(error**2)), likelihood, _rollout(evidence.on(held.rollouts), hypothesis))
 
 
 def floor_score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
     """Return the scores that a perfect model would have, by the noise of start and end alone."""
     _, covariance = _one_step(evidence.on(held.steps), hypothesis)
-    m = covariance.shape[-1]
-    logdet = np.linalg.slogdet(covariance)[1]
-    rollout = rollout_floor(evidence.on(held.rollouts), hypothesis)
-    positions = position_features(evidence)
     mse = float(np.mean(np.einsum("tmm->tm", covariance)))
-    likelihood = float(-0.5 * np.sum(m * np.log(2 * np.pi) + logdet + m))
-    return Score(mse, likelihood, float(np.sqrt(np.mean(rollout[positions] ** 2))), tuple(rollout.tolist()))
+    likelihood = _log_likelihood(covariance, covariance.shape[-1])
+    return _score(evidence, mse, likelihood, rollout_floor(evidence.on(held.rollouts), hypothesis))
+
+
+def _score(evidence: Evidence, mse: float, likelihood: float, rollout: np.ndarray) -> Score:
+    return Score(mse, likelihood, _rms(rollout[position_features(evidence.twin.setting)]), tuple(rollout.tolist()))
+
+
+def _rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _log_likelihood(covariance: np.ndarray, distance: np.ndarray | int) -> float:
+    """Of Gaussian errors at squared Mahalanobis distances ``(T,)``, with covariances ``(T, m, m)``."""
+    m, logdet = covariance.shape[-1], np.linalg.slogdet(covariance)[1]
+    return float(-0.5 * np.sum(m * np.log(2 * np.pi) + logdet + distance))
 
 
 def _one_step(evidence: Evidence, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
@@ -112,47 +108,41 @@ def _one_step(evidence: Evidence, hypothesis: Hypothesis) -> tuple[np.ndarray, n
     m, noise = evidence.chart.size, evidence.noise
     moved = np.concatenate([np.zeros((1, m)), np.eye(m), -np.eye(m)])[:, None]
     found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)
-    end = found.reshape(len(moved), len(evidence.windows), 2, m)[:, :, 1] * noise
-    end = np.where(np.isfinite(end), end, 1e3 * noise)
+    end = found[:, :, -m:] * noise
+    end = np.where(np.isfinite(end), end, LOST * noise)
     slope = np.moveaxis((end[1 : 1 + m] - end[1 + m :]) / 2, 0, -1)
-    covariance = slope @ np.swapaxes(slope, 1, 2) + np.diag(noise**2)
-    return end[0], covariance
-
-
-def _log_likelihood(error: np.ndarray, covariance: np.ndarray) -> float:
-    m = error.shape[1]
-    logdet = np.linalg.slogdet(covariance)[1]
-    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
-    return float(-0.5 * np.sum(m * np.log(2 * np.pi) + logdet + (error * solved).sum(1)))
+    return end[0], slope @ np.swapaxes(slope, 1, 2) + np.diag(noise**2)
 
 
 def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     """Root mean square open-loop error of each feature, ``(m,)``; infinite where a simulation diverged."""
-    found, known = evidence.residuals([hypothesis.variant])
-    m = evidence.chart.size
-    error = found.reshape(len(evidence.windows), -1, m)[:, 1:] * evidence.noise
+    found, known = (_after(x, evidence) for x in evidence.residuals([hypothesis.variant]))
+    error = found * evidence.noise
     error = np.where(np.isfinite(error), error, np.inf)
-    known = known.reshape(len(evidence.windows), -1, m)[:, 1:]
-    return np.sqrt((error**2 * known).sum((0, 1)) / np.maximum(known.sum((0, 1)), 1))
+    return np.sqrt((error**2 * known).sum((0, 1, 2)) / np.maximum(known.sum((0, 1, 2)), 1))
+
+
+def _after(rows: np.ndarray, evidence: Evidence) -> np.ndarray:
+    """Rows of residuals ``(K, W, N)`` by instant and feature, the initial one left out, ``(K, W, L, m)``."""
+    return rows.reshape(*rows.shape[:2], -1, evidence.chart.size)[:, :, 1:]
 
 
 def constant_velocity(evidence: Evidence, held: Held) -> float:
     """Return the open-loop error of positions that go on with the velocity at the start."""
-    windows = held.rollouts
-    time = np.arange(windows.length + 1)[None, :, None] * evidence.twin.setting.signals.timestep
-    rate_of = evidence.twin.rates
-    rates = np.where(rate_of >= 0, windows.measured[:, 0][:, np.maximum(rate_of, 0)], windows.rates)
+    windows, twin = held.rollouts, evidence.twin
+    time = np.arange(windows.length + 1)[None, :, None] * twin.setting.signals.timestep
+    rates = np.where(twin.rates >= 0, windows.measured[:, 0][:, np.maximum(twin.rates, 0)], windows.rates)
     moved = windows.measured[:, :1] + rates[:, None] * time
     error = evidence.chart.difference(windows.measured, moved)[:, 1:]
-    return float(np.sqrt((error[..., position_features(evidence)] ** 2).mean()))
+    return _rms(error[..., position_features(twin.setting)])
 
 
 def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     """Return the open-loop error of each feature that noise at start and end alone would make, ``(m,)``."""
-    m = evidence.chart.size
-    count = max(4, -(-DRAWS // len(evidence.windows)))
-    draws = np.random.default_rng(5).standard_normal((count, len(evidence.windows), m))
-    moved = np.concatenate([np.zeros((1, len(evidence.windows), m)), draws])
+    m, num_windows = evidence.chart.size, len(evidence.windows)
+    count = max(4, -(-DRAWS // num_windows))
+    draws = np.random.default_rng(SEED).standard_normal((count, num_windows, m))
+    moved = np.concatenate([np.zeros((1, num_windows, m)), draws])
     found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)
-    change = np.nan_to_num(found[1:] - found[:1], nan=1e3).reshape(len(draws), len(evidence.windows), -1, m)[:, :, 1:]
+    change = _after(np.nan_to_num(found[1:] - found[:1], nan=LOST), evidence)
     return np.sqrt((change**2).mean((0, 1, 2)) + 1) * evidence.noise

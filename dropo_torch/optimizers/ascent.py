@@ -11,7 +11,7 @@ import torch
 
 from dropo_torch.distribution import SearchBox
 from dropo_torch.objective import Reduce
-from dropo_torch.optimizers.gauss_newton import damped_step
+from dropo_torch.optimizers.least_squares import damped_step
 
 #: Damping beyond which no step is tried.
 MAX_DAMPING = 1e2

@@ -11,6 +11,7 @@ import torch
 from dropo_torch.distribution import SearchBox
 from dropo_torch.likelihood import DIVERGENCE_PENALTY, robust_cholesky
 from dropo_torch.objective import Reduce
+from dropo_torch.optimizers.least_squares import bounded_step
 
 #: Step of the forward differences, as a share of the search width.
 DIFFERENCE_STEP = 1e-5
@@ -83,7 +84,10 @@ class MeansStage:
         if self.iterations >= MAX_ITERATIONS and self.reason is None:
             self.reason = f"{MAX_ITERATIONS} iterations of the means"
         if self.reason is None:
-            self.candidate = np.clip(self.point + self._step(), self.low, self.high)
+            move = bounded_step(
+                self.hessian, -self.gradient, self.low - self.point, self.high - self.point, self.damping
+            )
+            self.candidate = np.clip(self.point + move, self.low, self.high)
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
 
@@ -125,24 +129,6 @@ class MeansStage:
         """Signed steps of the candidate's differences, which stay inside the box, ``(d,)``."""
         step = DIFFERENCE_STEP * self._width
         return np.where(self._center + step > self.high, -step, step)
-
-    def _step(self) -> np.ndarray:
-        """The damped step; parameters that press against a bound stay there."""
-        free = ~(((self.point <= self.low) & (self.gradient > 0)) | ((self.point >= self.high) & (self.gradient < 0)))
-        return damped_step(self.hessian, -self.gradient, free, self.damping)
-
-
-def damped_step(matrix: np.ndarray, force: np.ndarray, free: np.ndarray, damping: float) -> np.ndarray:
-    """Solve (A + damping · diag A) δ = force for the free entries; the others get 0."""
-    step = np.zeros(len(force))
-    if not free.any():
-        return step
-    part = matrix[np.ix_(free, free)]
-    diagonal = np.diag(part)
-    scale = np.sqrt(np.maximum(diagonal, 1e-14 * max(float(diagonal.max()), 1e-300)))
-    correlation = part / np.outer(scale, scale) + damping * np.eye(len(scale))
-    step[free] = np.linalg.lstsq(correlation, force[free] / scale, rcond=1e-14)[0] / scale
-    return step
 
 
 def normal_equations(

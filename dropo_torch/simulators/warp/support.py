@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import mujoco
 import numpy as np
 
-from dropo_torch.errors import InputError
+from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
 
 #: θ fields that a parameter may write and the adjoint differentiates.
@@ -46,14 +46,14 @@ def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tupl
         pairs: geoms that may touch, ``(geom1, geom2, pair or -1)``, the smaller geom type first.
 
     Raises:
-        InputError: the list of all offending elements.
+        UnsupportedModel: the list of all offending elements.
     """
     reasons = [
         *_options(model), *_structure(model), *_joints(model), *_actuators(model), *_equalities(model),
         *_contacts(model, pairs), *_parameters(model, space),
     ]  # fmt: skip
     if reasons:
-        raise InputError("backend warp does not simulate: " + "; ".join(reasons) + ". Use backend mujoco")
+        raise UnsupportedModel("backend warp does not simulate: " + "; ".join(reasons) + ". Use backend mujoco")
 
 
 def _options(model: mujoco.MjModel) -> Iterator[str]:

@@ -1,0 +1,128 @@
+"""Accepting effects: the one or two that remove the most, and better ones in the place of those accepted before."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from dropo_torch.effects.base import Placed
+from dropo_torch.gap.ground import FEWER, Ground
+from dropo_torch.gap.naming import State
+from dropo_torch.gap.refit import Refit, refit
+from dropo_torch.gap.rules import significant, simplest
+from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
+
+
+def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
+    """Return whether a hypothesis removes most of another's excess, or less of it all over the log."""
+    most = better.cost.excess < (1 - ground.rules.most) * worse.cost.excess
+    return most or ground.advantage(better, worse) >= ground.rules.significance
+
+
+def is_done(ground: Ground, state: State) -> bool:
+    """Return whether what is left is noise, or too small a part of the gap to tell anything."""
+    base, current = state.base, state.current
+    if ground.strategy.clears(base, current) or not significant(current.cost, ground.rules):
+        return True
+    return current.cost.excess < ground.rules.least * base.cost.excess
+
+
+def add(ground: Ground, state: State) -> State:
+    """Accept the one or two effects that remove the most; where nothing does, the search is done."""
+    rules, current = ground.rules, state.current
+    ranked = ground.screened(current) if state.number else state.first.ranked
+    alive = [c for c in ranked if not c.dead]
+    singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
+    if not singles:
+        return replace(state, done=True)
+    best = simplest(singles)
+    if best.cost.excess / current.cost.excess > 1 - rules.most:
+        families = promising_families(ground.focus(current), alive)
+        several = {"pairs": _pairs(ground, current, alive), "families": families}
+        for words, groups in several.items():
+            tried, state = ground.refits(state, current, groups, f"refitting {words}")
+            if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
+                best = tried[0]
+    gained = current.cost.excess - best.cost.excess
+    hopeless = best.cost.excess > rules.hopeless * current.cost.excess or gained < rules.least * state.base.cost.excess
+    if hopeless or not beats(ground, best, current):
+        return replace(state, done=True)
+    return replace(state, current=best)
+
+
+def _pairs(ground: Ground, current: Refit, alive: Sequence[Candidate]) -> list[list[Placed]]:
+    """Pairs of promising candidates, screened again from where they promise the most, on more windows."""
+    focus = ground.focus(current, 2 * FEWER)
+    return promising_pairs(focus, screen(focus, [c.placed for c in alive[:16]]), 5)
+
+
+def swap(ground: Ground, state: State) -> State:
+    """Try to put another effect in the place of each accepted one."""
+    for _ in range(2):
+        before = state.current
+        for index in range(len(before.hypothesis.placed)):
+            without = ground.refit(state.current.hypothesis.without(index))
+            rivals = [(c.placed,) for c in _rivals(ground, without, state.current)]
+            found, state = ground.refits(state, without, rivals, "swapping")
+            better = [r for r in found[:1] if r.cost.excess < state.current.cost.excess]
+            if better and beats(ground, better[0], state.current):
+                state = replace(state, current=better[0])
+        if state.current is before:
+            break
+    return state
+
+
+def _rivals(ground: Ground, without: Refit, current: Refit) -> list[Candidate]:
+    """Candidates that promise to explain more than the effect that was left out does, the best first."""
+    alive = [c for c in ground.screened(without) if not c.dead]
+    focus = ground.focus(without)
+    here = refit(focus.evidence, current.hypothesis, caps=focus.caps, iterations=0)
+    return [c for c in alive[:3] if c.chi2 < 0.8 * here.cost.chi2]
+
+
+def extend(ground: Ground, state: State) -> State:
+    """Put effects that contain an accepted one in its place, where that explains more."""
+    rules = ground.rules
+    for index, own in enumerate(state.current.hypothesis.placed):
+        starts = ((e, values) for e in ground.effects for values in e.extends(ground.setting, own))
+        groups = [(Placed(effect, own.target).at(values),) for effect, values in starts]
+        if not groups:
+            continue
+        origin = state.current.hypothesis.without(index)
+        found, state = ground.refits(state, ground.refit(origin), groups, "refining", origin)
+        for better in found[:1]:
+            gained = state.current.cost.excess - better.cost.excess
+            least = min(rules.least * state.base.cost.excess, rules.most * state.current.cost.excess)
+            if gained >= least and beats(ground, better, state.current):
+                state = replace(state, current=better)
+    return state
+
+
+def everywhere(ground: Ground, state: State) -> State:
+    """Put the last accepted effect at all its other targets, too, where that explains more."""
+    hypothesis = state.current.hypothesis
+    effect = hypothesis.placed[-1].effect
+    if len(hypothesis.placed[-1].values) != 1:
+        return state
+    idle = {p.key for p in (*hypothesis.placed, *state.first.silent)}
+    others = [
+        Placed(effect, target, (effect.quantities(ground.setting, target)[0].neutral,))
+        for target in effect.targets(ground.setting)
+        if (effect.name, target) not in idle
+    ]
+    ground.report("refitting families", 0.5)
+    whole = ground.refit(hypothesis.with_effects(others))
+    return replace(state, current=whole) if beats(ground, whole, state.current) else state
+
+
+def prune(ground: Ground, state: State) -> State:
+    """Drop effects that are not needed, the least needed first."""
+    current = state.current
+    while len(current.hypothesis.placed) > 1:
+        without = [ground.refit(current.hypothesis.without(i)) for i in range(len(current.hypothesis.placed))]
+        least = min(without, key=lambda r: r.cost.excess)
+        needed = least.cost.excess - current.cost.excess
+        if needed >= ground.rules.least * state.base.cost.excess and beats(ground, current, least):
+            break
+        current = least
+    return replace(state, current=current)

@@ -1,0 +1,134 @@
+"""What every step of a search stands on, and the refits of what a step proposes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Placed, Setting
+from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.log import blocks_of, spread
+from dropo_torch.gap.naming import Attempt, State
+from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.rules import Rules, paired
+from dropo_torch.gap.screen import Candidate, Focus, all_candidates, screen
+
+if TYPE_CHECKING:
+    from dropo_torch.gap.strategy import Strategy
+
+#: Windows that refits use, and that the screening uses; all if there are fewer.
+FEW, FEWER = 40, 10
+
+#: ``report(stage, share)`` as the work goes on.
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """What a search stands on, the same for all of its steps.
+
+    Attributes:
+        evidence: all windows of the training part.
+        effects: the vocabulary.
+        rules: thresholds.
+        strategy: how windows count that no effect explains.
+        report: called with a stage and its share done.
+        caps: factors of the refitted windows' residuals, ``(W,)``; 1 by default.
+    """
+
+    evidence: Evidence
+    effects: tuple[Effect, ...]
+    rules: Rules
+    strategy: Strategy
+    report: Report
+    caps: np.ndarray | None = None
+
+    def at(self, state: State) -> Ground:
+        """Return the ground with the noise and the caps that a state has found."""
+        return replace(self, evidence=replace(self.evidence, noise=state.noise), caps=state.caps)
+
+    @property
+    def setting(self) -> Setting:
+        """The model and its columns."""
+        return self.evidence.twin.setting
+
+    @cached_property
+    def part(self) -> Evidence:
+        """The evidence on the windows that refits use."""
+        return self.evidence.on(spread(self.evidence.windows, FEW))
+
+    @cached_property
+    def candidates(self) -> list[Placed]:
+        """Every effect at every target, at each of its starts."""
+        return list(all_candidates(self.setting, self.effects))
+
+    def refit(self, hypothesis: Hypothesis, iterations: int = 12) -> Refit:
+        """Return a hypothesis fitted on the windows that refits use."""
+        return refit(self.part, hypothesis, caps=self.caps, iterations=iterations)
+
+    def focus(self, fitted: Refit, count: int = FEWER) -> Focus:
+        """Return a fitted hypothesis on the windows that it fits worst and on a spread of the others."""
+        assert self.caps is not None
+        order = np.argsort(-fitted.cost.windows)
+        half = count // 2
+        others = np.linspace(0, len(order) - 1, count - half).astype(int)
+        rows = np.unique(np.concatenate([order[:half], order[others]]))
+        here = replace(
+            fitted, residual=fitted.residual[rows], slope=fitted.slope[:, rows], linear=fitted.linear.select(rows),
+            factor=fitted.factor[rows],
+        )  # fmt: skip
+        return Focus(self.part.on(self.part.windows.select(rows)), here, self.caps[rows])
+
+    def screened(self, fitted: Refit) -> list[Candidate]:
+        """Return what all candidates promise beside a fitted hypothesis."""
+        stage = f"screening {len(self.candidates)} candidates"
+        return screen(self.focus(fitted), self.candidates, lambda share: self.report(stage, share))
+
+    def advantage(self, better: Refit, worse: Refit) -> float:
+        """Return by how many standard errors, over blocks of the log, one hypothesis is nearer to it than another."""
+        return paired(worse.cost, better.cost, blocks_of(self.part.windows.episodes, 5))
+
+    def refits(
+        self, state: State, beside: Refit, groups: Sequence[Sequence[Placed]], stage: str,
+        origin: Hypothesis | None = None,
+    ) -> tuple[list[Refit], State]:  # fmt: skip
+        """Refit a hypothesis with each group of effects more; the best first, and the state with these attempts.
+
+        All are fitted a little, on few windows; those that come near the best of them are then fitted in full.
+
+        Args:
+            state: where the search stands.
+            beside: the fitted hypothesis.
+            groups: the effects to add.
+            stage: what to report.
+            origin: the hypothesis from which the fits begin; by default the fitted one.
+        """
+        if not groups:
+            return [], state
+        focus = self.focus(beside, 2 * FEWER)
+        before, known = focus.excess, len(beside.hypothesis.placed)
+
+        def rough(hypothesis: Hypothesis, iterations: int) -> Refit:
+            linear = focus.fitted.linear
+            return refit(focus.evidence, hypothesis, linear=linear, caps=focus.caps, iterations=iterations)
+
+        found = []
+        for number, group in enumerate(groups):
+            self.report(stage, number / (len(groups) + 2))
+            found.append(rough((origin or beside.hypothesis).with_effects(group), 2))
+        found.sort(key=lambda r: r.cost.excess)
+        found[:4] = [rough(r.hypothesis, 5) for r in found[:4]]
+        found.sort(key=lambda r: r.cost.excess)
+        attempts = [Attempt(p, r.cost.excess, before, state.number) for r in found for p in r.hypothesis.placed[known:]]
+        best = found[0].cost
+        near = 3 * max(best.excess, 0.0) + self.rules.least * before + 10 * best.sigma
+        full = []
+        for number, fitted in enumerate(r for r in found[:3] if r.cost.excess <= near):
+            self.report(stage, (len(groups) + number / 4) / (len(groups) + 2))
+            full.append(self.refit(fitted.hypothesis))
+        full.sort(key=lambda r: r.cost.excess)
+        return full, replace(state, attempts=(*state.attempts, *attempts))
