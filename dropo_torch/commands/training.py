@@ -17,7 +17,7 @@ from dropo_torch.config import Config
 from dropo_torch.errors import InputError
 from dropo_torch.report.train import WORLDS, evaluations, write_train_report
 from dropo_torch.rl.problem import TrainingProblem, make_training
-from dropo_torch.rl.train import Progress, TrainEntry, Training, check_training, train
+from dropo_torch.rl.train import EvaluationPoint, TrainEntry, Training, check_training, train
 from dropo_torch.rl.video import chosen_frames, draw, record
 from dropo_torch.support.files import write_json
 
@@ -46,7 +46,7 @@ def run_train(config: Config, out: Path, *, console: Console, resume: bool = Fal
     curves = _Curves(out / "tensorboard", problem.settings.steps) if log == "tensorboard" else None
     with TrainProgress(console, problem.settings.steps) as progress:
 
-        def show(entry: TrainEntry, evaluation: Progress | None) -> None:
+        def show(entry: TrainEntry, evaluation: EvaluationPoint | None) -> None:
             progress.update(entry.steps, entry.mean_return)
             if curves is not None:
                 curves.add(entry, evaluation)
@@ -107,7 +107,7 @@ class _Curves:
         self._folder, self._every, self._next = folder, max(1, steps // POINTS), 0
         self._logger: TensorboardLogger | None = None
 
-    def begin(self, history: Sequence[TrainEntry], evaluated: Sequence[Progress]) -> None:
+    def begin(self, history: Sequence[TrainEntry], evaluated: Sequence[EvaluationPoint]) -> None:
         """Start afresh with what an interrupted run had done."""
         shutil.rmtree(self._folder, ignore_errors=True)
         self._logger = TensorboardLogger(exp_name=self._folder.name, log_dir=str(self._folder.parent))
@@ -116,7 +116,7 @@ class _Curves:
         for evaluation in evaluated:
             self._evaluation(evaluation)
 
-    def add(self, entry: TrainEntry, evaluation: Progress | None) -> None:
+    def add(self, entry: TrainEntry, evaluation: EvaluationPoint | None) -> None:
         """Write an entry, unless one has just been written, and an evaluation."""
         assert self._logger is not None
         if evaluation is not None:
@@ -128,6 +128,6 @@ class _Curves:
         for name, value in {**scalars, **entry.scalars}.items():
             self._logger.log_scalar(f"train/{name}", value, step=entry.steps)
 
-    def _evaluation(self, evaluation: Progress) -> None:
+    def _evaluation(self, evaluation: EvaluationPoint) -> None:
         assert self._logger is not None
         self._logger.log_scalar("evaluation/return", evaluation.mean, step=evaluation.steps)

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dropo_torch.data.tables import Table, reading
+from dropo_torch.data.tables import Table
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.given import reading
 
 if TYPE_CHECKING:
     import pandas as pd

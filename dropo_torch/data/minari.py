@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from dropo_torch.data.formats import flatten
-from dropo_torch.data.tables import ColumnMap, Table, reading
+from dropo_torch.data.tables import ColumnMap, Table
 from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.given import reading
 
 PREFIX = "minari:"
 

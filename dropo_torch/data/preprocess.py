@@ -24,7 +24,7 @@ from scipy.signal import butter, sosfiltfilt
 from dropo_torch.data.recording import Recording, resolve_names
 from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
-from dropo_torch.support.entries import check_keys, number
+from dropo_torch.support.given import check_keys, number
 
 Actions = Literal["hold", "mean", "position", "velocity"]
 

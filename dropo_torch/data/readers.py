@@ -27,10 +27,10 @@ from dropo_torch.data.formats import missing_file, open_tables
 from dropo_torch.data.minari import PREFIX, is_minari, read_minari
 from dropo_torch.data.preprocess import Preprocess, preprocess
 from dropo_torch.data.recording import TOLERANCE, Recording
-from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns, reading
+from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
 from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
-from dropo_torch.support.entries import check_keys, number
+from dropo_torch.support.given import check_keys, number, reading
 
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
 

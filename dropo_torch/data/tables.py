@@ -16,8 +16,7 @@ and a map is one entry, a list of entries, or a mapping from names to entries su
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
@@ -25,7 +24,7 @@ import numpy as np
 
 from dropo_torch.data.trajectory import column_names
 from dropo_torch.errors import InputError, choices
-from dropo_torch.support.entries import check_keys, number
+from dropo_torch.support.given import check_keys, number
 
 ColumnMap = str | int | Mapping[str, Any] | Sequence[Any]
 
@@ -191,17 +190,6 @@ def missing(array: np.ndarray) -> np.ndarray:
     import pandas as pd
 
     return np.asarray(pd.isna(array))
-
-
-@contextmanager
-def reading(where: object, kind: str) -> Iterator[None]:
-    """Turn what a library raises on something that it cannot read into an :class:`InputError` of one line."""
-    try:
-        yield
-    except InputError:
-        raise
-    except Exception as error:  # on a corrupt file these libraries raise whatever comes up
-        raise InputError(f"{where}: cannot be read as {kind} ({str(error) or type(error).__name__})") from None
 
 
 def _parse_signal(entry: Mapping[str, Any], where: str) -> Signal:

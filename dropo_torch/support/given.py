@@ -1,12 +1,34 @@
-"""Entries that a user gives, checked one by one: keys that are known, numbers in their range."""
+"""What a user gives, checked: keys that are known, numbers in their range, files that can be read."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from dropo_torch.errors import InputError, choices
+
+#: Characters of a library's own message that are passed on.
+_LONGEST = 300
+
+
+@contextmanager
+def reading(where: object, kind: str, remedy: str = "") -> Iterator[None]:
+    """Turn what a library raises on something that it cannot read into an :class:`InputError` of one line.
+
+    Args:
+        where: what is read.
+        kind: what it should be.
+        remedy: what the user can do about it.
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except Exception as error:  # on a corrupt file these libraries raise whatever comes up
+        reason = " ".join(str(error).split())[:_LONGEST] or type(error).__name__
+        raise InputError(f"{where}: cannot be read as {kind} ({reason}){remedy and '; '}{remedy}") from None
 
 
 def check_keys(given: Iterable[object], known: Iterable[str], where: str) -> None:
