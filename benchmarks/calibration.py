@@ -2,7 +2,7 @@
 
     python benchmarks/calibration.py --logs 100 --out out/calibration --workers 2     # --resume goes on
 
-Writes ``trials.jsonl``, a line a fit below the settings, and ``calibration.md``. Mass and damping are searched for; the
+Writes ``cells/``, a file a fit, and ``calibration.md``. Mass and damping are searched for; the
 log has 60 transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.studies.calibration` has the
 two kinds of log.
 """
@@ -11,17 +11,17 @@ from __future__ import annotations
 
 import argparse
 import functools
-import json
 import tempfile
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import dropo_torch as dropo
-from dropo_torch.studies.calibration import Coverage, Trial, calibrate, coverages, plain
-from dropo_torch.support.parallel import in_parallel
+from dropo_torch.studies.calibration import KINDS, CalibrationCell, CalibrationRun, Coverage, calibrate, coverages
+from dropo_torch.studies.study import run_cells
 
 MODEL = """
 <mujoco>
@@ -80,13 +80,20 @@ def problem_of(folder: Path, name: str, transitions: int, threads: int) -> dropo
     return dropo.make_problem(dropo.make_config(document, base=folder))
 
 
-def fit_log(task: tuple[int, list[Trial]], *, methods: Sequence[str], transitions: int, threads: int) -> list[Trial]:
-    """Fit the logs of a number, one of each kind, by the methods; return what is not among the trials done."""
-    log, done = task
+@dataclass(frozen=True)
+class Plan:
+    """What all fits have in common."""
+
+    transitions: int
+    noise: tuple[float, ...] = tuple(NOISE.tolist())
+    methods: dict[str, Any] = field(default_factory=lambda: METHODS)
+
+
+def fit_cell(cell: CalibrationCell, *, transitions: int, threads: int) -> dict[str, Any]:
+    """Fit one simulated log by one method."""
     with tempfile.TemporaryDirectory() as folder:
-        problems = functools.partial(problem_of, Path(folder), transitions=transitions, threads=threads)
-        trials = calibrate(problems, methods, logs=[log], noise=NOISE, done=done)
-    return trials[len(done) :]
+        problem = problem_of(Path(folder), cell.method, transitions, threads)
+        return asdict(calibrate(cell, problem, noise=NOISE))
 
 
 def markdown(rows: Sequence[Coverage]) -> str:
@@ -111,32 +118,17 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     if given.workers < 1:
         parser.error(f"--workers {given.workers}: expected 1 or more")
-    given.out.mkdir(parents=True, exist_ok=True)
-    store = given.out / "trials.jsonl"
-    if store.exists() and not given.resume:
-        parser.error(f"{store} exists; add --resume, or name another folder")
-    done = []
-    plan = json.dumps({"transitions": given.transitions, "noise": NOISE.tolist(), "methods": METHODS})
-    if store.exists():
-        begun, *whole = store.read_text().splitlines(keepends=True)
-        if begun.strip() != plan:
-            parser.error(f"{store} holds fits with other settings; name another folder")
-        whole = [line for line in whole if line.endswith("\n")]  # a line that was cut short is done again
-        store.write_text(begun + "".join(whole))
-        done = [Trial(**json.loads(line)) for line in whole]
-    else:
-        store.write_text(plan + "\n")
-    kept = [[t for t in done if t.log == n and t.method in given.methods] for n in range(given.logs)]
-    waiting = [task for task in enumerate(kept) if len(task[1]) < 2 * len(given.methods)]  # two kinds of log
-    work = functools.partial(fit_log, methods=given.methods, transitions=given.transitions)
-    trials = list(done)
-    with store.open("a") as stream:
-        for number, (_, found) in enumerate(in_parallel(work, waiting, given.workers), given.logs - len(waiting) + 1):
-            stream.writelines(json.dumps(plain(trial)) + "\n" for trial in found)
-            stream.flush()
-            trials += found
-            print(f"{number} of {given.logs} logs of each kind", flush=True)
-    table = markdown(coverages(trials))
+    cells = [CalibrationCell(k, m, n) for n in range(given.logs) for k in KINDS for m in given.methods]
+    work = functools.partial(fit_cell, transitions=given.transitions)
+    try:
+        found = run_cells(
+            given.out, Plan(given.transitions), cells, work, resume=given.resume, workers=given.workers,
+            report=lambda stage, _: print(stage, flush=True),
+        )  # fmt: skip
+    except dropo.InputError as error:
+        parser.error(str(error))
+    runs = [CalibrationRun(**{k: v for k, v in run.items() if k != "cell"}) for run in found]
+    table = markdown(coverages(runs))
     (given.out / "calibration.md").write_text(table)
     print(table)
 

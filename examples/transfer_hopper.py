@@ -33,7 +33,7 @@ import dropo_torch as dropo
 from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import nominal_masses, record
 from dropo_torch.rl.problem import make_training
-from dropo_torch.rl.train import Progress, TrainEntry, train
+from dropo_torch.rl.train import EvaluationPoint, TrainEntry, train
 from dropo_torch.support.files import write_atomically
 from dropo_torch.support.parallel import in_parallel
 
@@ -107,7 +107,7 @@ def run(cell: tuple[int, str], given: argparse.Namespace, threads: int) -> dict[
     }  # fmt: skip
 
 
-def show_progress(name: str, entry: TrainEntry, evaluation: Progress | None) -> None:
+def show_progress(name: str, entry: TrainEntry, evaluation: EvaluationPoint | None) -> None:
     """Print each evaluation on the way."""
     if evaluation is not None:
         print(f"{name}: {entry.steps:,} steps, {evaluation.mean:.1f} in training", flush=True)

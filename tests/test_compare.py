@@ -75,11 +75,11 @@ def test_what_cannot_be_compared_is_one_line(
 
 def test_a_record_of_another_comparison_is_refused(tmp_path: Path) -> None:
     store = tmp_path / "store.json"
-    store.write_text('{"fingerprint": "another", "runs": {}}')
+    store.write_text('{"fingerprint": "another", "results": {}}')
     with pytest.raises(InputError, match="belongs to another config or log"):
         compare(lambda *_: None, methods=["fisher-warp"], seeds=[0], reference=None, store=store)  # type: ignore[arg-type]
     store.write_text("not json")
-    with pytest.raises(InputError, match="no record of a comparison"):
+    with pytest.raises(InputError, match="cannot be read as the record of a comparison"):
         compare(lambda *_: None, methods=["fisher-warp"], seeds=[0], reference=None, store=store)  # type: ignore[arg-type]
 
 

@@ -27,7 +27,7 @@ from dropo_torch.commands import cli
 from dropo_torch.config import _Loader, make_config, parse_overrides
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
-from dropo_torch.rl.policy import make_policy
+from dropo_torch.rl.policy import Policy
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -117,7 +117,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "robot.yaml").write_text(blocks(ROOT / "README.md", "yaml")[0])
     (folder / "out" / "policy").mkdir(parents=True)
     network = {"num_observations": 4, "num_actions": 2, "hidden": [4], "head": "tanh", "activation": "relu"}
-    make_policy(network).save(folder / "out" / "policy" / "policy.pt")
+    Policy(network).save(folder / "out" / "policy" / "policy.pt")
     return folder
 
 

@@ -45,7 +45,7 @@ def verdicts(results: list[dict[str, Any]]) -> list[bool]:
 def test_the_papers_findings_hold_where_they_should() -> None:
     found = all_findings(study())
     assert [f.holds for f in found] == [True] * 7 + [True]
-    assert "up to 0 deviations off" in found[3].measured
+    assert "up to 0 σ off" in found[3].measured
     assert "ε over variance: 1" in found[4].measured
 
 
@@ -70,7 +70,7 @@ def test_errors_do_not_cancel_over_seeds() -> None:
     assert rows[0]["largest_error_percent"] == pytest.approx(10)
     assert rows[0]["std"] == pytest.approx(DRAWN_STD * 0.2)
     tables = {"table": rows, "recovery": [], "sweep": [], "noise": [], "size": [], "cma": []}
-    by_title = {s.title: s for s in sections(tables, [])}
+    by_title = {s.title: s for s in sections(tables)}
     errors = by_title["Table 1: largest error of a mean, of all seeds (%)"]
     assert errors.rows == [["noiseless", "foot_mass", "4.000", "10"]]
 

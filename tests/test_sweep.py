@@ -100,7 +100,7 @@ def test_an_interrupted_sweep_repeats_no_finished_fit(tmp_path: Path) -> None:
 @pytest.mark.parametrize("content", ["", "{", "[]", '{"points": 3}', '{"fingerprint": "f", "points": [{"x": 1}]}'])
 def test_a_damaged_record_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "store").write_text(content)
-    with pytest.raises(InputError, match="no record of a sweep"):
+    with pytest.raises(InputError, match="cannot be read as the record of a sweep"):
         sweep_epsilon(point_at, EPSILONS, fingerprint="f", store=tmp_path / "store")
 
 

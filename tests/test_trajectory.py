@@ -132,7 +132,7 @@ def test_a_value_that_is_not_finite_is_named_by_row_and_column(name):
     arrays = {k: np.zeros((5, 3)) for k in ("observations", "next_observations", "actions")}
     arrays[name][3, 2] = np.nan
     arrays[name][4, 0] = np.inf
-    with pytest.raises(InputError, match=rf"robot\.npz: {name} is nan at row 3, column 2 and 1 more"):
+    with pytest.raises(InputError, match=rf"robot\.npz: {name}\[2\] is nan at row 3 \(counted from 0\) and 1 more"):
         Trajectories(**arrays, terminals=[0, 0, 0, 0, 1], source="robot.npz")
 
 

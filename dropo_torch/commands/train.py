@@ -22,7 +22,7 @@ from dropo_torch.support.files import write_json
 
 if TYPE_CHECKING:
     from dropo_torch.rl.problem import TrainingProblem
-    from dropo_torch.rl.train import Progress, TrainEntry, Training
+    from dropo_torch.rl.train import EvaluationPoint, TrainEntry, Training
 
 #: The learning curves on TensorBoard have about this many points.
 POINTS = 1000
@@ -52,7 +52,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     curves = None if given.log is None else _Curves(out / "tensorboard", problem.settings.steps)
     with TrainProgress(console, problem.settings.steps) as progress:
 
-        def show(entry: TrainEntry, evaluation: Progress | None) -> None:
+        def show(entry: TrainEntry, evaluation: EvaluationPoint | None) -> None:
             progress.show(entry.steps, entry.mean_return)
             if curves is not None:
                 curves.add(entry, evaluation)
@@ -116,7 +116,7 @@ class _Curves:
     def __init__(self, folder: Path, steps: int) -> None:
         self._folder, self._every, self._next = folder, max(1, steps // POINTS), 0
 
-    def begin(self, history: Sequence[TrainEntry], evaluated: Sequence[Progress]) -> None:
+    def begin(self, history: Sequence[TrainEntry], evaluated: Sequence[EvaluationPoint]) -> None:
         """Start afresh with what an interrupted run had done."""
         from torch.utils.tensorboard import SummaryWriter
 
@@ -127,7 +127,7 @@ class _Curves:
         for evaluation in evaluated:
             self._evaluation(evaluation)
 
-    def add(self, entry: TrainEntry, evaluation: Progress | None) -> None:
+    def add(self, entry: TrainEntry, evaluation: EvaluationPoint | None) -> None:
         """Write an entry, unless one has just been written, and an evaluation."""
         if evaluation is not None:
             self._evaluation(evaluation)
@@ -138,5 +138,5 @@ class _Curves:
         for name, value in {**scalars, **entry.scalars}.items():
             self._writer.add_scalar(f"train/{name}", value, entry.steps)
 
-    def _evaluation(self, evaluation: Progress) -> None:
+    def _evaluation(self, evaluation: EvaluationPoint) -> None:
         self._writer.add_scalar("evaluation/return", evaluation.mean, evaluation.steps)

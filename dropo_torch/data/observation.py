@@ -25,18 +25,27 @@ import numpy as np
 
 from dropo_torch.errors import InputError, choices
 
-_QPOS_WIDTH = {0: 7, 1: 4, 2: 1, 3: 1}  # free, ball, slide, hinge
-_DOF_WIDTH = {0: 6, 1: 3, 2: 1, 3: 1}
-_POSITION_SUFFIX = {
-    7: ("[x]", "[y]", "[z]", "[qw]", "[qx]", "[qy]", "[qz]"),
-    4: ("[qw]", "[qx]", "[qy]", "[qz]"),
-    1: ("",),
+_Labels = tuple[tuple[str, str], ...]  # a suffix and a unit for each column
+_PLACE: _Labels = tuple((f"[{axis}]", "m") for axis in "xyz")
+_QUATERNION: _Labels = tuple((f"[q{axis}]", "-") for axis in "wxyz")
+_LINEAR: _Labels = tuple((f"[v{axis}]", "m/s") for axis in "xyz")
+_ANGULAR: _Labels = tuple((f"[w{axis}]", "rad/s") for axis in "xyz")
+#: Kind of joint → its position and velocity columns.
+_KINDS: dict[int, tuple[_Labels, _Labels]] = {
+    int(mujoco.mjtJoint.mjJNT_FREE): (_PLACE + _QUATERNION, _LINEAR + _ANGULAR),
+    int(mujoco.mjtJoint.mjJNT_BALL): (_QUATERNION, _ANGULAR),
+    int(mujoco.mjtJoint.mjJNT_SLIDE): ((("", "m"),), (("", "m/s"),)),
+    int(mujoco.mjtJoint.mjJNT_HINGE): ((("", "rad"),), (("", "rad/s"),)),
 }
-_VELOCITY_SUFFIX = {
-    6: ("[vx]", "[vy]", "[vz]", "[wx]", "[wy]", "[wz]"),
-    3: ("[wx]", "[wy]", "[wz]"),
-    1: ("",),
-}
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """A joint, and its columns in the state ``[qpos, qvel]`` with their labels and units."""
+
+    name: str
+    positions: dict[int, tuple[str, str]]
+    velocities: dict[int, tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -108,21 +117,22 @@ def parse_observation(
     Raises:
         InputError: an entry that names nothing, a column named twice, a width that does not fit.
     """
-    labels, units = _state_labels(model)
+    joints = _joints(model)
     columns: list[int] = []
     log_columns: list[int] = []
     width = 0
     for entry in ("qpos", "qvel") if entries is None else entries:
-        found = _entry_columns(model, str(entry).strip())
+        found = _entry_columns(model, joints, str(entry).strip())
         if isinstance(found, int):
             width += found
             continue
         columns += found
         log_columns += range(width, width + len(found))
         width += len(found)
+    about = {c: entry for joint in joints for c, entry in (joint.positions | joint.velocities).items()}
     twice = {c for c in columns if columns.count(c) > 1}
     if twice:
-        raise InputError(f"observation: {labels[min(twice)]} stands there twice; name each state column once")
+        raise InputError(f"observation: {about[min(twice)][0]} stands there twice; name each state column once")
     if not columns:
         raise InputError("observation: no state column is named; expected entries such as 'qpos[1:]' and 'qvel'")
     if log_width is not None and log_width != width:
@@ -135,13 +145,17 @@ def parse_observation(
     default = np.concatenate([model.qpos0, np.zeros(model.nv)])
     return Observation(
         columns=tuple(columns),
-        labels=tuple(labels[c] for c in columns),
+        labels=tuple(about[c][0] for c in columns),
         log_columns=tuple(log_columns),
         log_width=width,
         default_state=tuple(default.tolist()),
-        units=tuple(units[c] for c in columns),
-        quaternions=_complete_quaternions(model, columns),
-        at_rest=_at_rest(model, set(columns)),
+        units=tuple(about[c][1] for c in columns),
+        quaternions=_complete_quaternions(joints, columns),
+        at_rest=tuple(
+            joint.name
+            for joint in joints
+            if not joint.positions.keys().isdisjoint(columns) and not joint.velocities.keys() <= set(columns)
+        ),
     )
 
 
@@ -162,97 +176,79 @@ def joint_name(model: mujoco.MjModel, joint: int) -> str:
     return model.joint(joint).name or f"joint{joint}"
 
 
-def _state_labels(model: mujoco.MjModel) -> tuple[list[str], list[str]]:
-    """Names and units of every state column, ``nq + nv`` of each."""
-    position_labels: list[str] = []
-    velocity_labels: list[str] = []
-    position_units: list[str] = []
-    velocity_units: list[str] = []
+def _joints(model: mujoco.MjModel) -> list[_Joint]:
+    found = []
     for j in range(model.njnt):
-        kind, name = int(model.jnt_type[j]), joint_name(model, j)
-        nq, nv = _QPOS_WIDTH[kind], _DOF_WIDTH[kind]
-        position_labels += [f"{name}.position{s}" for s in _POSITION_SUFFIX[nq]]
-        velocity_labels += [f"{name}.velocity{s}" for s in _VELOCITY_SUFFIX[nv]]
-        position_units += {0: ["m"] * 3 + ["-"] * 4, 1: ["-"] * 4, 2: ["m"], 3: ["rad"]}[kind]
-        velocity_units += {0: ["m/s"] * 3 + ["rad/s"] * 3, 1: ["rad/s"] * 3, 2: ["m/s"], 3: ["rad/s"]}[kind]
-    return position_labels + velocity_labels, position_units + velocity_units
+        name, (positions, velocities) = joint_name(model, j), _KINDS[int(model.jnt_type[j])]
+        first, begin = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
+        found.append(
+            _Joint(
+                name,
+                {first + i: (f"{name}.position{suffix}", unit) for i, (suffix, unit) in enumerate(positions)},
+                {begin + i: (f"{name}.velocity{suffix}", unit) for i, (suffix, unit) in enumerate(velocities)},
+            )
+        )
+    return found
 
 
-def _entry_columns(model: mujoco.MjModel, entry: str) -> list[int] | int:
+def _entry_columns(model: mujoco.MjModel, joints: Sequence[_Joint], entry: str) -> list[int] | int:
     """State columns of one entry, or the number of log columns to skip."""
     skip = re.fullmatch(r"skip(?:\[(\d+)\])?", entry)
     if skip:
         return int(skip[1] or 1)
     dotted = re.fullmatch(r"(.+)\.(position|velocity)", entry)
     if dotted:
-        return _joint_columns(model, dotted[1], dotted[2] == "position", entry)
+        joint = _joint(joints, dotted[1], entry)
+        return list(joint.positions if dotted[2] == "position" else joint.velocities)
     match = re.fullmatch(r"(qpos|qvel)(?:\[(.*)\])?", entry)
     if match is None:
         raise InputError(
             f"observation: {entry!r} is not understood; expected qpos, qvel, a slice qpos[1:], a joint "
             "qpos[elbow] or elbow.position, or skip" + choices(entry, ["qpos", "qvel", "skip"])
         )
-    size, offset = (model.nq, 0) if match[1] == "qpos" else (model.nv, model.nq)
-    inside = match[2]
+    every = range(model.nq) if match[1] == "qpos" else range(model.nq, model.nq + model.nv)
+    size, inside = len(every), match[2]
     if inside is None:
-        return list(range(offset, offset + size))
+        return list(every)
     if re.fullmatch(r"-?\d+", inside):
         index = int(inside)
         if not -size <= index < size:
             raise InputError(f"observation: {entry} is outside {match[1]}, which has {size} entries")
-        return [offset + index % size]
+        return [every[index]]
     part = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d+))?", inside)
     if part:
         bounds = [int(p) if p else None for p in part.groups()]
         if bounds[2] == 0:
             raise InputError(f"observation: {entry} has step 0; expected a step such as 1 or -1")
-        found = list(range(offset, offset + size))[slice(*bounds)]
+        found = list(every[slice(*bounds)])
         if not found:
             raise InputError(f"observation: {entry} is empty; {match[1]} has {size} entries")
         return found
-    return _joint_columns(model, inside, match[1] == "qpos", entry)
+    joint = _joint(joints, inside, entry)
+    return list(joint.positions if match[1] == "qpos" else joint.velocities)
 
 
-def _joint_columns(model: mujoco.MjModel, name: str, position: bool, entry: str) -> list[int]:
-    names = [joint_name(model, j) for j in range(model.njnt)]
-    if name not in names:
-        raise InputError(f"observation: {entry}: the model has no joint {name!r}" + choices(name, names))
-    j = names.index(name)
-    kind = int(model.jnt_type[j])
-    if position:
-        start, width = int(model.jnt_qposadr[j]), _QPOS_WIDTH[kind]
-    else:
-        start, width = model.nq + int(model.jnt_dofadr[j]), _DOF_WIDTH[kind]
-    return list(range(start, start + width))
+def _joint(joints: Sequence[_Joint], name: str, entry: str) -> _Joint:
+    for joint in joints:
+        if joint.name == name:
+            return joint
+    raise InputError(
+        f"observation: {entry}: the model has no joint {name!r}" + choices(name, [joint.name for joint in joints])
+    )
 
 
-def _at_rest(model: mujoco.MjModel, columns: set[int]) -> tuple[str, ...]:
-    """Joints of which a position is observed, and not every velocity."""
+def _complete_quaternions(joints: Sequence[_Joint], columns: list[int]) -> tuple[tuple[int, int, int, int], ...]:
     found = []
-    for joint in range(model.njnt):
-        kind = int(model.jnt_type[joint])
-        nq, nv = _QPOS_WIDTH[kind], _DOF_WIDTH[kind]
-        first, begin = int(model.jnt_qposadr[joint]), model.nq + int(model.jnt_dofadr[joint])
-        if columns.intersection(range(first, first + nq)) and not columns.issuperset(range(begin, begin + nv)):
-            found.append(joint_name(model, joint))
-    return tuple(found)
-
-
-def _complete_quaternions(model: mujoco.MjModel, columns: list[int]) -> tuple[tuple[int, int, int, int], ...]:
-    found = []
-    for j in range(model.njnt):
-        kind = int(model.jnt_type[j])
-        if kind > 1:
+    for joint in joints:
+        wanted = list(joint.positions)[-4:]
+        present = [columns.index(c) for c in wanted if c in columns]
+        if len(wanted) < 4:
             continue
-        start = int(model.jnt_qposadr[j]) + (3 if kind == 0 else 0)
-        wanted = list(range(start, start + 4))
-        present = [c for c in wanted if c in columns]
         if len(present) == 4:
-            a, b, c, d = (columns.index(w) for w in wanted)
-            found.append((a, b, c, d))
+            found.append((present[0], present[1], present[2], present[3]))
         elif present:
             raise InputError(
-                f"observation: only {len(present)} of the 4 quaternion columns of joint "
-                f"{joint_name(model, j)!r} are named; name all four or none"
+                f"observation: only {len(present)} of the 4 quaternion columns of joint {joint.name!r} are named; "
+                "name all four or none"
             )
     return tuple(found)

@@ -21,21 +21,13 @@ import numpy as np
 from scipy.interpolate import Akima1DInterpolator
 from scipy.signal import butter, sosfiltfilt
 
-from dropo_torch.data.recording import Recording, check_values, resolve_names
-from dropo_torch.data.trajectory import Trajectories, concatenate
+from dropo_torch.data.recording import Recording, resolve_names
+from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.given import check_keys, number
 
 Actions = Literal["hold", "mean", "position", "velocity"]
 
-_LEAST: dict[str, float | None] = {  # None: positive
-    "dt": None,
-    "cutoff": None,
-    "max_delay": None,
-    "max_gap": None,
-    "start": 0.0,
-    "stop": 0.0,
-    "trim": 0.0,
-}
 _EDGE = 1e-3  # fraction of a step by which a stamp may lie behind the grid and still count for it
 _GAP = 2.5  # steps, or sampling intervals, over which a signal is interpolated unless max_gap says otherwise
 _LEAST_CORRELATION = 0.5
@@ -95,18 +87,20 @@ class Preprocess:
     max_gap: float | None = None
 
     def __post_init__(self) -> None:
-        for name, least in _LEAST.items():
-            value = getattr(self, name)
-            if value is not None or name in ("dt", "max_delay"):
-                object.__setattr__(self, name, _number(value, name, least))
         if not isinstance(self.delays, Mapping):
             raise InputError(f"preprocess: delays is {self.delays!r}; expected signal: seconds")
-        object.__setattr__(
-            self, "delays", {str(k): _number(v, f"delays: {k}", -np.inf) for k, v in self.delays.items()}
-        )
+        checked: dict[str, Any] = {
+            "delays": {str(name): number(delay, f"preprocess: delays: {name}") for name, delay in self.delays.items()},
+            "quaternions": tuple(_names(group, "quaternions") for group in self.quaternions),
+        }
+        for name in ("dt", "max_delay", "cutoff", "max_gap", "start", "stop", "trim"):
+            value, bound = getattr(self, name), "least" if name in ("start", "stop", "trim") else "above"
+            if value is not None or name in ("dt", "max_delay"):
+                checked[name] = number(value, f"preprocess: {name}", **{bound: 0})
         for name in ("positions", "velocities", "controlled", "align"):
-            object.__setattr__(self, name, _names(getattr(self, name), name))
-        object.__setattr__(self, "quaternions", tuple(_names(q, "quaternions") for q in self.quaternions))
+            checked[name] = _names(getattr(self, name), name)
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
         if isinstance(self.order, bool) or not isinstance(self.order, int) or not 1 <= self.order <= 10:
             raise InputError(f"preprocess: order is {self.order!r}; expected a whole number from 1 to 10")
         if self.actions not in get_args(Actions):
@@ -134,10 +128,7 @@ class Preprocess:
         Raises:
             InputError: an unknown key, a value that makes no sense, no ``dt``.
         """
-        known = {f.name: f for f in fields(cls)}
-        for key in mapping:
-            if key not in known:
-                raise InputError(f"preprocess: unknown key {key!r}{choices(key, known)}")
+        check_keys(mapping, [field.name for field in fields(cls)], "preprocess")
         if "dt" not in mapping:
             raise InputError(
                 "preprocess: dt is missing; expected the simulator's time step times frame_skip, in seconds"
@@ -183,7 +174,7 @@ def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
             check_values(values, names, f"{recording.source}: preprocess without max_gap")
     delays = signal_delays(recording, options)
     logs = [
-        _episode(replace(part, source=f"{recording.source}: episode {i}"), options, delays)
+        _Episode(replace(part, source=f"{recording.source}: episode {i}"), options, delays).transitions()
         for i, part in enumerate(recording.split())
     ]
     return replace(concatenate(logs), source=recording.source)
@@ -195,7 +186,7 @@ def signal_delays(recording: Recording, options: Preprocess) -> dict[str, float]
     Raises:
         InputError: a name that is not there, a signal that does not correlate with the reference.
     """
-    names = recording.observation_names + recording.action_names
+    names = recording.names
     delays: dict[str, float] = {}
     for name, delay in options.delays.items():
         delays |= dict.fromkeys(resolve_names([name], names, recording.source, "preprocess: delays"), delay)
@@ -255,55 +246,12 @@ def estimate_delay(
 
 def _common_grid(part: Recording, reference: str, name: str) -> tuple[np.ndarray, np.ndarray, float]:
     """Two signals on one even grid at the faster one's sampling interval, and that interval."""
-    splines, stamps = [], []
-    for label in (reference, name):
-        samples = _samples(part, label)
-        stamps.append(samples.time)
-        splines.append(samples.spline)
-    dt = float(min(np.median(np.diff(time)) for time in stamps))
-    low, high = max(time[0] for time in stamps), min(time[-1] for time in stamps)
+    first, second = (_samples(part, label) for label in (reference, name))
+    dt = float(min(np.median(np.diff(s.time)) for s in (first, second)))
+    low, high = max(first.time[0], second.time[0]), min(first.time[-1], second.time[-1])
     grid = low + dt * np.arange(int((high - low) / dt + _EDGE) + 1)
     grid = grid[grid <= high]
-    return splines[0](grid), splines[1](grid), dt
-
-
-def _episode(part: Recording, options: Preprocess, delays: Mapping[str, float]) -> Trajectories:
-    positions, velocities = _measured(part, options)
-    quaternions = _quaternions(options, positions, part.source)
-    signals = {name: _samples(part, name, delays.get(name, 0.0)) for name in positions + velocities}
-    for quaternion in quaternions:
-        signals |= _continuous({name: signals[name] for name in quaternion}, part.source)
-    for name, samples in signals.items():
-        _check_gaps(samples, f"{part.source}: {name}", options)
-    if options.cutoff is not None:
-        signals = {name: _filtered(s, options, f"{part.source}: {name}") for name, s in signals.items()}
-    grid = _grid(part, options, [s.time for s in signals.values()], delays)
-    position, velocity, velocity_names = _motion(signals, positions, velocities, quaternions, grid, options)
-    if options.actions == "position":
-        actions = _controlled(position, positions, options, part.source)[1:]
-    elif options.actions == "velocity":
-        actions = _controlled(velocity, velocity_names, options, part.source)[1:]
-    else:
-        actions = _commands(part, grid[:-1], options, delays)
-    observations = np.concatenate([position, velocity], axis=1)
-    return Trajectories(
-        observations=observations[:-1],
-        next_observations=observations[1:],
-        actions=actions,
-        terminals=np.arange(2, len(grid) + 1) == len(grid),
-        dt=options.dt,
-        source=part.source,
-    )
-
-
-def _measured(part: Recording, options: Preprocess) -> tuple[list[str], list[str]]:
-    """The signals that are positions, and those that are velocities."""
-    names = part.observation_names
-    velocities = resolve_names(options.velocities or (), names, part.source, "preprocess: velocities")
-    wanted = options.positions
-    if wanted is None:
-        wanted = [name for name in names if name not in velocities]
-    return resolve_names(wanted, names, part.source, "preprocess: positions"), velocities
+    return first.spline(grid), second.spline(grid), dt
 
 
 def _samples(part: Recording, name: str, delay: float = 0.0) -> _Samples:
@@ -316,108 +264,161 @@ def _samples(part: Recording, name: str, delay: float = 0.0) -> _Samples:
     return _Samples(time=part.time[present] - part.time[0] - delay, values=values[present])
 
 
-def _check_gaps(samples: _Samples, where: str, options: Preprocess) -> None:
-    steps = np.diff(samples.time)
-    most = _GAP * max(options.dt, float(np.median(steps))) if options.max_gap is None else options.max_gap
-    longest = int(steps.argmax())
-    if steps[longest] > most:
-        raise InputError(
-            f"{where} has no sample for {steps[longest]:.4g} s from {samples.time[longest]:.6g} s on, and at most "
-            f"{most:.4g} s are interpolated; raise max_gap, or make two episodes of it"
+@dataclass(frozen=True)
+class _Episode:
+    """An episode on its way from samples to transitions."""
+
+    part: Recording
+    options: Preprocess
+    delays: Mapping[str, float]
+
+    def transitions(self) -> Trajectories:
+        names, given = self.part.observation_names, self.options.positions
+        velocities = self._resolve("velocities", self.options.velocities or (), names)
+        positions = self._resolve(
+            "positions", [n for n in names if n not in velocities] if given is None else given, names
+        )
+        quaternions = [self._quaternion(group, positions) for group in self.options.quaternions]
+        signals = {name: self._samples(name) for name in positions + velocities}
+        for group in quaternions:
+            signals |= self._continuous({name: signals[name] for name in group})
+        for name, samples in signals.items():
+            self._check_gaps(name, samples)
+        if self.options.cutoff is not None:
+            signals = {name: self._filtered(name, samples, self.options.cutoff) for name, samples in signals.items()}
+        grid = self._grid(list(signals.values()))
+        position = {name: signals[name].spline(grid, extrapolate=True) for name in positions}
+        if self.options.velocities is not None:
+            velocity = {name: signals[name].spline(grid, extrapolate=True) for name in velocities}
+        else:
+            slope = {name: signals[name].spline(grid, nu=1, extrapolate=True) for name in positions}
+            velocity = _velocities(position, slope, quaternions)
+        for group in quaternions:
+            norm = np.linalg.norm([position[name] for name in group], axis=0)
+            position |= {name: position[name] / norm for name in group}
+        if self.options.actions == "position":
+            actions = self._controlled(position)
+        elif self.options.actions == "velocity":
+            actions = self._controlled(velocity)
+        else:
+            actions = {name: self._commands(name, grid[:-1]) for name in self.part.action_names}
+        return Trajectories.of_samples(
+            np.concatenate([_columns(position, len(grid)), _columns(velocity, len(grid))], axis=1),
+            _columns(actions, len(grid) - 1),
+            dt=self.options.dt,
+            source=self.part.source,
         )
 
+    def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
+        return resolve_names(wanted, names, self.part.source, f"preprocess: {key}")
 
-def _filtered(samples: _Samples, options: Preprocess, where: str) -> _Samples:
-    """The samples, put on an even grid at their own rate, through the zero-phase low-pass filter."""
-    first, last = samples.time[0], samples.time[-1]
-    count = round((last - first) / float(np.median(np.diff(samples.time)))) + 1
-    rate = (count - 1) / (last - first)
-    assert options.cutoff is not None
-    if options.cutoff >= rate / 2:
-        raise InputError(
-            f"{where}: cutoff is {options.cutoff:g} Hz, but the signal is sampled at {rate:.4g} Hz; "
-            f"cutoff must lie below half of that, {rate / 2:.4g} Hz"
-        )
-    pad = int(np.ceil(2 * options.order * rate / options.cutoff))
-    time = np.linspace(first, last, count)
-    sections = butter(options.order, options.cutoff, fs=rate, output="sos")
-    values = sosfiltfilt(sections, samples.spline(time), padlen=min(pad, count - 1))
-    return _Samples(time=time, values=values)
+    def _samples(self, name: str) -> _Samples:
+        return _samples(self.part, name, self.delays.get(name, 0.0))
 
-
-def _grid(
-    part: Recording, options: Preprocess, stamps: Sequence[np.ndarray], delays: Mapping[str, float]
-) -> np.ndarray:
-    """The result's times: where every signal has samples, within start and stop."""
-    assert part.time is not None
-    length = float(part.time[-1] - part.time[0])
-    trim = 1 / options.cutoff if options.cutoff is not None and options.trim is None else options.trim or 0.0
-    early = [delays.get(name, 0.0) for name in part.action_names]
-    low = max([time[0] + trim for time in stamps] + [-delay for delay in early] + [options.start or 0.0])
-    high = min([time[-1] - trim for time in stamps] + [length - delay for delay in early])
-    if options.stop is not None:
-        high = min(high, options.stop)
-    steps = int(np.floor((high - low) / options.dt + _EDGE)) if high > low else 0
-    if steps < 1:
-        raise InputError(
-            f"{part.source}: preprocess leaves no transition of {options.dt:g} s: the recording lasts {length:.4g} s "
-            f"and {low:.4g} s to {high:.4g} s of it are used; see start, stop, trim and delays"
-        )
-    return low + options.dt * np.arange(steps + 1)
-
-
-def _quaternions(options: Preprocess, positions: Sequence[str], source: str) -> list[list[str]]:
-    groups = []
-    for quaternion in options.quaternions:
-        group = resolve_names(quaternion, positions, source, "preprocess: quaternions")
+    def _quaternion(self, given: Sequence[str], positions: Sequence[str]) -> list[str]:
+        group = self._resolve("quaternions", given, positions)
         if len(set(group)) != 4:
-            raise InputError(f"{source}: preprocess: quaternions: {', '.join(group)}: expected four different signals")
-        groups.append(group)
-    return groups
+            raise InputError(
+                f"{self.part.source}: preprocess: quaternions: {', '.join(group)}: expected four different signals"
+            )
+        return group
+
+    def _continuous(self, quaternion: Mapping[str, _Samples]) -> dict[str, _Samples]:
+        """The four components with signs by which no sample lies opposite to the one before it."""
+        where = f"{self.part.source}: preprocess: quaternions: {', '.join(quaternion)}"
+        parts = list(quaternion.values())
+        if any(not np.array_equal(part.time, parts[0].time) for part in parts):
+            raise InputError(f"{where} need samples at the same times and one delay")
+        values = np.stack([part.values for part in parts], axis=1)
+        norm = np.linalg.norm(values, axis=1)
+        bad = np.flatnonzero(np.abs(norm - 1) > 0.1)
+        if bad.size:
+            raise InputError(
+                f"{where} has length {norm[bad[0]]:.3g} at sample {bad[0]}; a unit quaternion (w, x, y, z) is expected"
+            )
+        flips = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+        values = values * np.cumprod(np.append(1.0, flips))[:, None]
+        return {name: replace(part, values=values[:, i]) for i, (name, part) in enumerate(quaternion.items())}
+
+    def _check_gaps(self, name: str, samples: _Samples) -> None:
+        steps, most = np.diff(samples.time), self.options.max_gap
+        if most is None:
+            most = _GAP * max(self.options.dt, float(np.median(steps)))
+        longest = int(steps.argmax())
+        if steps[longest] > most:
+            raise InputError(
+                f"{self.part.source}: {name} has no sample for {steps[longest]:.4g} s from {samples.time[longest]:.6g} "
+                f"s on, and at most {most:.4g} s are interpolated; raise max_gap, or make two episodes of it"
+            )
+
+    def _filtered(self, name: str, samples: _Samples, cutoff: float) -> _Samples:
+        """The samples, put on an even grid at their own rate, through the zero-phase low-pass filter."""
+        first, last = samples.time[0], samples.time[-1]
+        count = round((last - first) / float(np.median(np.diff(samples.time)))) + 1
+        rate = (count - 1) / (last - first)
+        if cutoff >= rate / 2:
+            raise InputError(
+                f"{self.part.source}: {name}: cutoff is {cutoff:g} Hz, but the signal is sampled at {rate:.4g} Hz; "
+                f"cutoff must lie below half of that, {rate / 2:.4g} Hz"
+            )
+        pad = int(np.ceil(2 * self.options.order * rate / cutoff))
+        time = np.linspace(first, last, count)
+        sections = butter(self.options.order, cutoff, fs=rate, output="sos")
+        values = sosfiltfilt(sections, samples.spline(time), padlen=min(pad, count - 1))
+        return _Samples(time=time, values=values)
+
+    def _grid(self, signals: Sequence[_Samples]) -> np.ndarray:
+        """The result's times: where every signal has samples, within start and stop."""
+        assert self.part.time is not None
+        options, length = self.options, float(self.part.time[-1] - self.part.time[0])
+        trim = 1 / options.cutoff if options.cutoff is not None and options.trim is None else options.trim or 0.0
+        early = [self.delays.get(name, 0.0) for name in self.part.action_names]
+        low = max([s.time[0] + trim for s in signals] + [-delay for delay in early] + [options.start or 0.0])
+        high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early])
+        if options.stop is not None:
+            high = min(high, options.stop)
+        steps = int(np.floor((high - low) / options.dt + _EDGE)) if high > low else 0
+        if steps < 1:
+            raise InputError(
+                f"{self.part.source}: preprocess leaves no transition of {options.dt:g} s: the recording lasts "
+                f"{length:.4g} s and {low:.4g} s to {high:.4g} s of it are used; see start, stop, trim and delays"
+            )
+        return low + options.dt * np.arange(steps + 1)
+
+    def _controlled(self, motion: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """What the robot was told, if it tracks it closely: what was measured at each step's end."""
+        names = list(motion)
+        return {name: motion[name][1:] for name in self._resolve("controlled", self.options.controlled or names, names)}
+
+    def _commands(self, name: str, begin: np.ndarray) -> np.ndarray:
+        """A command in the steps that begin at the given times, ``(T,)``: in force then, or the mean of each step."""
+        samples, dt = self._samples(name), self.options.dt
+        if samples.time[0] > begin[0] + _EDGE * dt:
+            raise InputError(
+                f"{self.part.source}: {name} has no sample before {samples.time[0]:.6g} s; use start from there on"
+            )
+        if self.options.actions == "hold":
+            return samples.values[np.searchsorted(samples.time, begin + _EDGE * dt, side="right") - 1]
+        time = np.append(samples.time, max(begin[-1] + dt, samples.time[-1]) + dt)
+        integral = np.append(0.0, np.cumsum(samples.values * np.diff(time)))
+        return (np.interp(begin + dt, time, integral) - np.interp(begin, time, integral)) / dt
 
 
-def _continuous(quaternion: Mapping[str, _Samples], source: str) -> dict[str, _Samples]:
-    """The four components with signs by which no sample lies opposite to the one before it."""
-    names, parts = list(quaternion), list(quaternion.values())
-    if any(not np.array_equal(part.time, parts[0].time) for part in parts):
-        raise InputError(
-            f"{source}: preprocess: quaternions: {', '.join(names)} need samples at the same times and one delay"
-        )
-    values = np.stack([part.values for part in parts], axis=1)
-    norm = np.linalg.norm(values, axis=1)
-    bad = np.flatnonzero(np.abs(norm - 1) > 0.1)
-    if bad.size:
-        raise InputError(
-            f"{source}: preprocess: quaternions: {', '.join(names)} has length {norm[bad[0]]:.3g} at sample {bad[0]}; "
-            "a unit quaternion (w, x, y, z) is expected"
-        )
-    flips = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    values = values * np.cumprod(np.append(1.0, flips))[:, None]
-    return {name: replace(part, values=values[:, i]) for i, (name, part) in enumerate(quaternion.items())}
-
-
-def _motion(
-    signals: Mapping[str, _Samples],
-    positions: Sequence[str],
-    velocities: Sequence[str],
-    quaternions: Sequence[Sequence[str]],
-    grid: np.ndarray,
-    options: Preprocess,
-) -> tuple[np.ndarray, np.ndarray, list[str]]:
-    """Positions ``(N, p)`` and velocities ``(N, v)`` on the grid, and the velocities' names."""
-    position = {name: signals[name].spline(grid, extrapolate=True) for name in positions}
-    slope = {name: signals[name].spline(grid, nu=1, extrapolate=True) for name in positions}
-    derived = {name: slope[name] for name in positions}
-    for group in quaternions:
-        components = np.stack([position[name] for name in group], axis=1)
-        angular = _angular_velocity(components, np.stack([slope[name] for name in group], axis=1))
-        components = components / np.linalg.norm(components, axis=1, keepdims=True)
-        position |= dict(zip(group, components.T, strict=True))
-        columns = {f"{group[0]}.angular[{axis}]": angular[:, axis] for axis in range(3)}
-        derived = _replaced(derived, group, columns)
-    if options.velocities is not None:
-        derived = {name: signals[name].spline(grid, extrapolate=True) for name in velocities}
-    return _columns(position, len(grid)), _columns(derived, len(grid)), list(derived)
+def _velocities(
+    position: Mapping[str, np.ndarray], slope: Mapping[str, np.ndarray], quaternions: Sequence[Sequence[str]]
+) -> dict[str, np.ndarray]:
+    """The derivatives of positions; in place of a quaternion's, its angular velocity."""
+    places = {next(name for name in slope if name in group): group for group in quaternions}
+    members = {name for group in quaternions for name in group}
+    velocity: dict[str, np.ndarray] = {}
+    for name, values in slope.items():
+        if name in places:
+            group = places[name]
+            angular = _angular_velocity(*(np.stack([of[n] for n in group], axis=1) for of in (position, slope)))
+            velocity |= {f"{group[0]}.angular[{axis}]": angular[:, axis] for axis in range(3)}
+        elif name not in members:
+            velocity[name] = values
+    return velocity
 
 
 def _angular_velocity(quaternion: np.ndarray, derivative: np.ndarray) -> np.ndarray:
@@ -427,68 +428,8 @@ def _angular_velocity(quaternion: np.ndarray, derivative: np.ndarray) -> np.ndar
     return np.asarray(2 * (w * dv - dw * v - np.cross(v, dv)) / (quaternion**2).sum(axis=1, keepdims=True))
 
 
-def _replaced(
-    columns: Mapping[str, np.ndarray], group: Sequence[str], new: Mapping[str, np.ndarray]
-) -> dict[str, np.ndarray]:
-    """``columns`` with ``new`` where the first of ``group`` stood, and without the rest of it."""
-    first = next(name for name in columns if name in group)
-    result: dict[str, np.ndarray] = {}
-    for name, values in columns.items():
-        if name == first:
-            result |= new
-        elif name not in group:
-            result[name] = values
-    return result
-
-
 def _columns(columns: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
     return np.stack(list(columns.values()), axis=1) if columns else np.empty((rows, 0))
-
-
-def _controlled(values: np.ndarray, names: Sequence[str], options: Preprocess, source: str) -> np.ndarray:
-    if not options.controlled:
-        return values
-    wanted = resolve_names(options.controlled, names, source, "preprocess: controlled")
-    return values[:, [list(names).index(name) for name in wanted]]
-
-
-def _commands(part: Recording, begin: np.ndarray, options: Preprocess, delays: Mapping[str, float]) -> np.ndarray:
-    """The commands of the steps that begin at the given times, ``(T, m)``."""
-    columns = {}
-    for name in part.action_names:
-        samples = _samples(part, name, delays.get(name, 0.0))
-        if samples.time[0] > begin[0] + _EDGE * options.dt:
-            raise InputError(
-                f"{part.source}: {name} has no sample before {samples.time[0]:.6g} s; use start from there on"
-            )
-        columns[name] = (
-            _mean(samples, begin, options.dt) if options.actions == "mean" else _hold(samples, begin, options.dt)
-        )
-    return _columns(columns, len(begin))
-
-
-def _hold(samples: _Samples, begin: np.ndarray, dt: float) -> np.ndarray:
-    return samples.values[np.searchsorted(samples.time, begin + _EDGE * dt, side="right") - 1]
-
-
-def _mean(samples: _Samples, begin: np.ndarray, dt: float) -> np.ndarray:
-    """Mean over each step of the commands, each in force until the next one."""
-    time = np.append(samples.time, max(begin[-1] + dt, samples.time[-1]) + dt)
-    integral = np.append(0.0, np.cumsum(samples.values * np.diff(time)))
-    return (np.interp(begin + dt, time, integral) - np.interp(begin, time, integral)) / dt
-
-
-def _number(value: object, name: str, least: float | None) -> float:
-    """A number that is at least ``least``, or positive (also where YAML reads ``1e-3`` as text)."""
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        number = float("nan")
-    fits = number > 0 if least is None else number >= least
-    if isinstance(value, bool) or not np.isfinite(number) or not fits:
-        wanted = "a positive number" if least is None else "a finite number" if least < 0 else "0 or a positive number"
-        raise InputError(f"preprocess: {name} is {value!r}; expected {wanted}")
-    return number
 
 
 def _names(value: object, what: str) -> tuple[str, ...] | None:

@@ -9,8 +9,8 @@ folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_act
 ``minari:ID``, a Minari folder     a local Minari dataset
 =================================  ===============================================================
 
-The column map is described in :mod:`dropo_torch.data.tables`. Where a log has no next observations, they
-are the observations of the next row of the same episode.
+The column map is described in :mod:`dropo_torch.data.tables`; :mod:`dropo_torch.data.formats` opens the files. Where a
+log has no next observations, they are the observations of the next row of the same episode.
 """
 
 from __future__ import annotations
@@ -19,31 +19,21 @@ import glob
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import numpy as np
 
+from dropo_torch.data.formats import missing_file, open_tables
+from dropo_torch.data.minari import PREFIX, is_minari, read_minari
 from dropo_torch.data.preprocess import Preprocess, preprocess
-from dropo_torch.data.recording import TOLERANCE, Recording, check_values, checked_time, sampling_interval
-from dropo_torch.data.tables import (
-    ColumnMap,
-    Table,
-    flatten,
-    missing,
-    missing_file,
-    open_tables,
-    parse_columns,
-    reading,
-)
-from dropo_torch.data.trajectory import Trajectories, concatenate
+from dropo_torch.data.recording import TOLERANCE, Recording
+from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
+from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.extras import extra
+from dropo_torch.support.given import check_keys, number, reading
 
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
-
-_MINARI = "minari:"
-_DATES = ("string", "datetime", "datetime64", "date")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -66,7 +56,7 @@ class ReadOptions:
         for name in ("dt", "tolerance"):
             value = getattr(self, name)
             if value is not None:
-                object.__setattr__(self, name, _positive(value, name))
+                object.__setattr__(self, name, number(value, f"data: {name}", above=0))
         for name in ("episode", "group", "separator"):
             value = getattr(self, name)
             if value is not None and not isinstance(value, str):
@@ -78,10 +68,7 @@ class ReadOptions:
 
     def updated(self, mapping: Mapping[str, Any]) -> ReadOptions:
         """Return these options with those of a config's mapping in their place."""
-        known = [field.name for field in fields(self)]
-        for key in mapping:
-            if key not in known:
-                raise InputError(f"data: unknown key {key!r}{choices(key, ['path', *known])}")
+        check_keys(mapping, [field.name for field in fields(self)], "data")
         return replace(self, **mapping)
 
 
@@ -170,8 +157,8 @@ def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories
             raise InputError(f"data: there is no key 'path'{choices('path', source)}")
         rest = {key: value for key, value in source.items() if key != "path"}
         return _read(source["path"], options.updated(rest), base)
-    if isinstance(source, str) and source.startswith(_MINARI):
-        return [_read_minari(source.removeprefix(_MINARI), options)]
+    if isinstance(source, str) and source.startswith(PREFIX):
+        return [_read_minari(source.removeprefix(PREFIX), options)]
     if isinstance(source, str | Path):
         return [log for path in _paths(source, base) for log in _read_path(path, options)]
     if isinstance(source, Sequence) and source:
@@ -192,7 +179,7 @@ def _paths(source: str | Path, base: Path) -> list[Path]:
 
 def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
     for folder in (path, path / "data"):
-        if (folder / "metadata.json").exists():
+        if is_minari(folder):
             return [_read_minari(folder, options)]
     if not path.exists() and not path.suffix and "-v" in path.name:
         raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
@@ -211,44 +198,43 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
     following = options.next_observations
     if following is None and options.observations is None and "next_observations" in table.names:
         following = "next_observations"
+    recording = _recording(table, options)
     if following is None:
-        return _recording(table, options).trajectories(tolerance=options.tolerance)
-    return _transitions(table, options, following)
+        return recording.trajectories(tolerance=options.tolerance)
+    return _transitions(recording, *table.matrix(following, "next_observations"), options)
 
 
-def _transitions(table: Table, options: ReadOptions, following: ColumnMap) -> Trajectories:
+def _transitions(
+    rows: Recording, next_observations: np.ndarray, next_names: Sequence[str], options: ReadOptions
+) -> Trajectories:
     """A log that has its next observations: each row is a transition."""
-    observations, names = _observations(table, options)
-    next_observations, next_names = table.matrix(following, "next_observations")
-    actions, action_names = _actions(table, options, len(observations))
-    for what, values, labels in (
-        ("observations", observations, names),
+    _check_rows(rows.source, "next_observations", len(next_observations), len(rows))
+    for what, values, names in (
+        ("observations", rows.observations, rows.observation_names),
         ("next_observations", next_observations, next_names),
-        ("actions", actions, action_names),
+        ("actions", rows.actions, rows.action_names),
     ):
-        _check_rows(table, what, len(values), len(observations))
-        check_values(values, labels, f"{table.source}: {what}")
-    episodes = _episodes(table, options, len(observations))
-    time = _time(table, options, episodes)
-    dt = options.dt
-    if time is not None:
-        stamps = checked_time(time, episodes, table.source)
-        dt = sampling_interval(stamps, episodes, table.source, options.tolerance)
+        check_values(values, names, f"{rows.source}: {what}")
     return Trajectories(
-        observations=observations,
+        observations=rows.observations,
         next_observations=next_observations,
-        actions=actions,
-        terminals=np.append(np.diff(episodes) != 0, True),
-        dt=dt,
-        source=table.source,
+        actions=rows.actions,
+        terminals=np.append(np.diff(rows.episodes) != 0, True),
+        dt=rows.interval(options.tolerance) or options.dt,
+        source=rows.source,
     )
 
 
 def _recording(table: Table, options: ReadOptions) -> Recording:
-    observations, names = _observations(table, options)
-    actions, action_names = _actions(table, options, len(observations))
-    _check_rows(table, "actions", len(actions), len(observations))
-    episodes = _episodes(table, options, len(observations))
+    observations, names = table.matrix(_wanted(table, options.observations, "observations"), "observations")
+    if not names:
+        raise InputError(f"{table.source}: observations: the list is empty; name at least one column")
+    if len(observations) == 0:
+        raise InputError(f"{table.source}: the log has no row; at least two samples are needed")
+    rows = len(observations)
+    actions, action_names = _actions(table, options, rows)
+    _check_rows(table.source, "actions", len(actions), rows)
+    episodes = _episodes(table, options, rows)
     return Recording(
         observations=observations,
         actions=actions,
@@ -258,15 +244,6 @@ def _recording(table: Table, options: ReadOptions) -> Recording:
         action_names=action_names,
         source=table.source,
     )
-
-
-def _observations(table: Table, options: ReadOptions) -> tuple[np.ndarray, tuple[str, ...]]:
-    observations, names = table.matrix(_wanted(table, options.observations, "observations"), "observations")
-    if not names:
-        raise InputError(f"{table.source}: observations: the list is empty; name at least one column")
-    if len(observations) == 0:
-        raise InputError(f"{table.source}: the log has no row; at least two samples are needed")
-    return observations, names
 
 
 def _actions(table: Table, options: ReadOptions, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -302,7 +279,7 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
             )
     values, names = table.matrix(flags, "terminals")
     if names:
-        _check_rows(table, names[0], len(values), rows)
+        _check_rows(table.source, names[0], len(values), rows)
         bad = np.argwhere(~np.isin(values, (0, 1)))
         if bad.size:
             row, column = bad[0]
@@ -313,10 +290,10 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
         start[1:] |= values[:-1].any(axis=1)
     if options.episode is not None:
         label = table.array(options.episode, "episode").reshape(-1)
-        _check_rows(table, options.episode, len(label), rows)
-        if missing(label).any():
-            row = np.flatnonzero(missing(label))[0]
-            raise InputError(f"{table.source}: {options.episode} has no value at row {row} (counted from 0)")
+        _check_rows(table.source, options.episode, len(label), rows)
+        empty = np.flatnonzero(missing(label))
+        if empty.size:
+            raise InputError(f"{table.source}: {options.episode} has no value at row {empty[0]} (counted from 0)")
         start[1:] |= label[1:] != label[:-1]
     return np.cumsum(start)
 
@@ -338,7 +315,7 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
     values, names = table.matrix(options.time, "time")
     if len(names) != 1:
         raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
-    _check_rows(table, "time", len(values), len(episodes))
+    _check_rows(table.source, "time", len(values), len(episodes))
     return values[:, 0]
 
 
@@ -348,7 +325,7 @@ def _are_dates(stamps: np.ndarray) -> bool:
         return False
     with extra("formats", "a column that holds no plain numbers"):
         import pandas as pd
-    if pd.api.types.infer_dtype(stamps) not in _DATES:
+    if pd.api.types.infer_dtype(stamps) not in ("string", "datetime", "datetime64", "date"):
         return False
     return stamps.dtype.kind == "M" or bool(np.isnan(pd.to_numeric(stamps[:1], errors="coerce"))[0])
 
@@ -361,76 +338,19 @@ def _since_first(stamps: np.ndarray, where: str) -> np.ndarray:
     return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
 
 
-def _check_rows(table: Table, what: str, rows: int, expected: int) -> None:
+def _check_rows(source: str, what: str, rows: int, expected: int) -> None:
     if rows != expected:
         raise InputError(
-            f"{table.source}: {what} has {rows} rows and observations has {expected}; both need one row a sample"
+            f"{source}: {what} has {rows} rows and observations has {expected}; both need one row a sample"
         )
 
 
 def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
-    """A local Minari dataset, by its id or its folder; an episode has one observation more than actions."""
-    minari = _minari()
-    source = f"{_MINARI}{dataset}" if isinstance(dataset, str) else str(dataset)
     unused = ("next_observations", "time", "episode", "terminals", "group", "separator", "preprocess")
     for name in unused:
         if getattr(options, name) is not None:
+            source = f"{PREFIX}{dataset}" if isinstance(dataset, str) else dataset
             raise InputError(
                 f"{source}: {name} has no meaning for a Minari dataset, which holds transitions; leave it out"
             )
-    if isinstance(dataset, str):
-        local = list(minari.list_local_datasets())
-        if dataset not in local:
-            raise InputError(f"{source}: no such local dataset{choices(dataset, local)}; `minari download` fetches one")
-    with reading(source, "a Minari dataset"):
-        data = minari.load_dataset(dataset) if isinstance(dataset, str) else minari.MinariDataset(dataset)
-        episodes = list(data.iterate_episodes())
-    logs = [_minari_episode(episode, f"{source}: episode {i}", options) for i, episode in enumerate(episodes)]
-    if not logs:
-        raise InputError(f"{source}: the dataset has no episode")
-    return replace(concatenate(logs), source=source)
-
-
-def _minari_episode(episode: Any, source: str, options: ReadOptions) -> Trajectories:
-    parts = {}
-    for what, chosen in (("observations", options.observations), ("actions", options.actions)):
-        arrays = flatten(getattr(episode, what), "/")
-        arrays = {name or what: array for name, array in arrays.items()}
-        table = Table(source, tuple(arrays), arrays.__getitem__)
-        if chosen is None and what not in arrays:
-            raise InputError(
-                f"{source}: {what} are a dictionary; choose from it with {what}: [KEY, ...]{choices(what, arrays)}"
-            )
-        values, names = table.matrix(what if chosen is None else chosen, what)
-        check_values(values, names, source)
-        parts[what] = values
-    observations, actions = parts["observations"], parts["actions"]
-    if len(observations) != len(actions) + 1:
-        raise InputError(
-            f"{source}: {len(observations)} observations and {len(actions)} actions; expected one observation more"
-        )
-    return Trajectories(
-        observations=observations[:-1],
-        next_observations=observations[1:],
-        actions=actions,
-        terminals=np.arange(1, len(actions) + 1) == len(actions),
-        dt=options.dt,
-        source=source,
-    )
-
-
-def _minari() -> ModuleType:
-    with extra("minari", "reading a Minari dataset"):
-        import minari
-    return minari
-
-
-def _positive(value: object, name: str) -> float:
-    """A positive number of seconds or fraction (also where YAML reads ``1e-3`` as text)."""
-    try:
-        number = float(value)  # type: ignore[arg-type]
-    except (TypeError, ValueError):
-        number = float("nan")
-    if isinstance(value, bool) or not (np.isfinite(number) and number > 0):
-        raise InputError(f"data: {name} is {value!r}; expected a positive number")
-    return number
+    return read_minari(dataset, observations=options.observations, actions=options.actions, dt=options.dt)

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dropo_torch.data.trajectory import Trajectories
+from dropo_torch.data.trajectory import Trajectories, check_values, set_frozen
 from dropo_torch.errors import InputError, choices
 
 TOLERANCE = 0.05
@@ -54,35 +54,32 @@ class Recording:
                     "one row a sample and one column a name"
                 )
             check_values(array, names, self.source, missing_allowed=True)
-            _set(self, name, array)
-        names = self.observation_names + self.action_names
-        twice = [name for name in names if names.count(name) > 1]
+            set_frozen(self, name, array)
+        twice = [name for name in self.names if self.names.count(name) > 1]
         if twice:
             raise InputError(f"{self.source}: two columns are named {twice[0]!r}; give each a name of its own")
         episodes = np.array(self.episodes, dtype=np.int64)
         if episodes.shape != (rows,) or (np.diff(episodes) < 0).any():
             raise InputError(f"{self.source}: episodes must be {rows} whole numbers that never fall")
-        _set(self, "episodes", episodes)
+        set_frozen(self, "episodes", episodes)
         if self.time is not None:
-            _set(self, "time", checked_time(self.time, episodes, self.source))
+            set_frozen(self, "time", self._checked_time(self.time))
 
     def __len__(self) -> int:
         """Return the number of samples N."""
         return len(self.observations)
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The signals: observations, then actions."""
+        return self.observation_names + self.action_names
+
     def split(self) -> tuple[Recording, ...]:
         """Return each episode as a recording of its own."""
         bounds = np.flatnonzero(np.diff(self.episodes)) + 1
-        return tuple(
-            replace(
-                self,
-                observations=self.observations[rows],
-                actions=self.actions[rows],
-                time=None if self.time is None else self.time[rows],
-                episodes=np.zeros(len(rows), dtype=np.int64),
-            )
-            for rows in np.split(np.arange(len(self)), bounds)
-        )
+        names = [name for name in ("observations", "actions", "time", "episodes") if getattr(self, name) is not None]
+        parts = zip(*(np.split(getattr(self, name), bounds) for name in names), strict=True)
+        return tuple(replace(self, **dict(zip(names, part, strict=True))) for part in parts)
 
     def signal(self, name: str) -> np.ndarray:
         """Return the samples ``(N,)`` of one named observation or action.
@@ -90,12 +87,35 @@ class Recording:
         Raises:
             InputError: a name that is not there.
         """
-        names = self.observation_names + self.action_names
-        if name not in names:
-            raise InputError(f"{self.source}: there is no signal {name!r}{choices(name, names)}")
-        column = names.index(name)
-        width = len(self.observation_names)
-        return self.observations[:, column] if column < width else self.actions[:, column - width]
+        if name in self.observation_names:
+            return self.observations[:, self.observation_names.index(name)]
+        if name in self.action_names:
+            return self.actions[:, self.action_names.index(name)]
+        raise InputError(f"{self.source}: there is no signal {name!r}{choices(name, self.names)}")
+
+    def interval(self, tolerance: float) -> float | None:
+        """Return the mean spacing of the time stamps in seconds; ``None`` without them, or if no episode has two.
+
+        Args:
+            tolerance: fraction by which a spacing may differ from the median.
+
+        Raises:
+            InputError: a spacing that differs by more.
+        """
+        end = np.flatnonzero(np.diff(self.episodes) == 0) + 1
+        if self.time is None or end.size == 0:
+            return None
+        steps = self.time[end] - self.time[end - 1]
+        median = float(np.median(steps))
+        off = np.flatnonzero(np.abs(steps - median) > tolerance * median)
+        if off.size:
+            first = off[0]
+            raise InputError(
+                f"{self.source}: irregular time stamps: {steps[first]:.6g} s before row {end[first]} (counted from 0) "
+                f"and {median:.6g} s as a rule, {off.size} spacings in all are off by more than {tolerance:.0%}; "
+                "resample the log with the option preprocess: {dt: SECONDS}"
+            )
+        return float(steps.mean())
 
     def trajectories(self, *, tolerance: float = TOLERANCE) -> Trajectories:
         """Return the transitions between consecutive samples, ``dt`` being the mean spacing of the time stamps.
@@ -108,7 +128,7 @@ class Recording:
         Raises:
             InputError: a missing value, irregular time stamps, no two samples in one episode.
         """
-        dt = None if self.time is None else sampling_interval(self.time, self.episodes, self.source, tolerance)
+        dt = self.interval(tolerance)
         check_values(self.observations, self.observation_names, self.source)
         start = np.flatnonzero(self.episodes[1:] == self.episodes[:-1])
         if start.size == 0:
@@ -127,6 +147,24 @@ class Recording:
             source=self.source,
         )
 
+    def _checked_time(self, time: np.ndarray) -> np.ndarray:
+        """Time stamps as float64 seconds, each later than the one before it in its episode."""
+        stamps = np.array(time, dtype=np.float64)
+        if stamps.shape != self.episodes.shape:
+            raise InputError(
+                f"{self.source}: time has shape {stamps.shape}; expected ({len(self)},), one stamp a sample"
+            )
+        check_values(stamps[:, None], ["time"], self.source)
+        backwards = np.flatnonzero((np.diff(stamps) <= 0) & (np.diff(self.episodes) == 0)) + 1
+        if backwards.size:
+            row = int(backwards[0])
+            raise InputError(
+                f"{self.source}: time goes from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s at row {row} (counted "
+                "from 0); it must rise within an episode (name the column that tells episodes apart with episode, or "
+                "remove the row)"
+            )
+        return stamps
+
 
 def resolve_names(wanted: Sequence[str], names: Sequence[str], source: str, what: str) -> list[str]:
     """Return the column names meant by ``wanted``, where ``q`` stands for ``q[0]``, ``q[1]``, ... as well.
@@ -141,66 +179,3 @@ def resolve_names(wanted: Sequence[str], names: Sequence[str], source: str, what
             raise InputError(f"{source}: {what}: there is no signal {name!r}{choices(name, names)}")
         found += matches
     return found
-
-
-def check_values(values: np.ndarray, names: Sequence[str], source: str, *, missing_allowed: bool = False) -> None:
-    """Check that ``values (N, len(names))`` are finite, or finite or NaN.
-
-    Raises:
-        InputError: naming the first bad row and its column.
-    """
-    bad = np.argwhere(np.isinf(values) if missing_allowed else ~np.isfinite(values))
-    if bad.size:
-        row, column = (int(i) for i in bad[0])
-        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
-        raise InputError(
-            f"{source}: {names[column]} is {values[row, column]} at row {row} (counted from 0){more}; "
-            "every value must be finite"
-        )
-
-
-def checked_time(time: np.ndarray, episodes: np.ndarray, source: str) -> np.ndarray:
-    """Return ``time (N,)`` as float64 seconds.
-
-    Raises:
-        InputError: a stamp that is not finite, or not later than the one before it in its episode.
-    """
-    stamps = np.array(time, dtype=np.float64)
-    if stamps.shape != episodes.shape:
-        raise InputError(f"{source}: time has shape {stamps.shape}; expected ({len(episodes)},), one stamp a sample")
-    check_values(stamps[:, None], ["time"], source)
-    backwards = np.flatnonzero((np.diff(stamps) <= 0) & (np.diff(episodes) == 0)) + 1
-    if backwards.size:
-        row = int(backwards[0])
-        raise InputError(
-            f"{source}: time goes from {stamps[row - 1]:.9g} s to {stamps[row]:.9g} s at row {row} (counted from 0); "
-            "it must rise within an episode (name the column that tells episodes apart with episode, or remove the row)"
-        )
-    return stamps
-
-
-def sampling_interval(time: np.ndarray, episodes: np.ndarray, source: str, tolerance: float) -> float | None:
-    """Return the mean spacing of regular time stamps in seconds, ``None`` if no episode has two.
-
-    Raises:
-        InputError: a spacing that differs from the median by more than the fraction ``tolerance``.
-    """
-    end = np.flatnonzero(np.diff(episodes) == 0) + 1
-    if end.size == 0:
-        return None
-    steps = time[end] - time[end - 1]
-    median = float(np.median(steps))
-    off = np.flatnonzero(np.abs(steps - median) > tolerance * median)
-    if off.size:
-        first = off[0]
-        raise InputError(
-            f"{source}: irregular time stamps: {steps[first]:.6g} s before row {end[first]} (counted from 0) and "
-            f"{median:.6g} s as a rule, {off.size} spacings in all are off by more than {tolerance:.0%}; resample the "
-            "log with the option preprocess: {dt: SECONDS}"
-        )
-    return float(steps.mean())
-
-
-def _set(recording: Recording, name: str, array: np.ndarray) -> None:
-    array.flags.writeable = False
-    object.__setattr__(recording, name, array)

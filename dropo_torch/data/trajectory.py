@@ -38,23 +38,19 @@ class Trajectories:
 
     def __post_init__(self) -> None:
         for name in ("observations", "next_observations", "actions"):
-            array = _matrix(getattr(self, name), name, self.source)
-            object.__setattr__(self, name, array)
+            set_frozen(self, name, _matrix(getattr(self, name), name, self.source))
         rows = len(self.observations)
         if rows == 0:
             raise InputError(f"{self.source}: the log has no transition; at least one is needed")
         terminals = np.asarray(self.terminals)
         if terminals.dtype.kind not in "biuf" or not np.isin(terminals, (0, 1)).all():
             raise InputError(f"{self.source}: terminals must be true/false or 0/1 flags")
-        terminals = terminals.reshape(-1).astype(bool)
-        for name, array in (
-            ("next_observations", self.next_observations),
-            ("actions", self.actions),
-            ("terminals", terminals),
-        ):
-            if len(array) != rows:
+        set_frozen(self, "terminals", np.append(terminals.reshape(-1).astype(bool)[:-1], True))
+        for name in ("next_observations", "actions", "terminals"):
+            found = len(getattr(self, name))
+            if found != rows:
                 raise InputError(
-                    f"{self.source}: {name} has {len(array)} rows and observations has {rows}; "
+                    f"{self.source}: {name} has {found} rows and observations has {rows}; "
                     "both need one row a transition"
                 )
         if self.next_observations.shape != self.observations.shape:
@@ -66,9 +62,14 @@ class Trajectories:
             raise InputError(
                 f"{self.source}: the time between samples is {self.dt}; expected a positive number of seconds"
             )
-        terminals = terminals.copy()
-        terminals[-1] = True
-        object.__setattr__(self, "terminals", _frozen(terminals))
+
+    @classmethod
+    def of_samples(
+        cls, observations: np.ndarray, actions: np.ndarray, *, dt: float | None, source: str
+    ) -> Trajectories:
+        """Return the episode of observations ``(T + 1, n)`` with the actions ``(T, m)`` between them."""
+        ends = np.arange(1, len(observations)) == len(observations) - 1
+        return cls(observations[:-1], observations[1:], actions, ends, dt, source)
 
     def __len__(self) -> int:
         """Return the number of transitions T."""
@@ -89,13 +90,8 @@ class Trajectories:
         """Return the given rows, ascending; an episode ends wherever rows are left out."""
         index = np.arange(len(self))[rows]
         gap = np.append(np.diff(index) != 1, True)
-        return replace(
-            self,
-            observations=self.observations[index],
-            next_observations=self.next_observations[index],
-            actions=self.actions[index],
-            terminals=self.terminals[index] | gap,
-        )
+        rest = {name: getattr(self, name)[index] for name in ("observations", "next_observations", "actions")}
+        return replace(self, **rest, terminals=self.terminals[index] | gap)
 
     def select_episodes(self, which: Sequence[int]) -> Trajectories:
         """Return the given episodes, counted from 0."""
@@ -125,11 +121,9 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
                 raise InputError(f"{log.source}: {theirs} columns of {name}, but {first.source} has {ours}")
         if log.dt is not None and first.dt is not None and not np.isclose(log.dt, first.dt, rtol=1e-3):
             raise InputError(f"{log.source}: sampled every {log.dt:g} s, but {first.source} every {first.dt:g} s")
+    names = ("observations", "next_observations", "actions", "terminals")
     return Trajectories(
-        observations=np.concatenate([log.observations for log in logs]),
-        next_observations=np.concatenate([log.next_observations for log in logs]),
-        actions=np.concatenate([log.actions for log in logs]),
-        terminals=np.concatenate([log.terminals for log in logs]),
+        **{name: np.concatenate([getattr(log, name) for log in logs]) for name in names},
         dt=next((log.dt for log in logs if log.dt is not None), None),
         source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
     )
@@ -166,14 +160,8 @@ class Transitions:
 
     def select(self, rows: np.ndarray | slice) -> Transitions:
         """Return the given windows."""
-        return replace(
-            self,
-            states=self.states[rows],
-            controls=self.controls[rows],
-            measured=self.measured[rows],
-            rows=self.rows[rows],
-            episodes=self.episodes[rows],
-        )
+        names = ("states", "controls", "measured", "rows", "episodes")
+        return replace(self, **{name: getattr(self, name)[rows] for name in names})
 
 
 def make_transitions(
@@ -271,8 +259,35 @@ def _window_length(lengths: np.ndarray, horizon: int) -> int:
     return max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
 
 
+def column_names(name: str, width: int) -> list[str]:
+    """Return the names of a matrix's columns: its own, or ``name[0]``, ``name[1]``, ... of several."""
+    return [name] if width == 1 else [f"{name}[{i}]" for i in range(width)]
+
+
+def check_values(values: np.ndarray, names: Sequence[str], source: str, *, missing_allowed: bool = False) -> None:
+    """Check that ``values (N, len(names))`` are finite, or finite or NaN.
+
+    Raises:
+        InputError: naming the first bad row and its column.
+    """
+    bad = np.argwhere(np.isinf(values) if missing_allowed else ~np.isfinite(values))
+    if bad.size:
+        row, column = (int(i) for i in bad[0])
+        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+        raise InputError(
+            f"{source}: {names[column]} is {values[row, column]} at row {row} (counted from 0){more}; "
+            "every value must be finite"
+        )
+
+
+def set_frozen(owner: object, name: str, array: np.ndarray) -> None:
+    """Give a frozen dataclass an array that cannot be written to."""
+    array.flags.writeable = False
+    object.__setattr__(owner, name, array)
+
+
 def _matrix(array: object, name: str, source: str) -> np.ndarray:
-    """``array`` as a read-only float64 ``(T, columns)`` matrix of finite values."""
+    """``array`` as a float64 ``(T, columns)`` matrix of finite values, a copy."""
     try:
         matrix = np.array(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -281,16 +296,5 @@ def _matrix(array: object, name: str, source: str) -> np.ndarray:
         matrix = matrix[:, None]
     if matrix.ndim != 2:
         raise InputError(f"{source}: {name} has shape {matrix.shape}; expected (transitions, columns)")
-    bad = np.argwhere(~np.isfinite(matrix))
-    if bad.size:
-        row, column = (int(i) for i in bad[0])
-        more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
-        raise InputError(
-            f"{source}: {name} is {matrix[row, column]} at row {row}, column {column}{more}; every value must be finite"
-        )
-    return _frozen(matrix)
-
-
-def _frozen(array: np.ndarray) -> np.ndarray:
-    array.flags.writeable = False
-    return array
+    check_values(matrix, column_names(name, matrix.shape[1]), source)
+    return matrix

@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from dropo_torch.report import figures, words
 from dropo_torch.report.html import config_yaml, render
-from dropo_torch.rl.evaluate import Evaluation
+from dropo_torch.rl.evaluate import Returns
 from dropo_torch.rl.train import Training
 from dropo_torch.support.files import write_atomically
 
@@ -65,7 +65,7 @@ def write_train_report(
     write_atomically(Path(path), render("train.html", content))
 
 
-def evaluations(training: Training) -> dict[str, Evaluation]:
+def evaluations(training: Training) -> dict[str, Returns]:
     """Return the evaluations that there are, by world."""
     given = {"distribution": training.training, "nominal": training.nominal, "target": training.target}
     return {name: e for name, e in given.items() if e is not None}
@@ -113,7 +113,7 @@ def curve_panel(training: Training) -> str:
     return figures.to_svg(figure, "return against environment steps")
 
 
-def episodes_panel(found: Mapping[str, Evaluation]) -> str:
+def episodes_panel(found: Mapping[str, Returns]) -> str:
     """Draw the return of every episode of each evaluation as a dot, and the mean as a stroke."""
     figure = figures.new_figure(760, 58 + 34 * len(found))
     axes = figures.new_axes(figure, (120, 42, 14, 8))
@@ -131,11 +131,11 @@ def episodes_panel(found: Mapping[str, Evaluation]) -> str:
     return figures.to_svg(figure, "returns of the evaluation episodes")
 
 
-def _return(found: Evaluation) -> str:
+def _return(found: Returns) -> str:
     return f"{words.number(found.mean, found.standard_error)} ± {words.number(found.std, found.std)}"
 
 
-def _row(name: str, found: Evaluation) -> dict[str, str]:
+def _row(name: str, found: Returns) -> dict[str, str]:
     return {
         "name": name,
         "what": WORLDS[name],

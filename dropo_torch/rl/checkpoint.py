@@ -1,4 +1,4 @@
-"""Keeping a training between two iterations, so that it goes on exactly after whatever ended it."""
+"""Files of tensors: whole or absent, and read without running code in them. A training's state between iterations."""
 
 from __future__ import annotations
 
@@ -12,10 +12,24 @@ import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
+from dropo_torch.support.given import reading
 
 SCHEMA = "dropo-torch/training/1"
 #: A checkpoint may take this share of the time since the last.
 SHARE = 0.05
+
+
+def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
+    """Write tensors, numbers and text in mappings and lists, whole or not at all."""
+    buffer = io.BytesIO()
+    torch.save(dict(content), buffer)
+    write_atomically(path, buffer.getvalue())
+
+
+def load_tensors(path: Path) -> dict[str, Any]:
+    """Return what :func:`save_tensors` has written, on the CPU; no code in the file is run."""
+    found: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
+    return found
 
 
 class Checkpoints:
@@ -40,29 +54,21 @@ class Checkpoints:
         if self._path is None:
             return
         begun = time.monotonic()
-        buffer = io.BytesIO()
-        torch.save({"schema": SCHEMA, "fingerprint": self._fingerprint, "state": dict(state)}, buffer)
-        write_atomically(self._path, buffer.getvalue())
+        save_tensors(self._path, {"schema": SCHEMA, "fingerprint": self._fingerprint, "state": dict(state)})
         ended = time.monotonic()
         self._next = ended + max(self._seconds, (ended - begun) / SHARE)
 
     def load(self) -> dict[str, Any] | None:
-        """Return the state that was kept last; ``None`` where there is none. No code in the file is run.
+        """Return the state that was kept last; ``None`` where there is none.
 
         Raises:
             InputError: a file that is no checkpoint, or that of another training.
         """
         if self._path is None or not self._path.is_file():
             return None
-        try:
-            content = torch.load(self._path, map_location="cpu", weights_only=True)
+        with reading(f"resume: {self._path}", "the checkpoint of a training", "start again without --resume"):
+            content = load_tensors(self._path)
             schema, owner, state = content["schema"], content["fingerprint"], content["state"]
-        except Exception as error:  # whatever torch raises on a file that is not its own
-            first = str(error).partition("\n")[0][:200]
-            raise InputError(
-                f"resume: {self._path} is no checkpoint of a training ({type(error).__name__}: {first}); "
-                "start again without --resume"
-            ) from None
         if schema != SCHEMA or owner != self._fingerprint:
             raise InputError(
                 f"resume: {self._path} belongs to another task, config, distribution or algorithm; restore those, "

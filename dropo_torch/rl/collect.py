@@ -48,25 +48,14 @@ class Collector:
             unit, extra = act(observation, parameters)
             now.set("action", self._to_action(unit).to(self._env.action_spec.dtype))
             after, now = self._env.step_and_maybe_reset(now)
-            rows.append(self._row(observation, parameters, unit, extra, after.get("next")))
+            found = after.get("next")
+            self._count(found.get("reward")[:, 0], found.get("done")[:, 0])
+            ends = {key: found.get(key) for key in ("observation", "reward", "done", "terminated")}
+            step = {"observation": observation, "parameters": parameters, "action": unit, **extra}
+            step["next"] = TensorDict._new_unsafe(ends, batch_size=unit.shape[:1])
+            rows.append(TensorDict._new_unsafe(step, batch_size=unit.shape[:1]))
         self._now = now
         return torch.stack(rows, 1)
-
-    def _row(
-        self, observation: torch.Tensor, parameters: torch.Tensor, unit: torch.Tensor,
-        extra: Mapping[str, torch.Tensor], after: TensorDictBase,
-    ) -> TensorDict:  # fmt: skip
-        self._count(after.get("reward")[:, 0], after.get("done")[:, 0])
-        return TensorDict._new_unsafe(
-            {
-                "observation": observation, "parameters": parameters, "action": unit, **extra,
-                "next": TensorDict._new_unsafe(
-                    {key: after.get(key) for key in ("observation", "reward", "done", "terminated")},
-                    batch_size=unit.shape[:1],
-                ),
-            },
-            batch_size=unit.shape[:1],
-        )  # fmt: skip
 
     def _count(self, reward: torch.Tensor, done: torch.Tensor) -> None:
         """Add up returns, and note those of finished episodes."""

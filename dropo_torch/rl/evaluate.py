@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,8 +14,8 @@ from dropo_torch.rl.policy import Policy
 
 
 @dataclass(frozen=True)
-class Evaluation:
-    """Episodes of a policy in one world.
+class Returns:
+    """Returns of the episodes of a policy in one world.
 
     Attributes:
         returns: undiscounted sum of rewards of each episode.
@@ -43,15 +43,12 @@ class Evaluation:
         return self.std / math.sqrt(len(self.returns))
 
     def document(self) -> dict[str, Any]:
-        """Return the evaluation as plain data."""
-        return {
-            "episodes": len(self.returns), "mean": self.mean, "std": self.std, "returns": list(self.returns),
-            "lengths": list(self.lengths), "diverged": self.diverged,
-        }  # fmt: skip
+        """Return them as plain data."""
+        return {"episodes": len(self.returns), "mean": self.mean, "std": self.std, **asdict(self)}
 
 
 @torch.no_grad()
-def evaluate(policy: Policy, env: EnvBase) -> Evaluation:
+def evaluate(policy: Policy, env: EnvBase) -> Returns:
     """Return the first episode of each environment of a fresh batch, acted without noise."""
     count = env.batch_size[0]
     total, length = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.int64)
@@ -67,4 +64,4 @@ def evaluate(policy: Policy, env: EnvBase) -> Evaluation:
         if found is not None:
             diverged |= going & found[:, 0].cpu()
         going &= ~after.get("done")[:, 0].cpu()
-    return Evaluation(tuple(total.tolist()), tuple(length.tolist()), int(diverged.sum()))
+    return Returns(tuple(total.tolist()), tuple(length.tolist()), int(diverged.sum()))

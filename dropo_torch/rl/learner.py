@@ -8,10 +8,13 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict
+from tensordict.nn import TensorDictModule
+from torchrl.modules import ProbabilisticActor
 
 from dropo_torch.errors import InputError
 from dropo_torch.rl.networks import Normalizer
 from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.settings import TrainSettings
 
 #: Updates in a row whose loss is not finite, after which training gives up.
 PATIENCE = 20
@@ -23,18 +26,18 @@ class Learner(ABC):
     Args:
         policy: what is improved, in place.
         num_parameters: width d of the episodes' parameters.
-        privileged: whether the critic sees them.
+        settings: how it learns.
     """
 
-    #: Steps of every environment between two updates.
-    horizon: int
+    #: Numbers that further learning depends on, beside :meth:`parts`.
+    counters: tuple[str, ...] = ("skipped", "in_a_row")
 
-    def __init__(self, policy: Policy, num_parameters: int, *, privileged: bool) -> None:
+    def __init__(self, policy: Policy, num_parameters: int, settings: TrainSettings) -> None:
         self.policy = policy
-        device = policy.low.device
-        self._seen = Normalizer(num_parameters if privileged else 0).to(device)
+        self._device = policy.low.device
+        self._seen = Normalizer(num_parameters if settings.privileged_critic else 0).to(self._device)
         self.skipped = 0
-        self._in_a_row = 0
+        self.in_a_row = 0
 
     @property
     def num_features(self) -> int:
@@ -57,15 +60,28 @@ class Learner(ABC):
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that further learning depends on."""
-        parts = {**self.parts(), "policy": self.policy, "seen": self._seen}
-        counts = {"skipped": self.skipped, "in_a_row": self._in_a_row}
-        return {**{name: part.state_dict() for name, part in parts.items()}, **counts}
+        parts = {name: part.state_dict() for name, part in self._every_part().items()}
+        return {**parts, "counters": {name: getattr(self, name) for name in self.counters}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that :meth:`state_dict` returned."""
-        for name, part in {**self.parts(), "policy": self.policy, "seen": self._seen}.items():
+        for name, part in self._every_part().items():
             part.load_state_dict(state[name])
-        self.skipped, self._in_a_row = state["skipped"], state["in_a_row"]
+        for name, count in state["counters"].items():
+            setattr(self, name, count)
+
+    def _every_part(self) -> dict[str, Any]:
+        return {**self.parts(), "policy": self.policy, "seen": self._seen}
+
+    def _actor(self, distribution: type) -> ProbabilisticActor:
+        """The policy's network as the losses take it, with actions of the given distribution."""
+        return ProbabilisticActor(
+            TensorDictModule(self.policy.actor, in_keys=["features"], out_keys=["loc", "scale"]),
+            in_keys=["loc", "scale"],
+            distribution_class=distribution,
+            return_log_prob=True,
+            log_prob_key="log_prob",
+        )
 
     def _take_in(self, rollout: TensorDict) -> None:
         """Let the running statistics see new experience."""
@@ -83,11 +99,11 @@ class Learner(ABC):
     def _is_sound(self, loss: torch.Tensor) -> bool:
         """Whether a loss may be followed; counts those that may not."""
         if bool(torch.isfinite(loss)):
-            self._in_a_row = 0
+            self.in_a_row = 0
             return True
         self.skipped += 1
-        self._in_a_row += 1
-        if self._in_a_row >= PATIENCE:
+        self.in_a_row += 1
+        if self.in_a_row >= PATIENCE:
             raise InputError(
                 f"train: the loss was not finite for {PATIENCE} updates in a row; lower train.learning_rate, "
                 "or scale the task's reward"

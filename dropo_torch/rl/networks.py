@@ -20,7 +20,7 @@ ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
 
 class Normalizer(nn.Module):
-    """Running mean and variance of inputs ``(..., n)``, float64 inside; maps them to mean 0 and deviation 1.
+    """Running mean and variance of inputs ``(..., n)``, float64 inside; maps them to mean 0 and standard deviation 1.
 
     Before the first update it changes nothing. An input that never varies becomes 0.
     """
@@ -61,16 +61,22 @@ class Actor(nn.Module):
     Args:
         num_features, num_actions: n and m.
         hidden: widths of the hidden layers.
-        head: ``"normal"``: a normal whose deviation is the same in every state, cut off at ±1 by whoever acts;
-            ``"tanh"``: a squashed normal whose deviation depends on the state.
+        head: ``"normal"``: a normal whose standard deviation is the same in every state, cut off at ±1 by whoever acts;
+            ``"tanh"``: a squashed normal whose standard deviation depends on the state.
         activation: of the hidden layers: tanh, relu or elu.
         initial_std: with ``"normal"``: the standard deviation at the start.
     """
 
     def __init__(
-        self, num_features: int, num_actions: int, *, hidden: Sequence[int], head: Head, activation: str,
+        self,
+        num_features: int,
+        num_actions: int,
+        *,
+        hidden: Sequence[int],
+        head: Head,
+        activation: str,
         initial_std: float = 0.6,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
         self.head = head
         self.num_actions = num_actions

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, overload
@@ -12,8 +11,9 @@ import torch
 from torch import nn
 
 from dropo_torch.errors import InputError
+from dropo_torch.rl.checkpoint import load_tensors, save_tensors
 from dropo_torch.rl.networks import Actor, Normalizer
-from dropo_torch.support.files import write_atomically
+from dropo_torch.support.given import reading
 
 SCHEMA = "dropo-torch/policy/1"
 
@@ -22,26 +22,39 @@ class Policy(nn.Module):
     """A deterministic policy with its observation statistics.
 
     Args:
+        architecture: num_observations n, num_actions m, hidden, head, activation and initial_std of the network.
+        config: the training's config, as plain data.
+        distribution: where the episodes' parameters came from, as plain data.
+
+    Attributes:
         actor: the network.
         normalizer: statistics of the observations.
         low, high: bounds of the actions, ``(m,)`` each; where one is infinite, [-1, 1] is not scaled.
-        architecture: what :func:`make_policy` needs to build the network again.
-        config: the training's config, as plain data.
-        distribution: where the episodes' parameters came from, as plain data.
     """
 
     low: torch.Tensor
     high: torch.Tensor
 
     def __init__(
-        self, actor: Actor, normalizer: Normalizer, low: torch.Tensor, high: torch.Tensor, *,
-        architecture: Mapping[str, Any], config: Mapping[str, Any] | None = None,
+        self,
+        architecture: Mapping[str, Any],
+        *,
+        config: Mapping[str, Any] | None = None,
         distribution: Mapping[str, Any] | None = None,
-    ) -> None:  # fmt: skip
+    ) -> None:
         super().__init__()
-        self.actor, self.normalizer = actor, normalizer
-        self.register_buffer("low", low.float().clone())
-        self.register_buffer("high", high.float().clone())
+        size, num_actions = architecture["num_observations"], architecture["num_actions"]
+        self.actor = Actor(
+            size,
+            num_actions,
+            hidden=architecture["hidden"],
+            head=architecture["head"],
+            activation=architecture["activation"],
+            initial_std=architecture.get("initial_std", 0.6),
+        )
+        self.normalizer = Normalizer(size)
+        self.register_buffer("low", torch.full((num_actions,), -1.0))
+        self.register_buffer("high", torch.full((num_actions,), 1.0))
         self.architecture = dict(architecture)
         self.config = dict(config or {})
         self.distribution = dict(distribution or {})
@@ -87,21 +100,7 @@ class Policy(nn.Module):
             "config": self.config,
             "distribution": self.distribution,
         }
-        buffer = io.BytesIO()
-        torch.save(content, buffer)
-        write_atomically(Path(path), buffer.getvalue())
-
-
-def make_policy(architecture: Mapping[str, Any], **about: Any) -> Policy:
-    """Return a fresh policy of an architecture: num_observations, num_actions, hidden, head and activation."""
-    actor = Actor(
-        architecture["num_observations"], architecture["num_actions"], hidden=architecture["hidden"],
-        head=architecture["head"], activation=architecture["activation"],
-        initial_std=architecture.get("initial_std", 0.6),
-    )  # fmt: skip
-    num_actions = architecture["num_actions"]
-    bounds = (torch.full((num_actions,), -1.0), torch.full((num_actions,), 1.0))
-    return Policy(actor, Normalizer(architecture["num_observations"]), *bounds, architecture=architecture, **about)
+        save_tensors(Path(path), content)
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -116,14 +115,11 @@ def load_policy(path: str | Path) -> Policy:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"policy: no file {path}; expected a policy.pt that dropo train has written")
-    try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+    with reading(f"policy: {path}", "a policy that dropo train has written"):
+        content = load_tensors(path)
         schema = content["schema"]
-        policy = make_policy(content["architecture"], config=content["config"], distribution=content["distribution"])
+        policy = Policy(content["architecture"], config=content["config"], distribution=content["distribution"])
         policy.load_state_dict(content["weights"])
-    except Exception as error:  # whatever torch raises on a file that is not its own
-        first = str(error).partition("\n")[0][:200]
-        raise InputError(f"policy: {path} holds no policy ({type(error).__name__}: {first})") from None
     if schema != SCHEMA:
         raise InputError(f"policy: {path} is of schema {schema!r}; expected {SCHEMA!r}")
     return policy.eval()

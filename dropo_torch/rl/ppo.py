@@ -9,7 +9,7 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from torchrl.modules import IndependentNormal, ProbabilisticActor
+from torchrl.modules import IndependentNormal
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
@@ -17,6 +17,14 @@ from dropo_torch.rl.learner import Learner
 from dropo_torch.rl.networks import Normalizer, mlp
 from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.settings import PPOSettings
+
+#: What an update tells → its entry in TorchRL's loss.
+_SCALARS = {
+    "loss_policy": "loss_objective",
+    "loss_critic": "loss_critic",
+    "kl": "kl_approx",
+    "clip_fraction": "clip_fraction",
+}
 
 
 class PPO(Learner):
@@ -28,40 +36,39 @@ class PPO(Learner):
     Args:
         policy: what is improved, in place.
         num_parameters: width d of the episodes' parameters.
-        num_envs: N.
         settings: how it learns.
     """
 
-    def __init__(self, policy: Policy, num_parameters: int, *, num_envs: int, settings: PPOSettings) -> None:
-        super().__init__(policy, num_parameters, privileged=settings.privileged_critic)
-        self.settings, self.horizon = settings, settings.horizon
-        device = policy.low.device
-        network = mlp(self.num_features, 1, settings.hidden, settings.activation, 1.0).to(device)
+    def __init__(self, policy: Policy, num_parameters: int, settings: PPOSettings) -> None:
+        super().__init__(policy, num_parameters, settings)
+        self.settings = settings
+        network = mlp(self.num_features, 1, settings.hidden, settings.activation, 1.0).to(self._device)
         self._critic = TensorDictModule(network, in_keys=["critic_features"], out_keys=["state_value"])
-        self._actor = ProbabilisticActor(
-            TensorDictModule(policy.actor, in_keys=["features"], out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"], distribution_class=IndependentNormal, return_log_prob=True,
-            log_prob_key="log_prob",
-        )  # fmt: skip
         self._loss = ClipPPOLoss(
-            self._actor, self._critic, clip_epsilon=settings.clip, entropy_bonus=settings.entropy > 0,
-            entropy_coeff=settings.entropy, loss_critic_type="l2", normalize_advantage=True, functional=False,
+            self._actor(IndependentNormal),
+            self._critic,
+            clip_epsilon=settings.clip,
+            entropy_bonus=settings.entropy > 0,
+            entropy_coeff=settings.entropy,
+            loss_critic_type="l2",
+            normalize_advantage=True,
+            functional=False,
             log_explained_variance=False,
-        )  # fmt: skip
+        )
         self._loss.set_keys(sample_log_prob="log_prob")
         self._advantage = GAE(gamma=settings.gamma, lmbda=settings.lambda_, value_network=None, vectorized=True)
         self._optimizer = torch.optim.Adam(
             [*policy.actor.parameters(), *network.parameters()], lr=settings.learning_rate, eps=1e-5, fused=True
         )
-        self._scale = ReturnScale(num_envs, settings.gamma).to(device)
+        self._scale = ReturnScale(settings.num_envs, settings.gamma).to(self._device)
 
     def act(
         self, observation: torch.Tensor, parameters: torch.Tensor
     ) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
         """Return sampled actions, whose excess over ±1 the environment does not see, and their log-probabilities."""
-        law = IndependentNormal(*self.policy.actor(self.policy.normalizer(observation)))
-        action = law.sample()
-        return action, {"log_prob": law.log_prob(action)}
+        distribution = IndependentNormal(*self.policy.actor(self.policy.normalizer(observation)))
+        action = distribution.sample()
+        return action, {"log_prob": distribution.log_prob(action)}
 
     def update(self, rollout: TensorDict, share: float) -> dict[str, float]:
         """Learn from steps ``(N, horizon)``."""
@@ -70,7 +77,8 @@ class PPO(Learner):
         data = self._prepared(rollout)
         scalars = self._epochs(data)
         self._take_in(rollout)
-        return {**scalars, "reward_scale": float(self._scale.factor), "std": self._std()}
+        std = float(self.policy.actor.log_std.detach().exp().mean())
+        return {**scalars, "reward_scale": float(self._scale.factor), "std": std}
 
     def parts(self) -> dict[str, Any]:
         """Return what holds state beside the policy."""
@@ -83,27 +91,13 @@ class PPO(Learner):
         self._scale.update(following["reward"][..., 0], following["done"][..., 0])
         features, seen = self._features(rollout["observation"], rollout["parameters"])
         _, seen_next = self._features(following["observation"], rollout["parameters"])
-        value = self._critic.module
-        data = TensorDict(
-            {
-                "state_value": value(seen),
-                "next": {
-                    "state_value": value(seen_next),
-                    "reward": following["reward"] * self._scale.factor,
-                    "done": following["done"],
-                    "terminated": following["terminated"],
-                },
-            },
-            batch_size=rollout.batch_size,
-        )  # fmt: skip
+        value, reward = self._critic.module, following["reward"] * self._scale.factor
+        after = {**following.select("done", "terminated"), "state_value": value(seen_next), "reward": reward}
+        data = TensorDict({"state_value": value(seen), "next": after}, batch_size=rollout.batch_size)
         self._advantage(data)
-        return TensorDict(
-            {
-                "features": features, "critic_features": seen, "action": rollout["action"],
-                "log_prob": rollout["log_prob"], "advantage": data["advantage"], "value_target": data["value_target"],
-            },
-            batch_size=rollout.batch_size,
-        ).reshape(-1)  # fmt: skip
+        kept = {**rollout.select("action", "log_prob"), **data.select("advantage", "value_target")}
+        inputs = {"features": features, "critic_features": seen}
+        return TensorDict({**inputs, **kept}, batch_size=rollout.batch_size).reshape(-1)
 
     def _epochs(self, data: TensorDict) -> dict[str, float]:
         """Pass over the data in minibatches until the policy has moved enough."""
@@ -115,16 +109,12 @@ class PPO(Learner):
                 losses = self._loss(data[rows])
                 if not self._step(losses):
                     continue
-                kl = losses["kl_approx"]
-                sums += torch.stack(
-                    [losses["loss_objective"], losses["loss_critic"], kl, losses["clip_fraction"]]
-                ).detach().cpu().double()  # fmt: skip
-                divergence, batches, updates = divergence + float(kl), batches + 1, updates + 1
+                sums += torch.stack([losses[key] for key in _SCALARS.values()]).detach().cpu().double()
+                divergence, batches, updates = divergence + float(losses["kl_approx"]), batches + 1, updates + 1
             if divergence > settings.target_kl * max(batches, 1):
                 break
-        names = ("loss_policy", "loss_critic", "kl", "clip_fraction")
         means = (sums / max(updates, 1)).tolist()
-        return {**dict(zip(names, means, strict=True)), "epochs": float(epochs)}
+        return {**dict(zip(_SCALARS, means, strict=True)), "epochs": float(epochs)}
 
     def _step(self, losses: TensorDict) -> bool:
         """Follow a gradient, unless the loss is not finite."""
@@ -140,12 +130,9 @@ class PPO(Learner):
         self._optimizer.step()
         return True
 
-    def _std(self) -> float:
-        return float(self.policy.actor.log_std.detach().exp().mean())
-
 
 class ReturnScale(nn.Module):
-    """Scales rewards so that discounted returns have deviation 1; adapts to those seen so far."""
+    """Scales rewards so that discounted returns have standard deviation 1; adapts to those seen so far."""
 
     running: torch.Tensor
 

@@ -5,17 +5,15 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 
 from dropo_torch.config import Config
 from dropo_torch.data.observation import parse_observation
-from dropo_torch.distribution import Distribution
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.errors import InputError, choices
@@ -24,9 +22,16 @@ from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.env import RandomizedEnv
 from dropo_torch.rl.sampling import ParameterSource, PointSource, load_source
-from dropo_torch.rl.settings import TrainSettings, train_settings
+from dropo_torch.rl.settings import Settings, train_settings
 from dropo_torch.rl.task import Task, load_task
+from dropo_torch.support.given import number
 
+#: Keys of a config that a training does not depend on, or whose meaning is told otherwise.
+_FITTING = (
+    "data", "trajectories", "optimizer", "budget", "population", "adam", "samples", "epsilon", "noise", "mask",
+    "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm", "method", "method_options",
+    "entropy", "covariance", "environment",
+)  # fmt: skip
 #: Distributions that need no file.
 KEYWORDS = ("uniform", "nominal")
 
@@ -46,13 +51,6 @@ class World:
     space: ParameterSpace
     source: ParameterSource | None
     effects: EffectSet | None
-
-    def env(self, num_envs: int, *, seed: int, backend: str, num_threads: int, device: str) -> RandomizedEnv:
-        """Return ``num_envs`` environments in this world."""
-        return RandomizedEnv(
-            self.task, num_envs, space=self.space, source=self.source, effects=self.effects, backend=backend,
-            seed=seed, num_threads=num_threads, device=device,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class TrainingProblem:
 
     config: Config
     algorithm: str
-    settings: TrainSettings
+    settings: Settings
     model_path: Path | None
     training: World
     nominal: World | None
@@ -85,8 +83,17 @@ class TrainingProblem:
 
     def env(self, world: World, num_envs: int, seed: int) -> RandomizedEnv:
         """Return environments of one of the worlds, on the config's backend."""
-        config = self.config
-        return world.env(num_envs, seed=seed, backend=config.backend, num_threads=config.threads, device=self.device)
+        return RandomizedEnv(
+            world.task,
+            num_envs,
+            space=world.space,
+            source=world.source,
+            effects=world.effects,
+            backend=self.config.backend,
+            seed=seed,
+            num_threads=self.config.threads,
+            device=self.device,
+        )
 
     @property
     def device(self) -> str:
@@ -109,15 +116,21 @@ def make_training(config: Config) -> TrainingProblem:
     task, model_path = _task(config, sim)
     specs = config.parameters if config.parameters is not None else (dict(sim.parameters) if sim else {})
     given, distribution_path = _given_distribution(config, bool(specs))
-    training = _world(config, sim, task, specs, given)
-    described = describe(training, given)
-    nominal = _nominal_world(training)
-    target = _target_world(config, sim, task, specs) if config.target else None
+    space, effects = _space_and_effects(config, sim, task, specs)
+    training = World(task, space, load_source(given, space) if len(space) else None, effects)
+    described = {"kind": "nominal", "parameters": {}} if training.source is None else training.source.document()
     return TrainingProblem(
-        config=config, algorithm=algorithm, settings=settings, model_path=model_path, training=training,
-        nominal=nominal, target=target, distribution=described, distribution_path=distribution_path,
+        config=config,
+        algorithm=algorithm,
+        settings=settings,
+        model_path=model_path,
+        training=training,
+        nominal=_nominal_world(training),
+        target=_target_world(config, sim, task, specs) if config.target else None,
+        distribution=described,
+        distribution_path=distribution_path,
         fingerprint=_fingerprint(config, algorithm, settings, task, described),
-    )  # fmt: skip
+    )
 
 
 def _task(config: Config, sim: BundledSim | None) -> tuple[Task, Path | None]:
@@ -149,7 +162,7 @@ def _given_distribution(config: Config, varies: bool) -> tuple[str | dict[str, f
             "distribution: no parameters are given that it could be of; give parameters, or distribution: nominal"
         )
     if isinstance(given, dict):
-        return _numbers("distribution", given), None
+        return {name: number(value, f"distribution.{name}") for name, value in given.items()}, None
     if given in KEYWORDS:
         return given, None
     beside = config.base / "fit.json"
@@ -161,21 +174,6 @@ def _given_distribution(config: Config, varies: bool) -> tuple[str | dict[str, f
             f"distribution: no file {path}; expected a fit.json, uniform, nominal, or name: value of every parameter"
         )
     return str(path), path
-
-
-def _numbers(key: str, given: Mapping[str, Any]) -> dict[str, float]:
-    for name, value in given.items():
-        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(value):
-            raise InputError(f"{key}.{name} is {value!r}; expected a number")
-    return {name: float(value) for name, value in given.items()}
-
-
-def _world(
-    config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]], given: Any
-) -> World:
-    """The world of parameters ``specs`` that come from what was given."""
-    space, effects = _space_and_effects(config, sim, task, specs)
-    return World(task, space, load_source(given, space) if len(space) else None, effects)
 
 
 def _space_and_effects(
@@ -192,44 +190,37 @@ def _space_and_effects(
 
 def _nominal_world(training: World) -> World | None:
     """The same with the model's own values."""
-    space = training.space
-    if not len(space):
+    if not len(training.space):
         return training
-    if not np.isfinite(space.nominal).all():
+    if not np.isfinite(training.space.nominal).all():
         return None
-    return World(training.task, space, PointSource(space.named(space.nominal)), training.effects)
+    return replace(training, source=PointSource.nominal(training.space))
 
 
 def _target_world(config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]) -> World:
     """The world of the config's ``target``: the model's own values but for those given."""
-    known = {**(dict(sim.parameters) if sim else {}), **specs}
+    known = {**(sim.parameters if sim else {}), **specs}
     wanted = dict(specs)
     values: dict[str, float] = {}
     for name, entry in config.target.items():
         if isinstance(entry, dict):
             spec = {k: v for k, v in entry.items() if k != "value"}
-            values[name] = _numbers(f"target.{name}", {"value": entry.get("value")})["value"]
+            values[name] = number(entry.get("value"), f"target.{name}.value")
             wanted[name] = {"bounds": _around(values[name]), **spec}
         elif name in known:
-            values |= _numbers("target", {name: entry})
+            values[name] = number(entry, f"target.{name}")
             wanted[name] = known[name]
         else:
-            raise InputError(
-                f"target: unknown parameter {name!r}" + choices(name, known)
-                + f"; any other is given as {name}: {{field: body_mass, name: BODY, value: 1.0}}"
-            )  # fmt: skip
+            other = f"; any other is given as {name}: {{field: body_mass, name: BODY, value: 1.0}}"
+            raise InputError(f"target: unknown parameter {name!r}{choices(name, known)}{other}")
     space, effects = _space_and_effects(config, sim, task, wanted)
-    vector = space.nominal.copy()
-    for name, value in values.items():
-        column = space.names.index(name)
-        low, high = space.limits[column]
-        if not low <= value <= high:
-            raise InputError(f"target.{name} is {value:g}; the model allows {low:g} to {high:g}")
-        vector[column] = value
-    if not np.isfinite(vector).all():
-        missing = space.names[int(np.flatnonzero(~np.isfinite(vector))[0])]
-        raise InputError(f"target: no value given for {missing!r}, which the model has none of")
-    return World(task, space, PointSource(space.named(vector)), effects)
+    vector = {**space.named(space.nominal), **values}
+    for name, (low, high) in zip(space.names, space.limits, strict=True):
+        if not np.isfinite(vector[name]):
+            raise InputError(f"target: no value given for {name!r}, which the model has none of")
+        if name in values and not low <= values[name] <= high:
+            raise InputError(f"target.{name} is {values[name]:g}; the model allows {low:g} to {high:g}")
+    return World(task, space, PointSource(vector), effects)
 
 
 def _around(value: float) -> list[float]:
@@ -237,36 +228,12 @@ def _around(value: float) -> list[float]:
     return sorted([0.5 * value, 2 * value]) if value else [0.0, 1.0]
 
 
-def describe(world: World, given: Any) -> dict[str, Any]:
-    """Return where a world's parameters come from, as plain data."""
-    space, source = world.space, world.source
-    if source is None:
-        return {"kind": "nominal", "parameters": {}}
-    units = {p.name: p.unit for p in space.parameters}
-    if given == "uniform":
-        entries = {
-            p.name: {"low": float(p.low), "high": float(p.high), "unit": p.unit, "scale": p.scale}
-            for p in space.parameters
-        }
-        return {"kind": "uniform", "parameters": entries}
-    if given == "nominal" or isinstance(given, Mapping):
-        vector = source.sample(1, torch.Generator())[0].tolist()
-        values = {n: {"value": v, "unit": units[n]} for n, v in zip(source.names, vector, strict=True)}
-        return {"kind": "nominal" if given == "nominal" else "point", "parameters": values}
-    distribution = given if isinstance(given, Distribution) else Distribution.load(given)
-    together = {} if distribution.correlation is None else {"correlation": distribution.correlation.tolist()}
-    return {"kind": "fitted", "parameters": distribution.summary(), **together}
-
-
 def _fingerprint(
-    config: Config, algorithm: str, settings: TrainSettings, task: Task, distribution: Mapping[str, Any]
+    config: Config, algorithm: str, settings: Settings, task: Task, distribution: Mapping[str, Any]
 ) -> str:
     """A digest of what decides a training's course."""
-    ignored = ("data", "trajectories", "optimizer", "budget", "population", "adam", "samples", "epsilon", "noise",
-               "mask", "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm", "method",
-               "method_options", "entropy", "covariance", "environment")  # fmt: skip
     learning = settings.model_dump(mode="json", exclude={"checkpoint_seconds"})
-    text = json.dumps([config.fingerprint(*ignored), algorithm, learning, dict(distribution)], sort_keys=True)
+    text = json.dumps([config.fingerprint(*_FITTING), algorithm, learning, dict(distribution)], sort_keys=True)
     digest = hashlib.sha256(text.encode())
     digest.update(f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}".encode())
     for name in (config.task or "", *config.own_effects):

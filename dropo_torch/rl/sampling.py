@@ -5,6 +5,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,6 +27,10 @@ class ParameterSource(abc.ABC):
     @abc.abstractmethod
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Return parameter values ``(count, d)``, in their units, float64."""
+
+    def document(self) -> dict[str, Any]:
+        """Return what is drawn from as plain data: its ``kind`` and an entry for each of its ``parameters``."""
+        return {"kind": type(self).__name__, "parameters": {name: {} for name in self.names}}
 
     def over(self, space: ParameterSpace) -> ParameterSource:
         """Return the same source with its columns in a space's order.
@@ -52,21 +57,45 @@ class _Ordered(ParameterSource):
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         return self._source.sample(count, generator)[:, self._columns]
 
+    def document(self) -> dict[str, Any]:
+        return self._source.document()
+
 
 class PointSource(ParameterSource):
     """The same values in every episode.
 
     Args:
         values: name → value.
+        units: name → unit, where it has one.
+        kind: ``point``, or ``nominal`` for the model's own values.
     """
 
-    def __init__(self, values: Mapping[str, float]) -> None:
-        self.names = tuple(values)
+    def __init__(
+        self, values: Mapping[str, float], units: Mapping[str, str] | None = None, kind: str = "point"
+    ) -> None:
+        self.names, self._units, self._kind = tuple(values), dict(units or {}), kind
         self._values = torch.tensor([float(v) for v in values.values()], dtype=torch.float64)
+
+    @classmethod
+    def nominal(cls, space: ParameterSpace) -> PointSource:
+        """Return the model's own values of a space's parameters.
+
+        Raises:
+            InputError: a parameter that the model has no value of.
+        """
+        unknown = [n for n, v in zip(space.names, space.nominal, strict=True) if not np.isfinite(v)]
+        if unknown:
+            raise InputError(f"distribution: the model has no nominal value of {unknown[0]!r}; give name: value of all")
+        return cls(space.named(space.nominal), _units(space), "nominal")
 
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Return the values ``(count, d)``."""
         return self._values.repeat(count, 1)
+
+    def document(self) -> dict[str, Any]:
+        """Return each parameter's value and unit."""
+        values = zip(self.names, self._values.tolist(), strict=True)
+        return {"kind": self._kind, "parameters": {n: {"value": v, "unit": self._units.get(n, "")} for n, v in values}}
 
 
 class UniformSource(ParameterSource):
@@ -77,7 +106,7 @@ class UniformSource(ParameterSource):
     """
 
     def __init__(self, space: ParameterSpace) -> None:
-        self.names = space.names
+        self.names, self._space = space.names, space
         self._is_log = space.is_log
         self._low, high = (to_coordinates(x, space.is_log) for x in (space.low, space.high))
         self._width = high - self._low
@@ -86,6 +115,14 @@ class UniformSource(ParameterSource):
         """Return values ``(count, d)`` inside the bounds."""
         uniforms = torch.rand(count, len(self.names), generator=generator, dtype=torch.float64).numpy()
         return torch.from_numpy(to_values(self._low + uniforms * self._width, self._is_log))
+
+    def document(self) -> dict[str, Any]:
+        """Return each parameter's bounds, unit and scale."""
+        entries = {
+            p.name: {"low": float(p.low), "high": float(p.high), "unit": p.unit, "scale": p.scale}
+            for p in self._space.parameters
+        }
+        return {"kind": "uniform", "parameters": entries}
 
 
 class DistributionSource(ParameterSource):
@@ -102,6 +139,12 @@ class DistributionSource(ParameterSource):
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Return independent values ``(count, d)``."""
         return self.distribution.sample(count, generator)
+
+    def document(self) -> dict[str, Any]:
+        """Return each parameter's entry in a ``fit.json``, and the correlation, where there is one."""
+        correlation = self.distribution.correlation
+        together = {} if correlation is None else {"correlation": correlation.tolist()}
+        return {"kind": "fitted", "parameters": self.distribution.summary(), **together}
 
 
 def load_source(
@@ -124,14 +167,11 @@ def load_source(
     if isinstance(given, Mapping):
         vector = space.vector(given)
         _check_limits(vector, vector, space)
-        return PointSource(given).over(space)
+        return PointSource(space.named(vector), _units(space))
     if given == "uniform":
         return UniformSource(space)
     if given == "nominal":
-        unknown = [n for n, v in zip(space.names, space.nominal, strict=True) if not np.isfinite(v)]
-        if unknown:
-            raise InputError(f"distribution: the model has no nominal value of {unknown[0]!r}; give name: value of all")
-        return PointSource(space.named(space.nominal))
+        return PointSource.nominal(space)
     return _checked(DistributionSource(Distribution.load(given)), space)
 
 
@@ -146,6 +186,10 @@ def _checked(source: DistributionSource, space: ParameterSpace) -> ParameterSour
     low, high = (to_values(end, found.is_log)[columns] for end in found.ends)
     _check_limits(low, high, space)
     return ordered
+
+
+def _units(space: ParameterSpace) -> dict[str, str]:
+    return {p.name: p.unit for p in space.parameters}
 
 
 def _check_limits(low: np.ndarray, high: np.ndarray, space: ParameterSpace) -> None:

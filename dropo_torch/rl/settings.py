@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import pydantic
 
 from dropo_torch.config import explained
-from dropo_torch.errors import InputError, choices
+from dropo_torch.errors import InputError
+from dropo_torch.support.given import check_keys
 
 Positive = Annotated[float, pydantic.Field(gt=0)]
 Share = Annotated[float, pydantic.Field(ge=0, le=1)]
@@ -33,6 +34,8 @@ class TrainSettings(pydantic.BaseModel):
     """
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, strict=False)
+    #: Whether actions are a normal's, cut off, or a squashed normal's.
+    head: ClassVar[Literal["normal", "tanh"]] = "normal"
 
     steps: Count = 1_000_000
     num_envs: Count = 1
@@ -88,6 +91,9 @@ class SACSettings(TrainSettings):
         target_entropy: of the policy; minus the number of actions by default.
     """
 
+    head = "tanh"
+    horizon: ClassVar[int] = 1
+    initial_std: ClassVar[float] = 1.0
     steps: Count = 700_000
     num_envs: Count = 16
     hidden: Widths = (256, 256)
@@ -100,20 +106,19 @@ class SACSettings(TrainSettings):
     target_entropy: float | None = None
 
 
-ALGORITHMS: dict[str, type[TrainSettings]] = {"ppo": PPOSettings, "sac": SACSettings}
+Settings = PPOSettings | SACSettings
+ALGORITHMS: dict[str, type[Settings]] = {"ppo": PPOSettings, "sac": SACSettings}
 
 
-def train_settings(algorithm: str, given: Mapping[str, Any]) -> TrainSettings:
+def train_settings(algorithm: str, given: Mapping[str, Any]) -> Settings:
     """Return the settings of a config's ``train``.
 
     Raises:
         InputError: an unknown key, or a value that does not fit.
     """
     kind = ALGORITHMS[algorithm]
-    known = [field.alias or name for name, field in kind.model_fields.items()]
+    check_keys(given, [field.alias or name for name, field in kind.model_fields.items()], f"train of {algorithm}")
     for key, value in given.items():
-        if key not in known:
-            raise InputError(f"train: unknown key {key!r} for {algorithm}" + choices(key, known))
         if isinstance(value, bool) and key not in ("anneal", "privileged_critic"):
             raise InputError(f"train.{key} is {str(value).lower()}; expected a number")
     try:

@@ -48,7 +48,7 @@ class Task(abc.ABC):
 
     @abc.abstractmethod
     def initial_states(self, count: int, generator: torch.Generator) -> torch.Tensor:
-        """Draw start states ``(count, nq + nv)``, float64, on the CPU."""
+        """Draw initial states ``(count, nq + nv)``, float64, on the CPU."""
 
     @abc.abstractmethod
     def observe(self, states: torch.Tensor) -> torch.Tensor:
@@ -122,9 +122,12 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
             raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
         name = sim.task
     maker = load_callable(
-        "task", name, path=lambda p: (base or Path()) / p, what="class {} that is a Task",
+        "task",
+        name,
+        path=lambda p: (base or Path()) / p,
+        what="class {} that is a Task",
         example="a bundled simulation such as hopper, or file.py:Class of a Task",
-    )  # fmt: skip
+    )
     with user_code("task", name):
         made = maker()
     if not isinstance(made, Task):

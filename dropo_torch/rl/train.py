@@ -15,13 +15,13 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.rl.checkpoint import Checkpoints
 from dropo_torch.rl.collect import Collector
-from dropo_torch.rl.evaluate import Evaluation, evaluate
+from dropo_torch.rl.evaluate import Returns, evaluate
 from dropo_torch.rl.learner import Learner
-from dropo_torch.rl.policy import Policy, make_policy
+from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.ppo import PPO
 from dropo_torch.rl.problem import TrainingProblem, World
 from dropo_torch.rl.sac import SAC
-from dropo_torch.rl.settings import PPOSettings, SACSettings
+from dropo_torch.rl.settings import SACSettings, Settings
 from dropo_torch.support.threads import single_thread
 
 SCHEMA = "dropo-torch/train/1"
@@ -52,7 +52,7 @@ class TrainEntry:
 
 
 @dataclass(frozen=True)
-class Progress:
+class EvaluationPoint:
     """An evaluation under the training's distribution on the way.
 
     Attributes:
@@ -90,10 +90,10 @@ class Training:
     policy: Policy
     algorithm: str
     history: tuple[TrainEntry, ...]
-    evaluations: tuple[Progress, ...]
-    training: Evaluation
-    nominal: Evaluation | None
-    target: Evaluation | None
+    evaluations: tuple[EvaluationPoint, ...]
+    training: Returns
+    nominal: Returns | None
+    target: Returns | None
     steps: int
     episodes: int
     diverged: int
@@ -108,20 +108,15 @@ class Training:
     def document(self) -> dict[str, Any]:
         """Return the training as plain data."""
         worlds = {"distribution": self.training, "nominal": self.nominal, "target": self.target}
+        same = ("algorithm", "steps", "episodes", "seconds", "diverged", "seed", "stop_reason")
         return {
             "schema": SCHEMA,
-            "algorithm": self.algorithm,
+            **{name: getattr(self, name) for name in same},
             "evaluation": {k: None if e is None else e.document() for k, e in worlds.items()},
-            "steps": self.steps,
-            "episodes": self.episodes,
-            "seconds": self.seconds,
             "simulating_seconds": self.simulating,
             "learning_seconds": self.learning,
-            "diverged": self.diverged,
             "repaired_steps": self.repaired,
             "skipped_updates": self.skipped,
-            "seed": self.seed,
-            "stop_reason": self.stop_reason,
             "distribution": self.policy.distribution,
             "evaluations": [asdict(e) for e in self.evaluations],
             "returns": [
@@ -136,8 +131,8 @@ def train(
     *,
     checkpoint: Path | None = None,
     resume: bool = False,
-    on_progress: Callable[[TrainEntry, Progress | None], None] | None = None,
-    on_start: Callable[[Sequence[TrainEntry], Sequence[Progress]], None] | None = None,
+    on_progress: Callable[[TrainEntry, EvaluationPoint | None], None] | None = None,
+    on_start: Callable[[Sequence[TrainEntry], Sequence[EvaluationPoint]], None] | None = None,
 ) -> Training:
     """Train a policy under the problem's distribution.
 
@@ -174,7 +169,7 @@ def check_training(problem: TrainingProblem) -> None:
         InputError: too few steps, or a task, parameters, effects and a backend that do not fit each other.
     """
     settings = problem.settings
-    per_iteration = settings.num_envs * (settings.horizon if isinstance(settings, PPOSettings) else 1)
+    per_iteration = settings.num_envs * settings.horizon
     if per_iteration > settings.steps:
         raise InputError(
             f"train.steps: {settings.steps} given, but one iteration takes {per_iteration} "
@@ -191,31 +186,34 @@ def check_training(problem: TrainingProblem) -> None:
 class _Run:
     """A training that is under way."""
 
+    #: Numbers that a resumed run goes on with.
+    counters = ("steps", "iterations", "stride", "simulating", "learning")
+
     def __init__(self, problem: TrainingProblem, checkpoint: Path | None) -> None:
         self.problem, settings = problem, problem.settings
         self.env = problem.env(problem.training, settings.num_envs, problem.config.seed)
         self.policy = _fresh_policy(problem)
-        self.learner = _make_learner(problem, self.policy)
+        self.learner = make_learner(self.policy, len(problem.training.space), settings)
         self.collector = Collector(self.env, self.policy.to_action)
-        self.per_iteration = settings.num_envs * self.learner.horizon
+        self.per_iteration = settings.num_envs * settings.horizon
         self.checkpoints = Checkpoints(checkpoint, problem.fingerprint, settings.checkpoint_seconds)
         self.steps, self.iterations, self.stride = 0, 0, 1
-        self.spent, self.simulating, self.learning = 0.0, 0.0, 0.0
+        self.simulating, self.learning = 0.0, 0.0
         self.history: list[TrainEntry] = []
-        self.evaluations: list[Progress] = []
+        self.evaluations: list[EvaluationPoint] = []
         self.best: tuple[float, dict[str, torch.Tensor]] | None = None
-        self.begun = time.monotonic()
+        self.begun = time.monotonic()  # of a resumed run as if it had never been interrupted
 
     @property
     def done(self) -> bool:
         """Whether no further iteration fits into the steps."""
         return self.steps + self.per_iteration > self.problem.settings.steps
 
-    def iterate(self) -> tuple[TrainEntry, Progress | None]:
+    def iterate(self) -> tuple[TrainEntry, EvaluationPoint | None]:
         """Collect, learn, evaluate if it is time, and keep the state if it is time."""
         settings = self.problem.settings
         before, begun = self.steps, time.monotonic()
-        rollout = self.collector.collect(self.learner.act, self.learner.horizon)
+        rollout = self.collector.collect(self.learner.act, settings.horizon)
         collected = time.monotonic()
         scalars = self.learner.update(rollout, before / settings.steps)
         self.simulating += collected - begun
@@ -231,25 +229,32 @@ class _Run:
         return entry, evaluation
 
     def result(self) -> Training:
-        """Evaluate the best policy in all worlds, in episodes it has not been chosen by."""
+        """Evaluate the best policy in all worlds, in episodes that did not choose it."""
         assert self.best is not None
         problem = self.problem
         self.policy.load_state_dict(self.best[1])
         self.policy.eval()
 
-        def found(world: World | None, number: int) -> Evaluation | None:
-            return None if world is None else self._episodes(world, number)
-
-        training = self._episodes(problem.training, 1)
-        nominal, target = found(problem.nominal, 2), found(problem.target, 3)
+        nominal, target = problem.nominal, problem.target
         return Training(
-            policy=self.policy, algorithm=problem.algorithm, history=tuple(self.history),
-            evaluations=tuple(self.evaluations), training=training, nominal=nominal, target=target, steps=self.steps,
-            episodes=self.collector.episodes, diverged=int(self.env.num_diverged),
+            policy=self.policy,
+            algorithm=problem.algorithm,
+            history=tuple(self.history),
+            evaluations=tuple(self.evaluations),
+            training=self._episodes(problem.training, 1),
+            nominal=None if nominal is None else self._episodes(nominal, 2),
+            target=None if target is None else self._episodes(target, 3),
+            steps=self.steps,
+            episodes=self.collector.episodes,
+            diverged=int(self.env.num_diverged),
             repaired=int(self.env.num_repaired),
-            skipped=self.learner.skipped, seconds=self._seconds(), simulating=self.simulating, learning=self.learning,
-            seed=problem.config.seed, stop_reason="all steps are done",
-        )  # fmt: skip
+            skipped=self.learner.skipped,
+            seconds=self._seconds(),
+            simulating=self.simulating,
+            learning=self.learning,
+            seed=problem.config.seed,
+            stop_reason="all steps are done",
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the rest of the run depends on."""
@@ -259,8 +264,8 @@ class _Run:
             "collector": self.collector.state_dict(),
             "random": torch.get_rng_state(),
             "random_device": torch.cuda.get_rng_state(device) if device.startswith("cuda") else None,
-            "counters": [self.steps, self.iterations, self.stride],
-            "seconds": [self._seconds(), self.simulating, self.learning],
+            "counters": {name: getattr(self, name) for name in self.counters},
+            "seconds": self._seconds(),
             "history": [asdict(e) for e in self.history],
             "evaluations": [asdict(e) for e in self.evaluations],
             "best": None if self.best is None else list(self.best),
@@ -273,28 +278,28 @@ class _Run:
             return
         self.learner.load_state_dict(state["learner"])
         self.collector.load_state_dict(state["collector"])
-        self.steps, self.iterations, self.stride = state["counters"]
-        self.spent, self.simulating, self.learning = state["seconds"]
+        for name, count in state["counters"].items():
+            setattr(self, name, count)
+        self.begun -= state["seconds"]
         self.history = [TrainEntry(**e) for e in state["history"]]
-        self.evaluations = [Progress(**e) for e in state["evaluations"]]
+        self.evaluations = [EvaluationPoint(**e) for e in state["evaluations"]]
         self.best = None if state["best"] is None else (state["best"][0], state["best"][1])
         torch.set_rng_state(state["random"])
         if state["random_device"] is not None:
             torch.cuda.set_rng_state(state["random_device"], self.problem.device)
 
-    def _evaluate(self) -> Progress:
+    def _evaluate(self) -> EvaluationPoint:
         """Evaluate under the training's distribution, and keep the policy if it is the best."""
         found = self._episodes(self.problem.training, 0)
         score = found.mean if math.isfinite(found.mean) else -math.inf
         better = self.best is None or score > self.best[0]
         if better:
             self.best = (score, {k: v.detach().cpu().clone() for k, v in self.policy.state_dict().items()})
-        progress = Progress(self.steps, found.mean, found.std, better)
-        self.evaluations.append(progress)
-        return progress
+        self.evaluations.append(EvaluationPoint(self.steps, found.mean, found.std, better))
+        return self.evaluations[-1]
 
-    def _episodes(self, world: World, number: int) -> Evaluation:
-        """Episodes of the policy as it is; the same starts and parameters for the same number."""
+    def _episodes(self, world: World, number: int) -> Returns:
+        """Episodes of the policy as it is; the same initial states and parameters for the same number."""
         seed = ((self.problem.config.seed * 4 + number) * 1_000_003 + 17) % 2**63
         with _own_random_numbers(seed, self.problem.device):
             return evaluate(self.policy, self.problem.env(world, self.problem.settings.episodes, seed % 2**31))
@@ -302,11 +307,14 @@ class _Run:
     def _entry(self, scalars: dict[str, float]) -> TrainEntry:
         returns, lengths = self.collector.returns, self.collector.lengths
         return TrainEntry(
-            steps=self.steps, seconds=self._seconds(), episodes=self.collector.episodes,
-            mean_return=sum(returns) / len(returns) if returns else float("nan"),
-            mean_length=sum(lengths) / len(lengths) if lengths else float("nan"),
-            diverged=int(self.env.num_diverged), scalars=scalars,
-        )  # fmt: skip
+            steps=self.steps,
+            seconds=self._seconds(),
+            episodes=self.collector.episodes,
+            mean_return=sum(returns) / len(returns) if returns else math.nan,
+            mean_length=sum(lengths) / len(lengths) if lengths else math.nan,
+            diverged=int(self.env.num_diverged),
+            scalars=scalars,
+        )
 
     def _remember(self, entry: TrainEntry) -> None:
         """Add an entry to the history; of very many, every second, fourth, ... is kept."""
@@ -317,29 +325,30 @@ class _Run:
             self.stride *= 2
 
     def _seconds(self) -> float:
-        return self.spent + time.monotonic() - self.begun
+        return time.monotonic() - self.begun
 
 
 def _fresh_policy(problem: TrainingProblem) -> Policy:
     settings, task = problem.settings, problem.training.task
-    low, high = (torch.as_tensor(x, dtype=torch.float32) for x in (task.action_low, task.action_high))
     architecture = {
-        "num_observations": task.num_observations, "num_actions": len(low), "hidden": list(settings.hidden),
-        "activation": settings.activation, "head": "tanh" if isinstance(settings, SACSettings) else "normal",
-        "initial_std": settings.initial_std if isinstance(settings, PPOSettings) else 1.0,
-    }  # fmt: skip
-    policy = make_policy(architecture, config=problem.config.document(), distribution=problem.distribution)
-    policy.low.copy_(low)
-    policy.high.copy_(high)
+        "num_observations": task.num_observations,
+        "num_actions": len(task.action_low),
+        "hidden": list(settings.hidden),
+        "activation": settings.activation,
+        "head": settings.head,
+        "initial_std": settings.initial_std,
+    }
+    policy = Policy(architecture, config=problem.config.document(), distribution=problem.distribution)
+    policy.low.copy_(torch.as_tensor(task.action_low, dtype=torch.float32))
+    policy.high.copy_(torch.as_tensor(task.action_high, dtype=torch.float32))
     return policy.to(problem.device)
 
 
-def _make_learner(problem: TrainingProblem, policy: Policy) -> Learner:
-    settings, width = problem.settings, len(problem.training.space)
+def make_learner(policy: Policy, num_parameters: int, settings: Settings) -> Learner:
+    """Return what improves a policy by the settings' algorithm."""
     if isinstance(settings, SACSettings):
-        return SAC(policy, width, num_envs=settings.num_envs, settings=settings)
-    assert isinstance(settings, PPOSettings)
-    return PPO(policy, width, num_envs=settings.num_envs, settings=settings)
+        return SAC(policy, num_parameters, settings)
+    return PPO(policy, num_parameters, settings)
 
 
 @contextlib.contextmanager

@@ -1,20 +1,22 @@
 """Simulation-based calibration: how often the interval of a fitted distribution holds what it should.
 
-Logs are simulated under known parameters, with the starts and actions of a given log, and fitted. Two questions:
+Logs are simulated under known parameters, with the initial states and actions of a given log, and fitted. Two
+questions:
 
 ``fixed``    one vector of parameters holds throughout, drawn from the search box: is it inside the interval?
 ``varying``  every transition has parameters of its own, drawn around such a vector: which share is inside?
 
-In both, starts are exact and the ends have noise. A method that says how uncertain a fixed value is should pass the
-first, one that says how much a value varies the second.
+In both, initial states are exact and the ends have noise. A method that says how uncertain a fixed value is should pass
+the first, one that says how much a value varies the second.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 import scipy.special
@@ -25,6 +27,7 @@ from dropo_torch.data.trajectory import make_transitions
 from dropo_torch.distribution import SearchBox, to_values
 from dropo_torch.fit import Fit
 from dropo_torch.problem import Problem
+from dropo_torch.studies.study import grouped
 
 Kind = Literal["fixed", "varying"]
 KINDS: tuple[Kind, ...] = ("fixed", "varying")
@@ -33,18 +36,36 @@ LEVELS = (0.5, 0.9)
 _INNER = 0.6
 #: Draws of a mixture of which its quantiles are taken.
 _DRAWS = 20_000
-#: Deviation of the parameters of ``varying`` logs, as a share of the search width.
+#: Standard deviation of the parameters of ``varying`` logs, as a share of the search width.
 SPREAD = 0.1
 
 
 @dataclass(frozen=True)
-class Trial:
-    """One fit of one simulated log.
+class CalibrationCell:
+    """One fit of one simulated log that is to be made.
 
     Attributes:
         kind: what the log is.
-        method: of the fit.
-        log: number of the log.
+        method: name of the method that fits it.
+        log: number of the log, which seeds it.
+    """
+
+    kind: Kind
+    method: str
+    log: int
+
+    @property
+    def name(self) -> str:
+        """The cell's file, without suffix."""
+        return f"{self.log:04d}-{self.kind}-{re.sub('[^a-z0-9]+', '-', self.method)}"
+
+
+@dataclass(frozen=True)
+class CalibrationRun:
+    """One fit of one simulated log.
+
+    Attributes:
+        kind, method, log: as of its cell.
         inside: level → share of each parameter's true values inside its central interval, name → share.
         width: level → width of the interval as a share of the search box, name → share.
         error: of the mean, as a share of the search box, name → share.
@@ -60,10 +81,10 @@ class Trial:
 
 @dataclass(frozen=True)
 class Coverage:
-    """All trials of a method on one kind of log, for one parameter.
+    """All runs of a method on one kind of log, for one parameter.
 
     Attributes:
-        kind, method: as of the trials.
+        kind, method: as of the runs.
         parameter: name.
         level: of the intervals.
         covered: mean share inside, over logs.
@@ -84,12 +105,12 @@ class Coverage:
 
 
 def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: int) -> Problem:
-    """Return the problem with a log simulated under known parameters, from its episodes' starts and actions.
+    """Return the problem with a log simulated under known parameters, from its episodes' initial states and actions.
 
     Args:
-        problem: whose log gives starts and actions; without effects that remember.
+        problem: whose log gives initial states and actions; without effects that remember.
         truths: parameters of each transition, in units, ``(T, d)``.
-        noise: deviation of the noise on each observed column of the ends of transitions, ``(n,)``.
+        noise: standard deviation of the noise on each observed column of the ends of transitions, ``(n,)``.
         seed: of the noise.
     """
     log, observation, simulator = problem.trajectories, problem.observation, problem.simulator
@@ -132,8 +153,8 @@ def draw_truths(problem: Problem, kind: Kind, seed: int) -> np.ndarray:
 def interval(found: Fit, level: float) -> tuple[np.ndarray, np.ndarray]:
     """Return each parameter's central interval, in units, ``(d,)`` each.
 
-    Of a mixture it is the mixture's own, of a Laplace posterior the normal's, of all others that of the law which draws
-    follow.
+    Of a mixture it is the mixture's own, of a Laplace posterior the normal's, of all others that of the
+    distribution which draws follow.
     """
     distribution = found.distribution
     if "mixture" in found.extras:
@@ -150,69 +171,31 @@ def interval(found: Fit, level: float) -> tuple[np.ndarray, np.ndarray]:
     return low, high
 
 
-def try_method(problem: Problem, truths: np.ndarray, *, kind: Kind, name: str, log: int) -> Trial:
-    """Fit a simulated log by the problem's method and compare with the truth.
+def calibrate(cell: CalibrationCell, problem: Problem, *, noise: np.ndarray) -> CalibrationRun:
+    """Simulate a log, fit it and compare with the truth.
 
     Args:
-        problem: with the simulated log.
-        truths: in coordinates, ``(T, d)``.
-        kind: of the log.
-        name: what the method is called in the result.
-        log: number of the log.
+        cell: what is simulated and fitted.
+        problem: fits by the cell's method; its log gives initial states and actions.
+        noise: standard deviation on each observed column of the ends of transitions, ``(n,)``.
     """
-    fitted = fit_problem(problem)
-    found = fitted.distribution
-    values = to_values(truths, problem.space.is_log)
-    box = SearchBox.of(problem.space)
-    names = problem.space.names
+    space, box = problem.space, SearchBox.of(problem.space)
+    truths = draw_truths(problem, cell.kind, cell.log)
+    values = to_values(truths, space.is_log)
+    fitted = fit_problem(with_seed(synthesise(problem, values, noise, seed=cell.log), cell.log))
     inside, width = {}, {}
     for level in LEVELS:
         low, high = interval(fitted, level)
-        held = ((values >= low) & (values <= high)).mean(0)
-        share = (high - low) / (problem.space.high - problem.space.low)
-        inside[f"{level:g}"] = dict(zip(names, map(float, held), strict=True))
-        width[f"{level:g}"] = dict(zip(names, map(float, share), strict=True))
-    error = np.abs(found.mean - truths.mean(0)) / box.width
-    return Trial(kind, name, log, inside, width, dict(zip(names, map(float, error), strict=True)))
+        inside[f"{level:g}"] = space.named(((values >= low) & (values <= high)).mean(0))
+        width[f"{level:g}"] = space.named((high - low) / (space.high - space.low))
+    error = np.abs(fitted.distribution.mean - truths.mean(0)) / box.width
+    return CalibrationRun(cell.kind, cell.method, cell.log, inside, width, space.named(error))
 
 
-def calibrate(
-    problems: Callable[[str], Problem],
-    methods: Sequence[str],
-    *,
-    logs: Iterable[int],
-    noise: np.ndarray,
-    done: Iterable[Trial] = (),
-) -> list[Trial]:
-    """Fit every simulated log by every method.
-
-    Args:
-        problems: name of a method → the problem that fits by it; their logs give starts and actions.
-        methods: names.
-        logs: numbers of the logs of each kind; the number seeds a log.
-        noise: deviation on each observed column of the ends of transitions, ``(n,)``.
-        done: trials of an interrupted run, which are not repeated.
-    """
-    trials = list(done)
-    known = {(t.kind, t.method, t.log) for t in trials}
-    given = {method: problems(method) for method in methods}
-    for log in logs:
-        for kind in KINDS:
-            for method in methods:
-                if (kind, method, log) in known:
-                    continue
-                truths = draw_truths(given[method], kind, log)
-                values = to_values(truths, given[method].space.is_log)
-                made = with_seed(synthesise(given[method], values, noise, seed=log), log)
-                trials.append(try_method(made, truths, kind=kind, name=method, log=log))
-    return trials
-
-
-def coverages(trials: Sequence[Trial]) -> list[Coverage]:
+def coverages(runs: Sequence[CalibrationRun]) -> list[Coverage]:
     """Return how much each method covered, by kind of log, parameter and level."""
     rows = []
-    for kind, method in dict.fromkeys((t.kind, t.method) for t in trials):
-        own = [t for t in trials if (t.kind, t.method) == (kind, method)]
+    for (kind, method), own in grouped(runs, lambda run: (run.kind, run.method)).items():
         for parameter in own[0].error:
             for level in (f"{level:g}" for level in LEVELS):
                 share = float(np.mean([t.inside[level][parameter] for t in own]))
@@ -223,13 +206,8 @@ def coverages(trials: Sequence[Trial]) -> list[Coverage]:
 
 
 def wilson(share: float, count: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a probability, from the share of so many independent trials."""
+    """Return Wilson's 95 % interval of a probability, from the share of so many independent runs."""
     z = 1.96
     centre = (share + z * z / (2 * count)) / (1 + z * z / count)
     reach = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count**2))
     return max(0.0, centre - reach), min(1.0, centre + reach)
-
-
-def plain(trial: Trial) -> dict[str, Any]:
-    """Return a trial as plain data."""
-    return asdict(trial)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -13,7 +13,7 @@ import numpy as np
 from dropo_torch.errors import InputError, choices
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
-from dropo_torch.support.files import write_atomically
+from dropo_torch.studies.store import Store
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/compare/1"
@@ -109,19 +109,16 @@ def compare(
     for method in methods:
         if method not in METHODS:
             raise InputError(f"methods: unknown {method!r}" + choices(method, METHODS))
-    kept = _stored(store, fingerprint)
-    raw: list[dict[str, Any]] = []
-    for method in methods:
-        for seed in seeds:
-            key = f"{method}/{seed}"
-            if key not in kept:
-                optimizer, backend = method.split("-")
-                kept[key] = _record(method, seed, *fit_with(optimizer, backend, seed))
-                if store is not None:
-                    write_atomically(store, json.dumps({"fingerprint": fingerprint, "runs": kept}).encode())
-                if on_run is not None:
-                    on_run(_judge(kept[key], reference or kept[key]["mean"]))
-            raw.append(kept[key])
+    kept = Store(store, fingerprint, "comparison")
+
+    def run(method: str, seed: int) -> dict[str, Any]:
+        optimizer, backend = method.split("-")
+        found = _record(method, seed, *fit_with(optimizer, backend, seed))
+        if on_run is not None:
+            on_run(_judge(found, reference or found["mean"]))
+        return found
+
+    raw = [kept.get(f"{m}/{seed}", functools.partial(run, m, seed)) for m in methods for seed in seeds]
     best = max(raw, key=lambda r: r["log_likelihood"])
     values = reference or best["mean"]
     known = "the values the log was recorded with" if reference else f"the means of {best['method']}, the likeliest run"
@@ -175,18 +172,3 @@ def _reached(history: np.ndarray, error: np.ndarray, limit: float) -> int | None
     outside = np.flatnonzero(error > limit)
     first = outside[-1] + 1 if outside.size else 0
     return int(history[first, 0]) if first < len(history) else None
-
-
-def _stored(store: Path | None, fingerprint: str) -> dict[str, dict[str, Any]]:
-    if store is None or not store.is_file():
-        return {}
-    try:
-        content = json.loads(store.read_text())
-        owner, runs = content["fingerprint"], dict(content["runs"])
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"resume: {store} is no record of a comparison ({error}); start again without --resume"
-        ) from None
-    if owner != fingerprint:
-        raise InputError(f"resume: {store} belongs to another config or log; start again without --resume")
-    return runs

@@ -1,11 +1,10 @@
 """Choosing ε by the elbow: raise it until the mean simulated next state fits no better.
 
-Or, where the starts of transitions are as noisy as their ends: raise the noise of both until the log is no likelier.
+Or, where initial states are as noisy as the ends of transitions: raise the noise of both until the log is no likelier.
 """
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -17,13 +16,13 @@ import numpy as np
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
-from dropo_torch.support.files import write_atomically
+from dropo_torch.studies.store import Store
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/sweep/1"
 #: An error within this share of the smallest one counts as no larger.
 TOLERANCE = 0.05
-#: ε beside a noise of the starts and ends, as a share of its variance: the noise stands for all.
+#: ε beside a noise of initial states and ends, as a share of its variance: the noise stands for all.
 NEGLIGIBLE = 1e-3
 
 
@@ -36,7 +35,8 @@ class SweepPoint:
         mse: mean squared difference between measured and simulated mean.
         log_likelihood: in nats.
         mean, std: the fitted distribution, name → value in its unit.
-        robust_log_likelihood: of a sweep with noisy starts: the one that may be compared between noises, in nats.
+        robust_log_likelihood: of a sweep with noisy initial states: the one that may be compared between noises, in
+            nats.
     """
 
     epsilon: float
@@ -66,9 +66,9 @@ class Sweep:
 
     Attributes:
         points: the fits.
-        chosen: the ε to use; with noisy starts the variance of the noise.
+        chosen: the ε to use; with noisy initial states the variance of the noise.
         reason: why, in words.
-        noisy_starts: whether ε stood for the variance of starts and ends alike.
+        noisy_starts: whether ε stood for the variance of initial states and ends alike.
     """
 
     points: tuple[SweepPoint, ...]
@@ -145,8 +145,8 @@ def likeliest(epsilons: Sequence[float], log_likelihoods: Sequence[float]) -> tu
         return chosen, f"the log still becomes likelier at the largest value tried, {chosen:g}: sweep further"
     below, above = (values[best] - values[i] for i in (best - 1, best + 1))
     return chosen, (
-        f"with noise of variance {chosen:g} on starts and ends the log is likeliest, by {below:.3g} nats against "
-        f"{epsilons[best - 1]:g} and {above:.3g} against {epsilons[best + 1]:g}"
+        f"with noise of variance {chosen:g} on initial states and ends the log is likeliest, by {below:.3g} nats "
+        f"against {epsilons[best - 1]:g} and {above:.3g} against {epsilons[best + 1]:g}"
     )
 
 
@@ -196,13 +196,13 @@ def sweep_epsilon(
     fingerprint: str = "",
     store: Path | None = None,
 ) -> Sweep:
-    """Fit at each ε and choose by the elbow, or with noisy starts by the robust log-likelihood.
+    """Fit at each ε and choose by the elbow, or with noisy initial states by the robust log-likelihood.
 
     Args:
         point_at: fits at an ε.
         epsilons: the values to try.
-        noisy_starts: whether ε stands for the variance of starts and ends alike; its points are then judged by their
-            robust log-likelihood.
+        noisy_starts: whether ε stands for the variance of initial states and ends alike; its points are then judged by
+            their robust log-likelihood.
         fingerprint: identifies config and log.
         store: file in which finished fits are kept; those of the same fingerprint are not repeated.
 
@@ -210,36 +210,15 @@ def sweep_epsilon(
         InputError: fewer than three values, or one that is not positive.
     """
     values = rising(epsilons)
-    owner = fingerprint + ("-noisy-starts" if noisy_starts else "")
-    done = _stored(store, owner)
-    for value in values:
-        if value in done:
-            continue
-        done[value] = point_at(value)
-        if store is not None:
-            content = {"fingerprint": owner, "points": [asdict(p) for p in done.values()]}
-            write_atomically(store, json.dumps(content).encode())
-    points = tuple(done[value] for value in values)
+    kept = Store(store, fingerprint + ("-noisy-starts" if noisy_starts else ""), "sweep")
+
+    def point(value: float) -> SweepPoint:
+        return SweepPoint(**kept.get(repr(value), lambda: asdict(point_at(value))))
+
+    points = tuple(map(point, values))
     if noisy_starts:
         robust = [math.nan if p.robust_log_likelihood is None else p.robust_log_likelihood for p in points]
         chosen, reason = likeliest(values, robust)
     else:
         chosen, reason = elbow(values, [p.mse for p in points])
     return Sweep(points, chosen, reason, noisy_starts)
-
-
-def _stored(store: Path | None, fingerprint: str) -> dict[float, SweepPoint]:
-    """Finished fits of an earlier, interrupted sweep of the same config and log."""
-    if store is None or not store.is_file():
-        return {}
-    try:
-        content = json.loads(store.read_text())
-        owner, points = content["fingerprint"], [SweepPoint(**p) for p in content["points"]]
-    except (ValueError, KeyError, TypeError) as error:
-        raise InputError(f"resume: {store} is no record of a sweep ({error}); start again without --resume") from None
-    if owner != fingerprint:
-        raise InputError(
-            f"resume: {store} belongs to another config or log, or to another kind of sweep; "
-            "start again without --resume"
-        )
-    return {p.epsilon: p for p in points}

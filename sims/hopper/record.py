@@ -81,7 +81,7 @@ def record(
         variant: one of :data:`VARIANTS`.
         episodes: number of episodes.
         steps: transitions of each.
-        seed: seeds policy, starts, noise and masses.
+        seed: seeds policy, initial states, noise and masses.
         masses: name → kg of the recorded Hopper; the model's own where absent.
 
     Raises:

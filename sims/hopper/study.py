@@ -1,13 +1,12 @@
 """The simulated Hopper experiments of the DROPO paper, redone: ``dropo reproduce hopper``.
 
-Every fit is a *cell* with a file of its own, so that an interrupted study loses at most one of them. The logs are
-recorded here (:mod:`dropo_sims.hopper.record`): compare numbers with the paper's in kind, not digit by digit.
+The logs are recorded here (:mod:`dropo_sims.hopper.record`): compare numbers with the paper's in kind, not digit by
+digit.
 """
 
 from __future__ import annotations
 
 import functools
-import json
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -20,23 +19,18 @@ import torch
 from dropo_torch.baselines import fit_problem
 from dropo_torch.baselines.density import require_sbi
 from dropo_torch.config import make_config
-from dropo_torch.errors import InputError
 from dropo_torch.problem import Problem, make_problem
+from dropo_torch.studies.study import run_cells
 from dropo_torch.studies.sweep import NEGLIGIBLE, robust_log_likelihood
-from dropo_torch.support.files import write_atomically
-from dropo_torch.support.parallel import in_parallel
 
-from . import SIM
-from .record import HopperLog, record
+from . import LINKS, SIM
+from .record import NOISE_VARIANCE, HopperLog, record
 from .study_tables import write_results
 
-SCHEMA = "dropo-torch/study/1"
 #: Methods of Table 1, with BayesSim's features.
 METHODS = (("dropo", ""), ("droid", ""), ("bayessim", "mdnn"), ("bayessim", "mdrff"))
 #: What the torso's mass is not among in the ``unmodeled`` variant.
 UNMODELED = "torso_mass"
-#: Variance of the noise that ``record`` puts on the ``noisy`` variant.
-NOISE_VARIANCE = 1e-5
 
 
 @dataclass(frozen=True)
@@ -95,11 +89,11 @@ class Cell:
         method: of the fit.
         seed: of the log and the fit.
         epsilon: ε.
-        knows_noise: whether the fit is given the deviation of the noise.
+        knows_noise: whether the fit is given the standard deviation of the noise.
         noise: variance of noise put on a noiseless log, on the end of a transition independently of the next one's
-            start; ``None`` for the variant's own, whose transitions share a measurement.
-        ends_only: whether that noise is on the ends of transitions alone, not on their starts.
-        noisy_starts: whether ε stands for the variance of every measurement, of the starts, too.
+            initial state; ``None`` for the variant's own, whose transitions share a measurement.
+        ends_only: whether that noise is on the ends of transitions alone, not on their initial states.
+        noisy_starts: whether ε stands for the variance of every measurement, of the initial states, too.
         size: transitions of a bootstrap sample; ``None`` for the whole log.
         resample: number of the bootstrap sample.
         optimizer: of DROPO.
@@ -157,14 +151,8 @@ def run_study(
     """
     require_sbi()
     plan = plan or (REDUCED if reduced else Plan())
-    _claim(out, plan, resume=resume)
-    cells = all_cells(plan)
-    waiting = [cell for cell in cells if not _path(out, cell).exists()]
-    report(f"{len(cells) - len(waiting)} of {len(cells)} fits are done", 1 - len(waiting) / len(cells))
-    work = functools.partial(_write_cell, plan=plan, out=out)
-    for number, (cell, _) in enumerate(in_parallel(work, waiting, workers), len(cells) - len(waiting) + 1):
-        report(f"{number} of {len(cells)}: {cell.name}", number / len(cells))
-    results = [{**json.loads(_path(out, cell).read_text()), "cell": asdict(cell)} for cell in cells]
+    run = functools.partial(run_cell, plan=plan, logs=out / "logs")
+    results = run_cells(out, plan, all_cells(plan), run, resume=resume, workers=workers, report=report)
     report("tables and figures", 1.0)
     return write_results(out, results, asdict(plan))
 
@@ -202,63 +190,54 @@ def all_cells(plan: Plan) -> list[Cell]:
     ]
 
 
-def _path(out: Path, cell: Cell) -> Path:
-    return out / "cells" / f"{cell.name}.json"
-
-
-def _write_cell(cell: Cell, *, plan: Plan, out: Path, threads: int) -> None:
-    found = run_cell(cell, plan, out / "logs", threads=threads)
-    write_atomically(_path(out, cell), json.dumps(found, indent=1).encode() + b"\n")
-
-
-def run_cell(cell: Cell, plan: Plan, logs: Path, *, threads: int = 0) -> dict[str, Any]:
+def run_cell(cell: Cell, *, plan: Plan, logs: Path, threads: int = 0) -> dict[str, Any]:
     """Record the cell's log, fit it, and return what was found beside what is true."""
-    sized = plan
     if cell.block == "noise":
-        sized = replace(plan, steps=plan.noise_steps)
+        plan = replace(plan, steps=plan.noise_steps)
     if cell.block == "cma":
-        sized = replace(plan, steps=plan.cma_steps, samples=plan.cma_samples)
-    if cell.size is not None:
-        sized = replace(plan, steps=-(-max(plan.sizes) // plan.episodes))
-    log = _log(cell, sized)
+        plan = replace(plan, steps=plan.cma_steps, samples=plan.cma_samples)
+    log = _log(cell, plan)
     path = logs / f"{cell.name}.npz"
     path.parent.mkdir(parents=True, exist_ok=True)
     log.save(path)
-    options = {
-        "droid": {"budget": plan.droid_budget},
-        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
-    }
-    parameters = {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED}
-    noisy = cell.knows_noise or cell.noisy_starts
-    document = {
-        "sim": "hopper",
-        "data": str(path.resolve()),
-        "backend": plan.backend,
-        "parameters": parameters,
-        "method": cell.method,
-        "method_options": options.get(cell.method, {}),
-        **({"optimizer": "cma", "budget": plan.cma_budget} if cell.optimizer == "cma" else {}),
-        "samples": sized.samples,
-        "seed": cell.seed,
-        "threads": threads,
-        "epsilon": cell.epsilon * (NEGLIGIBLE if cell.noisy_starts else 1),
-        **({"noise": (NOISE_VARIANCE if cell.knows_noise else cell.epsilon) ** 0.5} if noisy else {}),
-    }
-    problem = make_problem(make_config(document))
+    problem = make_problem(make_config({**_document(cell, plan), "data": str(path.resolve()), "threads": threads}))
     begun = time.monotonic()
     fit = fit_problem(problem)
     seconds = time.monotonic() - begun
     path.unlink()
-    realised = {f"{link}_mass": log.masses[:, i] for i, link in enumerate(("torso", "thigh", "leg", "foot"))}
+    truth = {f"{link}_mass": (float(m.mean()), float(m.std())) for link, m in zip(LINKS, log.masses.T, strict=True)}
     return {
         "cell": asdict(cell),
-        "truth": {n: {"mean": float(m.mean()), "std": float(m.std())} for n, m in realised.items()},
-        "mse_at_truth": mse_at(problem, {n: float(m.mean()) for n, m in realised.items()}),
+        "truth": {name: {"mean": mean, "std": std} for name, (mean, std) in truth.items()},
+        "mse_at_truth": mse_at(problem, {name: mean for name, (mean, _) in truth.items()}),
         **({"robust_log_likelihood": robust_log_likelihood(problem.objective, fit)} if cell.noisy_starts else {}),
         "transitions": len(log.actions),
         "wall_seconds": round(seconds, 3),
         "fit": fit.document(),
     }
+
+
+def _document(cell: Cell, plan: Plan) -> dict[str, Any]:
+    """The config of a cell's fit, but for its log."""
+    options = {
+        "droid": {"budget": plan.droid_budget},
+        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
+    }
+    document = {
+        "sim": "hopper",
+        "backend": plan.backend,
+        "parameters": {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED},
+        "method": cell.method,
+        "method_options": options.get(cell.method, {}),
+        "samples": plan.samples,
+        "seed": cell.seed,
+        "epsilon": cell.epsilon * (NEGLIGIBLE if cell.noisy_starts else 1),
+    }
+    if cell.optimizer == "cma":
+        document |= {"optimizer": "cma", "budget": plan.cma_budget}
+    if cell.knows_noise or cell.noisy_starts:
+        document["noise"] = (NOISE_VARIANCE if cell.knows_noise else cell.epsilon) ** 0.5
+    return document
 
 
 def mse_at(problem: Problem, values: Mapping[str, float]) -> float:
@@ -270,36 +249,21 @@ def mse_at(problem: Problem, values: Mapping[str, float]) -> float:
 
 def _log(cell: Cell, plan: Plan) -> HopperLog:
     """The log of a cell."""
-    log = record(variant=cell.variant, episodes=plan.episodes, steps=plan.steps, seed=cell.seed)
+    steps = plan.steps if cell.size is None else -(-max(plan.sizes) // plan.episodes)
+    log = record(variant=cell.variant, episodes=plan.episodes, steps=steps, seed=cell.seed)
     generator = np.random.default_rng([cell.seed, cell.resample, 17])
     if cell.noise is not None:
-        deviation, shape = np.sqrt(cell.noise), log.observations.shape
-        ends = log.next_observations + deviation * generator.standard_normal(shape)
-        starts = log.observations + (0.0 if cell.ends_only else deviation) * generator.standard_normal(shape)
+        sigma, shape = np.sqrt(cell.noise), log.observations.shape
+        ends = log.next_observations + sigma * generator.standard_normal(shape)
+        starts = log.observations + (0.0 if cell.ends_only else sigma) * generator.standard_normal(shape)
         log = replace(log, observations=starts, next_observations=ends)
-    if cell.size is not None:
-        rows = generator.integers(0, len(log.actions), cell.size)  # a bootstrap sample: with replacement
-        log = HopperLog(
-            observations=log.observations[rows],
-            next_observations=log.next_observations[rows],
-            actions=log.actions[rows],
-            terminals=np.ones(cell.size, dtype=bool),
-            masses=log.masses,
-        )
-    return log
-
-
-def _claim(out: Path, plan: Plan, *, resume: bool) -> None:
-    """Mark the folder as this study's; refuse one that holds another's results."""
-    mark = out / "plan.json"
-    wanted = json.loads(json.dumps({"schema": SCHEMA, "plan": asdict(plan)}))
-    if mark.exists():
-        if not resume:
-            raise InputError(f"--out: {out} holds a study; add --resume to go on with it, or name another folder")
-        if json.loads(mark.read_text()) != wanted:
-            raise InputError(
-                f"resume: {out} holds a study of another size; name another folder, or give --reduced as at its start"
-            )
-    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise InputError(f"--out: {out} is not an empty folder; name another one")
-    write_atomically(mark, json.dumps(wanted, indent=2).encode() + b"\n")
+    if cell.size is None:
+        return log
+    rows = generator.integers(0, len(log.actions), cell.size)  # a bootstrap sample: with replacement
+    return HopperLog(
+        observations=log.observations[rows],
+        next_observations=log.next_observations[rows],
+        actions=log.actions[rows],
+        terminals=np.ones(cell.size, dtype=bool),
+        masses=log.masses,
+    )

@@ -25,7 +25,7 @@ def label(result: Result) -> str:
 
 
 def drawn_std(result: Result, parameter: str) -> float:
-    """Return the deviation of a fit's draws: they end two σ from the mean."""
+    """Return the standard deviation of a fit's draws: they end two σ from the mean."""
     return float(DRAWN_STD * result["fit"]["parameters"][parameter]["std"])
 
 
@@ -73,16 +73,14 @@ def _bell(mean: float, std: float, narrow: float) -> tuple[np.ndarray, np.ndarra
 
 
 def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
-    """Draw error and mean deviation against ε, a line a case, the ε chosen marked."""
+    """Draw error and mean standard deviation against ε, a line a case, the ε chosen marked."""
     figure = figures.new_figure(920, 320)
-    for i, (key, title) in enumerate((("mse", "mean squared error"), ("mean_std", "mean deviation (kg)"))):
+    for i, (key, title) in enumerate((("mse", "mean squared error"), ("mean_std", "mean standard deviation (kg)"))):
         axes = _part(figure, i, 2)
         for colour, row in zip(_LINES, rows, strict=False):
             noise = "" if row["noise_variance"] is None else f", ε of {row['stands_for']}"
-            axes.loglog(
-                row["epsilons"], row[key], color=colour, marker=".", linewidth=1.2,
-                label=row["case"] + noise if i == 0 else None,
-            )  # fmt: skip
+            words = row["case"] + noise if i == 0 else None
+            axes.loglog(row["epsilons"], row[key], color=colour, marker=".", linewidth=1.2, label=words)
             at = row["epsilons"].index(row["chosen"])
             axes.plot(row["chosen"], row[key][at], marker="o", markersize=8, markerfacecolor="none", color=colour)
         axes.set_xlabel("ε")
@@ -111,7 +109,7 @@ def against_noise(rows: Sequence[dict[str, Any]]) -> Any:
 
 
 def sizes(rows: Sequence[dict[str, Any]]) -> Any:
-    """Draw relative mean and deviation against the number of transitions, with bootstrap intervals."""
+    """Draw the error of the mean against the number of transitions, with bootstrap intervals."""
     cases = list(dict.fromkeys(r["case"] for r in rows))
     names = list(dict.fromkeys(r["parameter"] for r in rows))
     figure = figures.new_figure(460 * len(cases), 320)
@@ -123,10 +121,8 @@ def sizes(rows: Sequence[dict[str, Any]]) -> Any:
             y, low, high = (
                 100 * np.array([r[k] / r["truth"] - 1 for r in own]) for k in ("mean", "mean_low", "mean_high")
             )
-            axes.errorbar(
-                x, y, np.maximum([y - low, high - y], 0), color=colour, marker=".", linewidth=1.1, capsize=2,
-                label=name if i == 0 else None,
-            )  # fmt: skip
+            bars, words = np.maximum([y - low, high - y], 0), name if i == 0 else None
+            axes.errorbar(x, y, bars, color=colour, marker=".", linewidth=1.1, capsize=2, label=words)
         axes.set_xscale("log")
         axes.set_yscale("symlog", linthresh=0.1)
         axes.set_xlabel(f"transitions, {case}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -12,44 +12,22 @@ import numpy as np
 from dropo_torch.commands.folder import versions
 from dropo_torch.report import write_study_report
 from dropo_torch.report.figures import to_svg
+from dropo_torch.studies.study import SCHEMA, Finding, Section, findings_section, grouped, markdown
 from dropo_torch.studies.sweep import elbow, likeliest
 from dropo_torch.support.files import write_atomically, write_json
 
+from .record import NOISE_VARIANCE
 from .study_figures import Result, draw_all, drawn_std, label
 
-SCHEMA = "dropo-torch/study/1"
-#: A deviation below this share of the search box has collapsed to a point; one above the other is wide.
+#: A standard deviation below this share of the search box has collapsed to a point; one above the other is wide.
 COLLAPSED, WIDE = 1e-3, 1e-2
 CASES = {"point": "noiseless", "noisy": "noisy", "unmodeled": "unmodeled torso", "distribution": "masses redrawn"}
 
-#: Tables of which a figure shows the same.
-RECOVERY, SWEEPS, AGAINST_NOISE, SIZES = (
-    "Recovery of a distribution: mean ± std of draws", "Sweeps over ε", "ε against the noise", "Number of transitions",
-)  # fmt: skip
-FIGURES = {RECOVERY: "recovery.png", SWEEPS: "sweep.png", AGAINST_NOISE: "noise.png", SIZES: "size.png"}
-
+TITLE = "The paper's simulated Hopper"
 INTRODUCTION = (
     "Written by dropo reproduce hopper. The logs are recorded by this project, from slow random torques: "
     "compare with the paper in kind, not digit by digit."
 )
-
-
-@dataclass(frozen=True)
-class Finding:
-    """A qualitative finding of the paper, and what was measured about it."""
-
-    finding: str
-    holds: bool
-    measured: str
-
-
-@dataclass(frozen=True)
-class Section:
-    """A table with its title, in words."""
-
-    title: str
-    head: list[str]
-    rows: list[list[str]]
 
 
 def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) -> list[str]:
@@ -65,19 +43,19 @@ def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) ->
     }
     document = {"schema": SCHEMA, "plan": plan, "findings": [asdict(f) for f in findings], "tables": tables}
     write_json(out / "study.json", document)
-    page, figures = sections(tables, findings), draw_all(results, tables)
+    page, figures = [findings_section(findings), *sections(tables)], draw_all(results, tables)
     for name, figure in figures.items():
         figure.savefig(out / name, dpi=110, facecolor="white", metadata={"Software": None})
-    write_atomically(out / "tables.md", markdown(page).encode())
+    write_atomically(out / "tables.md", markdown(TITLE, INTRODUCTION, page).encode())
     write_study_report(
         out / "report.html",
-        title="The paper's simulated Hopper",
+        title=TITLE,
         lead=INTRODUCTION,
         tables=[(section.title, section.head, section.rows) for section in page],
-        figures={title: to_svg(figures[name], name) for title, name in FIGURES.items()},
+        figures={s.title: to_svg(figures[s.figure], s.figure) for s in page if s.figure},
         versions=versions(),
     )
-    return [f"{'holds' if f.holds else 'DOES NOT HOLD'}: {f.finding} ({f.measured})" for f in findings]
+    return [finding.sentence() for finding in findings]
 
 
 def pick(results: Iterable[Result], block: str, **wanted: Any) -> list[Result]:
@@ -88,14 +66,10 @@ def pick(results: Iterable[Result], block: str, **wanted: Any) -> list[Result]:
 def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
     """Return one row for each case, parameter and method: means over the seeds, and the range of the means."""
     rows = []
-    chosen = pick(results, block)
-    for variant in dict.fromkeys(r["cell"]["variant"] for r in chosen):
-        case = [r for r in chosen if r["cell"]["variant"] == variant]
+    for variant, case in grouped(pick(results, block), lambda r: r["cell"]["variant"]).items():
         for parameter in case[0]["fit"]["parameters"]:
-            for method in dict.fromkeys(label(r) for r in case):
-                own = [r for r in case if label(r) == method]
+            for method, own in grouped(case, label).items():
                 means = np.array([r["fit"]["parameters"][parameter]["mean"] for r in own])
-                stds = np.array([drawn_std(r, parameter) for r in own])
                 truths = np.array([r["truth"][parameter]["mean"] for r in own])
                 rows.append(
                     {
@@ -105,7 +79,7 @@ def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
                         "truth": float(truths.mean()),
                         "true_std": float(np.mean([r["truth"][parameter]["std"] for r in own])),
                         "mean": float(means.mean()),
-                        "std": float(stds.mean()),
+                        "std": float(np.mean([drawn_std(r, parameter) for r in own])),
                         "largest_error_percent": float(100 * np.max(np.abs(means / truths - 1))),
                         "mse": float(np.mean([r["fit"]["mse"] for r in own])),
                         "seeds": len(own),
@@ -116,10 +90,8 @@ def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
 
 def sweep_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     """Return one row for each sweep over ε, with the one chosen and, where there is noise, its variance."""
-    groups: dict[tuple[Any, ...], list[Result]] = {}
-    for r in results:
-        cell = r["cell"]
-        groups.setdefault((cell["variant"], cell["noise"], cell["ends_only"], cell["noisy_starts"]), []).append(r)
+    keys = ("variant", "noise", "ends_only", "noisy_starts")
+    groups = grouped(results, lambda r: tuple(r["cell"][key] for key in keys))
     rows = []
     for (variant, noise, ends_only, noisy_starts), group in groups.items():
         ordered = sorted(group, key=lambda r: r["cell"]["epsilon"])
@@ -129,7 +101,7 @@ def sweep_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
             chosen, reason = likeliest(epsilons, [r["robust_log_likelihood"] for r in ordered])
         else:
             chosen, reason = elbow(epsilons, errors)
-        true = noise if noise is not None else {"noisy": 1e-5}.get(variant)
+        true = NOISE_VARIANCE if noise is None and variant == "noisy" else noise
         caused = None if true is None else float(ordered[0]["mse_at_truth"])
         rows.append(
             {
@@ -156,25 +128,22 @@ def size_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     Another sample is inside that range with probability (n − 1) / (n + 1), ``level``.
     """
     rows = []
-    chosen = pick(results, "size")
-    for variant in dict.fromkeys(r["cell"]["variant"] for r in chosen):
-        for size in dict.fromkeys(r["cell"]["size"] for r in chosen):
-            group = [r for r in chosen if (r["cell"]["variant"], r["cell"]["size"]) == (variant, size)]
-            for parameter in group[0]["fit"]["parameters"]:
-                truth = group[0]["truth"][parameter]
-                row: dict[str, Any] = {
-                    "case": CASES[variant],
-                    "transitions": size,
-                    "parameter": parameter,
-                    "truth": truth["mean"],
-                    "true_std": truth["std"],
-                    "resamples": len(group),
-                    "level": (len(group) - 1) / (len(group) + 1),
-                }
-                means = [r["fit"]["parameters"][parameter]["mean"] for r in group]
-                for key, values in (("mean", means), ("std", [drawn_std(r, parameter) for r in group])):
-                    row |= {key: float(np.median(values)), f"{key}_low": min(values), f"{key}_high": max(values)}
-                rows.append(row)
+    groups = grouped(pick(results, "size"), lambda r: (r["cell"]["variant"], r["cell"]["size"]))
+    for (variant, size), group in groups.items():
+        for parameter, truth in group[0]["truth"].items():
+            row: dict[str, Any] = {
+                "case": CASES[variant],
+                "transitions": size,
+                "parameter": parameter,
+                "truth": truth["mean"],
+                "true_std": truth["std"],
+                "resamples": len(group),
+                "level": (len(group) - 1) / (len(group) + 1),
+            }
+            means = [r["fit"]["parameters"][parameter]["mean"] for r in group]
+            for key, values in (("mean", means), ("std", [drawn_std(r, parameter) for r in group])):
+                row |= {key: float(np.median(values)), f"{key}_low": min(values), f"{key}_high": max(values)}
+            rows.append(row)
     return rows
 
 
@@ -208,20 +177,20 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
             f"largest error of a mean {error['dropo']:.2g} % and {error['droid']:.2g} %",
         ),
         Finding(
-            "DROID's deviations collapse in every case",
+            "DROID's standard deviations collapse in every case",
             droid < COLLAPSED,
-            f"widest deviation {100 * droid:.2g} % of the search box",
+            f"widest standard deviation {100 * droid:.2g} % of the search box",
         ),
         Finding(
             "DROPO widens under the unmodeled torso",
             after > max(10 * before, COLLAPSED),
-            f"widest deviation {100 * before:.2g} % of the search box noiseless, {100 * after:.2g} % unmodeled",
+            f"widest standard deviation {100 * before:.2g} % of the search box without noise, {100 * after:.2g} % here",
         ),
         Finding(
             "BayesSim is wide in every case",
             wide > WIDE,
-            f"its widest parameter's deviation is {100 * wide:.2g} % of the search box or more; "
-            f"under the unmodeled torso means are up to {off:.2g} deviations off",
+            f"its widest parameter's standard deviation is {100 * wide:.2g} % of the search box or more; "
+            f"under the unmodeled torso means are up to {off:.2g} σ off",
         ),
     ]
     ends, every = "ends of transitions", "every measurement"
@@ -243,40 +212,28 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
     return found
 
 
-def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding]) -> list[Section]:
+def sections(tables: dict[str, list[dict[str, Any]]]) -> list[Section]:
     """Return the tables as people read them."""
-    found = [[f.finding, "yes" if f.holds else "no", f.measured] for f in findings]
-    sweeps = {
-        name: [
-            [r["case"], _number(r["noise_variance"]), r["noise_on"] or "–", r["stands_for"], _number(r["chosen"])]
-            + [_number(r[k]) for k in ("ratio", "caused_variance", "caused_ratio")]
-            for r in tables[name]
-        ]
-        for name in ("sweep", "noise")
-    }
     sizes = [
         [r["case"], str(r["transitions"]), r["parameter"], _number(r["truth"])]
         + [f"{_number(r[k])} [{_number(r[k + '_low'])}, {_number(r[k + '_high'])}]" for k in ("mean", "std")]
         for r in tables["size"]
     ]
     level = min((r["level"] for r in tables["size"]), default=0.0)
+    bootstrap = f"mean [{100 * level:.0f} % of bootstrap]"
     cma = [[v if isinstance(v, str) else _number(v) for v in r.values()] for r in tables["cma"]]
-    swept = [
-        "case", "noise variance", "noise on", "ε stands for", "ε chosen", "ratio", "variance it causes in the ends",
-        "ratio",
-    ]  # fmt: skip
     return [
-        Section("Findings", ["finding", "holds", "measured"], found),
-        _methods("Table 1: mean ± std of draws, averaged over seeds", tables["table"], _law),
+        _methods("Table 1: mean ± std of draws, averaged over seeds", tables["table"], _draws),
         _methods("Table 1: largest error of a mean, of all seeds (%)", tables["table"], _error),
-        _methods(RECOVERY, tables["recovery"], _law),
+        _methods("Recovery of a distribution: mean ± std of draws", tables["recovery"], _draws, "recovery.png"),
         _methods("Recovery: largest error of a mean, of all seeds (%)", tables["recovery"], _error),
-        Section(SWEEPS, swept, sweeps["sweep"]),
-        Section(AGAINST_NOISE, swept, sweeps["noise"]),
+        _sweeps("Sweeps over ε", tables["sweep"], "sweep.png"),
+        _sweeps("ε against the noise", tables["noise"], "noise.png"),
         Section(
-            SIZES,
-            ["case", "transitions", "parameter", "truth", f"mean [{100 * level:.0f} % of bootstrap]", "std of draws"],
+            "Number of transitions",
+            ["case", "transitions", "parameter", "truth", bootstrap, "std of draws"],
             sizes,
+            "size.png",
         ),
         Section(
             "CMA-ES on a part",
@@ -286,30 +243,30 @@ def sections(tables: dict[str, list[dict[str, Any]]], findings: Sequence[Finding
     ]
 
 
-def markdown(page: Sequence[Section]) -> str:
-    """Return the study's page as Markdown."""
-    parts = ["# The paper's simulated Hopper\n", INTRODUCTION + "\n"]
-    for section in page:
-        lines = [section.head, ["---"] * len(section.head), *section.rows]
-        figure = FIGURES.get(section.title)
-        parts += [f"## {section.title}\n", *([f"![{section.title}]({figure})\n"] if figure else [])]
-        parts += ["\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"]
-    return "\n".join(parts)
+def _sweeps(title: str, rows: Sequence[dict[str, Any]], figure: str) -> Section:
+    head = ["case", "noise variance", "noise on", "ε stands for", "ε chosen", "ratio"]
+    lines = [
+        [r["case"], _number(r["noise_variance"]), r["noise_on"] or "–", r["stands_for"], _number(r["chosen"])]
+        + [_number(r[k]) for k in ("ratio", "caused_variance", "caused_ratio")]
+        for r in rows
+    ]
+    return Section(title, [*head, "variance it causes in the ends", "ratio"], lines, figure)
 
 
-def _methods(title: str, rows: Sequence[dict[str, Any]], entry: Callable[[dict[str, Any]], str]) -> Section:
+def _methods(
+    title: str, rows: Sequence[dict[str, Any]], entry: Callable[[dict[str, Any]], str], figure: str = ""
+) -> Section:
     """Cases and parameters down, methods across."""
     methods = list(dict.fromkeys(r["method"] for r in rows))
     lines = []
-    for case, parameter in dict.fromkeys((r["case"], r["parameter"]) for r in rows):
-        own = {r["method"]: r for r in rows if (r["case"], r["parameter"]) == (case, parameter)}
-        first = next(iter(own.values()))
-        cells = [entry(own[m]) if m in own else "–" for m in methods]
-        lines.append([case, parameter, _spread(first["truth"], first["true_std"]), *cells])
-    return Section(title, ["case", "parameter", "truth", *methods], lines)
+    for (case, parameter), group in grouped(rows, lambda r: (r["case"], r["parameter"])).items():
+        own = {r["method"]: entry(r) for r in group}
+        truth = _spread(group[0]["truth"], group[0]["true_std"])
+        lines.append([case, parameter, truth, *(own.get(method, "–") for method in methods)])
+    return Section(title, ["case", "parameter", "truth", *methods], lines, figure)
 
 
-def _law(row: dict[str, Any]) -> str:
+def _draws(row: dict[str, Any]) -> str:
     return f"{row['mean']:.3f} ± {row['std']:.2g}"
 
 
@@ -318,7 +275,7 @@ def _error(row: dict[str, Any]) -> str:
 
 
 def _spread(mean: float, std: float) -> str:
-    return f"{mean:.3f} ± {std:.2g}" if std > 1e-9 else f"{mean:.3f}"  # rounding is no deviation
+    return f"{mean:.3f} ± {std:.2g}" if std > 1e-9 else f"{mean:.3f}"  # rounding is no spread
 
 
 def _number(value: float | None) -> str:
@@ -331,11 +288,11 @@ def _largest_error(result: Result) -> float:
 
 
 def _farthest_off(result: Result) -> float:
-    """Largest error of a mean in deviations of the draws."""
+    """Largest error of a mean in standard deviations of the draws."""
     parameters = result["fit"]["parameters"]
     return max(abs(p["mean"] - result["truth"][n]["mean"]) / drawn_std(result, n) for n, p in parameters.items())
 
 
 def _widest(result: Result) -> float:
-    """Largest deviation as a share of its search box."""
+    """Largest standard deviation as a share of its search box."""
     return max(p["std"] / (p["high"] - p["low"]) for p in result["fit"]["parameters"].values())

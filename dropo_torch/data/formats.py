@@ -1,0 +1,244 @@
+"""The file formats of logs.
+
+A new one is a function that opens such a file as tables, and an entry of :data:`FORMATS`.
+"""
+
+from __future__ import annotations
+
+import re
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dropo_torch.data.tables import Table
+from dropo_torch.errors import InputError, choices
+from dropo_torch.support.extras import extra
+from dropo_torch.support.given import reading
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+
+
+def open_npz(path: Path, _: str | None) -> list[Table]:
+    """An archive of plain arrays."""
+    with reading(path, ".npz of plain arrays"), _npz(path) as archive:
+        names = tuple(archive.files)
+
+    def read(name: str) -> np.ndarray:
+        with reading(f"{path}: {name}", "a plain array"), _npz(path) as archive:
+            return np.asarray(archive[name])
+
+    return [Table(str(path), names, read)]
+
+
+def open_npy(path: Path, _: str | None) -> list[Table]:
+    """``PREFIX_observations.npy``, or the folder with the only one, and the files beside it of the same prefix."""
+    first = _only_log(path) if path.is_dir() else path
+    folder, prefix = first.parent, first.name.removesuffix("observations.npy")
+    names = ("observations", "next_observations", "actions", "terminals")
+    files = {name: folder / f"{prefix}{name.replace('_', '')}.npy" for name in names}
+    for name in ("next_observations", "actions"):
+        if not files[name].exists():
+            raise InputError(f"{folder}: there is no {files[name].name} beside {first.name}")
+
+    def read(name: str) -> np.ndarray:
+        with reading(files[name], "a plain .npy array"):
+            return np.asarray(np.load(files[name], allow_pickle=False))
+
+    return [Table(str(folder), tuple(name for name, file in files.items() if file.exists()), read)]
+
+
+def open_text(path: Path, separator: str | None) -> list[Table]:
+    """Text in columns, the first row naming them."""
+    with extra("formats", str(path)):
+        import pandas as pd
+    separator = separator or ("\t" if path.suffix.lower() == ".tsv" else ",")
+    with (
+        reading(path, "a table of text"),
+        warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
+    ):
+        frame = pd.read_csv(path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False)
+    frame.columns = frame.columns.str.strip()
+    only = str(frame.columns[0])
+    other = next((mark for mark in ";\t," if mark != separator and mark in only), None)
+    if len(frame.columns) == 1 and other is not None:
+        raise InputError(f"{path}: its one column is {only!r}; separator: {other!r} may be what is meant")
+    return [_frame(path, frame)]
+
+
+def open_parquet(path: Path, _: str | None) -> list[Table]:
+    """A data frame with its index."""
+    with extra("formats", str(path)):
+        import pandas as pd
+        import pyarrow  # noqa: F401  # what pandas reads it with
+    with reading(path, "Parquet"):
+        frame = pd.read_parquet(path, engine="pyarrow")
+    named = any(name is not None for name in frame.index.names)
+    return [_frame(path, frame.reset_index() if named else frame)]
+
+
+def open_hdf5(path: Path, group: str | None) -> list[Table]:
+    """The data sets of a file, by their paths; with a pattern, those of each group that it matches."""
+    with extra("formats", str(path)):
+        import h5py
+    groups: list[str] = []
+    datasets: list[str] = []
+
+    def visit(name: str | bytes, item: object) -> None:
+        if isinstance(name, str):  # a name that is no UTF-8 comes as bytes
+            (datasets if isinstance(item, h5py.Dataset) else groups).append(name)
+
+    def read(name: str) -> np.ndarray:
+        with reading(f"{path}: {name}", "an HDF5 data set"), h5py.File(path, "r") as file:
+            return np.asarray(file[name][()])
+
+    with reading(path, "HDF5"), h5py.File(path, "r") as file:
+        file.visititems(visit)
+    whole = Table(str(path), tuple(datasets), read)
+    if group is None:
+        return [whole]
+    pattern = f"/{group.strip('/')}"
+    matched = sorted((g for g in groups if PurePosixPath(f"/{g}").match(pattern)), key=_natural)
+    if not matched:
+        raise InputError(f"{path}: group: no group matches {group!r}{choices(group, groups)}")
+    return [_within(whole, g) for g in matched]
+
+
+def open_mat(path: Path, _: str | None) -> list[Table]:
+    """MATLAB variables; the fields of a struct ``log`` are called ``log.q``, vectors are ``(N,)``."""
+    with path.open("rb") as file:
+        if _HDF5_SIGNATURE in file.read(1024):
+            return [_mat73(open_hdf5(path, None)[0])]
+    import scipy.io
+
+    with reading(path, "a MATLAB file"):
+        arrays = flatten(scipy.io.loadmat(path, simplify_cells=True), ".")
+    return [Table(str(path), tuple(n for n in arrays if not n.startswith("__")), arrays.__getitem__)]
+
+
+@dataclass(frozen=True)
+class Format:
+    """A file format.
+
+    Attributes:
+        name: what it is called in messages.
+        suffixes: how its files end.
+        open: gives the tables in a file; the second argument is the value of ``option``, or ``None``.
+        option: of :func:`~dropo_torch.data.readers.read_trajectories`, which no other format has.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    open: Callable[[Path, str | None], list[Table]]
+    option: str | None = None
+
+
+NPY = Format("NumPy", ("_observations.npy",), open_npy)
+FORMATS = (
+    Format("NumPy archive", (".npz",), open_npz),
+    NPY,
+    Format("text", (".csv", ".tsv", ".txt"), open_text, option="separator"),
+    Format("Parquet", (".parquet", ".pq"), open_parquet),
+    Format("HDF5", (".h5", ".hdf5"), open_hdf5, option="group"),
+    Format("MATLAB", (".mat",), open_mat),
+)
+
+
+def open_tables(path: Path, *, group: str | None = None, separator: str | None = None) -> list[Table]:
+    """Return the logs in a file or folder: one, or one for each HDF5 group that ``group`` matches.
+
+    Args:
+        path: a file of one of the :data:`FORMATS`, or a folder with one ``*_observations.npy``.
+        group: pattern of the HDF5 groups that hold an episode each, such as ``data/demo_*``.
+        separator: what separates the columns of a text file; a comma by default, a tab in ``.tsv``.
+
+    Raises:
+        InputError: a file that is missing, unreadable or of an unknown kind.
+    """
+    if not path.exists():
+        raise InputError(missing_file(path))
+    kind = NPY if path.is_dir() else next((f for f in FORMATS if path.name.lower().endswith(f.suffixes)), None)
+    if kind is None:
+        known = ", ".join(suffix for f in FORMATS for suffix in f.suffixes)
+        raise InputError(f"{path}: unknown kind of log; expected {known}, a folder of .npy files or a Minari dataset")
+    given = {"group": group, "separator": separator}
+    for option, value in given.items():
+        if value is not None and option != kind.option:
+            owner = next(f for f in FORMATS if f.option == option)
+            raise InputError(
+                f"{path}: {option} is an option of {owner.name} files ({', '.join(owner.suffixes)}); leave it out here"
+            )
+    return kind.open(path, given[kind.option] if kind.option else None)
+
+
+def missing_file(path: Path) -> str:
+    """Return the message for a path that does not exist, with the nearest name beside it."""
+    if path.parent.is_dir():
+        return f"{path}: no such file or folder{choices(path.name, sorted(p.name for p in path.parent.iterdir()))}"
+    return f"{path}: no such file or folder (nor is there a folder {path.parent})"
+
+
+def flatten(nested: object, joint: str, prefix: str = "") -> dict[str, np.ndarray]:
+    """Return the leaves of nested mappings, lists and tuples, their keys joined by ``joint``."""
+    if isinstance(nested, list | tuple):
+        nested = dict(enumerate(nested))
+    if not isinstance(nested, Mapping):
+        return {prefix: np.asarray(nested)}
+    leaves: dict[str, np.ndarray] = {}
+    for key, value in nested.items():
+        leaves |= flatten(value, joint, f"{prefix}{joint}{key}" if prefix else str(key))
+    return leaves
+
+
+@contextmanager
+def _npz(path: Path) -> Iterator[Any]:
+    # the file is opened here because numpy leaves it open where it is corrupt
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+        yield archive
+
+
+def _within(table: Table, group: str) -> Table:
+    """The arrays below a group, named from there."""
+    prefix = f"{group}/"
+    names = tuple(n.removeprefix(prefix) for n in table.names if n.startswith(prefix))
+    return Table(f"{table.source}: {group}", names, lambda name: table.read(prefix + name))
+
+
+def _mat73(table: Table) -> Table:
+    """What MATLAB stores as HDF5: by columns, the fields of structs as groups."""
+    names = {name.replace("/", "."): name for name in table.names if not name.startswith("#")}
+
+    def read(name: str) -> np.ndarray:
+        array = table.read(names[name]).T
+        return array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
+
+    return Table(table.source, tuple(names), read)
+
+
+def _frame(path: Path, frame: pd.DataFrame) -> Table:
+    columns = {str(name): i for i, name in enumerate(frame.columns)}
+    return Table(str(path), tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
+
+
+def _only_log(folder: Path) -> Path:
+    found = sorted(folder.glob("*_observations.npy"))
+    if len(found) == 1:
+        return found[0]
+    if found:
+        raise InputError(f"{folder}: {len(found)} logs are in this folder; name one, such as {found[0]}")
+    raise InputError(
+        f"{folder}: no *_observations.npy in this folder and it is no Minari dataset"
+        f"{choices('observations.npy', sorted(p.name for p in folder.iterdir()))}"
+    )
+
+
+def _natural(name: str) -> list[str | int]:
+    """Sort key by which ``demo_10`` comes after ``demo_9``."""
+    return [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", name)]

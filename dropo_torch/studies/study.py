@@ -1,0 +1,134 @@
+"""A large study: cells that are computed side by side, each kept in a file of its own, and what they say together."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Callable, Hashable, Iterable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from dropo_torch.errors import InputError
+from dropo_torch.support.files import write_atomically
+from dropo_torch.support.parallel import in_parallel
+
+SCHEMA = "dropo-torch/study/1"
+
+Item = TypeVar("Item")
+Key = TypeVar("Key", bound=Hashable)
+
+
+class Cell(Protocol):
+    """One computation of a study, usually a fit; a frozen dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    @property
+    def name(self) -> str:
+        """The cell's file, without suffix."""
+
+
+def run_cells(
+    out: Path,
+    plan: Any,
+    cells: Sequence[Cell],
+    run: Callable[..., dict[str, Any]],
+    *,
+    resume: bool = False,
+    workers: int = 1,
+    report: Callable[[str, float], None] = lambda stage, share: None,
+) -> list[dict[str, Any]]:
+    """Run every cell whose file is not there yet, and return all results, each with its ``cell``, in the cells' order.
+
+    Args:
+        out: the folder, which gets ``plan.json`` and ``cells/``.
+        plan: a dataclass of how large the study is; a folder with another one is refused.
+        cells: what is to be run.
+        run: called as ``run(cell, threads=...)``, gives plain data; of a module's top level, as it is pickled.
+        resume: go on with the study that the folder holds.
+        workers: processes that run cells side by side. The results do not depend on it.
+        report: called with what is being done and the share that is.
+
+    Raises:
+        InputError: a folder with another study, or with one that is not to be resumed.
+    """
+    _claim(out, plan, resume=resume)
+    files = {cell.name: out / "cells" / f"{cell.name}.json" for cell in cells}
+    waiting = [cell for cell in cells if not files[cell.name].exists()]
+    done = len(cells) - len(waiting)
+    report(f"{done} of {len(cells)} fits are done", done / len(cells))
+    work = functools.partial(_write_cell, run=run, folder=out / "cells")
+    for number, (cell, _) in enumerate(in_parallel(work, waiting, workers), done + 1):
+        report(f"{number} of {len(cells)}: {cell.name}", number / len(cells))
+    return [{**json.loads(files[cell.name].read_text()), "cell": asdict(cell)} for cell in cells]
+
+
+def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
+    """Return items by their key, both in the order in which they come."""
+    groups: dict[Key, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A claim that the study tests, whether it holds, and what was measured about it."""
+
+    finding: str
+    holds: bool
+    measured: str
+
+    def sentence(self) -> str:
+        """Return the finding in a line."""
+        return f"{'holds' if self.holds else 'DOES NOT HOLD'}: {self.finding} ({self.measured})"
+
+
+@dataclass(frozen=True)
+class Section:
+    """A table as people read it, and the file of the figure that shows the same, where there is one."""
+
+    title: str
+    head: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    figure: str = ""
+
+
+def findings_section(findings: Iterable[Finding]) -> Section:
+    """Return the table of findings."""
+    rows = [[f.finding, "yes" if f.holds else "no", f.measured] for f in findings]
+    return Section("Findings", ["finding", "holds", "measured"], rows)
+
+
+def markdown(title: str, introduction: str, sections: Iterable[Section]) -> str:
+    """Return a study's page as Markdown."""
+    parts = [f"# {title}\n", introduction + "\n"]
+    for section in sections:
+        lines = [section.head, ["---"] * len(section.head), *section.rows]
+        parts.append(f"## {section.title}\n")
+        if section.figure:
+            parts.append(f"![{section.title}]({section.figure})\n")
+        parts.append("\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n")
+    return "\n".join(parts)
+
+
+def _write_cell(cell: Cell, *, run: Callable[..., dict[str, Any]], folder: Path, threads: int) -> None:
+    found = run(cell, threads=threads)
+    write_atomically(folder / f"{cell.name}.json", json.dumps(found, indent=1).encode() + b"\n")
+
+
+def _claim(out: Path, plan: Any, *, resume: bool) -> None:
+    """Mark the folder as this study's; refuse one that holds another's results."""
+    mark = out / "plan.json"
+    wanted = json.loads(json.dumps({"schema": SCHEMA, "plan": asdict(plan)}))
+    if mark.exists():
+        if not resume:
+            raise InputError(f"--out: {out} holds a study; add --resume to go on with it, or name another folder")
+        if json.loads(mark.read_text()) != wanted:
+            raise InputError(
+                f"resume: {out} holds a study of another size; name another folder, or give --reduced as at its start"
+            )
+    elif out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise InputError(f"--out: {out} is not an empty folder; name another one")
+    write_atomically(mark, json.dumps(wanted, indent=2).encode() + b"\n")
