@@ -447,11 +447,9 @@ def _select_objects(where: str, spec: Mapping[str, Any], names: Sequence[str], k
 def _rows(model: mujoco.MjModel, prefix: str, number: int) -> list[int]:
     """Rows of a field for one object: a joint's may be several degrees of freedom."""
     if prefix == "dof":
-        start = int(model.jnt_dofadr[number])
-        return list(range(start, start + {0: 6, 1: 3}.get(int(model.jnt_type[number]), 1)))
+        return np.flatnonzero(model.dof_jntid == number).tolist()
     if prefix in ("qpos0", "qpos"):
-        start = int(model.jnt_qposadr[number])
-        return list(range(start, start + {0: 7, 1: 4}.get(int(model.jnt_type[number]), 1)))
+        return list(range(model.jnt_qposadr[number], [*model.jnt_qposadr, model.nq][number + 1]))
     return [number]
 
 
