@@ -1,4 +1,4 @@
-"""The log as the gap sees it: features, windows with a start of their own, and the sizes of what it holds."""
+"""The log as the gap sees it: features, windows with initial states of their own, and the sizes of what it holds."""
 
 from __future__ import annotations
 

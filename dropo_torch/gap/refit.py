@@ -15,6 +15,8 @@ from dropo_torch.optimizers.least_squares import bounded_step
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.
 STEP, LEAST_MOVE = 1e-3, 2e-5
+#: Damping at first, at least, and at most.
+DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
 #: Move, relative to a parameter's scale, after which the initial states are linearised again.
@@ -100,7 +102,6 @@ class Refit:
         slope: projected derivatives by all numbers, in units of their scale, ``(q, W, N)``.
         linear: the linearisation in the initial states.
         scale: the numbers' scales, ``(q,)``.
-        converged: whether the moves became small.
         factor: factors of the windows' residuals that the fit ended with, ``(W,)``.
     """
 
@@ -110,7 +111,6 @@ class Refit:
     slope: np.ndarray
     linear: Linearisation
     scale: np.ndarray
-    converged: bool
     factor: np.ndarray
 
     @property
@@ -180,24 +180,21 @@ def refit(
         loss = float(robust_loss(chi2, tail).sum())
         return _Point(there, residual, slope, loss, caps * robust_factors(chi2, tail))
 
-    damping, converged = 1e-3, False
+    damping = DAMPING
     here = begin = at(hypothesis.vector)
     for _ in range(iterations):
         trial = here.hypothesis.vector + _move(here, limits, damping) * limits.scale
         trial = np.clip(trial, limits.low, limits.high)
         if np.abs((trial - here.hypothesis.vector) / limits.scale).max(initial=0.0) < LEAST_MOVE:
-            converged = True
             break
         there = at(trial)
         if there.loss < here.loss:
-            gain, here = here.loss - there.loss, there
-            damping = max(damping / 8, 1e-9)
+            gain, here, damping = here.loss - there.loss, there, max(damping / 8, LEAST_DAMPING)
             if gain < 1e-6 * here.loss + 0.01:
-                converged = True
                 break
         else:
             damping *= 6
-            if damping > 1e4:
+            if damping > MOST_DAMPING:
                 break
     moved = np.abs((here.hypothesis.vector - begin.hypothesis.vector) / limits.scale).max(initial=0.0)
     if relinearise and moved > FAR:
@@ -205,9 +202,7 @@ def refit(
         return refit(evidence, here.hypothesis, linear=again, caps=caps, iterations=4)
     degrees = evidence.degrees(linear) - len(limits.scale)
     cost = cost_of(here.residual, linear, degrees, caps, tail)
-    return Refit(
-        here.hypothesis, cost, here.residual, here.slope, linear, limits.scale, converged, here.factor / caps
-    )  # fmt: skip
+    return Refit(here.hypothesis, cost, here.residual, here.slope, linear, limits.scale, here.factor / caps)
 
 
 def _move(here: _Point, limits: Limits, damping: float) -> np.ndarray:

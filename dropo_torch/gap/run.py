@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import VOCABULARY, Effect
@@ -30,6 +31,10 @@ SEARCHES: tuple[tuple[str, Callable[[Scene], Evidence | None], Strategy], ...] =
 )
 
 
+def _quiet(stage: str, share: float) -> None:
+    """Report nothing."""
+
+
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
     """Return where simulation and log disagree, the largest share first; nothing if what remains is noise.
 
@@ -40,8 +45,7 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
         effects: the vocabulary; all of the package's by default.
         rules: thresholds.
     """
-    ground = _ground(scene.evidence, Strategy(), effects, rules)
-    state = start(ground, scene.begin)
+    state = start(_ground(scene, effects, rules), scene.begin)
     if state.done:
         return ()
     short = short_windows(scene.setting, scene.train)
@@ -58,7 +62,7 @@ def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules 
         effects: the vocabulary; all of the package's by default.
         rules: thresholds.
     """
-    return _name(scene, effects, rules)
+    return _name(scene, _ground(scene, effects, rules))
 
 
 def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
@@ -79,7 +83,7 @@ def find_gap(
     rules: Rules | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
-    report: Report | None = None,
+    report: Report = _quiet,
     scene: Scene | None = None,
 ) -> Gap:
     """Find where simulation and log disagree, name the missing effects, and verify them on held-out data.
@@ -97,44 +101,29 @@ def find_gap(
         InputError: a log or simulator in which nothing can be looked for.
     """
     started = time.perf_counter()
-    report = report or _quiet
     report("preparing", 0.0)
     scene = scene or prepare(problem)
-    naming = _name(scene, effects, rules, checkpoint, resume, report)
+    naming = _name(scene, _ground(scene, effects, rules, report), checkpoint, resume)
     report("verifying", 0.0)
     return make_result(scene, naming, started)
 
 
-def _name(
-    scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None, checkpoint: Path | None = None,
-    resume: bool = False, report: Report | None = None,
-) -> Naming:  # fmt: skip
+def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False) -> Naming:
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly."""
-    first = None
+    known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
+    found = []
     for suffix, make, strategy in SEARCHES:
         evidence = make(scene)
-        if evidence is None:
-            continue
-        ground = _ground(evidence, strategy, effects, rules, report)
-        path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
-        known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
-        naming = search(ground, scene.begin, Checkpoint(path, resume, known))
-        if naming.named:
-            return naming
-        first = first or naming
-        if not first.gap:
-            break
-    assert first is not None
-    return first
+        if evidence is not None:
+            path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
+            here = replace(ground, evidence=evidence, strategy=strategy)
+            found.append(search(here, scene.begin, Checkpoint(path, resume, known)))
+            if found[-1].named or not found[0].gap:
+                break
+    return found[-1] if found[-1].named else found[0]
 
 
-def _ground(
-    evidence: Evidence, strategy: Strategy, effects: Sequence[Effect] | None, rules: Rules | None,
-    report: Report | None = None,
-) -> Ground:  # fmt: skip
+def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None, report: Report = _quiet) -> Ground:
     """What a search stands on, by default with the whole vocabulary and the package's thresholds."""
-    return Ground(evidence, tuple(effects or VOCABULARY.values()), rules or Rules(), strategy, report or _quiet)
-
-
-def _quiet(stage: str, share: float) -> None:
-    """Report nothing."""
+    known = tuple(effects or VOCABULARY.values())
+    return Ground(scene.evidence, known, rules or Rules(), Strategy(), report)
