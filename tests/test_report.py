@@ -10,8 +10,11 @@ import pytest
 from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution
 from dropo_torch.fit import Fit, HistoryEntry
-from dropo_torch.report import figures, words, write_fit_report, write_sweep_report
-from dropo_torch.report.html import shown_columns, worst_stretch
+from dropo_torch.report import words, write_fit_report, write_sweep_report
+from dropo_torch.report.figures import to_svg
+from dropo_torch.report.figures.sweep import epsilon_panel
+from dropo_torch.report.fit import shown_columns, worst_stretch
+from dropo_torch.report.formatting import number
 from dropo_torch.studies.sweep import Sweep, SweepPoint
 
 NAMES = ("torso", "damping", "foot")
@@ -233,14 +236,12 @@ def test_worst_stretch_finds_the_misfit() -> None:
     ],
 )  # fmt: skip
 def test_numbers(value: float, uncertainty: float, text: str) -> None:
-    assert words.number(value, uncertainty) == text
+    assert number(value, uncertainty) == text
 
 
 def test_ticks_keep_their_digits() -> None:
-    svg = figures.log_log(
-        np.array([1e-4, 1e-2]), np.array([1.121, 1.139]), chosen=1e-4, x_label="x", y_label="y", y_log=False
-    )
-    assert ">1.125<" in svg
+    figure = epsilon_panel(np.array([1e-4, 1e-2]), np.array([1.121, 1.139]), 1e-4, "y", log=False)
+    assert ">1.125<" in to_svg(figure)
 
 
 def test_sweep(tmp_path: Path) -> None:
