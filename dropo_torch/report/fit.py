@@ -101,7 +101,7 @@ def _tiles(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
         (str(parameters), plural("parameter", parameters)),
         (f"{len(diagnostics.rows):,}", "transitions judged"),
         (str(columns), plural("compared column", columns)),
-        (rms(words.overall_rms(diagnostics)), "standardised residual, rms (1 is ideal)"),
+        (rms(words.overall_rms(diagnostics)), "standardized residual, rms (1 is ideal)"),
         (plain(fit.simulated_transitions), "simulated transitions"),
         (duration(fit.seconds), "computing time"),
     ]
@@ -290,17 +290,20 @@ def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     same = len(set(fit.epsilon)) == 1
     epsilon = ", ".join(plain(e) for e in (fit.epsilon[:1] if same else fit.epsilon))
     return [
-        ("Log-likelihood", f"{nats(fit.log_likelihood)} nats, on samples that the optimizer has not seen"),
-        ("Mean squared difference", f"{number(fit.mse)}, measured against mean simulated next state"),
+        ("Log-likelihood", f"{nats(fit.log_likelihood)} nats, on samples that the optimizer has not used"),
+        ("Mean squared difference", f"{number(fit.mse)}, between measured and mean simulated next states"),
         ("Simulator", fit.backend),
         ("Method", fit.method),
         ("Optimizer", fit.optimizer),
-        ("Stopped because", fit.stop_reason or "not recorded"),
+        ("Stop reason", fit.stop_reason or "not recorded"),
         ("Evaluations of the objective", f"{fit.evaluations:,}"),
         ("Simulated transitions", f"{fit.simulated_transitions:,}"),
         ("Computing time", f"{fit.seconds:,.1f} s" if np.isfinite(fit.seconds) else "n/a"),
         ("Parameter vectors per transition (K)", f"{fit.samples:,}"),
         ("ε, variance added to each column", epsilon),
         ("Seed", str(fit.seed)),
-        ("Diverged simulations", f"{fit.diverged:,} in the final evaluation, {diagnostics.diverged:,} in the checks"),
+        (
+            "Diverged simulations",
+            f"{fit.diverged:,} in the final evaluation, {diagnostics.diverged:,} in diagnostics",
+        ),
     ]

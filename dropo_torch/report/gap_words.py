@@ -11,9 +11,9 @@ from dropo_torch.gap.result import Gap, NamedEffect, Place, Strength
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
 UNNAMED = "unnamed"
-#: Times below this are given in milliseconds, in seconds.
+#: Times in seconds below this are given in milliseconds.
 SHORT = 0.1
-#: Effects with more numbers than this give but the first in the answer.
+#: Of effects with more numbers than this, the answer gives only the first.
 MOST_NUMBERS = 3
 #: What is missing, as it follows on "Your model lacks".
 _NOUNS = {
@@ -22,45 +22,45 @@ _NOUNS = {
     "joint_friction": "dry (Coulomb) friction in {0}",
     "joint_stribeck": "dry friction in {0} that is larger at rest than in motion (Stribeck)",
     "joint_stiffness": "a spring at {0}",
-    "joint_cogging": "a force at {0} that ripples with its position (cogging)",
+    "joint_cogging": "a force at {0} that is periodic in its position (cogging)",
     "armature": "rotor or gear inertia (armature) at {0}",
-    "joint_limit": "other stops of {0}",
-    "joint_coupling": "a spring between {0} and the joint before it in the chain",
+    "joint_limit": "different stops of {0}",
+    "joint_coupling": "a spring between {0} and its parent joint",
     "payload": "a mass on {0}",
-    "center_of_mass": "another centre of mass of {0}",
-    "inertia": "other moments of inertia of {0}",
-    "external_force": "a constant force on {0} from outside",
-    "fluid_drag": "drag of air or water on {0}",
-    "gravity_tilt": "a tilt of the base against gravity",
+    "center_of_mass": "a different center of mass of {0}",
+    "inertia": "different moments of inertia of {0}",
+    "external_force": "a constant external force on {0}",
+    "fluid_drag": "fluid drag on {0}",
+    "gravity_tilt": "a tilt of the base relative to gravity",
     "ground_slope": "a slope of the ground",
     "integration": "a finer integration step",
-    "actuator_gain": "another gain of {0}",
+    "actuator_gain": "a different gain of {0}",
     "actuator_bias": "a constant force from {0}",
-    "actuator_damping": "braking by {0} in proportion to its velocity",
+    "actuator_damping": "velocity-proportional damping in {0}",
     "actuator_delay": "a delay of the commands to {0}",
     "actuator_lag": "a first-order lag of {0}",
     "actuator_deadband": "a deadband of {0}",
-    "actuator_backlash": "play (backlash) of {0}",
-    "actuator_saturation": "a limit to the force of {0}",
+    "actuator_backlash": "backlash (play) in {0}",
+    "actuator_saturation": "a limit on the force of {0}",
     "sensor_bias": "an offset in the measurement of {0}",
-    "sensor_scale": "a wrong factor in the measurement of {0}",
+    "sensor_scale": "a scale error in the measurement of {0}",
     "sensor_delay": "a delay of the measurement of {0}",
-    "contact_friction": "another sliding friction of {0}",
+    "contact_friction": "a different sliding friction of {0}",
     "contact_stiffness": "softer or stiffer contacts of {0}",
-    "contact_margin": "contacts of {0} that act from a distance on",
+    "contact_margin": "contacts of {0} that act at a distance (margin)",
 }
 #: Whole clauses where "Your model lacks" does not fit.
 _CLAUSES = {
-    "joint_limit": "The stops of {0} sit elsewhere than in your model",
-    "center_of_mass": "The centre of mass of {0} sits elsewhere than in your model",
+    "joint_limit": "The stops of {0} are not where your model has them",
+    "center_of_mass": "The center of mass of {0} is not where your model has it",
     "inertia": "The moments of inertia of {0} are not those of your model",
-    "gravity_tilt": "The base does not stand level as in your model",
-    "ground_slope": "The ground is not level as in your model",
+    "gravity_tilt": "The base is tilted, unlike in your model",
+    "ground_slope": "The ground is sloped, unlike in your model",
     "integration": "The integration step of your model is too coarse for this motion",
-    "actuator_gain": "{0} gives another force for the same command than in your model",
-    "sensor_bias": "The measurement of {0} is off by a constant",
-    "sensor_scale": "The measurement of {0} is off by a factor",
-    "sensor_delay": "The measurement of {0} comes late",
+    "actuator_gain": "{0} produces a different force for the same command than in your model",
+    "sensor_bias": "The measurement of {0} has a constant offset",
+    "sensor_scale": "The measurement of {0} has a scale error",
+    "sensor_delay": "The measurement of {0} is delayed",
     "contact_friction": "The sliding friction of {0} is not that of your model",
     "contact_stiffness": "The contacts of {0} are softer or stiffer than in your model",
 }
@@ -68,7 +68,7 @@ _CLAUSES = {
 _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_stiffness", "armature",
            "actuator_damping", "contact_margin")  # fmt: skip
 _COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
-_CANNOT_RULE_OUT = "An effect that is weaker than the noise, or that this motion does not call on, cannot be ruled out."
+_CANNOT_RULE_OUT = "An effect that is weaker than the noise, or that this motion does not excite, cannot be ruled out."
 
 
 def is_named(effect: NamedEffect) -> bool:
@@ -185,7 +185,7 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
 def shows(gap: Gap) -> str:
     """Return where and when the gap shows."""
     if not gap.where:
-        return "this log does not tell where"
+        return "this log does not show where"
     first = gap.where[0]
     where = "in the whole model" if first.name is None else f"at {place_name(first)}"
     return f"it shows {where}{f', {first.when}' if first.when else ''}"

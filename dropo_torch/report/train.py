@@ -103,21 +103,21 @@ def _findings(training: Training) -> Iterator[Finding]:
         lost = nominal.mean - target.mean
         if lost > 3 * error and lost > 0.1 * abs(nominal.mean):
             yield attention(
-                "The policy loses in the target",
+                "Lower return in the target",
                 f"The target's return is {number(lost, error)} below the nominal model's. A distribution "
-                "that was fitted to a log of the target, or a wider one, may close the gap.",
+                "fitted to a log of the target, or a wider one, may close the gap.",
             )
     if training.diverged:
         yield note(
             "Diverged simulations",
-            f"{training.diverged:,} simulations diverged, and ended their episodes. Where that is frequent, "
-            "bounds or a distribution reach values that the model cannot be simulated with.",
+            f"{training.diverged:,} simulations diverged, which ended their episodes. If this is frequent, the "
+            "bounds or the distribution include values at which the model is unstable.",
         )
     if training.repaired or training.skipped:
         yield attention(
-            "Numbers that are not finite",
-            f"{training.repaired:,} steps with a number that was not finite were kept from the losses, and "
-            f"{training.skipped:,} updates were left out.",
+            "Non-finite numbers",
+            f"{training.repaired:,} steps with non-finite numbers were excluded from the losses, and "
+            f"{training.skipped:,} updates were skipped.",
         )
 
 
@@ -125,11 +125,11 @@ def _facts(training: Training) -> list[tuple[str, str]]:
     total = _busy(training)
     return [
         ("Algorithm", training.algorithm.upper()),
-        ("Stopped because", training.stop_reason),
+        ("Stop reason", training.stop_reason),
         ("Environment steps", f"{training.steps:,} in {training.episodes:,} finished episodes"),
         ("Computing time", f"{training.seconds:,.1f} s"),
-        ("of it simulating", f"{training.simulating:,.1f} s ({100 * training.simulating / total:.0f} %)"),
-        ("of it learning", f"{training.learning:,.1f} s ({100 * training.learning / total:.0f} %)"),
+        ("of which simulating", f"{training.simulating:,.1f} s ({100 * training.simulating / total:.0f} %)"),
+        ("of which learning", f"{training.learning:,.1f} s ({100 * training.learning / total:.0f} %)"),
         ("Seed", str(training.seed)),
         ("Diverged simulations", f"{training.diverged:,}"),
     ]

@@ -22,9 +22,9 @@ AT_BOUND = 2e-3
 AT_STD_BOUND = 1.02
 #: Standardised residuals with a root mean square above this are not explained, small logs apart.
 UNEXPLAINED = 1.5
-#: ... and below this they are so small that ε or noise, not the parameters, makes up what is expected.
+#: ... and below this they are so small that ε or noise, not the parameters, dominates what is expected.
 DROWNED = 0.3
-#: A standard error above this share of the search box tells that the log says little.
+#: A mean whose standard error exceeds this share of the search box is poorly identified.
 VAGUE = 0.25
 #: Share of its mean from which a standard deviation is suspect.
 WIDE = 0.5
@@ -92,24 +92,24 @@ def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
     standardised = column_rms(diagnostics)
     overall = overall_rms(diagnostics)
     if not np.isfinite(overall):
-        return False, "Whether the simulator explains the log cannot be told: no residual is finite."
+        return False, "No residual is finite, so the fit cannot be judged."
     worst = int(np.nanargmax(np.where(np.isfinite(standardised), standardised, -1)))
     scale = (
-        f"Measured next states lie {rms(overall)} expected deviations from the simulated ones (rms; 1 is ideal); "
+        f"Measured next states lie {rms(overall)} expected σ from the simulated ones (rms; 1 is ideal); "
         f"{diagnostics.labels[worst]} is worst, at {rms(standardised[worst])}."
     )
     limit = unexplained_above(diagnostics)
     if fit.method == "udr":
-        return True, f"A box was drawn at random; the log had no part in it. {scale}"
+        return True, f"This is a box drawn at random; the log was not used. {scale}"
     if standardised[worst] > limit:
         bad = int(np.sum(standardised > limit))
         where = "" if len(standardised) == 1 else f" in {bad} of {len(standardised)} columns"
         return False, f"The simulator does not explain the log{where}. {scale}"
     if fit.method == "dropo" and at_largest_std(fit.distribution).any():
         return False, (
-            f"The simulator explains the log only with parameters that vary as widely as they may (see below). {scale}"
+            f"The simulator explains the log only if parameters vary as much as the search allows (see below). {scale}"
         )
-    return True, f"The simulator explains the log{', with room to spare' if overall < DROWNED else ''}. {scale}"
+    return True, f"The simulator explains the log{', with margin to spare' if overall < DROWNED else ''}. {scale}"
 
 
 def column_rms(diagnostics: Diagnostics) -> np.ndarray:
@@ -136,12 +136,12 @@ def standardised_residual(diagnostics: Diagnostics) -> np.ndarray:
 
 
 def unexplained_above(diagnostics: Diagnostics) -> float:
-    """Return the rms above which a column is not explained: wider for a short log, whose rms varies by chance."""
+    """Return the rms above which a column is not explained: larger for a short log, whose rms varies by chance."""
     return UNEXPLAINED + 3 / math.sqrt(2 * max(len(diagnostics.rows), 1))
 
 
 def has_standard_errors(fit: Fit) -> bool:
-    """Whether the means are where the likelihood is largest, so that its curvature tells their standard errors."""
+    """Whether the means maximize the likelihood, so that its curvature gives their standard errors."""
     return fit.method not in ("bayessim", "simopt", "udr")
 
 
@@ -159,20 +159,20 @@ def shape(distribution: Distribution) -> str:
     """Return what the distribution is."""
     if distribution.is_uniform:
         return "Each parameter is uniform over a random interval"
-    together = "" if distribution.correlation is None else ", and parameters vary together (correlation in fit.json)"
-    return f"Each parameter follows a normal distribution cut off two standard deviations from its mean{together}"
+    together = "" if distribution.correlation is None else "; parameters are correlated (see fit.json)"
+    return f"Each parameter follows a normal distribution truncated at ±2σ{together}"
 
 
 def meaning_of_std(fit: Fit) -> str:
     """Return what the standard deviations say, by the method that found them."""
     meaning = {
-        "droid": "how far the search had contracted when it stopped; it says nothing about the log",
+        "droid": "how far the search had contracted when it stopped, which says nothing about the log",
         "simopt": "how far the search had contracted when it stopped",
-        "bayessim": "how uncertain the network is about one fixed value",
-        "laplace": "how uncertain the log leaves one fixed value; not how much the parameter varies",
-        "udr": "the width of a box that was drawn at random",
+        "bayessim": "how uncertain the network is about a single fixed value",
+        "laplace": "how uncertain a single fixed value is, not how much the parameter varies",
+        "udr": "how wide a box drawn at random is",
     }.get(fit.method, "how much the parameter must vary for the simulator to cover the log")
-    return f"The standard deviation says {meaning}"
+    return f"The standard deviation tells {meaning}"
 
 
 def density_curve(distribution: Distribution, index: int, points: int = 121) -> tuple[np.ndarray, np.ndarray]:
@@ -214,9 +214,9 @@ def strongest(diagnostics: Diagnostics) -> list[tuple[str, str, float]]:
 def _unobserved(diagnostics: Diagnostics) -> Iterator[Finding]:
     if diagnostics.at_rest:
         yield attention(
-            "Velocities that the log lacks",
-            f"{joined(diagnostics.at_rest)}: every simulated window starts with them at rest, which the robot was not. "
-            "Let data: preprocess derive velocities from the positions, and name them in observation.",
+            "Velocities missing from the log",
+            f"{joined(diagnostics.at_rest)}: every simulated window starts with these joints at rest, but the robot "
+            "was moving. Use data: preprocess to derive velocities from the positions, and list them in observation.",
         )
 
 
@@ -228,14 +228,14 @@ def _at_bounds(distribution: Distribution) -> Iterator[Finding]:
     if none := _with_values(distribution, lower & physical, distribution.low):
         yield note(
             "Mean at its physical limit",
-            f"{joined(none)}. The log shows no sign of this effect; leave it out, or log a motion that needs it.",
+            f"{joined(none)}. The log shows no sign of this effect. Drop it, or log a motion that excites it.",
         )
     for side, at, bound in (("lower", lower & ~physical, distribution.low), ("upper", upper, distribution.high)):
         if names := _with_values(distribution, at, bound):
             yield attention(
                 f"Mean at its {side} search bound",
-                f"{joined(names)}. The best value may lie outside: widen the bounds if the hardware allows it, "
-                "or look for what else in the model could cause the same motion.",
+                f"{joined(names)}. The optimum may lie outside. Widen the bounds if that is physically plausible, "
+                "or look for something else in the model that would cause the same motion.",
             )
 
 
@@ -247,35 +247,34 @@ def _standard_deviations(distribution: Distribution) -> Iterator[Finding]:
     if top.any():
         yield attention(
             "Standard deviation at its upper bound",
-            f"{_chosen(distribution, top)}. The log asks for more variation than a quarter of the search "
-            "box. Usually the model lacks something (a delay, friction, an offset) and this parameter stands in "
-            "for it; do not read the spread as that of the real quantity.",
+            f"{_chosen(distribution, top)}. The log calls for more variation than the largest σ allowed, a quarter of "
+            "the search box. Usually the model lacks something (a delay, friction, an offset) and this parameter "
+            "compensates for it. Do not read σ as the spread of the real quantity.",
         )
     if wide.any():
         yield attention(
             "Standard deviation as large as the mean",
-            f"{_chosen(distribution, wide)}. Such a spread rarely is the quantity's own: it usually stands "
-            "in for something that is wrong in the model, such as a mass whose inertia did not follow "
-            "(scale_inertia), one value tied over joints that differ, a missing friction or delay, or noise on "
-            "the log that was not declared.",
+            f"{_chosen(distribution, wide)}. Such a spread is rarely real. It usually compensates for a model error: "
+            "a mass whose inertia was not scaled along (scale_inertia), one value shared by joints that differ, a "
+            "missing friction or delay, or sensor noise that was not declared.",
         )
     if floor.any():
         yield note(
             "Standard deviation at its floor",
-            f"{_chosen(distribution, floor)}. One fixed value explains the log as well as any "
-            "distribution: this is a point estimate. For training a policy you may want to add spread.",
+            f"{_chosen(distribution, floor)}. A single fixed value explains the log as well as any distribution: "
+            "this is a point estimate. To train a policy, you may want to widen it.",
         )
 
 
 def _of_method(fit: Fit) -> Iterator[Finding]:
     """What to know about the standard deviations of a method other than DROPO."""
-    instead = "Take the means, and spread of your own."
+    instead = "Use the means, and choose σ yourself."
     texts: dict[str, tuple[Level, str]] = {
-        "droid": ("attention", f"They shrink with every generation, noise or not. {instead}"),
-        "simopt": ("attention", f"Other iterations or another bound on their steps give others. {instead}"),
-        "laplace": ("note", "The model lacking something does not widen them; a longer log narrows them."),
-        "udr": ("note", "The log has no part in them."),
-        "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior below."),
+        "droid": ("attention", f"They shrink with every generation, whatever the noise. {instead}"),
+        "simopt": ("attention", f"They depend on the number of iterations and on the step bound. {instead}"),
+        "laplace": ("note", "A longer log makes them smaller; a missing effect does not make them larger."),
+        "udr": ("note", "The log does not affect them."),
+        "bayessim": ("note", "They come from simulations that resemble the log; see the posterior below."),
     }
     if fit.extras.get("extrapolates"):
         texts["bayessim"] = ("attention", f"But the posterior is a guess: {fit.stop_reason.split('; but ')[-1]}.")
@@ -288,17 +287,17 @@ def _of_method(fit: Fit) -> Iterator[Finding]:
         yield attention(
             "Several values explain the log",
             f"{joined([f'{name}: {joined(values)}' for name, values in several.items()])}. The normal distribution "
-            "above covers the values between them, too, which the log excludes: do not train on it. Narrow the "
-            "bounds to one of them, or log a motion that tells them apart.",
+            "above also covers the values in between, which the log rules out: do not train on it. Narrow the "
+            "bounds to one of the peaks, or log a motion that distinguishes them.",
         )
     share = fit.distribution.std / search_box(fit.distribution).width
     names = zip(fit.distribution.names, share, strict=True)
     if vague := [name for name, s in names if s > 0.8 / math.sqrt(12) and name not in several]:
         yield attention(
             "Hardly narrower than the search box",
-            f"{joined(vague)}. By itself the log tells next to nothing about it, or the network has not learned "
-            "it: if the posterior's dots form a line, only a combination with another parameter is known; if not, "
-            "more simulations, or a horizon over which the parameter shows, may help.",
+            f"{joined(vague)}. Either the log barely constrains the parameter on its own, or the network has "
+            "not learned it. If the posterior samples form a line, only a combination with another parameter is "
+            "identified; if not, more simulations or a longer horizon may help.",
         )
 
 
@@ -321,16 +320,16 @@ def _residuals(diagnostics: Diagnostics) -> Iterator[Finding]:
     if bad := [f"{labels[i]} ({rms(standardised[i])})" for i in order if standardised[i] > limit]:
         yield attention(
             "The model does not explain every column",
-            f"{joined(bad)}: measured next states are further from the simulated ones than the fit expects "
-            "(rms of standardised residuals, 1 is ideal). Something that acts on these columns is not among the "
-            "parameters, or is wrong in the model; or their noise is larger than ε allows.",
+            f"{joined(bad)}: measured next states are farther from the simulated ones than the fit expects "
+            "(rms of standardized residuals; 1 is ideal). Either the model is missing or misrepresents something "
+            "that acts on these columns, or their noise is larger than ε allows.",
         )
     if drowned := [labels[i] for i in range(count) if _is_drowned(diagnostics, i)]:
         yield note(
-            "Columns that hardly count",
+            "Columns that barely count",
             f"{len(drowned)} of {count} columns: {joined(drowned)}. Their residuals are far smaller "
-            "than expected: ε (or the noise) given for them is larger than what the simulator misses by, so the "
-            "fit barely looks at them. Give ε per column, or lower it, to use them.",
+            "than expected: the ε (or noise) given for them exceeds the simulation error, so the fit barely uses "
+            "them. Set ε per column, or lower it.",
         )
     if lost := [labels[i] for i in range(count) if not np.isfinite(standardised[i])]:
         yield attention("Columns without a finite residual", f"{joined(lost)}.")
@@ -346,9 +345,9 @@ def _is_drowned(diagnostics: Diagnostics, column: int) -> bool:
 def _confounded(diagnostics: Diagnostics) -> Iterator[Finding]:
     if pairs := [f"{a} and {b} ({signed(correlation)})" for a, b, correlation in strongest(diagnostics)]:
         yield attention(
-            "Parameters that this log cannot tell apart",
-            f"{joined(pairs)}. Changing one is made up for by changing the other; only their combination is "
-            "known. Fix one of them, or log a motion in which they act differently.",
+            "Parameters that are not identifiable separately",
+            f"{joined(pairs)}. A change in one is compensated by a change in the other, so only their "
+            "combination is identified. Fix one of them, or log a motion that separates them.",
         )
 
 
@@ -356,9 +355,9 @@ def _vague(distribution: Distribution, diagnostics: Diagnostics) -> Iterator[Fin
     vague = ~(diagnostics.standard_error < VAGUE * search_box(distribution).width)
     if vague.any():
         yield attention(
-            "The log says little about some means",
-            f"{_chosen(distribution, vague)}: the standard error of the mean is not small against the search "
-            "box. Log a motion that excites it, or leave it out.",
+            "Poorly identified means",
+            f"{_chosen(distribution, vague)}: the standard error of the mean is not small compared to the search "
+            "box. Log a motion that excites the parameter, or drop it.",
         )
 
 
@@ -367,10 +366,10 @@ def _failures(fit: Fit, diagnostics: Diagnostics) -> Iterator[Finding]:
         yield attention(
             "Diverged simulations",
             f"{whole(lost, 'simulation')} diverged under the fitted distribution. Narrow the bounds or limits of "
-            "the parameters that make the model unstable, or shorten its time step.",
+            "the parameters that destabilize the model, or shorten its time step.",
         )
     if not (np.isfinite(fit.log_likelihood) and np.isfinite(fit.distribution.mean).all()):
-        yield attention("No finite likelihood", "The fit did not arrive at a usable result.")
+        yield attention("No finite likelihood", "The fit did not produce a usable result.")
 
 
 def _chosen(distribution: Distribution, mask: np.ndarray) -> str:
