@@ -210,7 +210,7 @@ def test_double_with_ties(tmp_path: Path) -> None:
     for part in (
         "a delay of the commands to all actuators: 12.1 ms (11.8 to 12.3)",
         "a spring at wrist: stiffness 0.81 N·m/rad (0.77 to 0.85), reference 0.31 rad (0.28 to 0.34)",
-        "This log is explained equally well by a first-order lag of all actuators, in place of a delay of the commands to",
+        "This log is explained equally well by a first-order lag of all actuators, in place of a delay of the commands",
         "a spring between wrist and its parent joint or a constant external force on hand",
         "With them in the model",
         "First round",
