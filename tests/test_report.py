@@ -10,8 +10,11 @@ import pytest
 from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution
 from dropo_torch.fit import Fit, HistoryEntry
-from dropo_torch.report import figures, words, write_fit_report, write_sweep_report
-from dropo_torch.report.html import shown_columns, worst_stretch
+from dropo_torch.report import words, write_fit_report, write_sweep_report
+from dropo_torch.report.figures import to_svg
+from dropo_torch.report.figures.sweep import epsilon_panel
+from dropo_torch.report.fit import shown_columns, worst_stretch
+from dropo_torch.report.formatting import number
 from dropo_torch.studies.sweep import Sweep, SweepPoint
 
 NAMES = ("torso", "damping", "foot")
@@ -116,7 +119,7 @@ def test_page_says_everything(tmp_path: Path) -> None:
     [
         (moved(mean=np.array([0.5, np.log(0.1), 3.5])), ["Mean at its lower search bound", "torso (0.5 kg)"]),
         (moved(mean=np.array([3.5, np.log(1.0), 3.5])), ["Mean at its upper search bound", "damping (1 kg)"]),
-        (moved(std=np.array([0.1, 0.1, 7.5 / 4])), ["deviation at its upper bound", "only with parameters that vary"]),
+        (moved(std=np.array([0.1, 0.1, 7.5 / 4])), ["deviation at its upper bound", "only if parameters vary"]),
         (moved(std=np.array([1e-5, 0.1, 0.1])), ["deviation at its floor", "point estimate"]),
         (replace(moved(), diverged=3), ["3 simulations diverged"]),
         (replace(moved(), log_likelihood=np.nan), ["No finite likelihood"]),
@@ -133,11 +136,11 @@ def test_fit_warnings(fit: Fit, expected: list[str]) -> None:
     [
         ({"confounded": (("torso", "foot", -0.99),)}, ["torso and foot (−0.99)"]),
         ({"diverged": 1}, ["1 simulation diverged"]),
-        ({"at_rest": ("elbow",)}, ["Velocities that the log lacks", "elbow"]),
-        ({"standard_error": np.array([0.01, 0.01, 9.0])}, ["The log says little about some means"]),
+        ({"at_rest": ("elbow",)}, ["Velocities missing from the log", "elbow"]),
+        ({"standard_error": np.array([0.01, 0.01, 9.0])}, ["Poorly identified means"]),
         ({"expected": np.full((50, 2), 0.002)}, ["does not explain the log in 2 of 2 columns"]),
-        ({"expected": np.full((50, 2), 1.0)}, ["with room to spare"]),  # by a wide distribution: ε is not to blame
-        ({"given": np.full((50, 2), 1.0)}, ["Columns that hardly count"]),
+        ({"expected": np.full((50, 2), 1.0)}, ["with margin to spare"]),  # by a wide distribution: ε is not to blame
+        ({"given": np.full((50, 2), 1.0)}, ["Columns that barely count"]),
     ],
 )
 def test_diagnostic_warnings(changes: dict[str, object], expected: list[str]) -> None:
@@ -184,7 +187,7 @@ def test_few_transitions_and_no_history(tmp_path: Path, count: int) -> None:
     fit = replace(make_fit(distribution), history=())
     text = page(tmp_path, fit, make_diagnostics(distribution, count), config=None)
     assert "The parameter only was fitted" in text
-    assert "How the fit converged" not in text
+    assert "Convergence" not in text
     assert "Correlation of the estimated means" not in text
 
 
@@ -233,14 +236,12 @@ def test_worst_stretch_finds_the_misfit() -> None:
     ],
 )  # fmt: skip
 def test_numbers(value: float, uncertainty: float, text: str) -> None:
-    assert words.number(value, uncertainty) == text
+    assert number(value, uncertainty) == text
 
 
 def test_ticks_keep_their_digits() -> None:
-    svg = figures.log_log(
-        np.array([1e-4, 1e-2]), np.array([1.121, 1.139]), chosen=1e-4, x_label="x", y_label="y", y_log=False
-    )
-    assert ">1.125<" in svg
+    figure = epsilon_panel(np.array([1e-4, 1e-2]), np.array([1.121, 1.139]), 1e-4, "y", log=False)
+    assert ">1.125<" in to_svg(figure)
 
 
 def test_sweep(tmp_path: Path) -> None:

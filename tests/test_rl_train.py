@@ -393,7 +393,7 @@ def test_a_run_writes_its_files_and_moves_an_earlier_one_aside(
     assert set(found["evaluation"]) == {"distribution", "nominal", "target"}
     assert len(found["evaluation"]["target"]["returns"]) == 2
     page = (tmp_path / "report.html").read_text()
-    for words in ("Learning curve", "How good it is", "the target model", "What it was trained on", "load_policy"):
+    for words in ("Learning curve", "Evaluation", "the target model", "Training distribution", "load_policy"):
         assert words in page
     assert "An episode" in page or "MUJOCO_GL" in page
     assert "the target model" in capsys.readouterr().out

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
-from dropo_torch.report.html import render
-from dropo_torch.support.files import write_atomically
+from dropo_torch.report.page import Versions, write_page
 
 
 def write_study_report(
@@ -18,7 +17,7 @@ def write_study_report(
     lead: str,
     tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]],
     figures: Mapping[str, str],
-    versions: Mapping[str, str] | None = None,
+    versions: Versions = None,
 ) -> None:
     """Write the report of a study as one self-contained file, whole or not at all.
 
@@ -30,12 +29,6 @@ def write_study_report(
         figures: heading of the table that a figure stands above → SVG.
         versions: name → version of what the results depend on.
     """
-    content = {
-        "title": title,
-        "lead": lead,
-        "tables": list(tables),
-        "figures": {heading: Markup(svg) for heading, svg in figures.items()},
-        "config": "",
-        "versions": dict(versions or {}),
-    }
-    write_atomically(Path(path), render("study.html", content))
+    drawn = {heading: Markup(svg) for heading, svg in figures.items()}
+    content = {"lead": lead, "tables": list(tables), "figures": drawn}
+    write_page(path, "study.html", title, content, config=None, versions=versions)

@@ -1,0 +1,132 @@
+"""Figures of the page on a gap: scores before and after, and the missing force against what drives it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.report.figures import drawing
+from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GREY, INK, ORANGE
+from dropo_torch.report.formatting import number, score
+
+#: Points of a cloud are thinned to about this many.
+MAX_DOTS = 700
+#: Points that a running median is taken over, at least.
+LEAST_POINTS = 8
+#: An axis of log-likelihoods is no narrower: smaller differences are chance.
+LEAST_NATS = 20.0
+_COLOURS = {"your model": ORANGE, "before": ORANGE, "after": BLUE, "noise floor": GREY}
+
+
+def score_panel(scores: Mapping[str, float], label: str, *, log: bool) -> Any:
+    """Draw one score of each model as a dot on a line, with its number.
+
+    Args:
+        scores: the scores of ``your model``, ``before``, ``after`` or ``noise floor``; what is not finite is
+            written, not drawn.
+        label: what the score is, with its unit.
+        log: whether the axis is logarithmic, for errors; it is not if one is not positive. Otherwise it is at least
+            :data:`LEAST_NATS` wide.
+    """
+    figure = drawing.new_figure(300, 56 + 26 * len(scores), label)
+    axes = drawing.new_axes(figure, (80, 40, 62, 8), grid="x")
+    drawn = np.array([v for v in scores.values() if np.isfinite(v)])
+    least = 0.0 if log else LEAST_NATS
+    log = log and len(drawn) > 0 and bool((drawn > 0).all())
+    if log:
+        drawing.log_scale(axes, "x")
+    axes.set_xlim(*_limits(drawn, log, least))
+    for row, (name, value) in enumerate(scores.items()):
+        axes.axhline(row, color=FAINT, linewidth=0.7, zorder=0.5)
+        if np.isfinite(value):
+            axes.plot([value], [row], marker="o", markersize=8, color=_COLOURS[name], clip_on=False)
+        text = score(value) if np.isfinite(value) else "not known" if np.isnan(value) else number(value)
+        axes.text(1.05, row, text, transform=axes.get_yaxis_transform(), va="center", fontsize=11, color=INK)
+    drawing.name_rows(axes, list(scores))
+    axes.tick_params(axis="x", labelsize=10)
+    if len(drawn):
+        drawing.few_ticks(axes, x=4, least=2)
+    else:
+        axes.set_xticks([])
+    axes.set_xlabel(label, fontsize=10.5)
+    return figure
+
+
+def force_panel(
+    variable: np.ndarray, force: np.ndarray, frame: tuple[float, float, float, float], x_label: str, y_label: str,
+    colour: str,
+) -> Any:  # fmt: skip
+    """Draw a force against a variable as a cloud, with its running median.
+
+    Args:
+        variable, force: ``(N,)`` each; what is not finite is left out.
+        frame: left, right, lower and upper end of the axes; what lies beyond is drawn at the edge.
+        x_label, y_label: of the axes.
+        colour: of the median.
+    """
+    figure = drawing.new_figure(420, 250, f"{y_label} against {x_label}")
+    axes = drawing.new_axes(figure, (62, 42, 14, 10))
+    left, right, low, high = frame
+    axes.set(xlabel=drawing.shorten(x_label, 56), ylabel=drawing.shorten(y_label, 36))
+    axes.yaxis.set_label_coords(-48 / 344, 0.5)
+    finite = np.isfinite(variable) & np.isfinite(force)
+    x, y = variable[finite], force[finite]
+    if len(x):
+        axes.axhline(0, color=GREY, linewidth=0.8)
+        keep = _spread(x, MAX_DOTS)
+        cloud = np.clip(y[keep], low, high)
+        drawing.strokes(axes, np.clip(x[keep], left, right), cloud, cloud, CLOUD, 2.6)
+        middle, median = running_median(x, y)
+        inside = (middle >= left) & (middle <= right)
+        axes.plot(middle[inside], np.clip(median[inside], low, high), color=colour, linewidth=2.0)
+    else:
+        drawing.say_empty(axes)
+    axes.set(xlim=(left, right), ylim=(low, high))
+    drawing.few_ticks(axes, 6, 6)
+    return figure
+
+
+def force_frame(variable: np.ndarray, *forces: np.ndarray) -> tuple[float, float, float, float]:
+    """Return left, right, lower and upper end of axes that suit all forces, a few outliers apart."""
+    x_low, x_high = _range(variable, 0.0025)
+    y_low, y_high = _range(np.concatenate(forces) if forces else np.zeros(0), 0.005)
+    return x_low, x_high, min(y_low, 0.0), max(y_high, 0.0)
+
+
+def running_median(x: np.ndarray, y: np.ndarray, most: int = 40) -> tuple[np.ndarray, np.ndarray]:
+    """Return medians of x and y over neighbours in x, as many in each; the whole where there are few."""
+    order = np.argsort(x, kind="stable")
+    count = int(np.clip(len(x) // LEAST_POINTS, 1, most))
+    groups = [g for g in np.array_split(order, count) if len(g)]
+    return np.array([np.median(x[g]) for g in groups]), np.array([np.median(y[g]) for g in groups])
+
+
+def _spread(x: np.ndarray, most: int) -> np.ndarray:
+    """Which points to draw: all, or as many as may be, at random but always the same."""
+    if len(x) <= most:
+        return np.arange(len(x))
+    return np.sort(np.random.default_rng(0).choice(len(x), most, replace=False))
+
+
+def _range(values: np.ndarray, share: float) -> tuple[float, float]:
+    """The range of values without a share at either end, a little wider."""
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return -1.0, 1.0
+    low, high = (float(v) for v in np.quantile(values, (share, 1 - share)))
+    pad = 0.06 * (high - low) or 0.5 * abs(high) or 1.0
+    return low - pad, high + pad
+
+
+def _limits(values: np.ndarray, log: bool, least: float) -> tuple[float, float]:
+    """Ends of an axis around a few values."""
+    if not len(values):
+        return 0.0, 1.0
+    low, high = float(values.min()), float(values.max())
+    if log:
+        factor = max((high / low) ** 0.12, 2.2)
+        return low / factor, high * factor
+    pad = max(0.12 * (high - low), 0.5 * (least - (high - low))) or 0.1 * abs(high) or 1.0
+    return low - pad, high + pad
