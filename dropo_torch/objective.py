@@ -254,7 +254,8 @@ class Objective:
             with single_thread():  # minibatches are small: more threads cost more than they give
                 features = self._simulate(self._states[part], part, leaf)
                 sums = reduce(features, self.target(part), self.base_covariance(part))
-                slope += torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0])
+                if sums.requires_grad:  # it does not where all of them diverge
+                    slope += torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0])
             total = sums.detach() if total is None else total + sums.detach()
         assert total is not None
         return total, slope
