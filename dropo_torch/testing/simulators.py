@@ -428,11 +428,11 @@ def _judge(name: str, labels: Sequence[str], exact: torch.Tensor, true: torch.Te
 
 LAWS = (
     _it_says_what_it_is,
+    _arguments_are_left_as_they_are,
     _results_have_their_shape_and_are_float64,
     _empty_batches_give_empty_results,
     _arguments_that_do_not_fit_are_refused,
     _the_same_arguments_give_the_same_result,
-    _arguments_are_left_as_they_are,
     _a_result_belongs_to_the_caller,
     _order_and_size_of_the_batch_do_not_matter,
     _threads_do_not_matter,
