@@ -217,15 +217,16 @@ def _arguments_that_do_not_fit_are_refused(case: SimulatorCase) -> None:
 def _the_same_arguments_give_the_same_result(case: SimulatorCase) -> None:
     simulator, states, controls, values = case.simulator, case.states, case.controls, case.values
     expected = case.result
-    simulator.simulate(states.flip(0), controls, values[:1])
-    simulator.simulate(states[:1], controls[:1, :1], torch.cat([values] * 3))
-    simulator.rollout(torch.full_like(states, torch.nan), controls, values)
-    if case.diverging is not None:
-        simulator.simulate(states[:2], controls[:2], case.diverging)
-    for _ in range(2):
-        require_same(
-            simulator.simulate(states, controls, values), expected, "a result after other simulations", "the first"
-        )
+    wild = values if case.diverging is None else case.diverging
+    for arguments in (
+        (states, controls, values),
+        (states.flip(0), controls, values[:1]),
+        (states[:1], controls[:1, :1], torch.cat([values] * 3)),
+        (torch.full_like(states, torch.nan), controls, wild),
+    ):
+        simulator.rollout(*arguments)
+        again = simulator.simulate(states, controls, values)
+        require_same(again, expected, "a result after other simulations", "the first")
 
 
 def _arguments_are_left_as_they_are(case: SimulatorCase) -> None:
