@@ -18,7 +18,7 @@ from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import record
 
 import dropo_torch as dropo
-from dropo_torch.objective import draw_uniforms
+from dropo_torch.support.random import draw_uniforms
 
 
 def make_objective(transitions: int) -> dropo.Objective:

@@ -23,6 +23,7 @@ from dropo_torch.fit import Fit, fit
 from dropo_torch.likelihood import log_likelihood
 from dropo_torch.models.export import export_model
 from dropo_torch.objective import Objective
+from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import Parameter, ParameterSpace
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.simulators import Simulator, make_simulator
@@ -46,6 +47,7 @@ __all__ = [
     "Distribution",
     "Effect",
     "Fit",
+    "FitSettings",
     "InputError",
     "Objective",
     "Observation",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import re
@@ -14,6 +15,7 @@ import yaml
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import CENTRES
+from dropo_torch.optimizers.settings import FitSettings, adam_settings
 
 
 class Config(pydantic.BaseModel):
@@ -54,13 +56,13 @@ class Config(pydantic.BaseModel):
     covariance: Literal["diagonal", "full"] = pydantic.Field("diagonal", description="whether parameters vary together")
     epsilon: float | list[float] = pydantic.Field(1e-5, description="ε, variance added to every column, or one each")
     noise: float | list[float] | None = pydantic.Field(
-        None, description="standard deviation of the measurement, or one per column; starts are then uncertain"
+        None, description="standard deviation of the measurement, or one per column; initial states are then uncertain"
     )
     samples: int = pydantic.Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
     lag: int = pydantic.Field(1, ge=1, description="λ, logged steps per window")
     seed: int = pydantic.Field(0, ge=0, lt=2**63, description="seed of everything that is random")
     mask: list[str | int] = pydantic.Field([], description="observed columns which the likelihood leaves out")
-    scaling: bool = pydantic.Field(False, description="divide each column by its deviation over the log")
+    scaling: bool = pydantic.Field(False, description="divide each column by its standard deviation over the log")
     budget: int = pydantic.Field(1000, ge=1, description="with cma: evaluations of the objective")
     population: int | None = pydantic.Field(None, ge=2, description="with cma: φ per generation")
     common_random_numbers: bool = pydantic.Field(False, description="with cma: the same samples in every generation")
@@ -94,6 +96,15 @@ class Config(pydantic.BaseModel):
     def path(self, given: str) -> Path:
         """Return a path of the config as one that can be opened."""
         return self.base / Path(given).expanduser()
+
+    def fit_settings(self) -> FitSettings:
+        """Return what a fit is told.
+
+        Raises:
+            InputError: settings that do not go together.
+        """
+        given = {f.name: getattr(self, f.name) for f in dataclasses.fields(FitSettings)}
+        return FitSettings(**given | {"adam": adam_settings(self.adam)})
 
     @property
     def has_effects(self) -> bool:

@@ -1,11 +1,11 @@
 """The randomization distribution p_φ: independent truncated normals, one a parameter.
 
-Each parameter follows a normal of mean μ and deviation σ, truncated at μ ± 2σ and redrawn until it
+Each parameter follows a normal of mean μ and standard deviation σ, truncated at μ ± 2σ and redrawn until it
 falls inside its physical limits: together, a normal truncated to the intersection of both intervals.
 Samples come from the inverse of its cumulative distribution, so that they are differentiable in μ
 and σ, and the same base uniforms give common random numbers.
 
-A log-scaled parameter has this law in the logarithm of its value. *Coordinates* are values, or
+The logarithm of a log-scaled parameter is distributed so. *Coordinates* are values, or
 logarithms of values for log-scaled parameters; μ and σ live there.
 """
 
@@ -24,9 +24,10 @@ import yaml
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.random import base_uniforms
 
 SCHEMA = "dropo-torch/distribution/1"
-#: A truncated normal reaches this many deviations from its mean.
+#: A truncated normal reaches this many σ from its mean.
 TRUNCATION = 2.0
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
@@ -34,7 +35,7 @@ _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 def truncated_interval(
     mean: torch.Tensor, std: torch.Tensor, low: torch.Tensor, high: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return the truncation interval ``(a, b)`` in deviations from the mean, all shapes broadcast.
+    """Return the truncation interval ``(a, b)`` in σ from the mean, all shapes broadcast.
 
     Where the limits lie outside μ ± 2σ altogether, the interval hugs the nearer end of the limits.
     """
@@ -70,7 +71,7 @@ def truncated_moments(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, t
     return first, second, fourth
 
 
-#: Deviation of draws from a normal that ends :data:`TRUNCATION` deviations from its mean, as a share of σ: 0.8796.
+#: Standard deviation of draws from a normal that ends :data:`TRUNCATION` σ from its mean, as a share of σ: 0.8796.
 DRAWN_STD = float(truncated_moments(*torch.tensor([-TRUNCATION, TRUNCATION], dtype=torch.float64))[1].sqrt())
 
 
@@ -83,10 +84,10 @@ class Distribution:
         mean, std: μ and σ in coordinates, ``(d,)`` float64.
         low, high: the search box of the mean, in the parameters' units, ``(d,)``.
         limits: physical limits in the parameters' units, ``(d, 2)``.
-        is_log: whether each parameter's law is that of its logarithm, ``(d,)`` bool.
+        is_log: whether the logarithm of each parameter is distributed so, ``(d,)`` bool.
         units: the parameters' units.
         correlation: of the underlying normals (a Gaussian copula), ``(d, d)``; ``None`` where they are independent.
-        is_uniform: each law is uniform over μ ± √3 σ instead, so that μ and σ are still its mean and deviation.
+        is_uniform: uniform over μ ± √3 σ instead, so that μ and σ are still mean and standard deviation.
     """
 
     names: tuple[str, ...]
@@ -117,14 +118,14 @@ class Distribution:
         """Return the distribution over ``space`` with μ and σ in coordinates, ``(d,)`` each."""
         return cls(
             names=space.names,
-            mean=np.asarray(mean, dtype=np.float64).copy(),
-            std=np.asarray(std, dtype=np.float64).copy(),
+            mean=np.array(mean, dtype=np.float64),
+            std=np.array(std, dtype=np.float64),
             low=space.low,
             high=space.high,
             limits=space.limits,
             is_log=space.is_log,
             units=tuple(p.unit for p in space.parameters),
-            correlation=None if correlation is None else np.asarray(correlation, dtype=np.float64).copy(),
+            correlation=None if correlation is None else np.array(correlation, dtype=np.float64),
             is_uniform=is_uniform,
         )
 
@@ -144,20 +145,23 @@ class Distribution:
             uniforms = correlate(uniforms, torch.as_tensor(self.correlation))
         if self.is_uniform:
             low, high = (torch.as_tensor(x) for x in self.ends)
-            x = low + uniforms * (high - low)
-            return torch.where(torch.as_tensor(self.is_log), torch.exp(x), x) if self.is_log.any() else x
-        return values_from_uniforms(
-            uniforms, torch.as_tensor(self.mean), torch.as_tensor(self.std), self.limits, self.is_log
-        )
+            return tensor_values(low + uniforms * (high - low), self.is_log)
+        normals = (self.mean, self.std, *coordinate_limits(self.limits, self.is_log))
+        return tensor_values(truncated_normal_icdf(uniforms, *map(torch.as_tensor, normals)), self.is_log)
 
     @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest value that occurs, in coordinates, ``(d,)`` each."""
         if self.is_uniform:
             return self.mean - math.sqrt(3) * self.std, self.mean + math.sqrt(3) * self.std
-        low, high = (torch.as_tensor(x) for x in coordinate_limits(self.limits, self.is_log))
-        a, b = truncated_interval(torch.as_tensor(self.mean), torch.as_tensor(self.std), low, high)
+        a, b = self._interval
         return self.mean + self.std * a.numpy(), self.mean + self.std * b.numpy()
+
+    @property
+    def _interval(self) -> tuple[torch.Tensor, torch.Tensor]:
+        """Where the normals are truncated, in σ from μ, ``(d,)`` each."""
+        limits = coordinate_limits(self.limits, self.is_log)
+        return truncated_interval(*map(torch.as_tensor, (self.mean, self.std, *limits)))
 
     def sample(self, num_samples: int, generator: torch.Generator) -> torch.Tensor:
         """Return ``num_samples`` independent parameter vectors ``(num_samples, d)``, in units."""
@@ -166,18 +170,17 @@ class Distribution:
     def log_prob(self, values: torch.Tensor) -> torch.Tensor:
         """Return the log-density of values ``(..., d)``, in units; ``(...)``, -inf outside the support."""
         is_log = torch.as_tensor(self.is_log)
-        mean, std = torch.as_tensor(self.mean), torch.as_tensor(self.std)
-        low, high = (torch.as_tensor(x) for x in coordinate_limits(self.limits, self.is_log))
         x = torch.where(is_log, torch.log(values), values)
+        stretch = torch.where(is_log, x, torch.zeros_like(x))  # d(log v)/dv = 1/v
         if self.is_uniform:
             low, high = (torch.as_tensor(e) for e in self.ends)
-            density = -torch.log(high - low) - torch.where(is_log, x, torch.zeros_like(x))
+            density = -torch.log(high - low) - stretch
             return torch.where((x >= low) & (x <= high), density, torch.full_like(x, -torch.inf)).sum(-1)
-        a, b = truncated_interval(mean, std, low, high)
+        mean, std = torch.as_tensor(self.mean), torch.as_tensor(self.std)
+        a, b = self._interval
         z = (x - mean) / std
         mass = torch.special.ndtr(b) - torch.special.ndtr(a)
-        density = -0.5 * z * z - _LOG_SQRT_2PI - torch.log(std) - torch.log(mass)
-        density = density - torch.where(is_log, x, torch.zeros_like(x))  # d(log v)/dv = 1/v
+        density = -0.5 * z * z - _LOG_SQRT_2PI - torch.log(std) - torch.log(mass) - stretch
         inside = (z >= a) & (z <= b)
         total = torch.where(inside, density, torch.full_like(density, -torch.inf)).sum(-1)
         if self.correlation is None:
@@ -239,45 +242,45 @@ class Distribution:
     def _from_entries(
         cls, entries: Mapping[str, Mapping[str, Any]], path: Path, correlation: np.ndarray | None
     ) -> Distribution:
-        for name, entry in entries.items():
-            for key in ("mean", "std", "low", "high"):
-                if not isinstance(entry, Mapping) or not isinstance(entry.get(key), (int, float)):
-                    have = entry if isinstance(entry, Mapping) else {}
-                    raise InputError(
-                        f"distribution: {path}: parameters.{name} has no number {key!r}" + choices(key, have)
-                    )
-        laws = {str(entry.get("law", "normal")) for entry in entries.values()}
+        laws = {str(entry.get("law", "normal")) for entry in entries.values() if isinstance(entry, Mapping)}
+        rows = [_numbers(path, name, entry) for name, entry in entries.items()]
         if laws not in ({"normal"}, {"uniform"}):
             raise InputError(f"distribution: {path}: law {', '.join(sorted(laws))}; expected all normal or all uniform")
-        is_log = np.array([entry.get("scale") == "log" for entry in entries.values()])
-        for (name, entry), log in zip(entries.items(), is_log, strict=True):
-            for key in ("log_mean", "log_std") if log else ():
-                if not isinstance(entry.get(key), (int, float)):
-                    raise InputError(f"distribution: {path}: parameters.{name} has scale: log and no number {key!r}")
-            values = [
-                float(entry[k]) for k in ("mean", "std", "low", "high", *(("log_mean", "log_std") if log else ()))
-            ]
-            if not np.isfinite(values).all() or entry["log_std" if log else "std"] <= 0:
-                raise InputError(
-                    f"distribution: {path}: parameters.{name} has mean {entry['mean']} and std {entry['std']}; "
-                    "expected finite numbers, and a std above 0"
-                )
-        pick = [("log_mean", "log_std") if log else ("mean", "std") for log in is_log]
+        mean, std, low, high = np.array(rows).T
         limits = [entry.get("limits") or [None, None] for entry in entries.values()]
         return cls(
             names=tuple(entries),
-            mean=np.array([float(e[k[0]]) for e, k in zip(entries.values(), pick, strict=True)]),
-            std=np.array([float(e[k[1]]) for e, k in zip(entries.values(), pick, strict=True)]),
-            low=np.array([float(e["low"]) for e in entries.values()]),
-            high=np.array([float(e["high"]) for e in entries.values()]),
+            mean=mean,
+            std=std,
+            low=low,
+            high=high,
             limits=np.array(
                 [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits], dtype=float
             ),
-            is_log=is_log,
+            is_log=np.array([entry.get("scale") == "log" for entry in entries.values()]),
             units=tuple(str(e.get("unit", "")) for e in entries.values()),
             correlation=correlation,
             is_uniform=laws == {"uniform"},
         )
+
+
+def _numbers(path: Path, name: str, entry: Any) -> list[float]:
+    """μ and σ in coordinates, and the search box, of one of a document's parameters."""
+    have = entry if isinstance(entry, Mapping) else {}
+    is_log = have.get("scale") == "log"
+    keys = ("mean", "std", "low", "high", *(("log_mean", "log_std") if is_log else ()))
+    for key in keys:
+        if not isinstance(have.get(key), (int, float)):
+            what = f"scale: log and no number {key!r}" if key.startswith("log_") else f"no number {key!r}"
+            raise InputError(f"distribution: {path}: parameters.{name} has {what}" + choices(key, have))
+    mean, std, low, high, *logs = (float(have[key]) for key in keys)
+    found = [*(logs or (mean, std)), low, high]
+    if not np.isfinite([mean, std, *found]).all() or found[1] <= 0:
+        raise InputError(
+            f"distribution: {path}: parameters.{name} has mean {entry['mean']} and std {entry['std']}; "
+            "expected finite numbers, and a std above 0"
+        )
+    return found
 
 
 def _correlation(given: Any, size: int, path: Path) -> np.ndarray | None:
@@ -308,18 +311,9 @@ def copula_log_density(scores: torch.Tensor, correlation: torch.Tensor) -> torch
     return -0.5 * log_det - 0.5 * torch.einsum("...i,ij,...j->...", scores, pull, scores)
 
 
-def base_uniforms(num_samples: int, num_parameters: int, generator: torch.Generator) -> torch.Tensor:
-    """Draw base uniforms ``(num_samples, num_parameters)``, float64."""
-    return torch.rand(num_samples, num_parameters, generator=generator, dtype=torch.float64)
-
-
-def values_from_uniforms(
-    uniforms: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, limits: np.ndarray, is_log: np.ndarray
-) -> torch.Tensor:
-    """Return parameter values, in units, of base uniforms under μ and σ in coordinates; shapes broadcast."""
-    low, high = (torch.as_tensor(x) for x in coordinate_limits(limits, is_log))
-    x = truncated_normal_icdf(uniforms, mean, std, low, high)
-    return torch.where(torch.as_tensor(is_log), torch.exp(x), x) if is_log.any() else x
+def tensor_values(coordinates: torch.Tensor, is_log: np.ndarray) -> torch.Tensor:
+    """Do what :func:`to_values` does for a tensor; differentiable."""
+    return torch.where(torch.as_tensor(is_log), torch.exp(coordinates), coordinates) if is_log.any() else coordinates
 
 
 def to_values(coordinates: np.ndarray, is_log: np.ndarray) -> np.ndarray:
@@ -335,37 +329,40 @@ def to_coordinates(values: np.ndarray, is_log: np.ndarray) -> np.ndarray:
 def coordinate_limits(limits: np.ndarray, is_log: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return physical limits ``(d, 2)`` in coordinates, as low ``(d,)`` and high ``(d,)``."""
     with np.errstate(divide="ignore"):
-        return to_coordinates(np.maximum(limits[:, 0], np.where(is_log, 0.0, -np.inf)), is_log), to_coordinates(
-            limits[:, 1], is_log
-        )
+        low = to_coordinates(np.maximum(limits[:, 0], np.where(is_log, 0.0, -np.inf)), is_log)
+        return low, to_coordinates(limits[:, 1], is_log)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class SearchBox:
     """Where μ and σ are searched, in coordinates, and the normalised form that CMA-ES sees.
 
-    Means are linear and deviations logarithmic, both scaled to [0, 4], so that one initial step size
+    Means are linear and standard deviations logarithmic, both scaled to [0, 4], so that one initial step size
     fits all of them. σ lies between 1e-5 (or 1e-5 of the width where that is less) and a quarter of
     the width of the mean's interval.
 
     Attributes:
         low, high: bounds of μ, ``(d,)``.
         min_std, max_std: bounds of σ, ``(d,)``.
+        limits: physical limits, low and high, ``(d,)`` each.
+        is_log: whether each coordinate is the logarithm of a value, ``(d,)`` bool.
     """
 
     low: np.ndarray
     high: np.ndarray
     min_std: np.ndarray
     max_std: np.ndarray
+    limits: tuple[np.ndarray, np.ndarray]
+    is_log: np.ndarray
 
     WIDTH = 4.0
 
     @classmethod
-    def of(cls, space: ParameterSpace) -> SearchBox:
-        """Return the search box of a parameter space."""
+    def of(cls, space: ParameterSpace | Distribution) -> SearchBox:
+        """Return the search box of a parameter space, or of a distribution over one."""
         low, high = to_coordinates(space.low, space.is_log), to_coordinates(space.high, space.is_log)
-        width = high - low
-        return cls(low, high, min_std=1e-5 * np.minimum(width, 1.0), max_std=width / 4)
+        width, limits = high - low, coordinate_limits(space.limits, space.is_log)
+        return cls(low, high, 1e-5 * np.minimum(width, 1.0), width / 4, limits, space.is_log)
 
     @property
     def width(self) -> np.ndarray:
@@ -377,8 +374,24 @@ class SearchBox:
         """Middle of the box of μ, ``(d,)``."""
         return 0.5 * (self.low + self.high)
 
+    def values(self, coordinates: np.ndarray) -> np.ndarray:
+        """Return values, in units, of coordinates ``(..., d)``."""
+        return to_values(coordinates, self.is_log)
+
+    def draw_coordinates(self, uniforms: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+        """Return what base uniforms are under μ and σ, all in coordinates; differentiable, shapes broadcast."""
+        return truncated_normal_icdf(uniforms, mean, std, *map(torch.as_tensor, self.limits))
+
+    def draw(self, uniforms: torch.Tensor, mean: torch.Tensor, std: torch.Tensor) -> torch.Tensor:
+        """Return the parameter values of base uniforms, in units, under μ and σ; differentiable, shapes broadcast."""
+        return tensor_values(self.draw_coordinates(uniforms, mean, std), self.is_log)
+
+    def varying(self, std: np.ndarray) -> np.ndarray | None:
+        """Return σ ``(d,)``; ``None`` where each is at its floor: a point estimate."""
+        return None if (std <= 2 * self.min_std).all() else std
+
     def normalise(self, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-        """Return φ in [0, 4]: d means, then d logarithms of deviations, ``(..., 2d)``."""
+        """Return φ in [0, 4]: d means, then d logarithms of σ, ``(..., 2d)``."""
         means = (mean - self.low) / self.width
         logs = np.log(std / self.min_std) / np.log(self.max_std / self.min_std)
         return self.WIDTH * np.concatenate([means, logs], axis=-1)

@@ -14,14 +14,16 @@ import numpy as np
 
 from dropo_torch.certify import certify, has_reference
 from dropo_torch.distribution import Distribution
-from dropo_torch.errors import InputError, choices
-from dropo_torch.objective import Objective, draw_uniforms, no_effect
-from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer, Progress
-from dropo_torch.optimizers.correlated import CorrelatedOptimizer
+from dropo_torch.errors import InputError
+from dropo_torch.evaluator import Sums
+from dropo_torch.excitation import refuse_dead_parameters
+from dropo_torch.initial_noise import InitialStateNoise
+from dropo_torch.objective import Evaluation, Objective
+from dropo_torch.optimizers import FitSettings, Optimizer, Progress, Request, make_optimizer
 from dropo_torch.support.files import write_atomically, write_json
+from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/fit/1"
-OPTIMIZERS = ("fisher", "cma", "adam")
 
 
 @dataclass(frozen=True)
@@ -61,7 +63,8 @@ class Fit:
         simulated_transitions: logged steps simulated altogether, checks and the final value included.
         diverged: simulations that diverged in the final evaluation.
         seconds: time spent, over all sessions of the fit.
-        stop_reason: why the optimizer stopped, in words.
+        stop_reason: why the optimizer stopped, in words, the caveat included.
+        caveat: what to know before the distribution is used; empty where there is nothing.
         history: one entry a batch.
         method: how the distribution was found.
         extras: what that method found beside it, as plain data.
@@ -81,6 +84,7 @@ class Fit:
     seconds: float
     stop_reason: str
     history: tuple[HistoryEntry, ...]
+    caveat: str = ""
     method: str = "dropo"
     extras: Mapping[str, Any] = field(default_factory=dict)
 
@@ -115,184 +119,119 @@ class Fit:
 
 def fit(
     objective: Objective,
+    settings: FitSettings | None = None,
     *,
-    optimizer: str = "fisher",
-    samples: int = 100,
-    seed: int = 0,
-    budget: int = 1000,
-    population: int | None = None,
-    common_random_numbers: bool = False,
-    adam: AdamSettings | None = None,
-    entropy: float = 0.0,
-    covariance: str = "diagonal",
+    search: Optimizer | None = None,
     checkpoint: str | Path | None = None,
     resume: bool = False,
     fingerprint: str = "",
     on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
-    search: Optimizer | None = None,
 ) -> Fit:
     """Fit the distribution of a simulator's parameters to a log.
 
     Args:
         objective: the likelihood of the log.
-        optimizer: ``"fisher"``, ``"cma"`` or, on a differentiable simulator, ``"adam"``.
-        samples: K, parameter vectors of each φ.
-        seed: seeds every random number.
-        budget, population, common_random_numbers: options of CMA-ES; see :class:`CMAOptimizer`.
-        adam: how Adam steps.
-        entropy: weight β of Σ log σ, the entropy of p_φ, beside the log-likelihood.
-        covariance: ``"full"`` lets parameters vary together; with ``"fisher"``.
+        settings: the optimizer and what it is told, by default :class:`FitSettings`'s own; those of a config are
+            :meth:`Config.fit_settings`.
+        search: what finds the distribution in place of the settings' optimizer, such as a method of
+            :mod:`dropo_torch.baselines`.
         checkpoint: file in which the fit's state is kept after every batch.
         resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
         fingerprint: identifies the config and log; a checkpoint of another one is refused.
         on_progress: called after every batch.
-        search: what finds the distribution in place of ``optimizer``, such as a method of
-            :mod:`dropo_torch.baselines`.
 
     Raises:
-        InputError: a parameter without effect on this log, an unknown optimizer, a checkpoint that does not fit;
+        InputError: a parameter without effect on this log, a checkpoint that does not fit;
             with Adam, a gradient that the differences of MuJoCo do not confirm on 20 transitions.
     """
-    if optimizer not in OPTIMIZERS:
-        raise InputError(f"optimizer: unknown {optimizer!r}" + choices(optimizer, OPTIMIZERS))
-    search = search or _optimizer(
-        objective,
-        optimizer,
-        samples=samples,
-        seed=seed,
-        budget=budget,
-        population=population,
-        common_random_numbers=common_random_numbers,
-        adam=adam,
-        entropy=entropy,
-        covariance=covariance,
-    )
-    path = None if checkpoint is None else Path(checkpoint)
-    history = _restore(path, fingerprint, search, objective) if resume and path is not None else None
-    if history is None:
-        history = []
-        refuse_dead_parameters(objective)
+    settings = settings or FitSettings()
+    search = search or make_optimizer(objective, settings)
+    kept = None if checkpoint is None else _Checkpoint(Path(checkpoint), fingerprint)
+    state = kept.restore(search, objective) if resume and kept is not None else None
+    if state is None:
+        state = _State(simulated_transitions=refuse_dead_parameters(objective))
         if search.name == "adam" and has_reference(objective):
-            certify(objective, max_transitions=20, points=1, seed=seed).check()
-    history = _run(search, objective, history, path, fingerprint, on_progress)
-    return _conclude(search, objective, history, samples, seed)
+            certify(objective, max_transitions=20, points=1, seed=settings.seed).check()
+    _run(search, objective, state, kept, on_progress)
+    return _conclude(search, objective, state, settings)
 
 
-def _optimizer(
-    objective: Objective,
-    optimizer: str,
-    *,
-    samples: int,
-    seed: int,
-    budget: int,
-    population: int | None,
-    common_random_numbers: bool,
-    adam: AdamSettings | None,
-    entropy: float,
-    covariance: str,
-) -> Optimizer:
-    """The optimizer of a name."""
-    if covariance not in ("diagonal", "full"):
-        raise InputError(f"covariance: {covariance!r} given; expected diagonal or full")
-    if covariance == "full" and optimizer != "fisher":
-        raise InputError(f"covariance: full needs optimizer: fisher; {optimizer} has independent parameters only")
-    if entropy and optimizer == "adam":
-        raise InputError("entropy: adam has no entropy bonus; use optimizer: fisher or cma")
-    if optimizer == "cma":
-        return CMAOptimizer(
-            objective,
-            samples=samples,
-            seed=seed,
-            budget=budget,
-            population=population,
-            common_random_numbers=common_random_numbers,
-            entropy=entropy,
-        )
-    if optimizer == "adam":
-        return AdamOptimizer(objective, settings=adam or AdamSettings(), seed=seed)
-    kind = CorrelatedOptimizer if covariance == "full" else FisherOptimizer
-    return kind(
-        objective.simulator.parameters,
-        samples=samples,
-        seed=seed,
-        noisy=objective.noise is not None,
-        differentiable=objective.simulator.differentiable,
-        entropy=entropy,
-    )
+@dataclass
+class _State:
+    """Where a fit stands, beside its optimizer."""
 
-
-def refuse_dead_parameters(objective: Objective) -> None:
-    """Raise an :class:`InputError` that names every parameter without effect on the log."""
-    dead = no_effect(objective)
-    if not dead:
-        return
-    space = objective.simulator.parameters
-    where = "; ".join(f"{p.name!r} ({p.where})" for p in space.parameters if p.name in dead)
-    raise InputError(
-        f"parameters: {where} moves no compared column of this log anywhere in its bounds; "
-        "leave it out, or log a motion that excites it"
-    )
+    simulated_transitions: int
+    history: list[HistoryEntry] = field(default_factory=list)
+    initial: InitialStateNoise | None = None
 
 
 def _run(
     search: Optimizer,
     objective: Objective,
-    history: list[HistoryEntry],
-    path: Path | None,
-    fingerprint: str,
+    state: _State,
+    kept: _Checkpoint | None,
     on_progress: Callable[[HistoryEntry, Progress], None] | None,
-) -> list[HistoryEntry]:
+) -> None:
     """Ask and tell until the optimizer stops; keep the state after every batch."""
-    begun = time.monotonic() - (history[-1].seconds if history else 0.0)
-    evaluations = history[-1].evaluations if history else 0
+    begun = time.monotonic() - (state.history[-1].seconds if state.history else 0.0)
+    evaluations = state.history[-1].evaluations if state.history else 0
     while search.stop_reason is None:
         request = search.ask()
         at, std = request.linearise_at, request.linearise_std
-        if at is not None and not (_same(at, objective.linearised_at) and _same(std, objective.linearised_std)):
-            objective.linearise(at, std)
-        if request.replay is not None:
-            search.tell(objective.map_replay(request.replay, request.values, request.reduce))
-        elif request.gradient:
-            search.tell(*objective.gradient(request.values, request.reduce, request.rows))
-        elif request.is_stencil and request.rows is None and objective.has_cheaper_jacobian:
-            search.tell(objective.map_linear(request.values, request.reduce))
-        else:
-            search.tell(objective.map(request.values, request.reduce, request.rows))
+        if at is not None and (state.initial is None or not state.initial.is_at(at, std)):
+            state.initial = objective.initial_noise(at, std)
+            state.simulated_transitions += state.initial.simulated_transitions if state.initial else 0
+        sums = answer(objective, request, state.initial)
+        search.tell(sums.total, sums.gradient)
         evaluations += request.evaluations
+        state.simulated_transitions += sums.simulated_transitions
         progress = search.progress
         mean, std = search.candidates()[0]
         entry = HistoryEntry(
             evaluations=evaluations,
-            simulated_transitions=objective.simulated_transitions,
+            simulated_transitions=state.simulated_transitions,
             seconds=time.monotonic() - begun,
             log_likelihood=progress.log_likelihood,
             stage=progress.stage,
             mean=np.array(mean),
             std=np.array(std),
         )
-        history.append(entry)
-        if path is not None:
-            _save_checkpoint(path, fingerprint, search, objective, history)
+        state.history.append(entry)
+        if kept is not None:
+            kept.save(search, state)
         if on_progress is not None:
             on_progress(entry, progress)
-    return history
 
 
-def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntry], samples: int, seed: int) -> Fit:
+def answer(objective: Objective, request: Request, initial: InitialStateNoise | None = None) -> Sums:
+    """Simulate what an optimizer asks for, around the noise of the initial states."""
+    run, values = objective.evaluator, request.values
+    if request.replay is not None:
+        return run.map_replay(request.replay, values, request.reduce)
+    visit = objective.comparing(request.reduce, initial)
+    if request.gradient:
+        return run.gradient(values, visit, request.rows)
+    if request.is_stencil and request.rows is None and run.has_cheaper_jacobian:
+        return run.map_linear(values, visit)
+    return run.map(values, visit, request.rows)
+
+
+def _conclude(search: Optimizer, objective: Objective, state: _State, settings: FitSettings) -> Fit:
     """Evaluate the candidates on draws of their own and return the best."""
     begun = time.monotonic()
-    spent = history[-1].seconds if history else 0.0
+    last = state.history[-1] if state.history else None
     space = objective.simulator.parameters
-    uniforms = draw_uniforms(samples, len(space), seed, 0)
-    results = []
+    uniforms = draw_uniforms(settings.samples, len(space), settings.seed, 0)
+    results: list[tuple[float, Distribution, Evaluation]] = []
     for candidate in search.distributions(space):
-        objective.linearise(candidate.mean, objective.varying(candidate.std))
-        evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None])[0]
+        initial = objective.initial_noise_of(candidate)
+        evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None], initial)[0]
         results.append((evaluation.log_likelihood + search.bonus(candidate), candidate, evaluation))
+        state.simulated_transitions += evaluation.simulated_transitions
+        state.simulated_transitions += initial.simulated_transitions if initial else 0
     _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
-    objective.linearise(distribution.mean, objective.varying(distribution.std))
     dropped = distribution.correlation is None and any(c.correlation is not None for _, c, _ in results)
-    remark = ", but makes the log no likelier: parameters vary independently" if dropped else ""
+    remark = "makes the log no likelier: parameters vary independently" if dropped else ""
     return Fit(
         distribution=distribution,
         log_likelihood=best.log_likelihood,
@@ -300,59 +239,66 @@ def _conclude(search: Optimizer, objective: Objective, history: list[HistoryEntr
         epsilon=tuple(objective.epsilon.tolist()),
         backend=objective.simulator.name,
         optimizer=search.name,
-        samples=samples,
-        seed=seed,
-        evaluations=history[-1].evaluations if history else 0,
-        simulated_transitions=objective.simulated_transitions,
+        samples=settings.samples,
+        seed=settings.seed,
+        evaluations=last.evaluations if last else 0,
+        simulated_transitions=state.simulated_transitions,
         diverged=best.diverged,
-        seconds=spent + time.monotonic() - begun,
-        stop_reason=(search.stop_reason or "") + remark,
-        history=tuple(history),
+        seconds=(last.seconds if last else 0.0) + time.monotonic() - begun,
+        stop_reason=(search.stop_reason or "") + (f", but {remark}" if remark else ""),
+        history=tuple(state.history),
+        caveat=f"a full covariance {remark}" if remark else search.caveat,
         method=search.method,
         extras=search.extras(),
     )
 
 
-def _same(one: np.ndarray | None, other: np.ndarray | None) -> bool:
-    return one is other or (one is not None and other is not None and np.array_equal(one, other))
+@dataclass(frozen=True)
+class _Checkpoint:
+    """The file in which a fit's state is kept, and whose fit it is."""
 
+    path: Path
+    fingerprint: str
 
-def _save_checkpoint(
-    path: Path, fingerprint: str, search: Optimizer, objective: Objective, history: list[HistoryEntry]
-) -> None:
-    state = {
-        "fingerprint": fingerprint,
-        "optimizer": search.name,
-        "state": search.state(),
-        "history": [vars(entry) for entry in history],
-        "simulated_transitions": objective.simulated_transitions,
-        "linearised": (objective.linearised_at, objective.linearised_std),
-    }
-    write_atomically(path, pickle.dumps(state))
+    def save(self, search: Optimizer, state: _State) -> None:
+        """Write the state, whole or not at all."""
+        initial = state.initial
+        content = {
+            "fingerprint": self.fingerprint,
+            "optimizer": search.name,
+            "state": search.state(),
+            "history": [vars(entry) for entry in state.history],
+            "simulated_transitions": state.simulated_transitions,
+            "linearised": None if initial is None else (initial.mean, initial.std),
+        }
+        write_atomically(self.path, pickle.dumps(content))
 
-
-def _restore(path: Path, fingerprint: str, search: Optimizer, objective: Objective) -> list[HistoryEntry] | None:
-    """Restore a checkpoint into a fresh optimizer; ``None`` where there is none yet."""
-    if not path.is_file():
-        return None
-    try:
-        state = pickle.loads(path.read_bytes())
-        owner, stored = (state["fingerprint"], state["optimizer"])
-        if owner == fingerprint and stored == search.name:
-            search.restore(state["state"])
-            history = [HistoryEntry(**entry) for entry in state["history"]]
-            simulated, (linearised_at, linearised_std) = state["simulated_transitions"], state["linearised"]
-    except Exception as error:
-        raise InputError(f"resume: {path} is no checkpoint of a fit ({error}); start again without --resume") from None
-    if owner != fingerprint or stored != search.name:
-        raise InputError(
-            f"resume: {path} belongs to another config, log or optimizer; restore those, "
-            "or start again without --resume"
-        )
-    if linearised_at is not None:
-        objective.linearise(linearised_at, linearised_std)
-    objective.simulated_transitions = simulated
-    return history
+    def restore(self, search: Optimizer, objective: Objective) -> _State | None:
+        """Restore the state of a fresh optimizer and its fit; ``None`` where there is none yet."""
+        if not self.path.is_file():
+            return None
+        try:
+            content = pickle.loads(self.path.read_bytes())
+            is_own = (content["fingerprint"], content["optimizer"]) == (self.fingerprint, search.name)
+            if is_own:
+                search.restore(content["state"])
+                state = _State(
+                    simulated_transitions=content["simulated_transitions"],
+                    history=[HistoryEntry(**entry) for entry in content["history"]],
+                )
+                linearised = content["linearised"]
+        except Exception as error:
+            raise InputError(
+                f"resume: {self.path} is no checkpoint of a fit ({error}); start again without --resume"
+            ) from None
+        if not is_own:
+            raise InputError(
+                f"resume: {self.path} belongs to another config, log or optimizer; restore those, "
+                "or start again without --resume"
+            )
+        if linearised is not None:
+            state.initial = objective.initial_noise(*linearised)  # already counted
+        return state
 
 
 def without_history(result: Fit) -> Fit:

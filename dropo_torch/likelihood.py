@@ -1,6 +1,6 @@
 """The likelihood of measured next states, equations 2 and 3 of Tiboni et al. 2023: pure functions of states.
 
-Beside the paper's Gaussians: what a noisy start state does to them, and how orientations enter.
+Beside the paper's Gaussians: what a noisy initial state does to them, and how orientations enter.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ def _whitened(residual: torch.Tensor, matrix: torch.Tensor) -> tuple[torch.Tenso
 def robust_cholesky(covariance: torch.Tensor) -> torch.Tensor:
     """Return the lower Cholesky factor, ``(..., n, n)``.
 
-    A matrix that rounding has left indefinite (deviations of very different size) gets the smallest
+    A matrix that rounding has left indefinite (standard deviations of very different size) gets the smallest
     multiple of its trace on the diagonal that cures it; all others are left as they are.
     """
     factor, info = torch.linalg.cholesky_ex(covariance)
@@ -102,7 +102,7 @@ def log_likelihood(
 
 
 def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return shift ``(t, m)`` and covariance ``(t, m, m)`` of outcomes of noisy starts.
+    """Return shift ``(t, m)`` and covariance ``(t, m, m)`` of outcomes of noisy initial states.
 
     Args:
         outcomes: the undisturbed one, then those of antithetic draws, ``(t, 1 + M, m)``.
@@ -125,21 +125,6 @@ def widening(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
     """
     chi2, _ = _whitened(residual, covariance)
     return ((STUDENT_DOF + chi2) / (STUDENT_DOF + residual.shape[-1])).clamp(min=1.0)
-
-
-def rotation_vector(measured: torch.Tensor, simulated: torch.Tensor) -> torch.Tensor:
-    """Return the rotation from measured to simulated unit quaternions (w, x, y, z), ``(..., 3)`` in rad.
-
-    Its length is the angle between the two orientations, in [0, π].
-    """
-    w0, v0 = measured[..., :1], measured[..., 1:]
-    w1, v1 = simulated[..., :1], simulated[..., 1:]
-    scalar = w0 * w1 + (v0 * v1).sum(-1, keepdim=True)
-    vector = w0 * v1 - w1 * v0 - torch.linalg.cross(v0.expand_as(v1), v1)
-    sign = torch.where(scalar < 0, -1.0, 1.0)
-    norm = vector.norm(dim=-1, keepdim=True)
-    angle = 2 * torch.atan2(norm, scalar * sign)
-    return sign * vector * torch.where(norm > 1e-12, angle / norm.clamp(min=1e-300), torch.full_like(norm, 2.0))
 
 
 def likelihood_with_losses(

@@ -16,7 +16,7 @@ from dropo_torch.data.observation import generic_observation as generic_observat
 from dropo_torch.data.trajectory import Transitions
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers import Optimizer
+from dropo_torch.optimizers import Optimizer, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.testing.linear import LinearSimulator as LinearSimulator
 from dropo_torch.testing.linear import linear_objective as linear_objective
@@ -172,11 +172,15 @@ def space_of(**bounds: Sequence[float] | dict) -> ParameterSpace:
 def drive(optimizer: Optimizer, objective: Objective, after_tell: Callable[[], None] = lambda: None) -> None:
     """Ask, simulate and tell until the optimizer stops."""
     while optimizer.stop_reason is None:
-        request = optimizer.ask()
-        if request.linearise_at is not None:
-            objective.linearise(request.linearise_at)
-        optimizer.tell(objective.map(request.values, request.reduce))
+        optimizer.tell(answered(objective, optimizer.ask()))
         after_tell()
+
+
+def answered(objective: Objective, request: Request) -> torch.Tensor:
+    """The sums that an optimizer asks for, around the noise of the initial states."""
+    at = request.linearise_at
+    initial = None if at is None else objective.initial_noise(at)
+    return objective.map(request.values, request.reduce, initial=initial).total
 
 
 def numerical_gradient(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-5) -> np.ndarray:

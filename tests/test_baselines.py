@@ -29,13 +29,14 @@ from dropo_torch.distribution import DRAWN_STD, Distribution, truncated_moments
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, fit
 from dropo_torch.likelihood import DIVERGENCE_PENALTY
-from dropo_torch.objective import draw_uniforms
+from dropo_torch.optimizers import FitSettings
 from dropo_torch.optimizers.correlated import random_effects
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.report import write_fit_report
 from dropo_torch.report.words import findings
 from dropo_torch.studies.calibration import calibrate, coverages, draw_truths, interval, synthesise, wilson
+from dropo_torch.support.random import draw_uniforms
 
 #: A driven pendulum; the rod has no mass, the bob's is to be found.
 PENDULUM_XML = """
@@ -120,7 +121,7 @@ def test_laplace_is_the_normal_of_least_squares(folder: Path) -> None:
     simulator = LinearSimulator(space, np.array([[1.0, 0.5], [0.0, 2.0], [1.0, -1.0]]))
     measured = np.array([1.0, -2.0]) @ simulator.effect.numpy().T + 0.1 * rng.standard_normal((40, 3))
     objective = linear_objective(simulator, measured, epsilon=[1e-2, 1e-2, 4e-2])
-    found = fit(objective, search=LaplaceOptimizer(objective), samples=10).distribution
+    found = fit(objective, FitSettings(samples=10), search=LaplaceOptimizer(objective)).distribution
     weight = np.diag(1 / np.array([1e-2, 1e-2, 4e-2]))
     design = simulator.effect.numpy()
     gram = 40 * design.T @ weight @ design
@@ -153,7 +154,7 @@ def test_laplace_keeps_a_direction_that_the_log_knows_where_another_is_unknown()
     rng = np.random.default_rng(0)
     simulator = LinearSimulator(space_of(a=[0, 1], b=[0, 100]), np.array([[1.0, 1.0]]))
     objective = linear_objective(simulator, 30.0 + 0.01 * rng.standard_normal((40, 1)), epsilon=1e-4)
-    found = fit(objective, search=LaplaceOptimizer(objective), samples=10).distribution
+    found = fit(objective, FitSettings(samples=10), search=LaplaceOptimizer(objective)).distribution
     assert found.correlation is not None
     covariance = found.correlation * np.outer(found.std, found.std)
     assert np.sqrt(covariance.sum()) == pytest.approx(0.01 / np.sqrt(40), rel=0.3)
@@ -328,7 +329,9 @@ def test_bayessim_measures_its_replays_as_the_log_was(folder: Path) -> None:
         assert search is not None
         request = search.ask()
         assert request.replay is not None
-        table = ours.objective.map_replay(request.replay, request.values, request.reduce).reshape(101, -1)
+        table = ours.objective.evaluator.map_replay(request.replay, request.values, request.reduce).total.reshape(
+            101, -1
+        )
         sums.append(table[:-1, 2:4].mean(0) / (4 * 19))
     assert (sums[1] - sums[0]).numpy() == pytest.approx([2 * 0.05**2, 2 * 0.3**2], rel=0.1)
 
@@ -354,7 +357,7 @@ def test_replays_follow_the_log_where_the_parameters_are_right(folder: Path) -> 
     def worst(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
         return (features - measured[:, None]).abs().amax((0, 2, 3))
 
-    error = ours.objective.map_replay(replay, np.array([[MASS, DAMPING], [1.0, 0.05]]), worst)
+    error = ours.objective.evaluator.map_replay(replay, np.array([[MASS, DAMPING], [1.0, 0.05]]), worst).total
     assert error[0] < 1e-9
     assert error[1] > 0.05
     assert make_replay(ours.trajectories, ours.observation, 10_000).horizon == STEPS
@@ -442,8 +445,8 @@ def test_full_covariance_is_found_where_parameters_vary_together() -> None:
     simulator = LinearSimulator(space, np.eye(2))
     drawn = rng.multivariate_normal([0.5, -0.5], [[0.25, 0.2], [0.2, 0.25]], size=600)
     objective = linear_objective(simulator, drawn + 0.01 * rng.standard_normal(drawn.shape), epsilon=1e-4)
-    plain = fit(objective, samples=200)
-    full = fit(objective, samples=200, covariance="full")
+    plain = fit(objective, FitSettings(samples=200))
+    full = fit(objective, FitSettings(samples=200, covariance="full"))
     assert full.distribution.correlation is not None
     assert full.distribution.correlation[0, 1] == pytest.approx(0.8, abs=0.08)
     assert full.distribution.mean == pytest.approx(drawn.mean(0), abs=0.02)
@@ -452,8 +455,8 @@ def test_full_covariance_is_found_where_parameters_vary_together() -> None:
 
 
 def test_entropy_keeps_deviations_open(folder: Path) -> None:
-    closed = fit(problem(folder, "dropo", "exact").objective, samples=20)
-    opened = fit(problem(folder, "dropo", "exact").objective, samples=20, entropy=2.0)
+    closed = fit(problem(folder, "dropo", "exact").objective, FitSettings(samples=20))
+    opened = fit(problem(folder, "dropo", "exact").objective, FitSettings(samples=20, entropy=2.0))
     assert (opened.distribution.std > 100 * closed.distribution.std).all()
     assert opened.log_likelihood < closed.log_likelihood
     assert opened.document()["entropy"] == 2.0
@@ -463,7 +466,7 @@ def test_entropy_keeps_deviations_open(folder: Path) -> None:
 def test_the_entropy_bonus_is_balanced_by_the_likelihood() -> None:
     """With one parameter and A = 1, Σ log N(0; 0, vσ² + ε) + β log σ is largest at vσ² = βε / (T − β)."""
     simulator = LinearSimulator(space_of(a=[-5, 5]), np.eye(1))
-    found = fit(linear_objective(simulator, np.zeros((50, 1)), epsilon=1e-2), entropy=5.0, samples=50)
+    found = fit(linear_objective(simulator, np.zeros((50, 1)), epsilon=1e-2), FitSettings(entropy=5.0, samples=50))
     variance = float(truncated_moments(torch.tensor(-2.0), torch.tensor(2.0))[1])
     assert variance * found.distribution.std[0] ** 2 == pytest.approx(5 * 1e-2 / (50 - 5), rel=0.02)
 
@@ -477,7 +480,7 @@ def test_an_interrupted_run_ends_as_one_never_interrupted(folder: Path, tmp_path
         "laplace": {},
     }[method]
     ours = problem(folder, method, "noisy", method_options=options)
-    whole = fit(ours.objective, search=make_search(ours), samples=10)
+    whole = fit(ours.objective, FitSettings(samples=10), search=make_search(ours))
 
     class Stop(Exception):
         pass
@@ -489,12 +492,12 @@ def test_an_interrupted_run_ends_as_one_never_interrupted(folder: Path, tmp_path
     for _ in range(2):  # killed after the first batch, and again after the second
         with pytest.raises(Stop):
             fit(
-                again.objective, search=make_search(again), samples=10, checkpoint=tmp_path / "c.pkl", resume=True,
-                on_progress=stop,
+                again.objective, FitSettings(samples=10), search=make_search(again), checkpoint=tmp_path / "c.pkl",
+                resume=True, on_progress=stop,
             )  # fmt: skip
     last = problem(folder, method, "noisy", method_options=options)
     resumed = fit(
-        last.objective, search=make_search(last), samples=10, checkpoint=tmp_path / "c.pkl", resume=True
+        last.objective, FitSettings(samples=10), search=make_search(last), checkpoint=tmp_path / "c.pkl", resume=True
     )  # fmt: skip
     assert resumed.distribution.mean == pytest.approx(whole.distribution.mean, rel=1e-12)
     assert resumed.distribution.std == pytest.approx(whole.distribution.std, rel=1e-12)
@@ -561,11 +564,11 @@ def test_a_bad_option_ends_the_command_before_an_earlier_run_is_moved(
 def test_options_of_the_fit_that_do_not_go_together_are_refused(folder: Path) -> None:
     objective = problem(folder, "dropo").objective
     with pytest.raises(InputError, match="needs optimizer: fisher"):
-        fit(objective, optimizer="cma", covariance="full")
+        fit(objective, FitSettings(optimizer="cma", covariance="full"))
     with pytest.raises(InputError, match="diagonal or full"):
-        fit(objective, covariance="round")
+        fit(objective, FitSettings(covariance="round"))
     with pytest.raises(InputError, match="no entropy bonus"):
-        fit(objective, optimizer="adam", entropy=1.0)
+        fit(objective, FitSettings(optimizer="adam", entropy=1.0))
 
 
 def test_a_log_of_single_transitions_has_nothing_for_bayessim(folder: Path) -> None:
@@ -849,7 +852,11 @@ def test_bayessim_summarises_orientations_of_log_and_replays_alike(tmp_path: Pat
     assert search is not None
     request = search.ask()
     assert request.replay is not None
-    table = ours.objective.map_replay(request.replay, np.array([[1.0]]), request.reduce).reshape(2, -1).numpy()
+    table = (
+        ours.objective.evaluator.map_replay(request.replay, np.array([[1.0]]), request.reduce)
+        .total.reshape(2, -1)
+        .numpy()
+    )
     assert table[0] == pytest.approx(table[1], abs=1e-9)
     assert (table[1, 6:9] > 1e-3).all()  # mean squares of the orientation's changes
 

@@ -14,16 +14,17 @@ from hypothesis import strategies as st
 from dropo_torch.distribution import (
     Distribution,
     SearchBox,
-    base_uniforms,
+    tensor_values,
     to_coordinates,
     to_values,
     truncated_interval,
     truncated_moments,
     truncated_normal_icdf,
-    values_from_uniforms,
 )
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
+from dropo_torch.optimizers import FitSettings
+from dropo_torch.support.random import base_uniforms
 
 #: μ, σ and physical limits: none, one that cuts, both that cut, μ at a limit, μ outside of one.
 LAWS = [
@@ -95,14 +96,15 @@ def test_no_sample_leaves_the_limits_or_two_deviations(mean, std, low, width, un
 @pytest.mark.parametrize("log", [False, True])
 def test_samples_are_differentiable_in_mean_and_deviation(law, log):
     mean, std, low, high = law
-    limits = np.array([[max(low, 0.05) if log else low, high]])
+    ends = np.array([max(low, 0.05) if log else low, high])
+    limits = torch.from_numpy(np.log(ends) if log else ends)
     u = torch.tensor([[0.03], [0.4], [0.77], [0.98]], dtype=torch.float64)
     at = np.array([np.log(abs(mean) + 0.5) if log else mean, std])
 
     def total(phi: np.ndarray | torch.Tensor) -> torch.Tensor:
         phi = torch.as_tensor(phi)
         weights = torch.tensor([[1.0], [-2.0], [0.5], [3.0]], dtype=torch.float64)
-        return (weights * values_from_uniforms(u, phi[:1], phi[1:], limits, np.array([log]))).sum()
+        return (weights * tensor_values(truncated_normal_icdf(u, *phi, *limits), np.array([log]))).sum()
 
     leaf = torch.tensor(at, requires_grad=True)
     total(leaf).backward()
@@ -178,7 +180,7 @@ def test_a_saved_distribution_is_read_back_exactly(tmp_path, suffix):
 def test_the_distribution_inside_a_fit_json_is_the_fitted_one(tmp_path):
     space = space_of(friction={"bounds": [0, 2], "limits": [0, 5]}, scale={"bounds": [1, 10], "scale": "log"})
     simulator = LinearSimulator(space, np.eye(2))
-    result = fit(linear_objective(simulator, np.tile([0.0, 3.0], (20, 1))), samples=10)
+    result = fit(linear_objective(simulator, np.tile([0.0, 3.0], (20, 1))), FitSettings(samples=10))
     result.save(tmp_path / "fit.json")
     back = Distribution.load(tmp_path / "fit.json")
     for key, value in vars(result.distribution).items():

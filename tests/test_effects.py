@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import HOPPER
+from conftest import HOPPER, simulated_columns
 from dropo_sims.hopper import SIM
 
 from dropo_torch.certify import certify
@@ -25,6 +25,7 @@ from dropo_torch.effects.placing import lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
+from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
 from dropo_torch.simulators import MujocoSimulator, make_simulator
@@ -518,7 +519,7 @@ def test_a_fit_recovers_a_hidden_delay_and_friction(tmp_path: Path, backend: str
         document["effects"] = [{"effect": "joint_friction", "target": "elbow", "friction": 0.15}]
     problem = make_problem(make_config(document))
     assert isinstance(problem.simulator, EffectSimulator)
-    mean = fit(problem.objective, samples=20, seed=0).distribution.summary()
+    mean = fit(problem.objective, FitSettings(samples=20)).distribution.summary()
     assert mean["delay"]["mean"] == pytest.approx(0.03, abs=1e-5)
     assert backend == "warp" or mean["friction"]["mean"] == pytest.approx(0.15, abs=1e-4)
 
@@ -575,7 +576,7 @@ def test_gymnasium_environments_have_effects_around_them() -> None:
     theirs = make_problem(make_config({**document, "backend": "gymnasium", "environment": "Hopper-v5"}))
     values = 0.5 * (ours.space.low + ours.space.high)[None]
     few = np.arange(0, len(ours.objective), 20)
-    found = [p.objective.on(p.objective.transitions.select(few)).simulated(values) for p in (ours, theirs)]
+    found = [simulated_columns(p.objective.on(p.objective.transitions.select(few)), values) for p in (ours, theirs)]
     torch.testing.assert_close(*found, rtol=0, atol=1e-8)
     force = [{"effect": "external_force", "target": "torso", "x": 1.0, "y": 0.0, "z": 0.0}]
     with pytest.raises(InputError, match=r"backend gymnasium cannot have external_force at torso.*backend: mujoco"):
@@ -637,7 +638,7 @@ def test_adam_says_why_it_has_no_gradients(tmp_path: Path) -> None:
     problem = make_problem(make_config(document))
     assert not hasattr(problem.simulator, "jacobian")
     with pytest.raises(InputError, match=r"adam needs gradients.*actuator_delay.*fisher or cma"):
-        fit(problem.objective, optimizer="adam", samples=4)
+        fit(problem.objective, FitSettings(optimizer="adam", samples=4))
 
 
 def test_ones_own_effect_joins_the_vocabulary(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -806,7 +807,7 @@ def test_a_found_config_fits(tmp_path: Path) -> None:
     }  # fmt: skip
     assert document["effects"] == [{"effect": "actuator_delay", "target": "bend", "delay": 0.028}]
     found = make_problem(load_config(tmp_path / "config.yaml"))
-    result = fit(found.objective, samples=20, seed=0).distribution.summary()
+    result = fit(found.objective, FitSettings(samples=20)).distribution.summary()
     assert result["elbow_friction"]["mean"] == pytest.approx(0.15, abs=1e-4)
     assert result["bend_delay"]["mean"] == pytest.approx(0.03, abs=1e-5)
     assert result["mass"]["mean"] == pytest.approx(0.7, abs=1e-3)

@@ -17,6 +17,7 @@ from conftest import LinearSimulator, linear_objective, space_of
 from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, fit, without_history
+from dropo_torch.optimizers import FitSettings
 from dropo_torch.problem import make_problem
 
 DRIVER = Path(__file__).with_name("killed.py")
@@ -37,10 +38,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Folder:
 def fitted(folder: Folder) -> Callable[..., Fit]:
     def run(**changes: Any) -> Fit:
         config = load_config(folder.config(**changes))
-        return fit(
-            make_problem(config).objective, optimizer=config.optimizer, samples=config.samples, seed=config.seed,
-            budget=config.budget, population=config.population,
-        )  # fmt: skip
+        return fit(make_problem(config).objective, config.fit_settings())
 
     return run
 
@@ -101,7 +99,7 @@ def test_cma_and_fisher_find_the_same_distribution() -> None:
 
     def result(**options: Any) -> Fit:
         simulator = LinearSimulator(space_of(a=[0.0, 3.0], b=[1.0, 9.0]), gain)
-        return fit(linear_objective(simulator, measured, epsilon=1e-2), samples=60, **options)
+        return fit(linear_objective(simulator, measured, epsilon=1e-2), FitSettings(samples=60, **options))
 
     ours, theirs = result(), result(optimizer="cma", budget=500, common_random_numbers=True)
     assert ours.log_likelihood > theirs.log_likelihood - 1.0
@@ -136,7 +134,7 @@ def test_fit_json_has_the_keys_of_the_contract(fitted: Callable[..., Fit]) -> No
 def test_an_unknown_optimizer_is_refused() -> None:
     objective = linear_objective(LinearSimulator(space_of(a=[0.0, 3.0]), np.eye(1)), np.ones((9, 1)))
     with pytest.raises(InputError, match="did you mean 'fisher'"):
-        fit(objective, optimizer="fischer")
+        fit(objective, FitSettings(optimizer="fischer"))
 
 
 def killed_and_resumed(folder: Folder, config: Path, kills: int, seed: int) -> dict[str, Any]:

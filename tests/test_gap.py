@@ -18,7 +18,6 @@ import numpy as np
 import pytest
 import yaml
 from arm import Folder
-from conftest import BOX_XML
 
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
@@ -26,14 +25,13 @@ from benchmarks.hidden.systems import CART_POLE, TORQUE_ARM
 from benchmarks.hidden.truths import Case, Effect, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
-from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
 from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Starts, cost_of, robust_factors
 from dropo_torch.gap.intervals import deviations
 from dropo_torch.gap.locate import guilty, regime
-from dropo_torch.gap.log import Chart, cut_windows
+from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
 from dropo_torch.gap.result import NamedEffect, Strength
@@ -292,46 +290,6 @@ def test_result_is_reproducible_and_independent_of_threads(threads: int) -> None
 
 
 # --- the log --------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def box_chart() -> tuple[Chart, np.ndarray]:
-    """The chart of a free body beside a hinge, and random columns of it."""
-    model = mujoco.MjModel.from_xml_string(BOX_XML)
-    observation = parse_observation(model, ["qpos", "qvel"])
-    columns = np.random.default_rng(0).standard_normal((2, 50, observation.size))
-    for q in observation.quaternions:
-        columns[..., list(q)] /= np.linalg.norm(columns[..., list(q)], axis=-1, keepdims=True)
-    return Chart.of(observation), columns
-
-
-def same(chart: Chart, first: np.ndarray, second: np.ndarray) -> bool:
-    """Whether columns are equal, orientations up to the quaternion's sign."""
-    plain = np.allclose(first[..., list(chart.plain)], second[..., list(chart.plain)], atol=1e-12)
-    inner = [np.abs((first[..., list(q)] * second[..., list(q)]).sum(-1)) for q in chart.quaternions]
-    return plain and all(np.allclose(i, 1.0, atol=1e-12) for i in inner)
-
-
-def test_move_undoes_difference(box_chart: tuple[Chart, np.ndarray]) -> None:
-    chart, (start, end) = box_chart
-    assert chart.size == start.shape[-1] - 1
-    assert same(chart, chart.move(start, chart.difference(end, start)), end)
-    assert np.all(chart.difference(start, start) == 0)
-
-
-@pytest.mark.parametrize("size", [1e-9, 1e-3, 0.5])
-def test_difference_undoes_move(box_chart: tuple[Chart, np.ndarray], size: float) -> None:
-    chart, (start, _) = box_chart
-    delta = size * np.random.default_rng(1).standard_normal((len(start), chart.size))
-    assert chart.difference(chart.move(start, delta), start) == pytest.approx(delta, abs=1e-14 + 1e-9 * size)
-
-
-def test_difference_ignores_the_sign_of_quaternions(box_chart: tuple[Chart, np.ndarray]) -> None:
-    chart, (start, end) = box_chart
-    flipped = end.copy()
-    for q in chart.quaternions:
-        flipped[..., list(q)] *= -1
-    assert chart.difference(flipped, start) == pytest.approx(chart.difference(end, start), abs=1e-12)
 
 
 def test_windows_share_no_measurement_and_cross_no_end() -> None:
@@ -680,14 +638,6 @@ def refused(capfd: pytest.CaptureFixture[str]) -> Callable[..., str]:
         return error
 
     return attempt
-
-
-def test_noise_of_columns_is_that_of_features() -> None:
-    """Of a quaternion's four columns, which stand between others, to three rotations and back."""
-    chart = Chart(plain=(0, 5), quaternions=((1, 2, 3, 4),), labels=("a", "b", "x", "y", "z"), units=("",) * 5)
-    columns = np.array([0.1, 0.02, 0.02, 0.02, 0.02, 0.3])
-    assert chart.feature_noise(columns) == pytest.approx([0.1, 0.3, 0.04, 0.04, 0.04])
-    assert chart.column_noise(chart.feature_noise(columns)) == pytest.approx(columns)
 
 
 def test_command_writes_its_files(cart: Path) -> None:

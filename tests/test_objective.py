@@ -16,26 +16,27 @@ from conftest import (
     masses,
     random_controls,
     random_states,
+    simulated_columns,
     space_of,
     windows,
 )
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from dropo_torch.data.observation import generic_observation, parse_observation
 from dropo_torch.errors import InputError
+from dropo_torch.excitation import no_effect
 from dropo_torch.likelihood import (
     DIVERGENCE_PENALTY,
     LOST_TRANSITION,
     gaussian_log_density,
     log_likelihood,
     robust_cholesky,
-    rotation_vector,
 )
-from dropo_torch.objective import Objective, draw_uniforms, no_effect
+from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator
+from dropo_torch.support.random import draw_uniforms
 
 
 def literal(samples: np.ndarray, measured: np.ndarray, epsilon) -> float:
@@ -49,7 +50,7 @@ def literal(samples: np.ndarray, measured: np.ndarray, epsilon) -> float:
 def reference(objective: Objective, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor, epsilon) -> float:
     """The literal likelihood of every transition under the same samples, one transition at a time."""
     values = objective.values(mean[None], std[None], uniforms)[0]
-    simulated = objective.simulated(values).numpy()
+    simulated = simulated_columns(objective, values).numpy()
     return sum(literal(s, m, epsilon) for s, m in zip(simulated, objective.transitions.measured, strict=True))
 
 
@@ -69,9 +70,9 @@ def middle(objective: Objective) -> tuple[np.ndarray, np.ndarray]:
     return objective.box.middle, objective.box.width / 10
 
 
-def evaluate(objective: Objective, uniforms: torch.Tensor, *phi: np.ndarray) -> float:
+def evaluate(objective: Objective, uniforms: torch.Tensor, *phi: np.ndarray, initial=None) -> float:
     mean, std = phi or middle(objective)
-    return objective.evaluate(mean[None], std[None], uniforms)[0].log_likelihood
+    return objective.evaluate(mean[None], std[None], uniforms, initial)[0].log_likelihood
 
 
 @given(st.integers(1, 6), st.integers(2, 30), st.integers(0, 10_000), st.floats(1e-3, 1e2))
@@ -94,7 +95,7 @@ def test_on_the_hopper_it_is_the_literal_likelihood(hopper, lag, epsilon):
     uniforms = draw_uniforms(20, 4, 0)
     found = objective.evaluate(mean[None], std[None], uniforms)[0]
     assert found.log_likelihood == pytest.approx(reference(objective, mean, std, uniforms, epsilon), rel=1e-8)
-    simulated = objective.simulated(objective.values(mean[None], std[None], uniforms)[0]).numpy()
+    simulated = simulated_columns(objective, objective.values(mean[None], std[None], uniforms)[0]).numpy()
     assert found.mse == pytest.approx(((simulated.mean(1) - objective.transitions.measured) ** 2).mean(), rel=1e-9)
     assert (found.diverged, found.simulated_transitions) == (0, 25 * 20 * lag)
 
@@ -140,10 +141,10 @@ def test_the_number_of_threads_does_not_matter_to_the_bit(hopper):
 def test_masked_columns_leave_the_likelihood(hopper):
     keep = [0, 1, 3, 4, 6, 7, 8, 9]
     masked = hopper_objective(hopper, mask=["thigh_joint.position", 5, "foot_joint.velocity"])
-    assert masked.num_features == len(masked.labels) == len(masked.units) == 8
+    assert masked.features.size == len(masked.features.labels) == len(masked.features.units) == 8
     mean, std = middle(masked)
     uniforms = draw_uniforms(15, 4, 0)
-    simulated = masked.simulated(masked.values(mean[None], std[None], uniforms)[0]).numpy()[..., keep]
+    simulated = simulated_columns(masked, masked.values(mean[None], std[None], uniforms)[0]).numpy()[..., keep]
     theirs = sum(literal(s, m, 1e-5) for s, m in zip(simulated, masked.transitions.measured[:, keep], strict=True))
     assert evaluate(masked, uniforms) == pytest.approx(theirs, rel=1e-8)
 
@@ -198,30 +199,7 @@ def test_a_change_of_units_with_its_epsilon_changes_the_density_by_the_jacobian(
 def test_a_column_that_never_changes_can_be_scaled():
     simulator = LinearSimulator(space_of(a=[0, 2]), np.array([[1.0], [0.0]]))
     objective = linear_objective(simulator, np.array([[1.0, 5.0], [1.2, 5.0]]), scaling=True)
-    assert objective.scale.tolist() == pytest.approx([0.1, 1.0])
-
-
-unit = st.builds(
-    lambda x, s: s * Rotation.from_rotvec(x).as_quat(scalar_first=True),
-    st.lists(st.floats(-3, 3), min_size=3, max_size=3),
-    st.sampled_from([-1, 1]),
-)
-
-
-@given(unit, unit)
-def test_rotation_vectors_turn_the_measured_into_the_simulated_orientation(measured, simulated):
-    ours = rotation_vector(torch.from_numpy(measured), torch.from_numpy(simulated)).numpy()
-    first, second = (Rotation.from_quat(q, scalar_first=True) for q in (measured, simulated))
-    np.testing.assert_allclose(np.linalg.norm(ours), (first.inv() * second).magnitude(), atol=1e-9)
-    reached = first * Rotation.from_rotvec(ours)
-    np.testing.assert_allclose((reached.inv() * second).magnitude(), 0, atol=1e-7)
-
-
-def test_small_rotations_keep_their_precision():
-    turn = np.array([1e-9, -2e-9, 3e-10])
-    q = Rotation.from_rotvec(turn).as_quat(scalar_first=True)
-    ours = rotation_vector(torch.tensor([1.0, 0, 0, 0], dtype=torch.float64), torch.from_numpy(q))
-    np.testing.assert_allclose(ours, turn, rtol=1e-6)
+    assert objective.features.scale.tolist() == pytest.approx([0.1, 1.0])
 
 
 def box_objective(**options) -> Objective:
@@ -247,10 +225,10 @@ def box_objective(**options) -> Objective:
 
 def test_an_orientation_enters_by_its_angle_with_both_signs_measured_zero():
     objective = box_objective(epsilon=1e-4)
-    assert objective.labels[3:] == tuple(f"root.position.rotation[{a}]" for a in "xyz")
+    assert objective.features.labels[3:] == tuple(f"root.position.rotation[{a}]" for a in "xyz")
     mean, std = middle(objective)
     uniforms = draw_uniforms(25, 3, 0)
-    simulated = objective.simulated(objective.values(mean[None], std[None], uniforms)[0]).numpy()
+    simulated = simulated_columns(objective, objective.values(mean[None], std[None], uniforms)[0]).numpy()
     theirs = 0.0
     for samples, measured in zip(simulated, objective.transitions.measured, strict=True):
         cosine = np.abs(samples[:, 3:] @ measured[3:]) / np.linalg.norm(samples[:, 3:], axis=1)
@@ -273,7 +251,7 @@ def test_the_sign_of_a_measured_quaternion_does_not_matter():
 
 
 def test_masking_one_column_of_a_quaternion_masks_the_orientation():
-    assert box_objective(mask=["root.position[qx]"]).labels == tuple(f"root.position[{a}]" for a in "xyz")
+    assert box_objective(mask=["root.position[qx]"]).features.labels == tuple(f"root.position[{a}]" for a in "xyz")
 
 
 def chained(model: mujoco.MjModel, states: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -374,17 +352,17 @@ def slide_objective(noise, *, lag: int = 2, epsilon: float = 1e-6, **options) ->
 def test_start_noise_goes_through_the_simulation_exactly_where_it_is_linear(lag, chunk_size):
     noise = np.array([0.02, 0.3])
     objective, matrix = slide_objective(noise, lag=lag, chunk_size=chunk_size)
-    objective.linearise(np.array([2.0]))
+    initial = objective.initial_noise(np.array([2.0]))
     expected = matrix @ np.diag(noise**2) @ matrix.T + np.diag(noise**2) + 1e-6 * np.eye(2)
     for block in (slice(0, 8), slice(3, 5)):
         np.testing.assert_allclose(
-            objective.base_covariance(block),
+            objective.base_covariance(block, initial),
             np.tile(expected, (block.stop - block.start, 1, 1)),
             rtol=1e-10,
             atol=1e-13,
         )
-    assert objective.linearised_at == [2.0]
-    torch.testing.assert_close(objective.target(slice(0, 8)), objective.measured, rtol=0, atol=1e-12)
+    assert initial.mean == [2.0]
+    torch.testing.assert_close(objective.target(slice(0, 8), initial), objective.measured, rtol=0, atol=1e-12)
 
 
 def test_a_window_that_the_noise_does_not_explain_is_widened_as_under_students_law():
@@ -394,10 +372,10 @@ def test_a_window_that_the_noise_does_not_explain_is_widened_as_under_students_l
     measured[2] += [0.5, -4.0]
     states, controls = (torch.from_numpy(x) for x in (exact.transitions.states, exact.transitions.controls))
     objective = exact.on(windows(states, controls, measured))
-    objective.linearise(np.array([2.0]))
+    initial = objective.initial_noise(np.array([2.0]))
     covariance = matrix @ np.diag(noise**2) @ matrix.T + np.diag(noise**2) + 1e-6 * np.eye(2)
     distance = [0.5, -4.0] @ np.linalg.inv(covariance) @ [0.5, -4.0]
-    found = objective.base_covariance(slice(0, 8))
+    found = objective.base_covariance(slice(0, 8), initial)
     np.testing.assert_allclose(found[2], covariance * (5 + distance) / (5 + 2), rtol=1e-9)
     np.testing.assert_allclose(found[3], covariance, rtol=1e-9)
 
@@ -413,11 +391,10 @@ def test_the_robust_likelihood_is_students_under_the_noise_as_it_is_given():
     values = objective.values(mean[None], std[None], uniforms)[0]
     base = matrix_at(objective, mean) + np.diag(noise**2) + 1e-6 * np.eye(2)
     theirs = 0.0
-    for samples, logged in zip(objective.simulated(values).numpy(), measured, strict=True):
+    for samples, logged in zip(simulated_columns(objective, values).numpy(), measured, strict=True):
         scale = base + np.cov(samples, rowvar=False)
         theirs += scipy.stats.multivariate_t.logpdf(logged - samples.mean(0), shape=scale, df=5)
     assert objective.robust_log_likelihood(mean, values) == pytest.approx(theirs, rel=1e-9)
-    assert objective.linearised_at is None  # it leaves no trace
 
 
 def matrix_at(objective: Objective, mean: np.ndarray) -> np.ndarray:
@@ -434,7 +411,7 @@ def test_the_noise_of_columns_gives_every_feature_its_variance(scaling):
     noise = objective.noise_of(4e-6)
     assert len(noise) == 7
     given = box_objective(scaling=scaling, noise=noise)
-    np.testing.assert_allclose(given.noise_deviation, np.full(6, 2e-3), rtol=1e-12)
+    np.testing.assert_allclose(given.feature_noise, np.full(6, 2e-3), rtol=1e-12)
     masked = box_objective(scaling=scaling, mask=["root.position[qw]"])
     np.testing.assert_allclose(masked.noise_of(4e-6), noise)  # its start is as noisy
 
@@ -442,13 +419,15 @@ def test_the_noise_of_columns_gives_every_feature_its_variance(scaling):
 def test_start_noise_follows_scaling_and_masks():
     noise = np.array([0.02, 0.3])
     scaled, matrix = slide_objective(noise, scaling=True)
-    scaled.linearise(np.array([2.0]))
+    initial = scaled.initial_noise(np.array([2.0]))
     expected = matrix @ np.diag(noise**2) @ matrix.T + np.diag(noise**2)
-    size = np.outer(scaled.scale, scaled.scale)
-    np.testing.assert_allclose(scaled.base_covariance(slice(0, 1))[0], expected / size + 1e-6 * np.eye(2), rtol=1e-10)
+    size = np.outer(scaled.features.scale, scaled.features.scale)
+    np.testing.assert_allclose(
+        scaled.base_covariance(slice(0, 1), initial)[0], expected / size + 1e-6 * np.eye(2), rtol=1e-10
+    )
     masked, _ = slide_objective(noise, mask=[0])
-    masked.linearise(np.array([2.0]))
-    assert float(masked.base_covariance(slice(0, 1))) == pytest.approx(expected[1, 1] + 1e-6, rel=1e-10)
+    initial = masked.initial_noise(np.array([2.0]))
+    assert float(masked.base_covariance(slice(0, 1), initial)) == pytest.approx(expected[1, 1] + 1e-6, rel=1e-10)
 
 
 def test_before_the_first_linearisation_the_noise_is_that_of_the_measured_end():
@@ -464,22 +443,26 @@ def test_no_noise_and_noise_of_zero_are_the_same():
     values = []
     for noise in (None, 0.0, [0.0, 0.0]):
         objective, _ = slide_objective(noise)
-        objective.linearise(np.array([2.0]))
+        assert objective.initial_noise(np.array([2.0])) is None
         values.append(evaluate(objective, uniforms, np.array([2.0]), np.array([0.1])))
     assert len(set(values)) == 1
 
 
 def test_noise_enters_the_likelihood_as_a_covariance():
     objective, _ = slide_objective([0.02, 0.3])
-    objective.linearise(np.array([2.0]))
+    initial = objective.initial_noise(np.array([2.0]))
     mean, std, uniforms = np.array([2.1]), np.array([0.3]), draw_uniforms(12, 1, 0)
-    simulated = objective.simulated(objective.values(mean[None], std[None], uniforms)[0]).numpy()
-    base = objective.base_covariance(slice(0, 8)).numpy()
+    simulated = simulated_columns(objective, objective.values(mean[None], std[None], uniforms)[0]).numpy()
+    base = objective.base_covariance(slice(0, 8), initial).numpy()
     theirs = sum(
         scipy.stats.multivariate_normal.logpdf(m, s.mean(0), np.cov(s, rowvar=False) + c)
         for s, m, c in zip(simulated, objective.transitions.measured, base, strict=True)
     )
-    assert evaluate(objective, uniforms, mean, std) == pytest.approx(theirs, rel=1e-9)
+    assert evaluate(objective, uniforms, mean, std, initial=initial) == pytest.approx(theirs, rel=1e-9)
+
+
+def dead(objective: Objective) -> list[str]:
+    return no_effect(objective)[0]
 
 
 def box_on_floor(parameters: dict) -> Objective:
@@ -506,14 +489,14 @@ def test_parameters_that_move_nothing_are_named_and_those_that_do_are_not():
             "free_fall": {"field": "opt.magnetic[0]", "bounds": [1, 2]},
         }
     )
-    assert no_effect(objective) == ["untouched", "free_fall"]
+    assert dead(objective) == ["untouched", "free_fall"]
 
 
 def test_a_parameter_that_only_moves_masked_columns_has_no_effect():
     simulator = LinearSimulator(space_of(a=[0, 2], b=[0, 2]), np.eye(2))
     measured = np.ones((5, 2))
-    assert no_effect(linear_objective(simulator, measured)) == []
-    assert no_effect(linear_objective(simulator, measured, mask=[1])) == ["b"]
+    assert dead(linear_objective(simulator, measured)) == []
+    assert dead(linear_objective(simulator, measured, mask=[1])) == ["b"]
 
 
 def test_draws_depend_on_their_seeds_alone():
@@ -526,6 +509,6 @@ def test_draws_depend_on_their_seeds_alone():
 
 def test_a_parameter_whose_effect_is_even_about_its_middle_is_no_dead_one() -> None:
     simulator = LinearSimulator(space_of(a=[-1, 1], b=[-1, 1]), np.eye(2), transform=lambda v: v.square())
-    assert no_effect(linear_objective(simulator, np.zeros((5, 2)))) == []
+    assert dead(linear_objective(simulator, np.zeros((5, 2)))) == []
     half = LinearSimulator(space_of(a=[-1, 1], b=[-1, 1]), np.array([[1.0, 0.0], [1.0, 0.0]]), transform=torch.square)
-    assert no_effect(linear_objective(half, np.zeros((5, 2)))) == ["b"]
+    assert dead(linear_objective(half, np.zeros((5, 2)))) == ["b"]

@@ -25,17 +25,17 @@ from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
 from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import coordinate_limits, to_values, truncated_interval, truncated_moments
+from dropo_torch.distribution import to_values, truncated_interval, truncated_moments
 from dropo_torch.fit import fit
 from dropo_torch.likelihood import LOST_TRANSITION
-from dropo_torch.objective import Objective, draw_uniforms
-from dropo_torch.optimizers import AdamOptimizer, AdamSettings, CMAOptimizer, FisherOptimizer, Optimizer
-from dropo_torch.optimizers.correlated import CorrelatedOptimizer
-from dropo_torch.optimizers.fisher import ScoringStage
+from dropo_torch.objective import Objective
+from dropo_torch.optimizers import AdamSettings, CMAOptimizer, FisherOptimizer, FitSettings, make_optimizer
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.sampled import SampledStage
+from dropo_torch.optimizers.sigma_points import SigmaPointStage
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator
+from dropo_torch.support.random import draw_uniforms
 from dropo_torch.testing import KnownProblem, LinearSimulator, check_optimizer, linear_objective, linear_problem
 from dropo_torch.testing.optimizers import MakeOptimizer
 
@@ -65,11 +65,11 @@ def spread_objective(**options) -> Objective:
 
 
 def fisher(objective: Objective, **options) -> FisherOptimizer:
-    return FisherOptimizer(objective.simulator.parameters, noisy=objective.noise is not None, **options)
+    return FisherOptimizer(objective, FitSettings(**options))
 
 
 def small_cma(objective: Objective, **options) -> CMAOptimizer:
-    return CMAOptimizer(objective, **{"samples": 12, "seed": 0, "budget": 48, "population": 8, **options})
+    return CMAOptimizer(objective, FitSettings(**{"samples": 12, "seed": 0, "budget": 48, "population": 8, **options}))
 
 
 def test_fisher_reaches_the_closed_form_optimum_of_mean_and_deviation():
@@ -103,7 +103,7 @@ def test_cma_reaches_the_optimum_of_its_own_samples():
     objective = linear_objective(
         LinearSimulator(space_of(a=[0.0, 3.0]), [[2.0]]), spread_data(60)[:, :1], epsilon=EPSILON
     )
-    optimizer = CMAOptimizer(objective, samples=25, seed=3, budget=600, common_random_numbers=True)
+    optimizer = CMAOptimizer(objective, FitSettings(samples=25, seed=3, budget=600, common_random_numbers=True))
     drive(optimizer, objective)
     z = (objective.values(np.zeros((1, 1)), np.ones((1, 1)), draw_uniforms(25, 1, 3, 1, 0))[0]).numpy()
     best_std = np.sqrt((spread_data(60)[:, 0].var() - EPSILON) / z.var(ddof=1)) / 2
@@ -117,7 +117,7 @@ def test_cma_with_fresh_samples_comes_near_the_closed_form():
     objective = linear_objective(
         LinearSimulator(space_of(a=[0.0, 3.0]), [[2.0]]), spread_data(60)[:, :1], epsilon=EPSILON
     )
-    optimizer = CMAOptimizer(objective, samples=50, seed=0, budget=300)
+    optimizer = CMAOptimizer(objective, FitSettings(samples=50, seed=0, budget=300))
     drive(optimizer, objective)
     mean, std = optimizer.candidates()[0]
     assert mean == pytest.approx(closed_form(spread_data(60))[0][0], abs=0.1)
@@ -155,21 +155,15 @@ def test_a_parameter_at_its_physical_limit_is_found_there():
     states, controls = random_states(model, 40), random_controls(model, 40, 1)
     truth = torch.tensor([[0.0, 2.3]], dtype=torch.float64)
     log = windows(states, controls, simulator.simulate(states, controls, truth)[:, 0])
-    result = fit(Objective(simulator, log, parse_observation(model, None), epsilon=1e-8), samples=20)
+    result = fit(Objective(simulator, log, parse_observation(model, None), epsilon=1e-8), FitSettings(samples=20))
     assert result.distribution.mean == pytest.approx([0, 2.3], abs=2e-3)
     assert result.distribution.mean[0] >= 0
     assert (result.distribution.sample(200, torch.Generator().manual_seed(0)) >= 0).all()
 
 
-def space_of_all(make: Callable[..., Optimizer], **options: Any) -> MakeOptimizer:
-    """A maker of those that see no more of an objective than its space and its noise."""
-    return lambda objective, seed: make(
-        objective.simulator.parameters,
-        seed=seed,
-        noisy=objective.noise is not None,
-        differentiable=objective.simulator.differentiable,
-        **options,
-    )
+def of_settings(**options: Any) -> MakeOptimizer:
+    """A maker of the fit's own optimizers."""
+    return lambda objective, seed: make_optimizer(objective, FitSettings(seed=seed, **options))
 
 
 def simopt(objective: Objective, seed: int) -> SimOptOptimizer:
@@ -195,16 +189,16 @@ def bayessim(objective: Objective, seed: int) -> BayesSimOptimizer:
 
 #: Every optimizer and baseline: how it is made, and how near the truth it comes; see ``check_optimizer``.
 SEARCHES: dict[str, tuple[MakeOptimizer, dict[str, float | None]]] = {
-    "fisher": (space_of_all(FisherOptimizer, samples=30), {"mean": 1e-4, "std": 0.01}),
-    "fisher, entropy": (space_of_all(FisherOptimizer, samples=30, entropy=1.0), {"mean": 1e-3, "std": 0.1}),
-    "correlated": (space_of_all(CorrelatedOptimizer, samples=30), {"mean": 1e-3, "std": 0.02}),
-    "cma": (lambda o, seed: CMAOptimizer(o, samples=12, seed=seed, budget=200), {"mean": 0.1, "std": None}),
+    "fisher": (of_settings(samples=30), {"mean": 1e-4, "std": 0.01}),
+    "fisher, entropy": (of_settings(samples=30, entropy=1.0), {"mean": 1e-3, "std": 0.1}),
+    "correlated": (of_settings(samples=30, covariance="full"), {"mean": 1e-3, "std": 0.02}),
+    "cma": (of_settings(optimizer="cma", samples=12, budget=200), {"mean": 0.1, "std": None}),
     "cma, common": (
-        lambda o, seed: CMAOptimizer(o, samples=12, seed=seed, budget=200, common_random_numbers=True),
+        of_settings(optimizer="cma", samples=12, budget=200, common_random_numbers=True),
         {"mean": 0.1, "std": 0.8},
     ),
     "adam": (
-        lambda o, seed: AdamOptimizer(o, settings=AdamSettings(steps=30, batch=20, samples=8), seed=seed),
+        of_settings(optimizer="adam", adam=AdamSettings(steps=30, batch=20, samples=8)),
         {"mean": 0.02, "std": None},
     ),
     "laplace": (lambda o, seed: LaplaceOptimizer(o), {"mean": 1e-3, "std": None}),
@@ -267,7 +261,7 @@ def stage_gradient(make_stage: Callable[[np.ndarray, np.ndarray], object], objec
 
     def sums(packed: np.ndarray) -> np.ndarray:
         stage = make_stage(packed[:d], np.exp(packed[d:]))
-        return objective.map(to_values(stage.points(), is_log), stage.reduction()).numpy()
+        return objective.map(to_values(stage.points(), is_log), stage.reduction()).total.numpy()
 
     at = np.concatenate([phi[0], np.log(phi[1])])
     return sums(at), numerical_gradient(lambda p: float(sums(p)[0]), at, 1e-5)
@@ -284,16 +278,9 @@ def mixed_objective(**options) -> Objective:
 AWAY = (np.array([1.1, 4.2]), np.array([0.3, 0.2]))
 
 
-def limits_of(objective: Objective) -> tuple[np.ndarray, np.ndarray]:
-    space = objective.simulator.parameters
-    return coordinate_limits(space.limits, space.is_log)
-
-
 def test_scores_are_the_gradient_of_the_sigma_point_likelihood():
     objective = mixed_objective()
-    sums, expected = stage_gradient(
-        lambda m, s: ScoringStage(objective.box, limits_of(objective), m, s), objective, *AWAY
-    )
+    sums, expected = stage_gradient(lambda m, s: SigmaPointStage(objective.box, m, s), objective, *AWAY)
     np.testing.assert_allclose(sums[1:5], expected, rtol=1e-6)
     assert sums[-1] == pytest.approx(0, abs=1e-6)  # nothing bends
 
@@ -304,9 +291,7 @@ def test_at_a_physical_limit_the_mean_of_the_samples_moves_with_the_deviation():
     )
     effect = np.array([[1.0, 0.2], [-0.3, 2.0], [0.5, 0.5]])
     objective = linear_objective(LinearSimulator(space, effect), np.full((5, 3), 1.5), epsilon=1e-2)
-    sums, expected = stage_gradient(
-        lambda m, s: ScoringStage(objective.box, limits_of(objective), m, s), objective, space.low, AWAY[1]
-    )
+    sums, expected = stage_gradient(lambda m, s: SigmaPointStage(objective.box, m, s), objective, space.low, AWAY[1])
     np.testing.assert_allclose(sums[3:5], expected[2:], rtol=1e-6)
 
 
@@ -315,7 +300,7 @@ def test_sampled_scores_are_the_gradient_of_the_sampled_likelihood():
     for samples in (8, 40):  # without and with bends in the regression
         uniforms = draw_uniforms(samples, 2, 0)
         sums, expected = stage_gradient(
-            lambda m, s, u=uniforms: SampledStage(objective.box, limits_of(objective), u, m, s),
+            lambda m, s, u=uniforms: SampledStage(objective.box, m, s, uniforms=u),
             objective,
             *AWAY,
         )
@@ -328,14 +313,14 @@ def test_sampled_scores_see_curvature():
     simulator = LinearSimulator(linear_space(), np.diag(GAINS), transform=lambda v: v + 0.1 * v.square())
     objective = linear_objective(simulator, spread_data(25) * 1.1, epsilon=1e-2)
     sums, expected = stage_gradient(
-        lambda m, s: SampledStage(objective.box, limits_of(objective), draw_uniforms(40, 2, 0), m, s), objective, *AWAY
+        lambda m, s: SampledStage(objective.box, m, s, uniforms=draw_uniforms(40, 2, 0)), objective, *AWAY
     )
     np.testing.assert_allclose(sums[1:5], expected, rtol=1e-6)
 
 
 def test_fisher_information_is_that_of_the_gaussians():
     objective = mixed_objective()
-    sums, _ = stage_gradient(lambda m, s: ScoringStage(objective.box, limits_of(objective), m, s), objective, *AWAY)
+    sums, _ = stage_gradient(lambda m, s: SigmaPointStage(objective.box, m, s), objective, *AWAY)
     effect = objective.simulator.effect.numpy()
     total = 1e-2 * np.eye(3) + effect @ np.diag(VARIANCE * AWAY[1] ** 2) @ effect.T
     inverse = np.linalg.inv(total)
@@ -351,7 +336,7 @@ def test_the_gradient_of_the_means_is_that_of_their_cost():
 
     def sums(mean: np.ndarray) -> np.ndarray:
         stage = MeansStage(box.low, box.high, mean)
-        return objective.map(stage.points(), stage.reduction()).numpy()
+        return objective.map(stage.points(), stage.reduction()).total.numpy()
 
     expected = numerical_gradient(lambda p: float(sums(p)[0]), AWAY[0])
     np.testing.assert_allclose(sums(AWAY[0])[2:4], expected, rtol=1e-5)
@@ -362,9 +347,9 @@ def test_lost_transitions_weigh_the_same_in_every_likelihood():
         return torch.where(v > -1, torch.nan, v)
 
     objective = linear_objective(LinearSimulator(linear_space(), np.diag(GAINS), transform=fragile), spread_data(5))
-    box, limits = objective.box, limits_of(objective)
-    for stage in (ScoringStage(box, limits, *AWAY), SampledStage(box, limits, draw_uniforms(9, 2, 0), *AWAY)):
-        assert float(objective.map(stage.points(), stage.reduction())[0]) == 5 * LOST_TRANSITION
+    box = objective.box
+    for stage in (SigmaPointStage(box, *AWAY), SampledStage(box, *AWAY, uniforms=draw_uniforms(9, 2, 0))):
+        assert float(objective.map(stage.points(), stage.reduction()).total[0]) == 5 * LOST_TRANSITION
     assert (
         objective.evaluate(AWAY[0][None], AWAY[1][None], draw_uniforms(9, 2, 0))[0].log_likelihood
         == 5 * LOST_TRANSITION
@@ -380,7 +365,9 @@ def test_a_fit_with_noisy_starts_still_finds_the_parameter():
     rng, noise = np.random.default_rng(0), np.array([0.002, 0.05])
     seen = states + torch.from_numpy(rng.normal(0, noise, (400, 2)))
     log = windows(seen, controls, after + rng.normal(0, noise, (400, 2)))
-    result = fit(Objective(simulator, log, parse_observation(model, None), epsilon=1e-8, noise=noise), samples=20)
+    result = fit(
+        Objective(simulator, log, parse_observation(model, None), epsilon=1e-8, noise=noise), FitSettings(samples=20)
+    )
     assert result.distribution.mean == pytest.approx([2.3], abs=0.05)
     assert result.distribution.std < 0.1
 
@@ -399,12 +386,12 @@ def test_a_fit_resumed_from_any_checkpoint_is_the_fit_never_interrupted(tmp_path
 
         return callback
 
-    whole = fit(spread_objective(), samples=10)
+    whole = fit(spread_objective(), FitSettings(samples=10))
     for steps in (1, len(whole.history) // 2):
         path = tmp_path / f"{steps}.pkl"
         with pytest.raises(Stop):
-            fit(spread_objective(), samples=10, checkpoint=path, on_progress=stop_after(steps))
-        again = fit(spread_objective(), samples=10, checkpoint=path, resume=True)
+            fit(spread_objective(), FitSettings(samples=10), checkpoint=path, on_progress=stop_after(steps))
+        again = fit(spread_objective(), FitSettings(samples=10), checkpoint=path, resume=True)
         assert len(again.history) == len(whole.history)
         for key in ("log_likelihood", "mse", "evaluations", "simulated_transitions", "stop_reason"):
             assert getattr(again, key) == getattr(whole, key), key

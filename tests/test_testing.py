@@ -14,7 +14,7 @@ from conftest import space_of
 from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers import FisherOptimizer, Progress, Request
+from dropo_torch.optimizers import FisherOptimizer, FitSettings, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.testing import (
     ConformanceError,
@@ -231,13 +231,13 @@ class Fisher(FisherOptimizer):
     """The scoring, made as a search of an objective."""
 
     def __init__(self, objective: Objective, seed: int) -> None:
-        super().__init__(objective.simulator.parameters, seed=seed, samples=10)
+        super().__init__(objective, FitSettings(seed=seed, samples=10))
         self.objective = objective
 
 
 class Endless(Fisher):
     stop_reason = property(lambda self: None)
-    ask = lambda self: FisherOptimizer(self.objective.simulator.parameters).ask()  # noqa: E731
+    ask = lambda self: FisherOptimizer(self.objective, FitSettings()).ask()  # noqa: E731
     tell = lambda self, sums, gradient=None: None  # noqa: E731
 
 

@@ -28,7 +28,6 @@ from dropo_torch.data.trajectory import make_replay
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, HistoryEntry, fit
 from dropo_torch.optimizers import Optimizer, Progress
-from dropo_torch.optimizers.adam import adam_settings
 from dropo_torch.problem import Problem
 
 __all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
@@ -64,10 +63,10 @@ def make_search(problem: Problem) -> Optimizer | None:
         return BayesSimOptimizer(
             space,
             replay,
-            objective.num_features,
+            objective.features.size,
             settings=settings,
             seed=seed,
-            noise=objective.noise_deviation,
+            noise=objective.feature_noise,
         )
     return None
 
@@ -92,21 +91,12 @@ def fit_problem(
     on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
 ) -> Fit:
     """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`."""
-    config = problem.config
     return fit(
         problem.objective,
-        optimizer=config.optimizer,
-        samples=config.samples,
-        seed=config.seed,
-        budget=config.budget,
-        population=config.population,
-        common_random_numbers=config.common_random_numbers,
-        adam=adam_settings(config.adam),
-        entropy=config.entropy,
-        covariance=config.covariance,
+        problem.config.fit_settings(),
+        search=make_search(problem),
         checkpoint=checkpoint,
         resume=resume,
         fingerprint=problem.fingerprint,
         on_progress=on_progress,
-        search=make_search(problem),
     )

@@ -12,9 +12,10 @@ from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
-from dropo_torch.objective import ReplayReduce, derived_seed, draw_uniforms
+from dropo_torch.evaluator import ReplayReduce
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.random import derived_seed, draw_uniforms
 
 #: Unlikeness above which the network has guessed outside what it was trained on.
 _UNLIKE = 1.5
@@ -112,8 +113,13 @@ class BayesSimOptimizer(Optimizer):
         if self._mixture is None:
             return None
         reason = f"{self._settings.simulations} simulations of the prior are used"
-        doubt = self._doubt()
-        return f"{reason}; but {doubt}, so the posterior is a guess" if doubt else reason
+        return f"{reason}; but {self.caveat}" if self.caveat else reason
+
+    @property
+    def caveat(self) -> str:
+        """That the network had to guess, where it had to."""
+        doubt = "" if self._mixture is None else self._doubt()
+        return f"{doubt}, so the posterior is a guess" if doubt else ""
 
     def _doubt(self) -> str:
         """Why the network had to guess outside what it was trained on; empty where it had not."""

@@ -17,7 +17,7 @@ from torch import nn
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.errors import InputError
-from dropo_torch.objective import single_thread
+from dropo_torch.support.threads import single_thread
 
 if TYPE_CHECKING:
     from sbi.neural_nets.estimators.mixture_density_estimator import MixtureDensityEstimator

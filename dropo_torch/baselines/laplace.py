@@ -34,7 +34,7 @@ class LaplaceOptimizer(Optimizer):
     def __init__(self, objective: Objective) -> None:
         self._space: ParameterSpace = objective.simulator.parameters
         self._box = SearchBox.of(self._space)
-        self._shape = (len(objective), objective.num_features)
+        self._shape = (len(objective), objective.features.size)
         self._means = MeansStage(self._box.low, self._box.high, self._box.middle, self._shape)
         self._linearised: np.ndarray | None = None if objective.noise is None else self._means.point
         self._round = 0

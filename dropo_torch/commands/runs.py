@@ -24,7 +24,8 @@ from dropo_torch.config import Config, make_config
 from dropo_torch.diagnostics import diagnose
 from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
-from dropo_torch.fit import Fit, refuse_dead_parameters
+from dropo_torch.excitation import refuse_dead_parameters
+from dropo_torch.fit import Fit
 from dropo_torch.gap import Gap, add, find_gap, prepare
 from dropo_torch.models.bundled import bundled_sim, bundled_study
 from dropo_torch.models.export import export_model

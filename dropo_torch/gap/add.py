@@ -6,11 +6,12 @@ from pathlib import Path
 
 import numpy as np
 
+from dropo_torch.data.features import Features
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.export import write_config, write_model
 from dropo_torch.errors import InputError
-from dropo_torch.gap.log import Chart, make_setting
+from dropo_torch.gap.log import make_setting
 from dropo_torch.gap.result import FAMILY, Gap
 from dropo_torch.problem import Problem
 
@@ -71,7 +72,7 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     setting = make_setting(problem, problem.trajectories)
     config = problem.config
     if config.noise is None:
-        columns = Chart.of(problem.observation).column_noise(np.array(gap.noise))
+        columns = Features.of(problem.observation).column_noise(np.array(gap.noise))
         config = config.model_copy(update={"noise": [float(f"{v:.3g}") for v in columns]})
     write_config(config, problem.space, setting, placed, intervals(gap, setting), model, folder / "config.yaml")
     return notes

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dropo_torch.data.features import Features
 from dropo_torch.effects.twin import Twin, Variant, Windows
-from dropo_torch.gap.log import Chart
 
 #: Antithetic pairs of start noise by which rough windows are linearised, and their seed.
 PAIRS, SEED = 16, 11
@@ -62,7 +62,7 @@ class Evidence:
         model_error: np.ndarray | None = None, robust: bool = False,
     ) -> None:  # fmt: skip
         self.twin, self.windows, self.noise, self.rough = twin, windows, np.asarray(noise, dtype=float), rough
-        self.chart = Chart.of(twin.setting.observation, twin.setting.masked)
+        self.chart = Features.of(twin.setting.observation, twin.setting.masked)
         self.model_error = np.ones(self.num_rows) if model_error is None else model_error
         self.robust = robust
 

@@ -3,127 +3,19 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
+from dropo_torch.data.features import masked_columns
 from dropo_torch.data.observation import Observation
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting, Signals
 from dropo_torch.effects.twin import Windows
-from dropo_torch.objective import masked_columns
 from dropo_torch.problem import Problem
 
 #: Configurations of the log at which the typical forces are computed.
 SAMPLES = 400
-
-
-@dataclass(frozen=True)
-class Chart:
-    """Coordinates in which observed columns are compared: a quaternion becomes a rotation vector.
-
-    Attributes:
-        plain: observed columns that are compared as they are.
-        quaternions: columns of each observed quaternion.
-        labels: names of the features, ``(m,)``.
-        units: their units.
-        masked: observed columns that are not compared.
-    """
-
-    plain: tuple[int, ...]
-    quaternions: tuple[tuple[int, int, int, int], ...]
-    labels: tuple[str, ...]
-    units: tuple[str, ...]
-    masked: frozenset[int] = frozenset()
-
-    @classmethod
-    def of(cls, observation: Observation, masked: frozenset[int] = frozenset()) -> Chart:
-        """Return the chart of an observation; masked columns are features that are never known."""
-        taken = {c for q in observation.quaternions for c in q}
-        plain = tuple(c for c in range(observation.size) if c not in taken)
-        stems = [observation.labels[q[0]].split("[")[0] for q in observation.quaternions]
-        turned = [f"{stem}.rotation[{axis}]" for stem in stems for axis in "xyz"]
-        return cls(
-            plain, observation.quaternions, tuple(observation.labels[c] for c in plain) + tuple(turned),
-            tuple(observation.units[c] for c in plain) + ("rad",) * len(turned), masked,
-        )  # fmt: skip
-
-    @property
-    def size(self) -> int:
-        """Number of features m."""
-        return len(self.plain) + 3 * len(self.quaternions)
-
-    def feature_noise(self, columns: np.ndarray) -> np.ndarray:
-        """Return deviations of the features ``(m,)`` from those of columns ``(n,)``; a quaternion's ν turns by 2ν."""
-        turned = [np.repeat(2 * columns[list(q)].mean(), 3) for q in self.quaternions]
-        return np.concatenate([columns[list(self.plain)], *turned])
-
-    def column_noise(self, features: np.ndarray) -> np.ndarray:
-        """Return deviations of the columns ``(n,)`` that give those of the features ``(m,)``; one to a quaternion."""
-        columns = np.empty(len(self.plain) + 4 * len(self.quaternions))
-        columns[list(self.plain)] = features[: len(self.plain)]
-        for q, turned in zip(self.quaternions, features[len(self.plain) :].reshape(-1, 3), strict=True):
-            columns[list(q)] = 0.5 * np.sqrt(np.mean(turned**2))
-        return columns
-
-    def difference(self, measured: np.ndarray, simulated: np.ndarray) -> np.ndarray:
-        """Return measured minus simulated, ``(..., m)``, of columns ``(..., n)``."""
-        parts = [(measured - simulated)[..., list(self.plain)]]
-        parts += [_rotation(simulated[..., list(q)], measured[..., list(q)]) for q in self.quaternions]
-        return np.concatenate(parts, -1)
-
-    def move(self, columns: np.ndarray, delta: np.ndarray) -> np.ndarray:
-        """Return columns ``(..., n)`` moved by features ``(..., m)``."""
-        out = np.broadcast_to(columns, (*delta.shape[:-1], columns.shape[-1])).copy()
-        out[..., list(self.plain)] += delta[..., : len(self.plain)]
-        for i, q in enumerate(self.quaternions):
-            turn = delta[..., len(self.plain) + 3 * i : len(self.plain) + 3 * i + 3]
-            out[..., list(q)] = _turned(out[..., list(q)], turn)
-        return out
-
-    def known(self, valid: np.ndarray) -> np.ndarray:
-        """Return which features ``(..., m)`` are known, of columns ``(..., n)``."""
-        valid = valid & ~np.isin(np.arange(valid.shape[-1]), list(self.masked))
-        parts = [valid[..., list(self.plain)]]
-        parts += [np.repeat(valid[..., list(q)].all(-1, keepdims=True), 3, -1) for q in self.quaternions]
-        return np.concatenate(parts, -1)
-
-
-def _rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
-    """Rotation vector, in the body's frame, from one quaternion to another."""
-    w0, x0, y0, z0 = np.moveaxis(start, -1, 0)
-    w1, x1, y1, z1 = np.moveaxis(end, -1, 0)
-    w = w0 * w1 + x0 * x1 + y0 * y1 + z0 * z1
-    v = np.stack(
-        [
-            w0 * x1 - x0 * w1 - y0 * z1 + z0 * y1,
-            w0 * y1 - y0 * w1 - z0 * x1 + x0 * z1,
-            w0 * z1 - z0 * w1 - x0 * y1 + y0 * x1,
-        ],
-        -1,
-    )
-    v, w = np.where(w[..., None] < 0, -v, v), np.abs(w)
-    sine = np.linalg.norm(v, axis=-1)
-    angle = 2 * np.arctan2(sine, w)
-    return v * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 2.0)[..., None]
-
-
-def _turned(quaternion: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Quaternion turned by a rotation vector in the body's frame."""
-    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
-    share = np.where(angle > 1e-12, np.sin(angle / 2) / np.maximum(angle, 1e-300), 0.5)
-    w1, (x1, y1, z1) = np.cos(angle / 2)[..., 0], np.moveaxis(turn * share, -1, 0)
-    w0, x0, y0, z0 = np.moveaxis(quaternion, -1, 0)
-    return np.stack(
-        [
-            w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
-            w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
-            w0 * y1 + y0 * w1 + z0 * x1 - x0 * z1,
-            w0 * z1 + z0 * w1 + x0 * y1 - y0 * x1,
-        ],
-        -1,
-    )
 
 
 def episode_bounds(log: Trajectories) -> list[tuple[int, int]]:
@@ -206,7 +98,7 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
         linear_speed=np.sqrt(speed / len(rows)),
         contacts=touches,
     )
-    masked = frozenset(masked_columns(problem.observation, problem.config.mask))
+    masked = masked_columns(problem.observation, problem.config.mask)
     return Setting(model, problem.observation, signals, frame_skip, masked)
 
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import Chart, cut_windows, make_setting, start_values
+from dropo_torch.gap.log import cut_windows, make_setting, start_values
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.verify import hold_out, spread
@@ -86,7 +87,7 @@ def _check_observed(problem: Problem) -> None:
 def _noise(problem: Problem, twin: Twin, train: Trajectories, begin: Hypothesis) -> np.ndarray:
     """The noise of each feature, as given or estimated."""
     if problem.objective.noise is not None:
-        return Chart.of(problem.observation).feature_noise(problem.objective.noise.numpy())
+        return Features.of(problem.observation).feature_noise(problem.objective.noise.numpy())
     return free_forces(twin, short_windows(problem, train), begin.variant).noise
 
 

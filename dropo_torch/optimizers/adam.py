@@ -9,19 +9,18 @@ step along an eigenvector is longer than Newton's, gradient / eigenvalue.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
 import torch
 
-from dropo_torch.distribution import SearchBox, to_values, values_from_uniforms
-from dropo_torch.errors import InputError, choices
-from dropo_torch.objective import Objective, Reduce, draw_uniforms
-from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.distribution import SearchBox, tensor_values
+from dropo_torch.errors import InputError
+from dropo_torch.objective import Objective, Reduce
+from dropo_torch.optimizers.base import LikelihoodOptimizer, Progress, Request
 from dropo_torch.optimizers.gauss_newton import MeansStage
-from dropo_torch.parameters import ParameterSpace
+from dropo_torch.optimizers.settings import FitSettings
+from dropo_torch.support.random import draw_uniforms
 
 #: Memory of the gradient and of its square. Both are short: over a fit gradients shrink by many orders of magnitude,
 #: and a long memory of their size would hold the steps back.
@@ -29,67 +28,13 @@ _BETAS = (0.8, 0.9)
 _TINY = 1e-300
 #: Steps before the gradient's running size is trusted.
 _WARM_UP = 10
-#: The first learning rate of the second stage, as a share of the first stage's.
-_JOINT_RATE = 0.2
 #: Standard errors by which residuals must exceed their covariance for deviations to leave their floor at once.
 _SIGNIFICANCE = 3.0
 #: Steps between two refreshes of the start noise at the current μ.
 _RELINEARISE = 100
 
 
-@dataclass(frozen=True)
-class AdamSettings:
-    """How Adam steps, in φ scaled to [0, 4] as for CMA-ES.
-
-    Attributes:
-        steps: of each of its two stages: the means alone, then means and deviations.
-        batch: transitions of a minibatch while means and deviations move, twice as many for the means alone;
-            the whole log where that is shorter.
-        samples: parameter vectors of each step of the second stage; the first simulates μ only.
-        learning_rate: the first of the means alone, falling linearly to 0; a fifth of it for means and deviations.
-        refresh: steps after which the basis of the means is computed anew.
-        clip: largest entry of a minibatch's gradient, in multiples of that entry's running root mean square:
-            a single transition at a stiff contact must not slow the steps that follow.
-        common_random_numbers: the same samples at every step instead of fresh ones.
-    """
-
-    steps: int = 200
-    batch: int = 25
-    samples: int = 16
-    learning_rate: float = 0.5
-    refresh: int = 20
-    clip: float = 3.0
-    common_random_numbers: bool = False
-
-    def __post_init__(self) -> None:
-        for name in ("steps", "batch", "samples", "learning_rate", "refresh", "clip"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"adam.{name}: {getattr(self, name)} given; expected a positive number")
-        if self.samples < 2:
-            raise InputError("adam.samples: 1 given; a covariance needs 2 or more")
-
-    def rate(self, step: int) -> float:
-        """Return the learning rate of a step, counted from 0 over both stages."""
-        first = self.learning_rate * (1.0 if step < self.steps else _JOINT_RATE)
-        return first * (1 - step % self.steps / self.steps)
-
-
-def adam_settings(given: Mapping[str, Any]) -> AdamSettings:
-    """Return the settings of a config's ``adam``.
-
-    Raises:
-        InputError: an unknown key, or a value that is no positive number.
-    """
-    known = {f.name: f.type for f in fields(AdamSettings)}
-    for key, value in given.items():
-        if key not in known:
-            raise InputError(f"adam: unknown key {key!r}" + choices(key, known))
-        if not isinstance(value, (int, float)):
-            raise InputError(f"adam.{key}: {value!r} given; expected a number")
-    return AdamSettings(**given)
-
-
-class AdamOptimizer(Optimizer):
+class AdamOptimizer(LikelihoodOptimizer):
     """Stochastic gradient ascent of the sampled likelihood over minibatches of transitions, in two stages.
 
     First the means alone, with deviations at their floor: weighted least squares, one simulation a transition. The
@@ -104,23 +49,19 @@ class AdamOptimizer(Optimizer):
 
     Args:
         objective: its reduction and its simulator's gradients are used; it is not evaluated here.
-        settings: how it steps.
-        seed: seeds minibatches and samples.
+        settings: how it steps, and the seed of minibatches and samples.
     """
 
     name = "adam"
 
-    def __init__(self, objective: Objective, *, settings: AdamSettings, seed: int) -> None:
+    def __init__(self, objective: Objective, settings: FitSettings) -> None:
         if not objective.simulator.differentiable:
             raise InputError(
                 f"optimizer: adam needs gradients, which backend {objective.simulator.name} has not; "
                 + objective.simulator.remedy
             )
-        self._objective = objective
-        self._space: ParameterSpace = objective.simulator.parameters
-        self._box = SearchBox.of(self._space)
-        self._settings, self._seed = settings, seed
-        self._noisy = objective.noise is not None
+        super().__init__(objective, settings)
+        self._adam = settings.adam
         d = len(self._space)
         self._phi = np.concatenate([np.full(d, SearchBox.WIDTH / 2), np.zeros(d)])
         self._first, self._second = np.zeros(2 * d), np.zeros(2 * d)
@@ -136,7 +77,7 @@ class AdamOptimizer(Optimizer):
         if self._is_refresh_due:
             stage = self._means_stage()
             return Request(
-                values=to_values(stage.points(), self._space.is_log),
+                values=self._box.values(stage.points()),
                 reduce=self._normal_equations(stage),
                 evaluations=0,
                 linearise_at=self._linearised,
@@ -145,7 +86,7 @@ class AdamOptimizer(Optimizer):
             )
         return Request(
             values=self._values(torch.from_numpy(self._phi)).detach().numpy(),
-            reduce=self._objective.likelihood_reduction(1) if self._is_joint else self._means_reduction(),
+            reduce=self._likelihood(1) if self._is_joint else self._means_reduction(),
             evaluations=1,
             linearise_at=self._linearised,
             rows=self._rows(),
@@ -166,13 +107,13 @@ class AdamOptimizer(Optimizer):
     @property
     def stop_reason(self) -> str | None:
         """Why it has stopped, in words."""
-        return f"{self._step} steps are taken" if self._step >= 2 * self._settings.steps else None
+        return f"{self._step} steps are taken" if self._step >= 2 * self._adam.steps else None
 
     @property
     def progress(self) -> Progress:
         """Smoothed log-likelihood of the whole log, and the share of steps taken."""
         stage = "Adam on means and deviations" if self._is_joint else "Adam on the means"
-        return Progress(stage, self._smoothed * len(self._objective), self._step / (2 * self._settings.steps))
+        return Progress(stage, self._smoothed * len(self._objective), self._step / (2 * self._adam.steps))
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the last φ."""
@@ -190,34 +131,34 @@ class AdamOptimizer(Optimizer):
     @property
     def _is_joint(self) -> bool:
         """Whether deviations move too."""
-        return self._step >= self._settings.steps
+        return self._step >= self._adam.steps
 
     @property
     def _batch(self) -> int:
         """Transitions of this step's minibatch."""
-        return min(self._settings.batch * (1 if self._is_joint else 2), len(self._objective))
+        return min(self._adam.batch * (1 if self._is_joint else 2), len(self._objective))
 
     @property
     def _is_new_stage(self) -> bool:
         """Whether the deviations are about to move for the first time."""
-        return self._step == self._settings.steps
+        return self._step == self._adam.steps
 
     @property
     def _is_refresh_due(self) -> bool:
-        return self._step % self._settings.steps % self._settings.refresh == 0 and self._refreshed != self._step
+        return self._step % self._adam.steps % self._adam.refresh == 0 and self._refreshed != self._step
 
     def _advance(self, force: np.ndarray) -> None:
         """One step of Adam along a gradient ``(2d,)`` whose part of the means is in the basis."""
-        taken = self._step % self._settings.steps
+        taken = self._step % self._adam.steps
         if taken >= _WARM_UP:
             usual = np.sqrt(self._second / (1 - _BETAS[1] ** taken))
-            force = np.clip(force, -self._settings.clip * usual, self._settings.clip * usual)
+            force = np.clip(force, -self._adam.clip * usual, self._adam.clip * usual)
         self._first = _BETAS[0] * self._first + (1 - _BETAS[0]) * force
         self._second = _BETAS[1] * self._second + (1 - _BETAS[1]) * force**2
         first, second = (m / (1 - b ** (taken + 1)) for m, b in zip((self._first, self._second), _BETAS, strict=True))
-        d, rate = len(self._space), self._settings.rate(self._step)
+        d, rate = len(self._space), self._adam.rate(self._step)
         size = np.sqrt(second + _TINY)
-        size[:d] = np.maximum(size[:d], self._settings.learning_rate * self._curvature)
+        size[:d] = np.maximum(size[:d], self._adam.learning_rate * self._curvature)
         move = rate * first / size
         move[:d] = self._basis @ move[:d]
         self._phi = np.clip(self._phi + move, 0.0, SearchBox.WIDTH)
@@ -256,16 +197,15 @@ class AdamOptimizer(Optimizer):
         low, width, least, most = (torch.as_tensor(x) for x in (box.low, box.width, box.min_std, box.max_std))
         mean = low + phi[:d] / SearchBox.WIDTH * width
         if not self._is_joint:
-            is_log = torch.as_tensor(self._space.is_log)
-            return (torch.where(is_log, torch.exp(mean), mean) if self._space.is_log.any() else mean)[None]
+            return tensor_values(mean, box.is_log)[None]
         std = least * (most / least) ** (phi[d:] / SearchBox.WIDTH)
-        draw = 0 if self._settings.common_random_numbers else self._step
-        uniforms = draw_uniforms(self._settings.samples, d, self._seed, 5, draw)
-        return values_from_uniforms(uniforms, mean, std, self._space.limits, self._space.is_log)
+        draw = 0 if self._adam.common_random_numbers else self._step
+        uniforms = draw_uniforms(self._adam.samples, d, self._settings.seed, 5, draw)
+        return box.draw(uniforms, mean, std)
 
     def _means_reduction(self) -> Reduce:
         """The likelihood of one vector: of two equal ones, whose covariance is nil."""
-        pair = self._objective.likelihood_reduction(1)
+        pair = self._likelihood(1)
         return lambda features, measured, covariance: pair(features.expand(-1, 2, -1), measured, covariance)
 
     def _means_stage(self) -> MeansStage:
@@ -290,7 +230,7 @@ class AdamOptimizer(Optimizer):
         """The transitions of this step: consecutive parts of a shuffle that is redrawn every epoch."""
         total = len(self._objective)
         epoch, part = divmod(self._step, max(1, total // self._batch))
-        order = np.random.default_rng((self._seed, 6, epoch)).permutation(total)
+        order = np.random.default_rng((self._settings.seed, 6, epoch)).permutation(total)
         return np.sort(order[part * self._batch : (part + 1) * self._batch])
 
 

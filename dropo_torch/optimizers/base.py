@@ -10,8 +10,10 @@ import numpy as np
 import torch
 
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import Distribution
-from dropo_torch.objective import Reduce, ReplayReduce
+from dropo_torch.distribution import Distribution, SearchBox
+from dropo_torch.evaluator import ReplayReduce
+from dropo_torch.objective import Objective, Reduce, likelihood_reduction
+from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.parameters import ParameterSpace
 
 
@@ -21,13 +23,13 @@ class Request:
 
     Attributes:
         values: parameter vectors in their units, ``(P, d)``.
-        reduce: what to sum over transitions, handed to :meth:`Objective.map`.
+        reduce: what to sum over transitions, as for :meth:`Objective.map`.
         evaluations: how many evaluations of the objective this counts as.
-        linearise_at: μ in coordinates at which the start noise is propagated first, or ``None``.
+        linearise_at: μ in coordinates at which the noise of initial states is propagated, or ``None``.
         linearise_std: σ that then counts as explained when windows are widened, or ``None``.
         rows: the transitions to simulate, ascending; ``None`` for all of them.
         replay: windows that are replayed open loop in place of the log's transitions; ``reduce`` is then a
-            :data:`~dropo_torch.objective.ReplayReduce`.
+            :data:`~dropo_torch.evaluator.ReplayReduce`.
         is_stencil: whether all vectors lie so close to the first that the simulation is linear between them.
         gradient: whether ``tell`` wants the gradient of the first sum in ``values``.
     """
@@ -91,6 +93,11 @@ class Optimizer(abc.ABC):
         """Why the optimizer has stopped, in words, or ``None`` while it goes on."""
 
     @property
+    def caveat(self) -> str:
+        """What to know before the result is used; empty where there is nothing."""
+        return ""
+
+    @property
     @abc.abstractmethod
     def progress(self) -> Progress:
         """Where the optimizer stands."""
@@ -118,3 +125,30 @@ class Optimizer(abc.ABC):
     @abc.abstractmethod
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
+
+
+class LikelihoodOptimizer(Optimizer):
+    """What the optimizers of DROPO itself share.
+
+    Args:
+        objective: gives the reduction, the parameters and the size of the log; it is not evaluated here.
+        settings: what the fit was told.
+    """
+
+    def __init__(self, objective: Objective, settings: FitSettings) -> None:
+        self._objective, self._settings = objective, settings
+        self._space: ParameterSpace = objective.simulator.parameters
+        self._box: SearchBox = objective.box
+        self._noisy = objective.noise is not None
+
+    def extras(self) -> dict[str, Any]:
+        """Return the weight of the entropy, where there is one."""
+        return {"entropy": self._settings.entropy} if self._settings.entropy else {}
+
+    def bonus(self, distribution: Distribution) -> float:
+        """Return the weighted entropy."""
+        return self._settings.entropy * entropy_of(distribution) if self._settings.entropy else 0.0
+
+    def _likelihood(self, num_phi: int) -> Reduce:
+        """The reduction to the sampled likelihood of P φ."""
+        return likelihood_reduction(self._objective.features, num_phi)

@@ -12,17 +12,18 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.distribution import DRAWN_STD, Distribution, to_values
-from dropo_torch.objective import Reduce
+from dropo_torch.distribution import DRAWN_STD, Distribution
+from dropo_torch.objective import Objective, Reduce
 from dropo_torch.optimizers.base import Progress, Request
 from dropo_torch.optimizers.fisher import FisherOptimizer
 from dropo_torch.optimizers.gauss_newton import MeansStage
+from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.parameters import ParameterSpace
 
 #: Times that the simulation is linearised anew, at most.
 _ROUNDS = 5
 _ITERATIONS = 500
-#: The means rest when no round moves them by more than this share of their box.
+#: The means have converged when no round moves them by more than this share of their box.
 _AT_REST = 1e-4
 
 
@@ -36,7 +37,7 @@ def random_effects(
     Args:
         gram: G_t, ``(T, d, d)``.
         force: g_t, ``(T, d)``.
-        start: first guess of C, positive definite, ``(d, d)``; its deviations stay below 1.
+        start: first guess of C, positive definite, ``(d, d)``; its standard deviations stay below 1.
         entropy: β.
     """
     wider = len(gram) / max(len(gram) - entropy, 1e-3 * len(gram))
@@ -62,8 +63,8 @@ def random_effects(
 class CorrelatedOptimizer(FisherOptimizer):
     """Fisher scoring with independent parameters, then their full covariance; the likelier of both is the result."""
 
-    def __init__(self, space: ParameterSpace, **options: Any) -> None:
-        super().__init__(space, **options)
+    def __init__(self, objective: Objective, settings: FitSettings) -> None:
+        super().__init__(objective, settings)
         self._center: np.ndarray | None = None
         self._covariance: np.ndarray | None = None
         self._rounds = 0
@@ -76,7 +77,7 @@ class CorrelatedOptimizer(FisherOptimizer):
         stage = MeansStage(self._box.low, self._box.high, self._at)
         self._gathered = []
         return Request(
-            values=to_values(stage.points(), self._space.is_log),
+            values=self._box.values(stage.points()),
             reduce=self._gather(stage.points()),
             evaluations=1,
             linearise_at=self._linearised,
@@ -99,7 +100,7 @@ class CorrelatedOptimizer(FisherOptimizer):
             gram * torch.outer(scale, scale),
             force * scale,
             torch.from_numpy(start) / torch.outer(scale, scale),
-            entropy=self._entropy,
+            entropy=self._settings.entropy,
         )
         self._covariance = (found * torch.outer(scale, scale)).numpy()
         moved = np.clip(self._at + (shift * scale).numpy(), self._box.low, self._box.high)
@@ -124,10 +125,9 @@ class CorrelatedOptimizer(FisherOptimizer):
         independent = super().distributions(space)
         if self._covariance is None:
             return independent
-        deviation = np.sqrt(np.maximum(np.diag(self._covariance), 1e-300))
-        std = deviation / DRAWN_STD  # the cut takes its share again
-        correlation = self._covariance / np.outer(deviation, deviation)
-        bounded = np.clip(std, self._box.min_std, self._box.max_std)
+        drawn = np.sqrt(np.maximum(np.diag(self._covariance), 1e-300))
+        correlation = self._covariance / np.outer(drawn, drawn)
+        bounded = np.clip(drawn / DRAWN_STD, self._box.min_std, self._box.max_std)  # the cut takes its share again
         return [*independent, Distribution.over(space, self._at, bounded, correlation=correlation)]
 
     def state(self) -> dict[str, Any]:

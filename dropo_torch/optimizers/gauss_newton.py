@@ -47,13 +47,11 @@ class MeansStage:
 
     def points(self) -> np.ndarray:
         """Return the stencil of the candidate: itself, then one moved point a parameter, ``(d + 1, d)``."""
-        center = self.point if self.candidate is None else self.candidate
-        return np.concatenate([center[None], center + np.diag(self._steps(center))])
+        return np.concatenate([self._center[None], self._center + np.diag(self.steps)])
 
     def reduction(self) -> Reduce:
         """Return the reduction to cost, losses, normal equations and moments, ``(2 + 2d + 2d²,)``."""
-        center = self.point if self.candidate is None else self.candidate
-        steps = torch.from_numpy(self._steps(center))
+        steps = torch.from_numpy(self.steps)
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
             return normal_equations(features, measured, covariance, steps)
@@ -64,10 +62,10 @@ class MeansStage:
         """Accept or reject the candidate, and propose the next one."""
         d = len(self.low)
         cost = float(sums[0])
-        step = np.inf if self.candidate is None else float(np.max(np.abs(self.candidate - self.point) / self._width))
+        step = np.inf if self.candidate is None else float(np.max(np.abs(self._center - self.point) / self._width))
         if np.isfinite(cost) and cost < self.cost:
             gain = self.cost - cost
-            self.point = self.point if self.candidate is None else self.candidate
+            self.point = self._center
             self.cost, self.lost = cost, float(sums[1])
             vectors, matrices = sums[2 : 2 + 2 * d].numpy(), sums[2 + 2 * d :].numpy()
             self.gradient, self.excess = vectors.reshape(2, d).copy()
@@ -117,10 +115,16 @@ class MeansStage:
     def _width(self) -> np.ndarray:
         return self.high - self.low
 
-    def _steps(self, center: np.ndarray) -> np.ndarray:
-        """Signed difference steps that stay inside the box, ``(d,)``."""
+    @property
+    def _center(self) -> np.ndarray:
+        """The candidate, or the point itself before there is one, ``(d,)``."""
+        return self.point if self.candidate is None else self.candidate
+
+    @property
+    def steps(self) -> np.ndarray:
+        """Signed steps of the candidate's differences, which stay inside the box, ``(d,)``."""
         step = DIFFERENCE_STEP * self._width
-        return np.where(center + step > self.high, -step, step)
+        return np.where(self._center + step > self.high, -step, step)
 
     def _step(self) -> np.ndarray:
         """The damped step; parameters that press against a bound stay there."""

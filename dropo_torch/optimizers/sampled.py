@@ -8,57 +8,37 @@ its gradient follows from how the samples' next states regress on z: no further 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any, Protocol
 
 import numpy as np
 import torch
 
-from dropo_torch.distribution import SearchBox, truncated_normal_icdf
 from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density, sample_moments
 from dropo_torch.objective import Reduce
-from dropo_torch.optimizers.gauss_newton import damped_step
-
-MAX_ITERATIONS = 25
-#: The stage stops after two accepted steps in a row that each gain less than this, in nats.
-SMALL_GAIN = 0.1
-MAX_DAMPING = 1e2
+from dropo_torch.optimizers.ascent import Ascent
 
 
 @dataclass
-class SampledStage:
-    """Maximises the sampled likelihood over μ and log σ on fixed base uniforms.
+class SampledStage(Ascent):
+    """Maximises the sampled likelihood on fixed base uniforms.
 
     Attributes:
-        box: bounds of μ and σ in coordinates.
-        limits: physical limits in coordinates, low and high, ``(d,)`` each.
         uniforms: base uniforms, ``(K, d)``.
-        mean, std: the best φ so far, ``(d,)`` each.
-        is_log: which parameters are searched by their logarithm, ``(d,)`` bool; none by default.
     """
 
-    box: SearchBox
-    limits: tuple[np.ndarray, np.ndarray]
-    uniforms: torch.Tensor
-    mean: np.ndarray
-    std: np.ndarray
-    is_log: np.ndarray = field(default_factory=lambda: np.zeros(1, dtype=bool))
-    damping: float = 1e-2
-    log_likelihood: float = -np.inf
-    iterations: int = 0
-    small_gains: int = 0
-    reason: str | None = None
-    candidate: tuple[np.ndarray, np.ndarray] | None = None
-    sums: np.ndarray | None = None
+    uniforms: torch.Tensor = field(kw_only=True)
+
+    TITLE = "Fisher scoring on samples"
+    BEGUN_AT = 0.7
+    SMALL_GAIN = 0.1
+    MAX_ITERATIONS = 25
 
     def points(self) -> np.ndarray:
         """Return the candidate's samples in coordinates, ``(K, d)``."""
-        mean, std = (torch.as_tensor(x) for x in self.candidate or (self.mean, self.std))
-        low, high = (torch.as_tensor(x) for x in self.limits)
-        return truncated_normal_icdf(self.uniforms, mean, std, low, high).numpy()
+        return self.box.draw_coordinates(self.uniforms, *map(torch.as_tensor, self.phi)).numpy()
 
     def reduction(self) -> Reduce:
         """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d²,)``."""
-        mean, std = self.candidate or (self.mean, self.std)
+        mean, std = self.phi
         z = torch.from_numpy((self.points() - mean) / std)
         sigma = torch.from_numpy(std)
 
@@ -67,100 +47,16 @@ class SampledStage:
 
         return reduce
 
-    def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
-        """Accept or reject the candidate, and propose the next one.
+    def with_exact_scores(self, sums: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
+        """Return the sums with the chain rule's scores of (μ, log σ) in the place of the regressed ones.
 
         Args:
             sums: of :meth:`reduction`.
-            gradient: of the log-likelihood in the samples' values, ``(K, d)``; replaces the regressed scores.
+            gradient: of the log-likelihood in the samples' values, ``(K, d)``.
         """
-        if gradient is not None:
-            sums = self._with_exact_scores(sums, gradient)
-        judge(self, sums, small_gain=SMALL_GAIN, max_damping=MAX_DAMPING, max_iterations=MAX_ITERATIONS)
-        if self.reason is None and self.sums is not None:
-            self.candidate = scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
-
-    def state(self) -> dict[str, Any]:
-        """Return everything but the box, the limits, the uniforms and the scales."""
-        return {k: v for k, v in vars(self).items() if k not in ("box", "limits", "uniforms", "is_log")}
-
-    def _with_exact_scores(self, sums: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
-        """Put the chain rule's scores of (μ, log σ) in the place of the regressed ones."""
-        mean, std = (torch.as_tensor(x).clone().requires_grad_(True) for x in self.candidate or (self.mean, self.std))
-        low, high = (torch.as_tensor(x) for x in self.limits)
-        x = truncated_normal_icdf(self.uniforms, mean, std, low, high)
-        values = torch.where(torch.as_tensor(self.is_log), torch.exp(x), x) if self.is_log.any() else x
-        by_mean, by_std = torch.autograd.grad(values, (mean, std), gradient)
-        d = len(mean)
-        return torch.cat([sums[:1], by_mean, by_std * std.detach(), sums[1 + 2 * d :]])
-
-
-class Ascent(Protocol):
-    """What a stage that climbs the likelihood by steps in (μ, log σ) remembers."""
-
-    mean: np.ndarray
-    std: np.ndarray
-    damping: float
-    log_likelihood: float
-    iterations: int
-    small_gains: int
-    reason: str | None
-    candidate: tuple[np.ndarray, np.ndarray] | None
-    sums: np.ndarray | None
-
-
-def judge(stage: Ascent, sums: torch.Tensor, *, small_gain: float, max_damping: float, max_iterations: int) -> None:
-    """Accept or reject a stage's candidate by its log-likelihood, the first of its sums; stop where it is time.
-
-    Args:
-        stage: changed in place.
-        sums: of the candidate.
-        small_gain: two accepted steps in a row that each gain less end the stage, in nats.
-        max_damping: damping beyond which no step is tried.
-        max_iterations: candidates after which the stage ends.
-    """
-    value = float(sums[0])
-    if np.isfinite(value) and value > stage.log_likelihood:
-        gain = value - stage.log_likelihood
-        stage.mean, stage.std = stage.candidate or (stage.mean, stage.std)
-        stage.log_likelihood, stage.sums = value, sums.numpy().copy()
-        stage.damping = max(stage.damping / 4, 1e-6)
-        stage.small_gains = stage.small_gains + 1 if gain < small_gain else 0
-        if stage.small_gains >= 2:
-            stage.reason = f"two steps in a row gained less than {small_gain:g} nat"
-    elif stage.candidate is None:
-        stage.reason = "no simulation succeeded at the starting point"
-    else:
-        stage.damping *= 8
-        if stage.damping > max_damping:
-            stage.reason = "no step improves the likelihood"
-    stage.iterations += 1
-    if stage.iterations >= max_iterations and stage.reason is None:
-        stage.reason = f"{max_iterations} iterations of Fisher scoring"
-
-
-def scoring_step(
-    mean: np.ndarray, std: np.ndarray, sums: np.ndarray, box: SearchBox, damping: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the next (μ, σ): a damped Fisher step in μ and log σ, clipped and kept inside the box.
-
-    Args:
-        mean, std: φ, ``(d,)`` each.
-        sums: log-likelihood, scores and Fisher matrices of (μ, log σ), packed as ``(1 + 2d + 2d² ...,)``.
-        box: bounds of μ and σ.
-        damping: Marquardt's, on the diagonal of the Fisher matrices scaled to 1.
-    """
-    d = len(mean)
-    score_mean, score_log = sums[1 : 1 + d], sums[1 + d : 1 + 2 * d]
-    fisher_mean, fisher_log = sums[1 + 2 * d : 1 + 2 * d + 2 * d * d].reshape(2, d, d)
-    free = ~((mean <= box.low) & (score_mean < 0)) & ~((mean >= box.high) & (score_mean > 0))
-    move = np.clip(damped_step(fisher_mean, score_mean, free, damping), -0.25 * box.width, 0.25 * box.width)
-    log_std, low, high = np.log(std), np.log(box.min_std), np.log(box.max_std)
-    free = ~((log_std <= low) & (score_log < 0)) & ~((log_std >= high) & (score_log > 0))
-    turn = np.clip(damped_step(fisher_log, score_log, free, damping), -1.5, 1.5)
-    # a deviation that no longer shows in the covariance has no curvature left: send it down
-    turn = np.where(free & (score_log <= 0) & (np.diag(fisher_log) < 1e-3), -1.5 / (1 + damping), turn)
-    return np.clip(mean + move, box.low, box.high), np.exp(np.clip(log_std + turn, low, high))
+        mean, std = (torch.as_tensor(x).clone().requires_grad_(True) for x in self.phi)
+        by_mean, by_std = torch.autograd.grad(self.box.draw(self.uniforms, mean, std), (mean, std), gradient)
+        return torch.cat([sums[:1], by_mean, by_std * std.detach(), sums[1 + 2 * len(mean) :]])
 
 
 def sampled_scores(
@@ -173,7 +69,7 @@ def sampled_scores(
         measured: ``(t, m)``.
         covariance: what no parameter explains, ``(t, m, m)``.
         std: σ, ``(d,)``.
-        z: the samples' deviations from μ in units of σ, ``(K, d)``.
+        z: how far the samples lie from μ, in σ, ``(K, d)``.
     """
     num_samples = len(z)
     alive = torch.isfinite(features).flatten(1).all(-1)

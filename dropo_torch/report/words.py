@@ -360,7 +360,7 @@ def _of_method(fit: Fit) -> list[Finding]:
         "bayessim": ("note", "They rest on simulations that resemble the log; see the posterior below."),
     }
     if fit.extras.get("extrapolates"):
-        texts["bayessim"] = ("attention", f"But the posterior is a guess: {fit.stop_reason.split('; but ')[-1]}.")
+        texts["bayessim"] = ("attention", f"But the posterior is a guess: {fit.caveat}.")
     level, text = texts.get(fit.method, ("note", ""))
     found = [Finding(cast(Level, level), "What the standard deviations are", f"{law(fit).split('. ')[1]}. {text}")]
     if fit.method != "bayessim":

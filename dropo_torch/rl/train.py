@@ -13,7 +13,6 @@ from typing import Any
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.objective import single_thread
 from dropo_torch.rl.checkpoint import Checkpoints
 from dropo_torch.rl.collect import Collector
 from dropo_torch.rl.evaluate import Evaluation, evaluate
@@ -23,6 +22,7 @@ from dropo_torch.rl.ppo import PPO
 from dropo_torch.rl.problem import TrainingProblem, World
 from dropo_torch.rl.sac import SAC
 from dropo_torch.rl.settings import PPOSettings, SACSettings
+from dropo_torch.support.threads import single_thread
 
 SCHEMA = "dropo-torch/train/1"
 #: History entries that are kept: a run of many short iterations keeps some of them.

@@ -12,8 +12,9 @@ import numpy as np
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.fit import Fit
-from dropo_torch.objective import Objective, draw_uniforms
+from dropo_torch.objective import Objective
 from dropo_torch.support.files import write_atomically
+from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/compare/1"
 #: optimizer-backend pairs that are compared.
@@ -134,9 +135,9 @@ def _record(method: str, seed: int, fit: Fit, objective: Objective) -> dict[str,
     uniforms = draw_uniforms(fit.samples, len(fit.distribution), fit.seed, 0)
     likelihood = {}
     for i in picked:
-        objective.linearise(history[i].mean)
+        initial = objective.initial_noise(history[i].mean)
         std = np.maximum(history[i].std, objective.box.min_std)
-        found = objective.evaluate(history[i].mean[None], std[None], uniforms)[0]
+        found = objective.evaluate(history[i].mean[None], std[None], uniforms, initial)[0]
         likelihood[int(i)] = found.log_likelihood
     summary = fit.distribution.summary()
     centers = [type(fit.distribution).over(objective.simulator.parameters, h.mean, h.std).center for h in history]

@@ -16,8 +16,9 @@ import numpy as np
 
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit
-from dropo_torch.objective import Objective, draw_uniforms
+from dropo_torch.objective import Objective
 from dropo_torch.support.files import write_atomically
+from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/sweep/1"
 #: An error within this share of the smallest one counts as no larger.

@@ -265,8 +265,7 @@ def mse_at(problem: Problem, values: Mapping[str, float]) -> float:
     """Return the mean squared error of the log's predicted ends at values of the parameters."""
     row = [values[name] for name in problem.simulator.parameters.names]
     two = torch.tensor([[row, row]], dtype=torch.float64)  # a likelihood needs two samples; both are the same
-    fresh = problem.objective.on(problem.objective.transitions)  # without what a fit has made of noisy starts
-    return fresh.evaluate_values(two)[0].mse
+    return problem.objective.evaluate_values(two)[0].mse
 
 
 def _log(cell: Cell, plan: Plan) -> HopperLog:

@@ -1,0 +1,26 @@
+"""Random draws, each a pure function of its seeds or of the generator that is handed in."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+
+def base_uniforms(num_samples: int, num_parameters: int, generator: torch.Generator) -> torch.Tensor:
+    """Draw base uniforms ``(num_samples, num_parameters)``, float64."""
+    return torch.rand(num_samples, num_parameters, generator=generator, dtype=torch.float64)
+
+
+def draw_uniforms(num_samples: int, num_parameters: int, *seeds: int) -> torch.Tensor:
+    """Draw base uniforms ``(num_samples, num_parameters)`` from a generator of their own."""
+    return base_uniforms(num_samples, num_parameters, torch.Generator().manual_seed(derived_seed(*seeds)))
+
+
+def draw_normals(num_draws: int, width: int, seed: int) -> torch.Tensor:
+    """Draw standard normals ``(num_draws, width)``, float64."""
+    return torch.special.ndtri(draw_uniforms(num_draws, width, seed))
+
+
+def derived_seed(*seeds: int) -> int:
+    """Return a seed that torch accepts, of seeds of any size."""
+    return int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]) >> 1
