@@ -183,6 +183,12 @@ class Objective:
         """Simulate transitions under parameter values ``(P, d)``, in units, and sum ``reduce`` over chunks."""
         return self.evaluator.map(values, self.comparing(reduce, initial), rows)
 
+    def simulated(self, values: np.ndarray | torch.Tensor) -> torch.Tensor:
+        """Return the observed columns ``(T, P, n)`` that the simulator gives for values ``(P, d)``, in units."""
+        run, vectors = self.evaluator, torch.as_tensor(np.asarray(values), dtype=torch.float64)
+        parts = (run.simulator.simulate(run.states[b], run.controls[b], vectors) for b in run.blocks(len(vectors)))
+        return torch.cat([after[..., self.observation.index] for after in parts])
+
     def values(self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor) -> torch.Tensor:
         """Return parameter values ``(P, K, d)``, in units, of φ ``(P, d)`` and base uniforms."""
         mu, sigma = (torch.as_tensor(x)[:, None, :] for x in (mean, std))

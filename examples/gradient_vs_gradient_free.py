@@ -134,7 +134,8 @@ def compare_on(
         simulator = dropo.make_simulator(backend, system.model, parameters=space, frame_skip=system.frame_skip)
         objective = dropo.Objective(simulator, transitions, observation, epsilon=EPSILON)
         evaluations = budget or BUDGET[len(space)]
-        fit = dropo.fit(objective, optimizer=optimizer, samples=samples, seed=seed, adam=adam, budget=evaluations)
+        settings = dropo.FitSettings(optimizer, samples=samples, seed=seed, adam=adam, budget=evaluations)
+        fit = dropo.fit(objective, settings)
         return fit, objective
 
     def show(run: Run) -> None:

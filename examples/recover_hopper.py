@@ -44,7 +44,7 @@ def recover(
         noise=NOISE_VARIANCE**0.5 if experiment == "noisy" else None,
     )
     begun = time.monotonic()
-    fit = dropo.fit(objective, optimizer=optimizer, samples=samples, budget=budget, seed=seed)
+    fit = dropo.fit(objective, dropo.FitSettings(optimizer=optimizer, samples=samples, budget=budget, seed=seed))
     seconds = time.monotonic() - begun
     realised = log.masses[::25] if experiment == "distribution" else log.masses
     return {

@@ -63,7 +63,7 @@ def fit_log(folder: Path, seed: int, given: argparse.Namespace) -> Path:
     document = {"sim": "hopper", "data": "log.npz", "parameters": {n: dict(SIM.parameters[n]) for n in FITTED}}
     settings = {"seed": seed, "epsilon": given.epsilon, "threads": given.threads}
     problem = dropo.make_problem(dropo.make_config(document, settings, base=folder))
-    dropo.fit(problem.objective, seed=seed).save(path)
+    dropo.fit(problem.objective, dropo.FitSettings(seed=seed)).save(path)
     return path
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from conftest import HOPPER, simulated_columns
+from conftest import HOPPER
 from dropo_sims.hopper import SIM
 
 from dropo_torch.certify import certify
@@ -576,7 +576,7 @@ def test_gymnasium_environments_have_effects_around_them() -> None:
     theirs = make_problem(make_config({**document, "backend": "gymnasium", "environment": "Hopper-v5"}))
     values = 0.5 * (ours.space.low + ours.space.high)[None]
     few = np.arange(0, len(ours.objective), 20)
-    found = [simulated_columns(p.objective.on(p.objective.transitions.select(few)), values) for p in (ours, theirs)]
+    found = [p.objective.on(p.objective.transitions.select(few)).simulated(values) for p in (ours, theirs)]
     torch.testing.assert_close(*found, rtol=0, atol=1e-8)
     force = [{"effect": "external_force", "target": "torso", "x": 1.0, "y": 0.0, "z": 0.0}]
     with pytest.raises(InputError, match=r"backend gymnasium cannot have external_force at torso.*backend: mujoco"):

@@ -131,6 +131,16 @@ def test_fit_json_has_the_keys_of_the_contract(fitted: Callable[..., Fit]) -> No
     assert document["simulated_transitions"] >= 60 * document["evaluations"]
 
 
+def test_a_fit_leaves_no_trace_in_its_objective() -> None:
+    gain = np.array([[2.0, 0.3], [-0.5, 1.0], [0.2, 0.8]])
+    measured = np.random.default_rng(3).normal([1.2, 4.0], [0.15, 0.4], (50, 2)) @ gain.T
+    simulator = LinearSimulator(space_of(a=[0.0, 3.0], b=[1.0, 9.0]), gain)
+    objective = linear_objective(simulator, measured, epsilon=1e-4, noise=0.1)
+    documents = [fit(objective, FitSettings(samples=20)).document() for _ in range(2)]
+    assert [d.pop("seconds") >= 0 for d in documents] == [True, True]
+    assert documents[0] == documents[1]
+
+
 def test_an_unknown_optimizer_is_refused() -> None:
     objective = linear_objective(LinearSimulator(space_of(a=[0.0, 3.0]), np.eye(1)), np.ones((9, 1)))
     with pytest.raises(InputError, match="did you mean 'fisher'"):

@@ -16,7 +16,6 @@ from conftest import (
     masses,
     random_controls,
     random_states,
-    simulated_columns,
     space_of,
     windows,
 )
@@ -33,7 +32,7 @@ from dropo_torch.likelihood import (
     log_likelihood,
     robust_cholesky,
 )
-from dropo_torch.objective import Objective
+from dropo_torch.objective import Objective, likelihood_reduction
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator
 from dropo_torch.support.random import draw_uniforms
@@ -50,7 +49,7 @@ def literal(samples: np.ndarray, measured: np.ndarray, epsilon) -> float:
 def reference(objective: Objective, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor, epsilon) -> float:
     """The literal likelihood of every transition under the same samples, one transition at a time."""
     values = objective.values(mean[None], std[None], uniforms)[0]
-    simulated = simulated_columns(objective, values).numpy()
+    simulated = objective.simulated(values).numpy()
     return sum(literal(s, m, epsilon) for s, m in zip(simulated, objective.transitions.measured, strict=True))
 
 
@@ -95,7 +94,7 @@ def test_on_the_hopper_it_is_the_literal_likelihood(hopper, lag, epsilon):
     uniforms = draw_uniforms(20, 4, 0)
     found = objective.evaluate(mean[None], std[None], uniforms)[0]
     assert found.log_likelihood == pytest.approx(reference(objective, mean, std, uniforms, epsilon), rel=1e-8)
-    simulated = simulated_columns(objective, objective.values(mean[None], std[None], uniforms)[0]).numpy()
+    simulated = objective.simulated(objective.values(mean[None], std[None], uniforms)[0]).numpy()
     assert found.mse == pytest.approx(((simulated.mean(1) - objective.transitions.measured) ** 2).mean(), rel=1e-9)
     assert (found.diverged, found.simulated_transitions) == (0, 25 * 20 * lag)
 
@@ -144,7 +143,7 @@ def test_masked_columns_leave_the_likelihood(hopper):
     assert masked.features.size == len(masked.features.labels) == len(masked.features.units) == 8
     mean, std = middle(masked)
     uniforms = draw_uniforms(15, 4, 0)
-    simulated = simulated_columns(masked, masked.values(mean[None], std[None], uniforms)[0]).numpy()[..., keep]
+    simulated = masked.simulated(masked.values(mean[None], std[None], uniforms)[0]).numpy()[..., keep]
     theirs = sum(literal(s, m, 1e-5) for s, m in zip(simulated, masked.transitions.measured[:, keep], strict=True))
     assert evaluate(masked, uniforms) == pytest.approx(theirs, rel=1e-8)
 
@@ -228,7 +227,7 @@ def test_an_orientation_enters_by_its_angle_with_both_signs_measured_zero():
     assert objective.features.labels[3:] == tuple(f"root.position.rotation[{a}]" for a in "xyz")
     mean, std = middle(objective)
     uniforms = draw_uniforms(25, 3, 0)
-    simulated = simulated_columns(objective, objective.values(mean[None], std[None], uniforms)[0]).numpy()
+    simulated = objective.simulated(objective.values(mean[None], std[None], uniforms)[0]).numpy()
     theirs = 0.0
     for samples, measured in zip(simulated, objective.transitions.measured, strict=True):
         cosine = np.abs(samples[:, 3:] @ measured[3:]) / np.linalg.norm(samples[:, 3:], axis=1)
@@ -391,7 +390,7 @@ def test_the_robust_likelihood_is_students_under_the_noise_as_it_is_given():
     values = objective.values(mean[None], std[None], uniforms)[0]
     base = matrix_at(objective, mean) + np.diag(noise**2) + 1e-6 * np.eye(2)
     theirs = 0.0
-    for samples, logged in zip(simulated_columns(objective, values).numpy(), measured, strict=True):
+    for samples, logged in zip(objective.simulated(values).numpy(), measured, strict=True):
         scale = base + np.cov(samples, rowvar=False)
         theirs += scipy.stats.multivariate_t.logpdf(logged - samples.mean(0), shape=scale, df=5)
     assert objective.robust_log_likelihood(mean, values) == pytest.approx(theirs, rel=1e-9)
@@ -438,6 +437,50 @@ def test_before_the_first_linearisation_the_noise_is_that_of_the_measured_end():
     )
 
 
+def test_evaluations_do_not_interfere_whatever_their_order():
+    objective, _ = slide_objective([0.02, 0.3], epsilon=1e-3)
+    uniforms, std = draw_uniforms(10, 1, 0), np.array([0.2])
+    noises = [None, objective.initial_noise(np.array([1.5])), objective.initial_noise(np.array([3.0]), std)]
+    kept = [(n.shift.clone(), n.covariance.clone(), n.widening.clone()) for n in noises[1:]]
+    before = dict(vars(objective))
+
+    def value(which: int) -> float:
+        return evaluate(objective, uniforms, np.array([2.0]), std, initial=noises[which])
+
+    first = [value(i) for i in (0, 1, 2)]
+    assert len(set(first)) == 3
+    objective.robust_log_likelihood(np.array([2.5]), objective.values(np.array([[2.5]]), std[None], uniforms)[0])
+    assert [value(i) for i in (2, 1, 2, 0)] == [first[i] for i in (2, 1, 2, 0)]
+    again = objective.initial_noise(np.array([1.5]))
+    for found in (again, noises[1]):
+        for ours, theirs in zip((found.shift, found.covariance, found.widening), kept[0], strict=True):
+            assert torch.equal(ours, theirs)
+    assert vars(objective) == before
+    assert again.is_at(np.array([1.5]), None)
+    assert not again.is_at(np.array([1.5]), std)
+    assert noises[2].is_at(np.array([3.0]), std.copy())
+
+
+@pytest.mark.parametrize("noise", [None, [0.02, 0.3]])
+def test_what_an_evaluation_takes_is_what_the_simulator_did(noise, monkeypatch):
+    objective, _ = slide_objective(noise, lag=3, chunk_size=5)
+    simulate, done = objective.simulator.simulate, []
+
+    def counting(states, controls, values):
+        done.append(len(states) * controls.shape[1] * len(values))
+        return simulate(states, controls, values)
+
+    monkeypatch.setattr(objective.simulator, "simulate", counting)
+    initial = objective.initial_noise(np.array([2.0]), np.array([0.1]))
+    assert (0 if initial is None else initial.simulated_transitions) == sum(done)
+    done.clear()
+    found = objective.evaluate(np.full((2, 1), 2.0), np.full((2, 1), 0.1), draw_uniforms(7, 1, 0), initial)
+    assert sum(f.simulated_transitions for f in found) == sum(done) == 2 * 7 * 8 * 3
+    done.clear()
+    sums = objective.map(np.full((4, 1), 2.0), likelihood_reduction(objective.features, 1), np.array([1, 5, 7]))
+    assert sums.simulated_transitions == sum(done) == 4 * 3 * 3
+
+
 def test_no_noise_and_noise_of_zero_are_the_same():
     uniforms = draw_uniforms(10, 1, 0)
     values = []
@@ -452,7 +495,7 @@ def test_noise_enters_the_likelihood_as_a_covariance():
     objective, _ = slide_objective([0.02, 0.3])
     initial = objective.initial_noise(np.array([2.0]))
     mean, std, uniforms = np.array([2.1]), np.array([0.3]), draw_uniforms(12, 1, 0)
-    simulated = simulated_columns(objective, objective.values(mean[None], std[None], uniforms)[0]).numpy()
+    simulated = objective.simulated(objective.values(mean[None], std[None], uniforms)[0]).numpy()
     base = objective.base_covariance(slice(0, 8), initial).numpy()
     theirs = sum(
         scipy.stats.multivariate_normal.logpdf(m, s.mean(0), np.cov(s, rowvar=False) + c)

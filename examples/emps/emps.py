@@ -29,7 +29,7 @@ def fit_emps(data: Path, overrides: dict[str, Any] | None = None) -> tuple[dropo
     """Fit the first three quarters of the log."""
     config = dropo.load_config(CONFIG, {"data.path": str(data.resolve()), **(overrides or {})})
     problem = dropo.make_problem(config)
-    return dropo.fit(problem.objective, seed=config.seed), problem
+    return dropo.fit(problem.objective, config.fit_settings()), problem
 
 
 def open_loop_error(problem: dropo.Problem, values: np.ndarray) -> np.ndarray:
