@@ -11,8 +11,8 @@ import pytest
 import torch
 import yaml
 from conftest import HOPPER
-from dropo_sims.hopper import SIM
 
+from dropo_sims.hopper import SIM
 from dropo_torch.certify import certify
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config, make_config
@@ -334,7 +334,7 @@ def test_coupling_is_a_spring_between_neighbours() -> None:
     setting = setting_of(model)
     states = some_states(model).numpy()
     found = find_effect("joint_coupling").force(
-        setting, "elbow", np.array([2.0]), states[:, : model.nq], states[:, model.nq :]
+        setting, "elbow", np.array([[2.0]]), states[:, : model.nq], states[:, model.nq :]
     )
     assert found is not None
     stretch = states[:, 1] - states[:, 0]

@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 from cartpole import CART_POLE, CartPole
-from dropo_sims.hopper import SIM
-from dropo_sims.hopper.task import HopperTask
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torchrl.envs.utils import check_env_specs
 
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.task import HopperTask
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.distribution import Distribution
 from dropo_torch.effects import VOCABULARY, find_effect, register
@@ -496,14 +496,19 @@ def test_a_task_is_of_its_model() -> None:
 # effects
 
 
-class Reversed(ActuatorDeadband):
-    """An effect of a user's own, which only the general way can simulate: the mean of the last three commands."""
+class Mean(ActuatorDeadband):
+    """An effect of a user's own: the mean of the last three commands, times a number."""
 
     name = "own_command_test"
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        at = np.arange(signal.shape[1])
-        return sum(signal[:, np.maximum(at - k, 0)] for k in range(3)) * (values[0] / 3)
+    def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:
+        return command.expand(-1, 2)
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        known = torch.cat([state, signal], 1)
+        return known.unfold(1, 3, 1).sum(-1) * (values[:, :1] / 3), known[:, -2:]
 
     def memory(self, values: np.ndarray) -> float:
         return 0.02
@@ -560,7 +565,7 @@ CASES: dict[str, tuple[list[dict], Mapping[str, Mapping[str, Any]]]] = {
 
 @pytest.fixture(autouse=True, scope="module")
 def own_effects() -> None:
-    for effect in (Reversed(), Offset()):
+    for effect in (Mean(), Offset()):
         if effect.name not in VOCABULARY:
             register(effect)
 

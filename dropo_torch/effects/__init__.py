@@ -15,7 +15,7 @@ from dropo_torch.effects.actuator import (
     ActuatorLag,
     ActuatorSaturation,
 )
-from dropo_torch.effects.base import Effect, Path, Placed, Quantity, Setting, Signals
+from dropo_torch.effects.base import VOCABULARY, Effect, Placed, Quantity, Setting, Signals, find_effect
 from dropo_torch.effects.body import CenterOfMass, ExternalForce, FluidDrag, Inertia, Payload
 from dropo_torch.effects.contact import ContactFriction, ContactMargin, ContactStiffness
 from dropo_torch.effects.joint import (
@@ -29,22 +29,20 @@ from dropo_torch.effects.joint import (
     JointStiffness,
     JointStribeck,
 )
+from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorBias, SensorDelay, SensorScale
 from dropo_torch.effects.world import GravityTilt, GroundSlope, Integration
-from dropo_torch.errors import InputError, choices
+from dropo_torch.errors import InputError
 from dropo_torch.support.usercode import load_callable, user_code
 
-#: Every effect of the package, by name. A user's own joins with :func:`register`.
-VOCABULARY: dict[str, Effect] = {
-    effect.name: effect
-    for effect in (
-        JointDamping(), JointQuadraticDamping(), JointFriction(), JointStribeck(), JointStiffness(), JointCogging(),
-        Armature(), JointLimit(), JointCoupling(), Payload(), CenterOfMass(), Inertia(), ExternalForce(), FluidDrag(),
-        GravityTilt(), GroundSlope(), Integration(), ActuatorGain(), ActuatorBias(), ActuatorDamping(),
-        ActuatorDelay(), ActuatorLag(), ActuatorDeadband(), ActuatorBacklash(), ActuatorSaturation(), SensorBias(),
-        SensorScale(), SensorDelay(), ContactFriction(), ContactStiffness(), ContactMargin(),
-    )
-}  # fmt: skip
+for _effect in (
+    JointDamping(), JointQuadraticDamping(), JointFriction(), JointStribeck(), JointStiffness(), JointCogging(),
+    Armature(), JointLimit(), JointCoupling(), Payload(), CenterOfMass(), Inertia(), ExternalForce(), FluidDrag(),
+    GravityTilt(), GroundSlope(), Integration(), ActuatorGain(), ActuatorBias(), ActuatorDamping(),
+    ActuatorDelay(), ActuatorLag(), ActuatorDeadband(), ActuatorBacklash(), ActuatorSaturation(), SensorBias(),
+    SensorScale(), SensorDelay(), ContactFriction(), ContactStiffness(), ContactMargin(),
+):  # fmt: skip
+    VOCABULARY[_effect.name] = _effect
 
 
 def register(effect: Effect) -> Effect:
@@ -86,23 +84,12 @@ def _source(effect: Effect) -> tuple[str, str]:
     return type(effect).__module__, type(effect).__qualname__
 
 
-def find_effect(name: str) -> Effect:
-    """Return an effect by its name.
-
-    Raises:
-        InputError: an unknown name; the nearest is offered.
-    """
-    if name not in VOCABULARY:
-        raise InputError(f"effect: unknown {name!r}" + choices(name, VOCABULARY))
-    return VOCABULARY[name]
-
-
 __all__ = [
     "VOCABULARY",
     "Effect",
-    "Path",
     "Placed",
     "Quantity",
+    "SensedPath",
     "Setting",
     "Signals",
     "find_effect",

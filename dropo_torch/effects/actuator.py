@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import mujoco
 import numpy as np
+import torch
 from scipy.signal import lfilter
 
-from dropo_torch.effects.base import Effect, Quantity, Setting
-from dropo_torch.parameters import object_names
+from dropo_torch.effects.base import Effect, Quantity, Setting, object_number
 
 _NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
 def actuator_number(model: mujoco.MjModel, target: str | None) -> int:
     """Return the number of an actuator by its name; one without a name is called by its joint's."""
-    return object_names(model, "actuator").index(str(target))
+    return object_number(model, "actuator", target)
 
 
 class ActuatorEffect(Effect):
@@ -133,6 +133,7 @@ class ActuatorSaturation(ActuatorEffect):
 
     name = "actuator_saturation"
     sentence = "actuator {target} cannot give more than a certain force"
+    shares = (0.3, 0.5, 0.7, 0.85)
 
     def targets(self, setting: Setting) -> list[str | None]:
         m = setting.model
@@ -151,111 +152,138 @@ class ActuatorSaturation(ActuatorEffect):
             return 3 * self.force_scale(setting, target)
         return abs(float(m.actuator_gainprm[i, 0])) * self.command_scale(setting, target)
 
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        largest = self.largest(setting, target)
-        return [np.array([share * largest]) for share in (0.3, 0.5, 0.7, 0.85)]
-
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         i = actuator_number(model, target)
         model.actuator_forcelimited[i] = 1
         model.actuator_forcerange[i] = (-values[0], values[0])
 
 
-class CommandEffect(ActuatorEffect):
-    """An effect on the command before it reaches the actuator, which MJCF cannot express."""
-
-    native = False
-
-
-class ActuatorDelay(CommandEffect):
+class ActuatorDelay(ActuatorEffect):
     """A command that arrives late."""
 
     name = "actuator_delay"
     sentence = "commands reach actuator {target} late"
+    shares = (0.4, 2.0, 5.0)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("delay", "s", 0.0, 0.0, 20 * setting.signals.timestep, setting.signals.timestep),)
 
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([k * setting.signals.timestep]) for k in (0.4, 2.0, 5.0)]
-
     def memory(self, values: np.ndarray) -> float:
         return float(values[0])
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        """Shift in time; a physics step takes the mean over it of what arrives."""
-        whole, part = divmod(float(values[0]) / step, 1.0)
-        late = np.arange(signal.shape[1]) - int(whole)
-        return (1 - part) * signal[:, np.maximum(late, 0)] + part * signal[:, np.maximum(late - 1, 0)]
+    def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:
+        """Return as many past commands as the longest delay asks for."""
+        return command.expand(-1, int(values[:, 0].max() / step) + 1)
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Shift in time; a physics step takes the mean over it of what arrives. The state is the last commands."""
+        late = values[:, :1] / step
+        whole = late.floor()
+        part = late - whole
+        known = torch.cat([state, signal], 1)
+        at = state.shape[1] + torch.arange(signal.shape[1], device=signal.device) - whole.long()
+        at = at.expand(len(signal), -1)
+        return (1 - part) * known.gather(1, at) + part * known.gather(1, at - 1), known[:, signal.shape[1] :]
 
 
-class ActuatorLag(CommandEffect):
+class ActuatorLag(ActuatorEffect):
     """A command that acts through a first-order filter."""
 
     name = "actuator_lag"
     sentence = "actuator {target} follows its command with a first-order lag"
+    shares = (0.4, 2.0, 5.0)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("time_constant", "s", 0.0, 0.0, 50 * setting.signals.timestep, setting.signals.timestep),)
-
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([k * setting.signals.timestep]) for k in (0.4, 2.0, 5.0)]
 
     def memory(self, values: np.ndarray) -> float:
         """Return the time after which a step is followed to 3e-4."""
         return 8 * float(values[0])
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        """Filter exactly; a physics step takes the mean over it of the filter's output."""
-        tau = float(values[0])
-        if tau <= 1e-6 * step:
-            return signal
-        decay = np.exp(-step / tau)
-        state, _ = lfilter([1 - decay], [1, -decay], signal, axis=1, zi=decay * signal[:, :1])
-        before = np.concatenate([signal[:, :1], state[:, :-1]], axis=1)
-        return signal + (before - signal) * (tau / step) * -np.expm1(-step / tau)
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Filter exactly; a physics step takes the mean over it of the filter's output, which is the state."""
+        tau = values[:, :1]
+        absent = tau <= 1e-6 * step
+        tau = torch.where(absent, step, tau)
+        decay = torch.where(absent, 0.0, torch.exp(-step / tau))
+        after = first_order(signal, decay, state)
+        before = torch.cat([state, after[:, :-1]], 1)
+        mean = signal + (before - signal) * (tau / step) * -torch.expm1(-step / tau)
+        return torch.where(absent, signal, mean), after[:, -1:]
 
 
-class ActuatorDeadband(CommandEffect):
+def first_order(signal: torch.Tensor, decay: torch.Tensor, before: torch.Tensor) -> torch.Tensor:
+    """Return y[s] = decay·y[s - 1] + (1 - decay)·signal[s], ``(R, S)``.
+
+    Args:
+        signal: what is filtered, ``(R, S)``.
+        decay: of each row ``(R, 1)``, or of all ``(1, 1)``.
+        before: y before the first step, ``(R, 1)``.
+    """
+    if len(decay) == 1 and signal.device.type == "cpu":  # one pass, however long
+        d = float(decay)
+        out, _ = lfilter([1 - d], [1, -d], signal.numpy(), axis=1, zi=d * before.numpy())
+        return torch.from_numpy(out)
+    out = (1 - decay) * signal
+    out[:, :1] += decay * before
+    reach = 1
+    while reach < signal.shape[1]:  # sums over 1, 2, 4, ... steps
+        out = torch.cat([out[:, :reach], out[:, reach:] + decay * out[:, :-reach]], 1)
+        decay, reach = decay**2, 2 * reach
+    return out
+
+
+class ActuatorDeadband(ActuatorEffect):
     """Small commands that do nothing."""
 
     name = "actuator_deadband"
     sentence = "small commands do nothing at actuator {target}"
+    shares = (0.03, 0.15)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         largest = self.command_scale(setting, target)
         return (Quantity("width", "command", 0.0, 0.0, largest, largest),)
 
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([share * self.command_scale(setting, target)]) for share in (0.03, 0.15)]
-
     def memory(self, values: np.ndarray) -> float:
         return 0.0
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        return np.sign(signal) * np.maximum(np.abs(signal) - values[0], 0.0)
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Take the width off every command; it remembers nothing."""
+        return signal.sign() * (signal.abs() - values[:, :1]).clamp(min=0.0), state
 
 
-class ActuatorBacklash(CommandEffect):
+class ActuatorBacklash(ActuatorEffect):
     """Play in the transmission: a reversed command first crosses a gap."""
 
     name = "actuator_backlash"
     sentence = "actuator {target} has play: a reversed command first crosses a gap"
+    shares = (0.03, 0.2)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         largest = self.command_scale(setting, target)
         return (Quantity("width", "command", 0.0, 0.0, 2 * largest, largest),)
 
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([share * self.command_scale(setting, target)]) for share in (0.03, 0.2)]
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Hold what is within half the width of the command; the state is what is held.
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        half = 0.5 * float(values[0])
-        out = np.empty_like(signal)
-        held = signal[:, 0].copy()
-        changes = np.append(True, (np.diff(signal, axis=1) != 0).any(0))
-        for s in range(signal.shape[1]):
-            if changes[s]:
-                held = np.clip(held, signal[:, s] - half, signal[:, s] + half)
-            out[:, s] = held
-        return out
+        Each step clamps what was held to its limits. A clamp after a clamp is again one, so that those of 1, 2, 4, ...
+        steps are found in turn, and no step waits for the one before.
+        """
+        half = 0.5 * values[:, :1]
+        low, high = signal - half, signal + half
+        reach = 1
+        while reach < signal.shape[1]:
+            low, high = (
+                torch.cat([x[:, :reach], x[:, :-reach].clamp(low[:, reach:], high[:, reach:])], 1) for x in (low, high)
+            )
+            reach *= 2
+        held = state.clamp(low, high)
+        return held, held[:, -1:]

@@ -10,11 +10,16 @@ from typing import Any, ClassVar, Literal
 
 import mujoco
 import numpy as np
+import torch
 
-from dropo_torch.data.observation import Observation, joint_name
+from dropo_torch.data.observation import Observation
+from dropo_torch.effects.path import SensedPath
+from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import object_names
 
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
+#: The methods by which an effect acts on a simulation.
+Method = Literal["apply", "force", "wrench", "command", "sense"]
 
 
 @dataclass(frozen=True)
@@ -74,49 +79,73 @@ class Setting:
     frame_skip: int
     masked: frozenset[int] = frozenset()
 
-    def joint(self, name: str) -> int:
+    def joint(self, name: str | None) -> int:
         """Return a joint's number."""
-        return [joint_name(self.model, j) for j in range(self.model.njnt)].index(name)
+        return object_number(self.model, "jnt", name)
 
-    def dof(self, name: str) -> int:
+    def dof(self, name: str | None) -> int:
         """Return the degree of freedom of a hinge or slide joint."""
         return int(self.model.jnt_dofadr[self.joint(name)])
 
-    def coordinate(self, name: str) -> int:
+    def coordinate(self, name: str | None) -> int:
         """Return the position coordinate of a hinge or slide joint."""
         return int(self.model.jnt_qposadr[self.joint(name)])
 
-    def is_slide(self, name: str) -> bool:
+    def is_slide(self, name: str | None) -> bool:
         """Return whether a joint slides, so that its force is in newtons."""
         return bool(self.model.jnt_type[self.joint(name)] == mujoco.mjtJoint.mjJNT_SLIDE)
+
+    def column(self, name: str | None) -> int:
+        """Return the number of an observed column."""
+        return self.observation.labels.index(str(name))
 
     def names(self, prefix: str) -> list[str]:
         """Return the names of all objects of a kind, in order; unnamed ones are called ``geom0``."""
         return object_names(self.model, prefix)
 
 
+def object_number(model: mujoco.MjModel, prefix: str, name: str | None) -> int:
+    """Return the number of an object of a kind by its name, as :func:`~dropo_torch.parameters.object_names` has it."""
+    return object_names(model, prefix).index(str(name))
+
+
+#: Every effect that a config may name, by its name: the package's, and a user's own.
+VOCABULARY: dict[str, Effect] = {}
+
+
+def find_effect(name: str) -> Effect:
+    """Return an effect by its name.
+
+    Raises:
+        InputError: an unknown name; the nearest is offered.
+    """
+    if name not in VOCABULARY:
+        raise InputError(f"effect: unknown {name!r}" + choices(name, VOCABULARY))
+    return VOCABULARY[name]
+
+
 class Effect(abc.ABC):
     """A kind of physical effect that a model may lack. It holds no state.
 
     A class says where the effect can sit, what its quantities are there, and overrides whichever of
-    :meth:`apply`, :meth:`force`, :meth:`wrench`, :meth:`command` and :meth:`sense` it needs.
+    :meth:`apply`, :meth:`force`, :meth:`wrench`, :meth:`command` and :meth:`sense` it needs. Forces, commands and
+    sensors are computed for R rows (simulations, windows, environments) at once; ``values`` are ``(R, p)``, or
+    ``(1, p)`` where all rows have the same.
 
     Attributes:
         name: its name in files and reports.
         kind: what its target is.
         sentence: what it is, to a person; ``{target}`` stands for the target.
-        native: whether MJCF can express it.
+        shares: the values, in scales of its only quantity, from which a search begins; none for the neutral value.
     """
 
     name: ClassVar[str]
     kind: ClassVar[Kind]
     sentence: ClassVar[str]
-    native: ClassVar[bool] = True
+    shares: ClassVar[tuple[float, ...]] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Pickle by name: whoever reads it must have registered the effect, too."""
-        from dropo_torch.effects import find_effect
-
         return find_effect, (self.name,)
 
     @abc.abstractmethod
@@ -128,8 +157,11 @@ class Effect(abc.ABC):
         """Return the effect's numbers at a target."""
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        """Return the values from which a search begins, each ``(p,)``; by default the neutral ones."""
-        return [np.array([q.neutral for q in self.quantities(setting, target)])]
+        """Return the values from which a search begins, each ``(p,)``: those of :attr:`shares`, or the neutral ones."""
+        quantities = self.quantities(setting, target)
+        return [np.array([share * quantities[0].scale]) for share in self.shares] or [
+            np.array([q.neutral for q in quantities])
+        ]
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
         """Return starts near a simpler effect that this one contains, each ``(p,)``; none where it contains none."""
@@ -144,68 +176,72 @@ class Effect(abc.ABC):
         return values
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        """Write the effect into a copy of the model; constants are derived afterwards."""
+        """Write the effect, with values ``(p,)``, into a copy of the model; constants are derived afterwards."""
         return
 
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
-    ) -> np.ndarray | None:
-        """Return generalised forces ``(R, nv)`` at states ``(R, nq)`` and ``(R, nv)``, or ``None`` if it has none."""
-        return None
+    ) -> np.ndarray:
+        """Return generalised forces ``(R, nv)`` at states ``(R, nq)`` and ``(R, nv)``."""
+        return np.zeros_like(velocity)
 
-    def wrench(self, setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray | None:
-        """Return constant world-frame forces and torques on the bodies' centres ``(nbody, 6)``, or ``None``."""
-        return None
+    def wrench(self, setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray:
+        """Return constant world-frame forces and torques on the bodies' centres ``(nbody, 6)``, of values ``(p,)``."""
+        return np.zeros((setting.model.nbody, 6))
 
-    def command(self, signal: np.ndarray, actuator: int, step: float, values: np.ndarray) -> np.ndarray:
-        """Return one actuator's commands ``(E, S)`` as they act, at every physics step of whole episodes."""
-        return signal
+    def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:
+        """Return the state of a filter that has long had commands ``(R, 1)``, ``(R, k)``; by default, these commands.
 
-    def sense(self, path: Path, column: int, values: np.ndarray) -> Path:
-        """Return what the sensors say of a simulated path."""
-        return path
+        Its width may depend on the values. Where another call's is wider, the last entries count.
+        """
+        return command
 
-    def unsense(self, start: np.ndarray, rate: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
-        """Return observed columns ``(W, n)`` of the true state from measured ones and their rates."""
-        return start
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Filter an actuator's commands, a whole episode's or those of some physics steps.
+
+        Args:
+            signal: commands of S physics steps, ``(R, S)``.
+            values: the effect's numbers, ``(R, p)`` or ``(1, p)``.
+            step: seconds of a physics step.
+            state: what is remembered of the commands before, ``(R, k)``; see :meth:`settled`.
+
+        Returns:
+            The commands as they act, ``(R, S)``, and the state to go on from.
+        """
+        return signal, state
+
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        """Return what the sensor of an observed column shows of simulated paths, ``(R, T)``."""
+        return path.shown[..., column]
+
+    def unsense(self, shown: torch.Tensor, rates: torch.Tensor, column: int, values: torch.Tensor) -> torch.Tensor:
+        """Return a column of true states ``(R,)`` from observed columns and their time derivatives, ``(R, n)`` each."""
+        return shown[:, column]
 
     def memory(self, values: np.ndarray) -> float:
         """Return the seconds that :meth:`command` or :meth:`sense` looks back; infinite for all of the past."""
-        return math.inf if self.acts_on_command else 0.0
+        return math.inf if self.has("command") else 0.0
+
+    def has(self, method: Method) -> bool:
+        """Whether the effect acts by a method."""
+        return getattr(type(self), method) is not getattr(Effect, method)
 
     @property
-    def acts_on_command(self) -> bool:
-        """Whether the effect filters commands."""
-        return type(self).command is not Effect.command
+    def native(self) -> bool:
+        """Whether MJCF can express the effect: it is numbers of the model and nothing else."""
+        return not (self.has("force") or self.has("wrench") or self.is_filter)
 
     @property
-    def acts_on_sensor(self) -> bool:
-        """Whether the effect filters measurements."""
-        return type(self).sense is not Effect.sense
+    def outer(self) -> bool:
+        """Whether the effect stays outside of the simulator: it filters commands or measurements and nothing else."""
+        return self.is_filter and not (self.has("apply") or self.has("force") or self.has("wrench"))
 
     @property
-    def has_force(self) -> bool:
-        """Whether the effect is a force that depends on the state."""
-        return type(self).force is not Effect.force
-
-
-@dataclass(frozen=True)
-class Path:
-    """Observed columns of a simulated window.
-
-    Attributes:
-        columns: at the logged instants, the start included, ``(W, L + 1, n)``.
-        fine: at every physics step, the start included, ``(W, L·skip + 1, n)``.
-        valid: which of ``columns`` the simulation can know, ``(W, L + 1, n)`` bool.
-        step: seconds of a physics step.
-        rates: for a column, the column that is its time derivative, or -1, ``(n,)``.
-    """
-
-    columns: np.ndarray
-    fine: np.ndarray
-    valid: np.ndarray
-    step: float
-    rates: np.ndarray
+    def is_filter(self) -> bool:
+        """Whether the effect filters commands or measurements."""
+        return self.has("command") or self.has("sense")
 
 
 @dataclass(frozen=True)

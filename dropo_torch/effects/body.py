@@ -156,7 +156,6 @@ class ExternalForce(BodyEffect):
 
     name = "external_force"
     sentence = "a constant force on {target} from outside, such as a hanging cable"
-    native = False
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m = setting.model

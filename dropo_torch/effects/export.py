@@ -16,7 +16,7 @@ import yaml
 from dropo_torch.config import Config
 from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.effects.placing import EffectSet, Entry
-from dropo_torch.effects.simulator import is_native, is_outer, overlap
+from dropo_torch.effects.simulator import overlap
 from dropo_torch.errors import InputError
 from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.models.export import read_spec, write_inertials
@@ -57,7 +57,7 @@ def write_model(
         InputError: a source that is no XML file, or numbers that MuJoCo refuses.
     """
     spec, path = read_spec(source), Path(path)
-    native = [p for p in placed if is_native(p.effect)]
+    native = [p for p in placed if p.effect.native]
     unsimplify(spec)
     write_inertials(spec)
     model = spec.compile()
@@ -77,7 +77,7 @@ def write_model(
         raise InputError(f"export: MJCF cannot express these effects: {' '.join(str(error).split())}") from None
     write_atomically(path, text.encode())
     _compare(path, model)
-    return [p for p in placed if not is_native(p.effect)]
+    return [p for p in placed if not p.effect.native]
 
 
 def _copy_rest(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
@@ -140,7 +140,7 @@ def write_config(
         path: where to write.
     """
     document = _document(config, path.parent)
-    native = [p for p in placed if is_native(p.effect)]
+    native = [p for p in placed if p.effect.native]
     # Fields are written after the model is read: what both a parameter and an effect write must stay an effect.
     entries = tuple(Entry(p.effect, p.target, p.values, (-1,) * len(p.values)) for p in native)
     plain = (
@@ -160,12 +160,12 @@ def write_config(
             for q, v in zip(quantities, p.values, strict=True)
             if q.name in intervals.get(p.key, {})
         }
-        if plain and is_native(p.effect):
+        if plain and p.effect.native:
             _add_fields(document, p, quantities, boxes, fields[p.key] or {}, setting)
         else:
-            fixed = config.backend == "gymnasium" and is_native(p.effect)
+            fixed = config.backend == "gymnasium" and p.effect.native
             _add_effect(document, p, quantities, {} if fixed else boxes)
-    inside = [p for p in placed if not is_outer(p.effect) and not (plain and is_native(p.effect))]
+    inside = [p for p in placed if not p.effect.outer and not (plain and p.effect.native)]
     if inside and config.backend == "warp":
         document["backend"] = "mujoco"
     if document.get("effects") and config.optimizer == "adam":

@@ -115,7 +115,6 @@ class JointStribeck(JointEffect):
 
     name = "joint_stribeck"
     sentence = "dry friction in {target} that is larger at rest than in motion (Stribeck)"
-    native = False
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         dof = setting.dof(str(target))
@@ -146,7 +145,8 @@ class JointStribeck(JointEffect):
         dof = setting.dof(str(target))
         v = velocity[:, dof]
         out = np.zeros_like(velocity)
-        out[:, dof] = max(values[1] - values[0], 0.0) * -np.expm1(-((v / values[2]) ** 2)) * np.sign(v)
+        coulomb, static, speed = values.T
+        out[:, dof] = np.maximum(static - coulomb, 0.0) * -np.expm1(-((v / speed) ** 2)) * np.sign(v)
         return out
 
 
@@ -192,7 +192,6 @@ class JointCogging(JointEffect):
 
     name = "joint_cogging"
     sentence = "a force at {target} that ripples with its position, as of a motor's magnets or a gear's teeth"
-    native = False
     #: Ripples of a turn that are tried, and how many of a slide, each half a wave more over the measured range.
     WAVES = 40
     POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
@@ -227,8 +226,9 @@ class JointCogging(JointEffect):
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
         out = np.zeros_like(velocity)
-        angle = values[1] * position[:, setting.coordinate(str(target))] + values[2]
-        out[:, setting.dof(str(target))] = values[0] * np.sin(angle)
+        amplitude, poles, phase = values.T
+        angle = poles * position[:, setting.coordinate(str(target))] + phase
+        out[:, setting.dof(str(target))] = amplitude * np.sin(angle)
         return out
 
 
@@ -281,7 +281,6 @@ class JointCoupling(JointEffect):
 
     name = "joint_coupling"
     sentence = "a spring between {target} and the joint before it in the chain, as of a tendon or belt"
-    native = False
 
     def targets(self, setting: Setting) -> list[str | None]:
         return [t for t in super().targets(setting) if self.partner(setting, t) is not None]
@@ -310,6 +309,6 @@ class JointCoupling(JointEffect):
         assert other is not None
         stretch = position[:, setting.coordinate(str(target))] - position[:, m.jnt_qposadr[other]]
         out = np.zeros_like(velocity)
-        out[:, setting.dof(str(target))] = -values[0] * stretch
-        out[:, m.jnt_dofadr[other]] += values[0] * stretch
+        out[:, setting.dof(str(target))] = -values[:, 0] * stretch
+        out[:, m.jnt_dofadr[other]] += values[:, 0] * stretch
         return out

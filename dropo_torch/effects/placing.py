@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.data.observation import Observation
-from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals
+from dropo_torch.effects.base import Effect, Method, Placed, Quantity, Setting, Signals
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import Parameter, ParameterSpace
 
@@ -77,16 +77,35 @@ class EffectSet:
         """Return the effects of a kind."""
         return EffectSet(tuple(e for e in self.entries if wanted(e.effect)), self.setting)
 
-    def look_back(self, space: ParameterSpace, *, sensors: bool) -> float:
-        """Return the most seconds that command filters (or sensors) remember, wherever the parameters may go."""
-        seconds = 0.0
-        for entry in self.entries:
-            if not (entry.effect.acts_on_sensor if sensors else entry.effect.acts_on_command):
-                continue
-            top = np.minimum(space.high + (space.high - space.low), space.limits[:, 1])
-            for vector in (space.low, space.high, top):
-                seconds = max(seconds, entry.effect.memory(np.asarray(entry.at(vector).values)))
-        return seconds
+    @property
+    def native(self) -> EffectSet:
+        """The effects that are numbers of the model."""
+        return self.matching(lambda effect: effect.native)
+
+    @property
+    def outer(self) -> EffectSet:
+        """The effects that stay outside of a simulator."""
+        return self.matching(lambda effect: effect.outer)
+
+    def having(self, method: Method) -> EffectSet:
+        """Return the effects that act by a method."""
+        return self.matching(lambda effect: effect.has(method))
+
+    def kinds(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return which parameter vectors ``(K, d)`` give the effects the same numbers.
+
+        Returns:
+            A row of each kind, ``(N,)``, and the kind of each row, ``(K,)``.
+        """
+        numbers = [np.zeros((len(vectors), 1)), *(e.values(vectors) for e in self.entries)]
+        _, first, kind = np.unique(np.concatenate(numbers, 1), axis=0, return_index=True, return_inverse=True)
+        return first, kind.reshape(-1)
+
+    def look_back(self, space: ParameterSpace) -> float:
+        """Return the most seconds that the effects look back, wherever the parameters may go."""
+        top = np.minimum(space.high + (space.high - space.low), space.limits[:, 1])
+        numbers = [(e.effect, v) for e in self.entries for v in e.values(np.stack([space.low, space.high, top]))]
+        return max((effect.memory(values) for effect, values in numbers), default=0.0)
 
 
 def plain_setting(model: mujoco.MjModel, observation: Observation, frame_skip: int, size: float = 1.0) -> Setting:

@@ -2,33 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from typing import TypeVar
-
 import numpy as np
 import torch
 
-from dropo_torch.effects.base import Effect, Path, Quantity, Setting
-
-Numbers = TypeVar("Numbers", np.ndarray, torch.Tensor)
+from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.effects.path import SensedPath
 
 
 class SensorEffect(Effect):
     """An effect of one observed column; columns of quaternions are left out."""
 
     kind = "sensor"
-    native = False
 
     def targets(self, setting: Setting) -> list[str | None]:
         turned = {c for q in setting.observation.quaternions for c in q}
         labels = setting.observation.labels
         left_out = turned | setting.masked
         return [n for c, n in enumerate(labels) if c not in left_out and setting.signals.column[c] > 0]
-
-    @staticmethod
-    def column(setting: Setting, target: str | None) -> int:
-        """Return the number of an observed column."""
-        return setting.observation.labels.index(str(target))
 
 
 class SensorBias(SensorEffect):
@@ -38,19 +28,15 @@ class SensorBias(SensorEffect):
     sentence = "the measurement of {target} is off by a constant"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        c = self.column(setting, target)
+        c = setting.column(target)
         scale = float(setting.signals.column[c])
         return (Quantity("bias", setting.observation.units[c], 0.0, -10 * scale, 10 * scale, scale),)
 
-    def sense(self, path: Path, column: int, values: np.ndarray) -> Path:
-        columns = path.columns.copy()
-        columns[..., column] += values[0]
-        return replace(path, columns=columns)
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        return path.shown[..., column] + values[:, :1]
 
-    def unsense(self, start: np.ndarray, rate: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
-        out = start.copy()
-        out[:, column] -= values[0]
-        return out
+    def unsense(self, shown: torch.Tensor, rates: torch.Tensor, column: int, values: torch.Tensor) -> torch.Tensor:
+        return shown[:, column] - values[:, 0]
 
 
 class SensorScale(SensorEffect):
@@ -62,15 +48,11 @@ class SensorScale(SensorEffect):
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("factor", "-", 1.0, 0.2, 5.0, 0.3),)
 
-    def sense(self, path: Path, column: int, values: np.ndarray) -> Path:
-        columns = path.columns.copy()
-        columns[..., column] *= values[0]
-        return replace(path, columns=columns)
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        return path.shown[..., column] * values[:, :1]
 
-    def unsense(self, start: np.ndarray, rate: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
-        out = start.copy()
-        out[:, column] /= values[0]
-        return out
+    def unsense(self, shown: torch.Tensor, rates: torch.Tensor, column: int, values: torch.Tensor) -> torch.Tensor:
+        return shown[:, column] / values[:, 0]
 
 
 class SensorDelay(SensorEffect):
@@ -78,49 +60,17 @@ class SensorDelay(SensorEffect):
 
     name = "sensor_delay"
     sentence = "the measurement of {target} comes late"
+    shares = (0.4, 1.5)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("delay", "s", 0.0, 0.0, 5 * setting.signals.timestep, setting.signals.timestep),)
 
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([k * setting.signals.timestep]) for k in (0.4, 1.5)]
-
     def memory(self, values: np.ndarray) -> float:
         return float(values[0])
 
-    def sense(self, path: Path, column: int, values: np.ndarray) -> Path:
-        """Interpolate the fine path at earlier instants; those before the window are not known."""
-        delay = float(values[0])
-        if delay <= 0:
-            return path
-        num_steps, fine = path.columns.shape[1] - 1, path.fine
-        skip = (fine.shape[1] - 1) // num_steps
-        at = np.arange(num_steps + 1) * skip - delay / path.step
-        known = at >= -1e-9
-        at = np.maximum(at, 0.0)
-        whole = np.minimum(at.astype(int), fine.shape[1] - 2)
-        part = at - whole
-        left, right = fine[:, whole, column], fine[:, whole + 1, column]
-        rate = int(path.rates[column])
-        if rate >= 0:
-            h = path.step
-            slopes = fine[:, whole, rate] * h, fine[:, whole + 1, rate] * h
-            value = hermite(left, right, *slopes, part)
-        else:
-            value = (1 - part) * left + part * right
-        columns, valid = path.columns.copy(), path.valid.copy()
-        columns[..., column] = value
-        valid[:, ~known, column] = False
-        return replace(path, columns=columns, valid=valid)
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        delay = values[:, :1]
+        return torch.where(delay > 0, path.ago(column, delay), path.shown[..., column])
 
-    def unsense(self, start: np.ndarray, rate: np.ndarray, column: int, values: np.ndarray) -> np.ndarray:
-        out = start.copy()
-        out[:, column] += values[0] * rate[:, column]
-        return out
-
-
-def hermite(left: Numbers, right: Numbers, slope: Numbers, next_slope: Numbers, part: Numbers) -> Numbers:
-    """Return the cubic interpolation between two values with their slopes a step, at a part of the step."""
-    t2, t3 = part**2, part**3
-    ends = (2 * t3 - 3 * t2 + 1) * left + (3 * t2 - 2 * t3) * right
-    return ends + (t3 - 2 * t2 + part) * slope + (t3 - t2) * next_slope
+    def unsense(self, shown: torch.Tensor, rates: torch.Tensor, column: int, values: torch.Tensor) -> torch.Tensor:
+        return shown[:, column] + values[:, 0] * rates[:, column]

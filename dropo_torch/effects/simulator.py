@@ -11,11 +11,20 @@ import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.effects.actuator import actuator_number
-from dropo_torch.effects.base import Effect, Path, Placed, Setting
+from dropo_torch.effects.base import Setting
+from dropo_torch.effects.engine import Variant, VariantEngine
+from dropo_torch.effects.filters import (
+    Filter,
+    command_filters,
+    extended,
+    filtered,
+    observed_rates,
+    rate_columns,
+    sensed,
+    unsensed,
+)
+from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, Entry
-from dropo_torch.effects.sensor import SensorEffect
-from dropo_torch.effects.twin import Twin, Variant
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import Simulator
@@ -25,16 +34,13 @@ LONGEST_HISTORY = 200
 
 
 class Engine(Protocol):
-    """Simulates states under commands of every physics step."""
+    """Simulates true states under commands of every physics step."""
 
-    def paths(
-        self, values: np.ndarray, placed: list[tuple[Placed, ...]], starts: np.ndarray, signals: np.ndarray, fine: bool
-    ) -> np.ndarray:
+    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
         """Return states ``(K, T, S, n)`` or, not fine, ``(K, T, S / skip, n)``, NaN where diverged.
 
         Args:
             values: parameter vectors, ``(K, d)``.
-            placed: the effects under each.
             starts: true states, ``(K, T, n)``.
             signals: commands as they act, ``(K, T, S, nu)``.
             fine: states after every physics step instead of every logged one.
@@ -42,43 +48,36 @@ class Engine(Protocol):
         ...
 
 
-class TwinEngine:
+class InnerEngine:
     """MuJoCo, with every kind of effect."""
 
-    def __init__(self, setting: Setting, space: ParameterSpace, num_threads: int) -> None:
-        self._twin = Twin(setting, space, num_threads=num_threads)
+    def __init__(self, effects: EffectSet, space: ParameterSpace, num_threads: int) -> None:
+        self._engine, self._effects = VariantEngine(effects.setting, space, num_threads=num_threads), effects
 
-    def paths(
-        self, values: np.ndarray, placed: list[tuple[Placed, ...]], starts: np.ndarray, signals: np.ndarray, fine: bool
-    ) -> np.ndarray:
-        """Simulate; see :meth:`Engine.paths`."""
-        variants = [Variant(tuple(v), p) for v, p in zip(values.tolist(), placed, strict=True)]
-        return self._twin.paths(variants, starts, signals, fine=fine)
+    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
+        """Simulate; see :class:`Engine`."""
+        variants = [Variant(tuple(v.tolist()), self._effects.at(v)) for v in values]
+        return self._engine.paths(variants, self._engine.models(variants), starts, signals, fine=fine)
 
 
 class OuterEngine:
     """Another simulator, which takes one physics step a control; effects stay outside of it."""
 
-    def __init__(self, inner: Simulator, skip: int) -> None:
-        self._inner, self._skip = inner, skip
+    def __init__(self, effects: EffectSet, inner: Simulator) -> None:
+        self._inner, self._effects, self._skip = inner, effects, effects.setting.frame_skip
 
-    def paths(
-        self, values: np.ndarray, placed: list[tuple[Placed, ...]], starts: np.ndarray, signals: np.ndarray, fine: bool
-    ) -> np.ndarray:
-        """Simulate; parameter vectors whose effects are the same go together. See :meth:`Engine.paths`."""
-        groups: dict[tuple, list[int]] = {}
-        for k, effects in enumerate(placed):
-            groups.setdefault(tuple(p.values for p in effects), []).append(k)
+    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
+        """Simulate; parameter vectors whose effects are the same go together. See :class:`Engine`."""
+        first, kind = self._effects.kinds(values)
         every = 1 if fine else self._skip
         out = np.empty((len(values), starts.shape[1], signals.shape[2] // every, starts.shape[2]))
-        for members in groups.values():
-            first = members[0]
+        for number, row in enumerate(first):
             with torch.no_grad():
                 found = self._inner.rollout(
-                    torch.from_numpy(starts[first]), torch.from_numpy(np.ascontiguousarray(signals[first])),
-                    torch.from_numpy(values[members]),
+                    torch.from_numpy(starts[row]), torch.from_numpy(np.ascontiguousarray(signals[row])),
+                    torch.from_numpy(values[kind == number]),
                 )  # fmt: skip
-            out[members] = found.numpy().swapaxes(0, 1)[:, :, every - 1 :: every]
+            out[kind == number] = found.numpy().swapaxes(0, 1)[:, :, every - 1 :: every]
         return out
 
 
@@ -93,7 +92,7 @@ class EffectSimulator(Simulator):
         effects: the effects, understood in a setting.
         parameters: what varies, numbers of effects among it.
         history: logged steps of controls before each window.
-        timestep: seconds of a logged transition, or ``None``.
+        timestep: seconds of a logged transition.
         name: the backend's name.
         chunk_size: simulations held at once.
     """
@@ -115,13 +114,11 @@ class EffectSimulator(Simulator):
         self.frame_skip, self.timestep = setting.frame_skip, timestep
         self.num_states = setting.model.nq + setting.model.nv
         self.num_controls = setting.model.nu
-        self.effects = effects
-        self._engine = engine
+        self._engine, self._step = engine, timestep / setting.frame_skip
         self._chunk_size = max(1, chunk_size // setting.frame_skip)
-        self._rates = rate_columns(setting.model)
-        sensors = effects.matching(lambda e: e.acts_on_sensor)
-        self._sensed = bool(len(sensors))
-        late = sensors.look_back(parameters, sensors=True)
+        self._commands, self._sensors, self._setting = effects.having("command"), effects.having("sense"), setting
+        self._rates, self._observed_rates = rate_columns(setting.model), observed_rates(setting)
+        late = self._sensors.look_back(parameters)
         self._late = min(math.ceil(late / timestep - 1e-9), LONGEST_HISTORY) if late < math.inf else LONGEST_HISTORY
 
     def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
@@ -147,54 +144,50 @@ class EffectSimulator(Simulator):
         lag = control.shape[1] - self.history
         out = np.empty((len(start), len(vectors), 1 if last else lag, self.num_states))
         for k in _parts(len(vectors), self._chunk_size):
-            placed = [self.effects.at(vector) for vector in vectors[k]]
-            for t in _parts(len(start), max(1, self._chunk_size // len(placed))):
-                found = self._chunk(start[t], control[t], vectors[k], placed)
+            for t in _parts(len(start), max(1, self._chunk_size // len(vectors[k]))):
+                found = self._chunk(start[t], control[t], vectors[k])
                 out[t, k] = (found[:, :, -1:] if last else found).swapaxes(0, 1)
         return torch.from_numpy(out)
 
-    def _chunk(
-        self, start: np.ndarray, control: np.ndarray, values: np.ndarray, placed: list[tuple[Placed, ...]]
-    ) -> np.ndarray:
+    def _chunk(self, start: np.ndarray, control: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return states as the sensors show them, ``(K, T, lag, num_states)``."""
-        signals = self._signals(control, placed)
+        signals = self._signals(control, values)
         begin = self.history * self.frame_skip
         starts = np.repeat(start[None], len(values), 0)
-        if not self._sensed:
-            return self._engine.paths(values, placed, starts, signals[:, :, begin:], False)
-        rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0)], values, placed)
-        index, known = self.effects.setting.observation.index, self._rates >= 0
-        for k, effects in enumerate(placed):
-            shown = start[:, index]
-            starts[k][:, index] = unsensed(shown, rates[k][:, index], effects, self.effects.setting)
-            if self._late:  # with the velocities now true, and changing, the past shows what is missing
-                rates[k][:, known] = starts[k][:, self._rates[known]]
-                starts[k][:, index] += shown - self._shown(starts[k][:, None], rates[k], effects)[:, 0]
-        fine = self._engine.paths(values, placed, starts, signals[:, :, begin:], True)
+        if not len(self._sensors):
+            return self._engine(values, starts, signals[:, :, begin:], False)
+        rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0)], values)
+        index, known = self._setting.observation.index, self._rates >= 0
+        shown = starts[..., index].copy()
+        sensors = self._sensor_filters(values, len(start))
+        flat, slope = (torch.from_numpy(x[..., index].reshape(-1, len(index))) for x in (starts, rates))
+        starts[..., index] = unsensed(flat, slope, sensors).numpy().reshape(shown.shape)
+        if self._late:  # with the velocities now true, and changing, the past shows what is missing
+            rates[..., known] = starts[..., self._rates[known]]
+            starts[..., index] += shown - self._shown(starts[:, :, None], rates, sensors)[:, :, 0]
+        fine = self._engine(values, starts, signals[:, :, begin:], True)
         fine = np.concatenate([starts[:, :, None], fine], 2)
         out = fine[:, :, self.frame_skip :: self.frame_skip].copy()
-        for k, effects in enumerate(placed):
-            out[k][..., index] = self._shown(fine[k], rates[k], effects)[:, 1:]
+        out[..., index] = self._shown(fine, rates, sensors)[:, :, 1:]
         return out
 
-    def _signals(self, control: np.ndarray, placed: list[tuple[Placed, ...]]) -> np.ndarray:
+    def _signals(self, control: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return commands as they act in every physics step, ``(K, T, (history + lag)·skip, nu)``."""
-        skip = self.frame_skip
-        plain = np.repeat(control, skip, axis=1)
-        step = (self.timestep or 0.0) / skip
-        known: dict[tuple, np.ndarray] = {}
-        out = []
-        for effects in placed:
-            filters = [p for p in effects if p.effect.acts_on_command]
-            key = tuple(p.values for p in filters)
-            if key not in known:
-                known[key] = filtered(plain, filters, self.effects.setting.model, step)
-            out.append(known[key])
-        return np.stack(out)
+        plain = np.repeat(control, self.frame_skip, axis=1)
+        first, kind = self._commands.kinds(values)
+        found = [
+            filtered(plain, command_filters(self._commands.at(values[k]), self._setting), self._step) for k in first
+        ]
+        return np.stack(found)[kind]
 
-    def _start_rates(
-        self, starts: np.ndarray, command: np.ndarray, values: np.ndarray, placed: list[tuple[Placed, ...]]
-    ) -> np.ndarray:
+    def _sensor_filters(self, values: np.ndarray, windows: int) -> list[Filter]:
+        """Return the effects on measurements, with the numbers of K·T rows."""
+        return [
+            Filter(e.effect, self._setting.column(e.target), torch.from_numpy(e.values(values).repeat(windows, 0)))
+            for e in self._sensors.entries
+        ]
+
+    def _start_rates(self, starts: np.ndarray, command: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return time derivatives of the states at the starts, ``(K, T, num_states)``, just before them.
 
         A position's is the velocity; a velocity's is found by one physics step under the last command ``(K, T, nu)``
@@ -202,61 +195,27 @@ class EffectSimulator(Simulator):
         """
         if not self._late:
             return np.zeros_like(starts)
-        after = self._engine.paths(values, placed, starts, command[:, :, None], True)[:, :, 0]
+        after = self._engine(values, starts, command[:, :, None], True)[:, :, 0]
         rates = np.nan_to_num((after - starts) * (self.frame_skip / (self.timestep or 1.0)))
         known = self._rates >= 0
         rates[..., known] = starts[..., self._rates[known]]
         return rates
 
-    def _shown(self, fine: np.ndarray, rates: np.ndarray, effects: tuple[Placed, ...]) -> np.ndarray:
-        """Return observed columns as the sensors show them ``(T, L + 1, n)``, of states ``(T, L·skip + 1, ...)``."""
-        setting, skip = self.effects.setting, self.frame_skip
-        index = setting.observation.index
-        step = (self.timestep or 0.0) / skip
-        before = np.arange(-self._late * skip, 0)[None, :, None] * step
-        columns = fine[..., index]
-        curved = np.where(self._rates[index] >= 0, rates[:, self._rates[index]], 0.0)[:, None]
-        past = columns[:, :1] + before * rates[:, None, index] + 0.5 * before * (before + step) * curved
-        columns = np.concatenate([past, columns], 1)
-        places = {int(c): i for i, c in enumerate(index)}
-        path = Path(
-            columns=columns[:, ::skip], fine=columns, valid=np.ones(columns[:, ::skip].shape, dtype=bool), step=step,
-            rates=np.array([places.get(int(self._rates[c]), -1) for c in index]),
-        )  # fmt: skip
-        for placed in effects:
-            if placed.effect.acts_on_sensor:
-                column = SensorEffect.column(setting, placed.target)
-                path = placed.effect.sense(path, column, np.asarray(placed.values))
-        return path.columns[:, self._late :]
+    def _shown(self, fine: np.ndarray, rates: np.ndarray, sensors: list[Filter]) -> np.ndarray:
+        """Return observed columns as the sensors show them, of states at every physics step ``(K, T, L·skip + 1, ·)``.
 
-
-def filtered(signal: np.ndarray, filters: list[Placed], model: mujoco.MjModel, step: float) -> np.ndarray:
-    """Return commands ``(T, S, nu)`` of physics steps as they act."""
-    out = signal.copy() if filters else signal
-    for placed in filters:
-        actuator = actuator_number(model, placed.target)
-        column = int(model.actuator_ctrladr[actuator])
-        out[..., column] = placed.effect.command(out[..., column], actuator, step, np.asarray(placed.values))
-    return out
-
-
-def unsensed(shown: np.ndarray, rates: np.ndarray, effects: tuple[Placed, ...], setting: Setting) -> np.ndarray:
-    """Return observed columns ``(T, n)`` of true states, of which the sensors show ``shown``."""
-    for placed in reversed(effects):
-        if placed.effect.acts_on_sensor:
-            column = SensorEffect.column(setting, placed.target)
-            shown = placed.effect.unsense(shown, rates, column, np.asarray(placed.values))
-    return shown
-
-
-def rate_columns(model: mujoco.MjModel) -> np.ndarray:
-    """Return for every state column the one that is its time derivative, or -1, ``(nq + nv,)``."""
-    found = np.full(model.nq + model.nv, -1)
-    for j in range(model.njnt):
-        position, velocity = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
-        width = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}.get(int(model.jnt_type[j]), 1)
-        found[position : position + width] = velocity + np.arange(width)
-    return found
+        Before its start, a window has moved with the start's velocity and acceleration.
+        """
+        index, skip = self._setting.observation.index, self.frame_skip
+        of = self._rates[index]
+        curved = np.where(of >= 0, rates[..., of], 0.0)
+        columns, slope, curvature = (
+            torch.from_numpy(x.reshape(-1, *x.shape[2:])) for x in (fine[..., index], rates[..., index], curved)
+        )
+        past = extended(columns, slope, curvature, self._late * skip, self._step)
+        instants = (fine.shape[2] - 1) // skip + 1
+        path = SensedPath.of(past, instants, skip, self._step, self._observed_rates)
+        return sensed(path, sensors).numpy().reshape(*fine.shape[:2], instants, len(index))
 
 
 def apply_native(model: mujoco.MjModel, effects: EffectSet) -> mujoco.MjModel:
@@ -291,9 +250,9 @@ def overlap(effects: EffectSet, space: ParameterSpace) -> tuple[Entry, str] | No
 
 def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, longest: int) -> int:
     """Return how many logged steps of controls the effects need before a window, of an episode of ``longest``."""
-    seconds = effects.look_back(space, sensors=False)
+    seconds = effects.having("command").look_back(space)
     if seconds == 0:  # a late sensor asks for the command just before the window
-        return min(1, longest) if effects.look_back(space, sensors=True) > 0 else 0
+        return min(1, longest) if effects.having("sense").look_back(space) > 0 else 0
     steps = LONGEST_HISTORY if seconds == math.inf else math.ceil(seconds / timestep - 1e-9) + 1
     return min(steps, longest)
 
@@ -329,12 +288,12 @@ def effect_simulator(
         InputError: effects that the backend cannot have.
     """
     setting = effects.setting
-    native, outer = effects.matching(is_native), effects.matching(is_outer)
+    native, outer = effects.native, effects.outer
     if needs_mujoco(effects, space):
         check_backend(backend, effects, space)
-        simulator: Engine = TwinEngine(setting, space, num_threads)
         make(setting.model, setting.frame_skip, space)  # for what it refuses
-        wrapped, kept = simulator, effects
+        engine: Engine = InnerEngine(effects, space, num_threads)
+        kept = effects
         _check_timestep(setting, effects, space)
     else:
         if len(native) and not owns_model:
@@ -351,33 +310,17 @@ def effect_simulator(
         inner_space = space.on(model)
         if not len(outer):
             return make(model, setting.frame_skip * finer, inner_space), 0
-        wrapped, kept = OuterEngine(make(model, finer, inner_space), setting.frame_skip), outer
+        engine, kept = OuterEngine(outer, make(model, finer, inner_space)), outer
     history = history_steps(kept, space, timestep, longest)
     return EffectSimulator(
-        wrapped, kept, parameters=space, history=history, timestep=timestep, name=backend, chunk_size=chunk_size
+        engine, kept, parameters=space, history=history, timestep=timestep, name=backend, chunk_size=chunk_size
     ), history  # fmt: skip
-
-
-def is_outer(effect: Effect) -> bool:
-    """Whether an effect stays outside of the simulator: it filters commands or measurements and does nothing else."""
-    return (effect.acts_on_command or effect.acts_on_sensor) and not (
-        _is_force(effect) or type(effect).apply is not Effect.apply
-    )
-
-
-def is_native(effect: Effect) -> bool:
-    """Whether an effect is numbers of the model and nothing else."""
-    return effect.native and not (effect.acts_on_command or effect.acts_on_sensor or _is_force(effect))
-
-
-def _is_force(effect: Effect) -> bool:
-    return effect.has_force or type(effect).wrench is not Effect.wrench
 
 
 def needs_mujoco(effects: EffectSet, space: ParameterSpace) -> bool:
     """Whether effects are forces in the simulation or change its model from one parameter vector to another."""
-    native = effects.matching(is_native)
-    inside = len(native) + len(effects.matching(is_outer)) < len(effects)
+    native = effects.native
+    inside = any(not (e.effect.native or e.effect.outer) for e in effects.entries)
     return inside or any(e.varies for e in native.entries) or overlap(native, space) is not None
 
 
@@ -386,11 +329,11 @@ def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> No
     if backend == "mujoco":
         return
     for entry in effects.entries:
-        if not is_native(entry.effect) and not is_outer(entry.effect):
+        if not (entry.effect.native or entry.effect.outer):
             raise InputError(
                 f"effects: backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
             )
-    native = effects.matching(is_native)
+    native = effects.native
     for entry in native.entries:
         if entry.varies:
             raise InputError(
@@ -423,7 +366,7 @@ def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSe
 
 def _check_timestep(setting: Setting, effects: EffectSet, space: ParameterSpace) -> None:
     """Raise unless the finer steps of the effects fill the model's."""
-    native = effects.matching(is_native)
+    native = effects.native
     for vector in (space.low, 0.5 * (space.low + space.high)):
         changed = copy.copy(setting.model)
         for placed in native.at(vector):
@@ -435,4 +378,4 @@ def _parts(total: int, size: int) -> Iterator[slice]:
     return (slice(a, min(a + size, total)) for a in range(0, total, size))
 
 
-__all__ = ["EffectSimulator", "effect_simulator", "filtered", "history_steps"]
+__all__ = ["EffectSimulator", "effect_simulator", "history_steps"]

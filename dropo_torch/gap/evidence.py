@@ -14,7 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from dropo_torch.data.features import Features
-from dropo_torch.effects.twin import Twin, Variant, Windows
+from dropo_torch.effects.engine import Variant
+from dropo_torch.effects.twin import Twin, Windows
 
 #: Antithetic pairs of start noise by which rough windows are linearised, and their seed.
 PAIRS, SEED = 16, 11

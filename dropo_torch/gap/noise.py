@@ -11,7 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dropo_torch.effects.twin import Twin, Variant, Windows
+from dropo_torch.effects.engine import Variant
+from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.gap.evidence import Evidence
 
 #: Logged steps of a window, and coefficients of a force in it.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dropo_torch.effects.base import Placed, Setting
-from dropo_torch.effects.twin import Variant
+from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.evidence import Cost, Evidence, Starts, cost_of, robust_factors
 from dropo_torch.parameters import ParameterSpace
 

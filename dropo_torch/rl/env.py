@@ -84,8 +84,7 @@ class RandomizedEnv(EnvBase):
         )  # fmt: skip
         self._commands, self._sensors = None, None
         if effects is not None:
-            model, skip = effects.setting.model, self.task.frame_skip
-            commands = Commands(effects, num_envs, model=model, skip=skip, device=self.device)
+            commands = Commands(effects, num_envs, device=self.device)
             sensors = Sensors(effects, num_envs, space=self.space, device=self.device)
             self._commands, self._sensors = commands or None, sensors or None
         self._exposed = expose_parameters and len(self.space) > 0

@@ -9,11 +9,11 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from dropo_torch.effects.base import Effect
+from dropo_torch.effects.engine import Force, Forces, Variant, VariantEngine
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.effects.simulator import apply_native, finer_steps, overlap
-from dropo_torch.effects.twin import Middle, Twin, Variant
 from dropo_torch.errors import InputError
+from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
 
 
@@ -39,13 +39,48 @@ def inside_model(space: ParameterSpace, effects: EffectSet | None) -> Inside:
         InputError: effects whose finer steps do not fill the model's.
     """
     assert space.model is not None
-    applied = None if effects is None else effects.matching(lambda e: type(e).apply is not Effect.apply)
+    applied = None if effects is None else effects.having("apply")
     if applied is None or not len(applied):
         return Inside(copy.copy(space.model), 1, False)
     if any(e.varies for e in applied.entries) or overlap(applied, space) is not None:
         return Inside(copy.copy(space.model), 1, True)
     model = apply_native(space.model, applied)
     return Inside(model, finer_steps(space.model, model, applied), False)
+
+
+class RowFields:
+    """Writes parameter vectors into some simulations of a batch, and what MuJoCo derives from them.
+
+    Args:
+        batch: the batch.
+        space: the parameters, over the batch's model.
+        finer: steps of the batch's model in one of the given model's.
+    """
+
+    def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, finer: int) -> None:
+        self._batch, self._space = batch, space
+        self._fields = {f: batch.expand(f) for f in derived_fields(batch.model, space)} if space.fields else {}
+        self._shared = {f: read_field(batch.model, f).copy() for f in self._fields}
+        self._groups = [(np.arange(batch.nsim, dtype=np.int32), finer)]
+
+    def write(self, ids: np.ndarray, values: np.ndarray) -> None:
+        """Give simulations ``ids`` the values ``(k, d)``; the others are untouched."""
+        if not self._fields:
+            return
+        fresh = {f: np.repeat(self._shared[f][None], len(ids), 0) for f in self._space.fields}
+        self._space.write(fresh, values)
+        for field, own in self._fields.items():  # whatever an earlier call derived starts afresh
+            own[ids] = fresh.get(field, self._shared[field])
+        try:
+            with quiet_mujoco():
+                self._batch.set_const(ids.astype(np.int32))
+        except mujoco.batch.SimulationError as error:
+            row = int(np.flatnonzero(ids == error.ids[0])[0])
+            raise _refused(self._space, values[row], self._batch.error(int(error.ids[0]))) from None
+
+    def groups(self) -> list[tuple[np.ndarray, int]]:
+        """Return all simulations, and how many of their steps make one of the given model's."""
+        return self._groups
 
 
 class RowModels:
@@ -62,7 +97,7 @@ class RowModels:
 
     def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, effects: EffectSet) -> None:
         self._space, self._effects = space, effects
-        self._twin = Twin(effects.setting, space, num_threads=1)
+        self._engine = VariantEngine(effects.setting, space, num_threads=1)
         self._base = effects.setting.model
         drawn = np.random.default_rng(0).uniform(space.low, space.high, (self.PROBES, len(space)))
         models = [self._model(v) for v in (space.low, 0.5 * (space.low + space.high), space.high, *drawn)]
@@ -83,12 +118,9 @@ class RowModels:
 
     def _model(self, vector: np.ndarray) -> mujoco.MjModel:
         try:
-            return self._twin.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
+            return self._engine.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
         except ValueError as error:
-            named = ", ".join(f"{n} {v:g}" for n, v in self._space.named(vector).items())
-            raise InputError(
-                f"distribution: MuJoCo refuses {named}: {error}; narrow the distribution or give limits"
-            ) from None
+            raise _refused(self._space, vector, str(error)) from None
 
 
 def _changed(base: mujoco.MjModel, models: list[mujoco.MjModel]) -> list[str]:
@@ -99,12 +131,29 @@ def _changed(base: mujoco.MjModel, models: list[mujoco.MjModel]) -> list[str]:
     ]  # fmt: skip
 
 
-class Forces:
+def derived_fields(model: mujoco.MjModel, space: ParameterSpace) -> list[str]:
+    """Return the real-valued model fields that the parameters write, and those that ``mj_setConst`` then does."""
+    probe = mujoco.batch.Batch(model, 1, 1)
+    for field in space.fields:
+        probe.expand(field)
+    probe.set_const()
+    return [
+        f
+        for f in sorted(mujoco.batch.MODEL_FIELDS)
+        if probe.expanded(f) is not None and read_field(model, f).dtype.kind == "f"
+    ]
+
+
+def _refused(space: ParameterSpace, values: np.ndarray, reason: str) -> InputError:
+    named = ", ".join(f"{n} {v:g}" for n, v in space.named(values).items())
+    return InputError(f"distribution: MuJoCo refuses {named}: {reason}; narrow the distribution or give limits")
+
+
+class RowForces:
     """Forces that depend on the state, and constant wrenches, of effects with numbers of each simulation's own.
 
     Args:
         batch: the batch.
-        space: the parameters.
         effects: the effects.
 
     Attributes:
@@ -112,16 +161,13 @@ class Forces:
         before: velocities one physics step ago, ``(N, nv)``.
     """
 
-    def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, effects: EffectSet) -> None:
-        self._setting = effects.setting
-        forces = effects.matching(lambda e: e.has_force)
-        self._entries = forces.entries
-        self._wrenches = effects.matching(lambda e: type(e).wrench is not Effect.wrench).entries
+    def __init__(self, batch: mujoco.batch.Batch, effects: EffectSet) -> None:
+        self._setting, self._forces = effects.setting, Forces(effects.setting)
+        self._entries, self._wrenches = (effects.having(method).entries for method in ("force", "wrench"))
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
         self._force, self._wrench = batch.bind("qfrc_applied"), batch.bind("xfrc_applied")
-        self._middle = Middle(effects.setting.model)
         self._values = [np.full((batch.nsim, len(e.fixed)), e.fixed) for e in self._entries]
-        self._pushes = np.zeros_like(self._wrench)
+        self._constant = np.zeros_like(self._wrench)
         self.any = bool(self._entries)
         self.before = np.zeros_like(self._qvel)
 
@@ -130,27 +176,22 @@ class Forces:
         for entry, own in zip(self._entries, self._values, strict=True):
             own[ids] = entry.values(values)
         for row, vector in zip(ids, values, strict=True) if self._wrenches else ():
-            wrenches = (e.effect.wrench(self._setting, e.target, e.values(vector[None])[0]) for e in self._wrenches)
-            self._pushes[row] = sum(w for w in wrenches if w is not None)
+            self._constant[row] = sum(
+                e.effect.wrench(self._setting, e.target, e.values(vector[None])[0]) for e in self._wrenches
+            )
 
     def restart(self, ids: np.ndarray) -> None:
         """Begin episodes in simulations whose states have just been set."""
         self.before[ids] = self._qvel[ids]
         if self._wrenches:
-            self._wrench[ids] = self._pushes[ids]
+            self._wrench[ids] = self._constant[ids]
 
     def apply(self, ids: np.ndarray, finer: int) -> None:
         """Set the forces that act in the next physics step of simulations ``ids``."""
-        step = float(self._setting.model.opt.timestep) / finer
-        position, velocity = self._middle.ahead(self._qpos[ids], self._qvel[ids], self.before[ids], step)
-        self.before[ids] = self._qvel[ids]
-        total = np.zeros_like(velocity)
-        for entry, own in zip(self._entries, self._values, strict=True):
-            kinds, which = (own[:1], None) if not entry.varies else np.unique(own[ids], axis=0, return_inverse=True)
-            for k, numbers in enumerate(kinds):
-                rows = slice(None) if which is None else which == k
-                with np.errstate(all="ignore"):
-                    found = entry.effect.force(self._setting, entry.target, numbers, position[rows], velocity[rows])
-                if found is not None:
-                    total[rows] += np.nan_to_num(found)
-        self._force[ids] = total
+        step, velocity = float(self._setting.model.opt.timestep) / finer, self._qvel[ids]
+        acting = [
+            Force(e.effect, e.target, own[ids] if e.varies else own[:1], slice(None))
+            for e, own in zip(self._entries, self._values, strict=True)
+        ]
+        self._force[ids] = self._forces(acting, self._qpos[ids], velocity, self.before[ids], step)
+        self.before[ids] = velocity

@@ -1,4 +1,4 @@
-"""Sensor effects that go on from step to step: what the sensors of N environments show."""
+"""Effects on measurements from step to step: what the sensors of N environments show."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ import math
 import numpy as np
 import torch
 
-from dropo_torch.effects.base import Effect, Path
+from dropo_torch.effects.filters import Filter, extended, observed_rates, rate_columns, sensed
+from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet
-from dropo_torch.effects.sensor import SensorBias, SensorDelay, SensorEffect, SensorScale, hermite
-from dropo_torch.effects.simulator import LONGEST_HISTORY, rate_columns
+from dropo_torch.effects.simulator import LONGEST_HISTORY
 from dropo_torch.parameters import ParameterSpace
 
 
@@ -27,22 +27,19 @@ class Sensors:
     """
 
     def __init__(self, effects: EffectSet, num_envs: int, *, space: ParameterSpace, device: torch.device) -> None:
-        setting = effects.setting
-        sensing = effects.matching(lambda e: e.acts_on_sensor)
+        setting, sensing = effects.setting, effects.having("sense")
         self._entries = sensing.entries
         self._skip, self._step = setting.frame_skip, float(setting.model.opt.timestep)
         self._index = torch.from_numpy(setting.observation.index).to(device)
-        self._columns = [SensorEffect.column(setting, e.target) for e in self._entries]
-        late = sensing.look_back(space, sensors=True)
+        late = sensing.look_back(space)
         steps = math.ceil(late / (self._step * self._skip) - 1e-9) if late < math.inf else LONGEST_HISTORY
-        self._window = min(steps, LONGEST_HISTORY) * self._skip + self._skip + 1
-        places = {int(c): i for i, c in enumerate(setting.observation.index)}
-        of = rate_columns(setting.model)
-        self._rates = np.array([places.get(int(of[c]), -1) for c in setting.observation.index])
-        self._state_rates = torch.from_numpy(of).to(device)
-        shape = (num_envs, self._window, len(self._index))
-        self._past = torch.zeros(shape, dtype=torch.float64, device=device)
-        self._values = [torch.zeros(num_envs, len(e.fixed), dtype=torch.float64, device=device) for e in self._entries]
+        window = min(steps, LONGEST_HISTORY) * self._skip + self._skip + 1
+        self._rates, self._rate_of = observed_rates(setting), torch.from_numpy(rate_columns(setting.model)).to(device)
+        self._past = torch.zeros(num_envs, window, len(self._index), dtype=torch.float64, device=device)
+        self._filters = [
+            Filter(e.effect, setting.column(e.target), self._past.new_zeros(num_envs, len(e.fixed)))
+            for e in self._entries
+        ]
 
     def __bool__(self) -> bool:
         """Whether there are any."""
@@ -50,12 +47,11 @@ class Sensors:
 
     def reset(self, rows: torch.Tensor, states: torch.Tensor, values: np.ndarray) -> None:
         """Begin episodes in environments ``rows`` at true states ``(k, nq + nv)``, with values ``(k, d)``."""
-        for entry, own in zip(self._entries, self._values, strict=True):
-            own[rows] = torch.from_numpy(entry.values(values)).to(own.device)
-        known = self._state_rates >= 0
-        rates = torch.where(known, states[:, self._state_rates.clamp(min=0)], 0.0)[:, self._index]
-        ago = self._step * torch.arange(1 - self._window, 1, device=states.device, dtype=torch.float64)
-        self._past[rows] = states[:, None, self._index] + ago[:, None] * rates[:, None]
+        for entry, f in zip(self._entries, self._filters, strict=True):
+            f.values[rows] = torch.from_numpy(entry.values(values)).to(f.values.device)
+        rates = torch.where(self._rate_of >= 0, states[:, self._rate_of], 0.0)[:, self._index]
+        start = states[:, None, self._index]
+        self._past[rows] = extended(start, rates, 0.0, self._past.shape[1] - 1, self._step)
 
     def record(self, fine: torch.Tensor) -> None:
         """Take in true states ``(N, skip, nq + nv)`` after each physics step."""
@@ -64,51 +60,9 @@ class Sensors:
     def show(self, states: torch.Tensor) -> torch.Tensor:
         """Return true states ``(N, nq + nv)`` with what the sensors show of them now in their places."""
         shown = states.clone()
-        columns = self._past[:, -1].clone()
-        for entry, column, values in zip(self._entries, self._columns, self._values, strict=True):
-            kind = type(entry.effect)
-            if kind is SensorBias:
-                columns[:, column] += values[:, 0]
-            elif kind is SensorScale:
-                columns[:, column] *= values[:, 0]
-            elif kind is SensorDelay:
-                columns[:, column] = self._late(column, values[:, 0], columns[:, column])
-            else:
-                columns = self._called(entry.effect, column, values, columns)
-        shown[:, self._index] = columns
+        path = SensedPath.of(self._past, 1, self._skip, self._step, self._rates)
+        shown[:, self._index] = sensed(path, self._filters)[:, 0]
         return shown
-
-    def _late(self, column: int, delay: torch.Tensor, now: torch.Tensor) -> torch.Tensor:
-        """A column as it was ``delay`` seconds ago, ``(N,)``."""
-        at = (self._window - 1 - delay / self._step).clamp(min=0.0)
-        whole = at.long().clamp(max=self._window - 2)
-        part = at - whole
-        rows = torch.arange(len(delay), device=delay.device)
-        left, right = self._past[rows, whole, column], self._past[rows, whole + 1, column]
-        rate = int(self._rates[column])
-        if rate >= 0:
-            slope, next_slope = (self._step * self._past[rows, whole + i, rate] for i in (0, 1))
-            value = hermite(left, right, slope, next_slope, part)
-        else:
-            value = (1 - part) * left + part * right
-        return torch.where(delay > 0, value, now)
-
-    def _called(self, effect: Effect, column: int, values: torch.Tensor, columns: torch.Tensor) -> torch.Tensor:
-        """What any other effect makes of the columns ``(N, n)``."""
-        fine, now, given = (x.cpu().numpy() for x in (self._past, columns, values))
-        fine = fine[:, (self._window - 1) % self._skip :]
-        out = np.empty_like(now)
-        kinds, which = np.unique(given, axis=0, return_inverse=True)
-        for k, numbers in enumerate(kinds):
-            rows = which == k
-            coarse = fine[rows, :: self._skip].copy()
-            coarse[:, -1] = now[rows]
-            path = Path(
-                columns=coarse, fine=fine[rows], valid=np.ones(coarse.shape, dtype=bool), step=self._step,
-                rates=self._rates,
-            )  # fmt: skip
-            out[rows] = effect.sense(path, column, numbers).columns[:, -1]
-        return torch.from_numpy(out).to(columns.device)
 
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return what the sensors remember."""

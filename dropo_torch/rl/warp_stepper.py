@@ -13,8 +13,8 @@ import warp as wp
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.effects.simulator import check_backend
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.rl.batch_stepper import BatchStepper
 from dropo_torch.rl.inside import inside_model
-from dropo_torch.rl.stepper import BatchStepper
 from dropo_torch.simulators.warp.engine import Problem
 from dropo_torch.simulators.warp.simulator import make_engine
 
@@ -70,9 +70,7 @@ class WarpStepper(BatchStepper):
     def step(self, controls: torch.Tensor) -> torch.Tensor:
         """Make an environment step; see :meth:`BatchStepper.step`."""
         count = controls.shape[1]
-        problem = Problem(
-            self.num_envs, self.num_envs, count, self.frame_skip * self._finer // count, paired=True
-        )  # fmt: skip
+        problem = Problem(self.num_envs, self.num_envs, count, self.frame_skip * self._finer // count, paired=True)
         given = controls.to(self._device, torch.float64).contiguous()
         flat, _ = self._engine.simulate(problem, self._theta, self._states, given, keep=False)
         path = flat.view(self.num_envs, count, self.num_states)

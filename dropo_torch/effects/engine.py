@@ -1,0 +1,267 @@
+"""The model with effects in it, simulated under many variants at once: other models, forces, wrenches."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import mujoco
+import mujoco.batch
+import numpy as np
+
+from dropo_torch.effects.base import Effect, Method, Placed, Setting
+from dropo_torch.models.load import quiet_mujoco
+from dropo_torch.parameters import ParameterSpace, write_field
+from dropo_torch.simulators.base import DIVERGED
+from dropo_torch.simulators.mujoco import control_range, default_row, filter_activations
+
+#: Simulations below which handing work to threads costs more than it saves.
+ALONE = 200
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One hypothesis about the robot: values of the declared parameters ``(d,)``, and effects."""
+
+    declared: tuple[float, ...]
+    placed: tuple[Placed, ...] = ()
+
+    def has(self, *methods: Method) -> bool:
+        """Whether any of its effects acts by one of some methods."""
+        return any(p.effect.has(m) for p in self.placed for m in methods)
+
+
+@dataclass(frozen=True)
+class Force:
+    """An effect that is a force, and the rows on which it acts, with their numbers ``(R, p)`` or ``(1, p)``."""
+
+    effect: Effect
+    target: str | None
+    values: np.ndarray
+    rows: slice
+
+
+class Forces:
+    """The forces of effects that depend on the state, at states half a physics step ahead.
+
+    A force that is held over the step is then right to second order. Free and ball joints stay where they are.
+    """
+
+    def __init__(self, setting: Setting) -> None:
+        model = setting.model
+        simple = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)))
+        self._setting, self._position, self._velocity = setting, model.jnt_qposadr[simple], model.jnt_dofadr[simple]
+
+    def __call__(
+        self, acting: Iterable[Force], position: np.ndarray, velocity: np.ndarray, before: np.ndarray, step: float
+    ) -> np.ndarray:
+        """Return generalised forces ``(R, nv)``.
+
+        Args:
+            acting: the effects.
+            position, velocity: the states, ``(R, nq)`` and ``(R, nv)``.
+            before: velocities a physics step ago, ``(R, nv)``; those of the states at an episode's start.
+            step: seconds of a physics step.
+        """
+        ahead = position.copy()
+        ahead[:, self._position] += 0.5 * step * velocity[:, self._velocity]
+        then, out = velocity + 0.5 * (velocity - before), np.zeros_like(velocity)
+        for f in acting:
+            with np.errstate(all="ignore"):
+                found = f.effect.force(self._setting, f.target, f.values, ahead[f.rows], then[f.rows])
+            out[f.rows] += np.nan_to_num(found)
+        return out
+
+
+@dataclass(frozen=True)
+class _Work:
+    """Variants that go together: their models and states ``(K, W, n)``, commands ``(K, W, S, nu)``, other forces.
+
+    ``finer`` steps of the models make one of the base's, of which ``every`` lie between states that are wanted.
+    """
+
+    models: list[mujoco.MjModel | None]
+    variants: list[Variant]
+    starts: np.ndarray
+    signals: np.ndarray
+    pushes: np.ndarray | None
+    finer: int
+    every: int
+
+
+class VariantEngine:
+    """Simulates a model under variants of it, from full states and under commands as they act.
+
+    Args:
+        setting: the model as given.
+        space: the declared parameters.
+        num_threads: threads, 0 for all processors; results do not depend on it.
+        warp: simulate with the Warp backend wherever it can; MuJoCo does the rest, with the same physics.
+    """
+
+    def __init__(self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, warp: bool = False) -> None:
+        self._setting, self._space, self._num_threads = setting, space, num_threads
+        self._warp = _warp_variants(space, num_threads) if warp else None
+        self._base = copy.copy(setting.model)
+        self._base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+        self._filters = filter_activations(self._base)
+        self._data = mujoco.MjData(self._base)
+        self._row = default_row(self._base)
+        self._forces = Forces(setting)
+        self._batches: dict[int, mujoco.batch.Batch] = {}
+
+    def model(self, variant: Variant) -> mujoco.MjModel:
+        """Return the model of a variant, with its derived constants.
+
+        Raises:
+            ValueError: values that MuJoCo refuses.
+        """
+        model = copy.copy(self._base)
+        for column, parameter in enumerate(self._space.parameters):
+            for target in parameter.targets:
+                write_field(model, target.field, target.index, target.factor * variant.declared[column])
+        for placed in variant.placed:
+            placed.effect.apply(model, placed.target, np.asarray(placed.values))
+        if (model.body_mass < 0).any() or (model.body_inertia < 0).any() or (model.dof_armature < 0).any():
+            raise ValueError("a mass or an inertia is negative")
+        try:
+            with quiet_mujoco():
+                mujoco.mj_setConst(model, self._data)
+        except mujoco.FatalError as error:
+            raise ValueError(str(error)) from None
+        return model
+
+    def models(self, variants: Sequence[Variant]) -> list[mujoco.MjModel | None]:
+        """Return the models of variants, ``None`` where MuJoCo refuses the values."""
+        found: list[mujoco.MjModel | None] = []
+        for variant in variants:
+            try:
+                found.append(self.model(variant))
+            except ValueError:
+                found.append(None)
+        return found
+
+    def paths(
+        self, variants: Sequence[Variant], models: Sequence[mujoco.MjModel | None], starts: np.ndarray,
+        signals: np.ndarray, *, fine: bool = False, pushes: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Simulate.
+
+        Args:
+            variants: the hypotheses, K of them.
+            models: their models, of :meth:`models`.
+            starts: true states, ``(K, W, nq + nv)``.
+            signals: commands of every physics step, ``(K, W, S, nu)``.
+            fine: return the states after every physics step instead of every logged one.
+            pushes: further generalised forces in every logged step, ``(K, S / skip, nv)``; none by default.
+
+        Returns:
+            States ``(K, W, S, nq + nv)`` or ``(K, W, S / skip, nq + nv)``, NaN where a simulation diverged or has no
+            model.
+        """
+        every = 1 if fine else self._setting.frame_skip
+        groups: dict[tuple, list[int]] = {}
+        for k, (variant, model) in enumerate(zip(variants, models, strict=True)):
+            if model is not None:
+                groups.setdefault(self._kind(variant, model), []).append(k)
+        out = np.full((*starts.shape[:2], signals.shape[2] // every, starts.shape[2]), np.nan)
+        for (finer, *_), members in groups.items():
+            rows = members if len(members) < len(variants) else slice(None)  # all of them need no copy
+            work = _Work(
+                [models[k] for k in members], [variants[k] for k in members], starts[rows], signals[rows],
+                None if pushes is None else pushes[rows], finer, every,
+            )  # fmt: skip
+            found = self._by_warp(work)
+            out[rows] = self._by_mujoco(work) if found is None else found
+        return out
+
+    def _kind(self, variant: Variant, model: mujoco.MjModel) -> tuple:
+        """What variants that are simulated together share; the base's steps in a step of theirs comes first."""
+        finer = max(round(self._base.opt.timestep / model.opt.timestep), 1)
+        natives = () if self._warp is None else tuple(p.key for p in variant.placed if p.effect.native)
+        return finer, variant.has("force"), self._warp is not None and variant.has("wrench"), natives
+
+    def _by_warp(self, work: _Work) -> np.ndarray | None:
+        """Do what :meth:`_by_mujoco` does with Warp, or return ``None`` where it cannot."""
+        forced = work.pushes is not None or any(v.has("force", "wrench") for v in work.variants)
+        if self._warp is None or forced or self._filters:
+            return None
+        every, out = work.finer * work.every, []
+        for model, starts, signals in zip(work.models, work.starts, work.signals, strict=True):
+            path = self._warp.rollout(model, starts, np.repeat(signals, work.finer, axis=1))
+            if path is None:
+                return None
+            out.append(path[:, every - 1 :: every])
+        return np.stack(out)
+
+    def _by_mujoco(self, work: _Work) -> np.ndarray:
+        """Return states after each logged (or physics) step, ``(K, W, S / every, nq + nv)``."""
+        num_k, num_w, total = work.signals.shape[:3]
+        rows, nq, finer, every = num_k * num_w, self._base.nq, work.finer, work.every
+        batch = self._batch(rows)
+        batch.set_models([m for m in work.models for _ in range(num_w)])
+        batch.state[:] = self._row
+        qpos, qvel, ctrl, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
+        starts, control = work.starts.reshape(rows, -1), work.signals.reshape(rows, total, -1)
+        qpos[:], qvel[:] = starts[:, :nq], starts[:, nq:]
+        if self._filters:
+            activation, source = (list(x) for x in zip(*self._filters, strict=True))
+            batch.bind("act")[:, activation] = np.clip(control[:, 0], *control_range(self._base))[:, source]
+        forces = []
+        for k, variant in enumerate(work.variants):
+            own = slice(k * num_w, (k + 1) * num_w)
+            for p in variant.placed:
+                if p.effect.has("force"):
+                    forces.append(Force(p.effect, p.target, np.array([p.values]), own))
+                if p.effect.has("wrench"):
+                    batch.bind("xfrc_applied")[own] += p.effect.wrench(self._setting, p.target, np.array(p.values))
+        held = 1 if forces or _varies(control, every) else every  # steps of the base between changes
+        calls, steps = (finer, 1) if forces else (1, finer * held)
+        out, failed, before = np.empty((rows, total // every, starts.shape[1])), np.zeros(rows, bool), qvel.copy()
+        for step in range(0, total, held):
+            ctrl[:] = control[:, step]
+            for _ in range(calls):
+                if forces:
+                    found = self._forces(forces, qpos, qvel, before, self._base.opt.timestep / finer)
+                    applied[:], before = found, qvel.copy()
+                if work.pushes is not None:
+                    pushes = np.repeat(work.pushes[:, step // self._setting.frame_skip], num_w, axis=0)
+                    applied[:] = applied + pushes if forces else pushes
+                try:
+                    with quiet_mujoco():
+                        batch.step(nstep=steps)
+                except mujoco.batch.SimulationError as error:
+                    failed[error.ids] = True
+            if (step + held) % every == 0:
+                at = (step + held) // every - 1
+                out[:, at, :nq], out[:, at, nq:] = qpos, qvel
+        with np.errstate(invalid="ignore"):
+            failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
+        out[failed] = np.nan
+        batch.set_models(None)
+        return out.reshape(num_k, num_w, *out.shape[1:])
+
+    def _batch(self, rows: int) -> mujoco.batch.Batch:
+        if rows not in self._batches:
+            if len(self._batches) > 8:
+                self._batches.clear()
+            threads = 1 if rows < ALONE else self._num_threads
+            self._batches[rows] = mujoco.batch.Batch(self._base, rows, threads)
+        return self._batches[rows]
+
+
+def _warp_variants(space: ParameterSpace, num_threads: int) -> Any:
+    """The Warp backend, imported only where it is asked for."""
+    from dropo_torch.simulators.warp.variants import Variants
+
+    return Variants(space, num_threads=num_threads)
+
+
+def _varies(control: np.ndarray, every: int) -> bool:
+    """Whether commands change within a logged step."""
+    if every == 1:
+        return False
+    blocks = control.reshape(control.shape[0], -1, every, control.shape[2])
+    return bool((blocks != blocks[:, :, :1]).any())

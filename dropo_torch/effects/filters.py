@@ -1,0 +1,120 @@
+"""Effects on commands and measurements, one after the other: in a search, a fit and a training alike."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import mujoco
+import numpy as np
+import torch
+
+from dropo_torch.effects.base import Effect, Placed, Setting, object_number
+from dropo_torch.effects.path import SensedPath
+
+
+@dataclass(frozen=True)
+class Filter:
+    """An effect on one command or one observed column, with the numbers of each row.
+
+    Attributes:
+        effect: the effect.
+        column: of the commands, or of the observation.
+        values: its numbers, ``(R, p)``, or ``(1, p)`` where all rows have the same.
+    """
+
+    effect: Effect
+    column: int
+    values: torch.Tensor
+
+
+def command_column(model: mujoco.MjModel, target: str | None) -> int:
+    """Return the command of an actuator by the actuator's name."""
+    return int(model.actuator_ctrladr[object_number(model, "actuator", target)])
+
+
+def command_filters(placed: Iterable[Placed], setting: Setting) -> list[Filter]:
+    """Return the effects on commands, with the same numbers in all rows."""
+    return [
+        Filter(p.effect, command_column(setting.model, p.target), torch.tensor([p.values], dtype=torch.float64))
+        for p in placed
+        if p.effect.has("command")
+    ]
+
+
+def sensor_filters(placed: Iterable[Placed], setting: Setting) -> list[Filter]:
+    """Return the effects on measurements, with the same numbers in all rows."""
+    return [
+        Filter(p.effect, setting.column(p.target), torch.tensor([p.values], dtype=torch.float64))
+        for p in placed
+        if p.effect.has("sense")
+    ]
+
+
+def filtered(signal: np.ndarray, filters: Iterable[Filter], step: float) -> np.ndarray:
+    """Return commands ``(R, S, nu)`` of physics steps as they act, of filters that have settled at the first ones."""
+    out = torch.from_numpy(signal.copy())
+    for f in filters:
+        given = out[..., f.column]
+        out[..., f.column], _ = f.effect.command(given, f.values, step, f.effect.settled(given[:, :1], f.values, step))
+    return out.numpy()
+
+
+def sensed(path: SensedPath, sensors: Iterable[Filter]) -> torch.Tensor:
+    """Return what sensors show of paths, ``(R, T, n)``."""
+    for f in sensors:
+        shown = path.shown.clone()
+        shown[..., f.column] = f.effect.sense(path, f.column, f.values)
+        path = replace(path, shown=shown)
+    return path.shown
+
+
+def unsensed(shown: torch.Tensor, rates: torch.Tensor, sensors: Sequence[Filter]) -> torch.Tensor:
+    """Return observed columns ``(R, n)`` of true states, of which the sensors show ``shown``.
+
+    Args:
+        shown: what the sensors show, ``(R, n)``.
+        rates: time derivatives of the columns, ``(R, n)``.
+        sensors: the effects on measurements.
+    """
+    out = shown.clone()
+    for f in reversed(sensors):
+        out[:, f.column] = f.effect.unsense(out, rates, f.column, f.values)
+    return out
+
+
+def extended(
+    fine: torch.Tensor, rates: torch.Tensor, curvature: torch.Tensor | float, count: int, step: float
+) -> torch.Tensor:
+    """Return fine paths with ``count`` physics steps before them, as if they had moved evenly so far.
+
+    Args:
+        fine: columns at every physics step, ``(R, F, n)``.
+        rates: their time derivatives at the first, ``(R, n)``.
+        curvature: the second derivatives, ``(R, n)``.
+        count: physics steps of the past.
+        step: seconds of a physics step.
+    """
+    if not count:
+        return fine
+    before = step * torch.arange(-count, 0, dtype=fine.dtype, device=fine.device)[:, None]
+    curved = torch.as_tensor(curvature, dtype=fine.dtype, device=fine.device)
+    curved = curved[:, None] if curved.ndim else curved
+    past = fine[:, :1] + before * rates[:, None] + 0.5 * before * (before + step) * curved
+    return torch.cat([past, fine], 1)
+
+
+def rate_columns(model: mujoco.MjModel) -> np.ndarray:
+    """Return for every state column the one that is its time derivative, or -1, ``(nq + nv,)``."""
+    found = np.full(model.nq + model.nv, -1)
+    for j in range(model.njnt):
+        position, velocity = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
+        width = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}.get(int(model.jnt_type[j]), 1)
+        found[position : position + width] = velocity + np.arange(width)
+    return found
+
+
+def observed_rates(setting: Setting) -> tuple[int, ...]:
+    """Return for every observed column the observed one that is its time derivative, or -1."""
+    of, places = rate_columns(setting.model), {int(c): i for i, c in enumerate(setting.observation.index)}
+    return tuple(places.get(int(of[c]), -1) for c in setting.observation.index)
