@@ -139,7 +139,8 @@ class Evaluator:
 
         def part(picked: Rows) -> torch.Tensor:
             sums = visit(self.after(picked, leaf), picked)
-            slope.add_(torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0]))
+            if sums.requires_grad:  # it does not where all of them diverge
+                slope.add_(torch.nan_to_num(torch.autograd.grad(sums[0], leaf)[0]))
             return sums.detach()
 
         return Sums(_total(part, self._picked(len(leaf), rows)), self._cost(len(leaf), rows), slope)

@@ -12,13 +12,15 @@ import numpy as np
 import pytest
 import torch
 
-from dropo_torch.data.observation import generic_observation
+from dropo_torch.data.observation import generic_observation as generic_observation
 from dropo_torch.data.trajectory import Transitions
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import Optimizer, Request
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators import Simulator
+from dropo_torch.testing.linear import LinearSimulator as LinearSimulator
+from dropo_torch.testing.linear import linear_objective as linear_objective
+from dropo_torch.testing.simulators import stepped as settled_rollout  # noqa: F401
 
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True, max_examples=60, database=None)
 hypothesis.settings.load_profile("tests")
@@ -167,57 +169,6 @@ def space_of(**bounds: Sequence[float] | dict) -> ParameterSpace:
     return ParameterSpace(None, {k: v if isinstance(v, dict) else {"bounds": list(v)} for k, v in bounds.items()})
 
 
-class LinearSimulator(Simulator):
-    """s' = A s + B u + C f(ξ), with f the identity unless given: everything about it is known in closed form."""
-
-    name = "linear"
-    timestep = 1.0
-    frame_skip = 1
-
-    def __init__(
-        self,
-        space: ParameterSpace,
-        effect: np.ndarray,
-        *,
-        transition: np.ndarray | None = None,
-        control: np.ndarray | None = None,
-        transform: Callable[[torch.Tensor], torch.Tensor] = lambda x: x,
-    ) -> None:
-        self.parameters = space
-        self.effect = torch.as_tensor(effect, dtype=torch.float64)
-        self.num_states = len(self.effect)
-        zero = np.zeros((self.num_states, self.num_states))
-        self.transition = torch.as_tensor(zero if transition is None else transition, dtype=torch.float64)
-        self.control = torch.as_tensor(np.zeros((self.num_states, 1)) if control is None else control).double()
-        self.num_controls = self.control.shape[1]
-        self.transform = transform
-        self.calls = 0
-
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        return self.rollout(states, controls, values)[:, :, -1]
-
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        self.check_arguments(states, controls, values)
-        self.calls += 1
-        push = self.transform(values) @ self.effect.T
-        now = states[:, None].expand(-1, len(values), -1)
-        out = []
-        for u in controls.unbind(1):
-            now = now @ self.transition.T + (u @ self.control.T)[:, None] + push
-            out.append(now)
-        return torch.stack(out, 2)
-
-
-def linear_objective(simulator: LinearSimulator, measured: np.ndarray, **options: object) -> Objective:
-    """The likelihood of measured next states from zero start states and controls."""
-    number = len(measured)
-    states = torch.zeros(number, simulator.num_states, dtype=torch.float64)
-    controls = torch.zeros(number, 1, simulator.num_controls, dtype=torch.float64)
-    return Objective(
-        simulator, windows(states, controls, measured), generic_observation(simulator.num_states), **options
-    )
-
-
 def drive(optimizer: Optimizer, objective: Objective, after_tell: Callable[[], None] = lambda: None) -> None:
     """Ask, simulate and tell until the optimizer stops."""
     while optimizer.stop_reason is None:
@@ -236,21 +187,3 @@ def numerical_gradient(function: Callable[[np.ndarray], float], at: np.ndarray, 
     """Central differences of a scalar function, ``(d,)``."""
     eye = step * np.eye(len(at))
     return np.array([(function(at + e) - function(at - e)) / (2 * step) for e in eye])
-
-
-def settled_rollout(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, frame_skip: int) -> np.ndarray:
-    """C MuJoCo's own answer: ``mj_step`` from a reset, filters settled at their first control."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
-    for i in range(model.nactuator):
-        if model.actuator_actadr[i] >= 0:
-            u = model.actuator_ctrladr[i]
-            low, high = model.actuator_ctrlrange[u] if model.actuator_ctrllimited[u] else (-np.inf, np.inf)
-            data.act[model.actuator_actadr[i]] = np.clip(controls[0, u], low, high)
-    states = []
-    for control in controls:
-        data.ctrl[:] = control
-        for _ in range(frame_skip):
-            mujoco.mj_step(model, data)
-        states.append(np.concatenate([data.qpos, data.qvel]))
-    return np.array(states)

@@ -1,18 +1,15 @@
 from __future__ import annotations
 
-import pickle
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from conftest import (
     SLIDE_XML,
-    LinearSimulator,
-    answered,
     compiled,
     drive,
-    linear_objective,
     numerical_gradient,
     random_controls,
     random_states,
@@ -20,18 +17,27 @@ from conftest import (
     windows,
 )
 
+from dropo_torch.baselines.bayessim import BayesSimOptimizer
+from dropo_torch.baselines.droid import DroidOptimizer
+from dropo_torch.baselines.laplace import LaplaceOptimizer
+from dropo_torch.baselines.settings import BayesSimSettings, DroidSettings, SimOptSettings, UdrSettings
+from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
+from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.data.observation import parse_observation
+from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import to_values, truncated_interval, truncated_moments
 from dropo_torch.fit import fit
 from dropo_torch.likelihood import LOST_TRANSITION
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers import CMAOptimizer, FisherOptimizer, FitSettings, Optimizer
+from dropo_torch.optimizers import AdamSettings, CMAOptimizer, FisherOptimizer, FitSettings, make_optimizer
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.sampled import SampledStage
 from dropo_torch.optimizers.sigma_points import SigmaPointStage
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator
 from dropo_torch.support.random import draw_uniforms
+from dropo_torch.testing import KnownProblem, LinearSimulator, check_optimizer, linear_objective, linear_problem
+from dropo_torch.testing.optimizers import MakeOptimizer
 
 #: Variance of a standard normal truncated at two deviations.
 VARIANCE = float(truncated_moments(*truncated_interval(*torch.tensor([0.0, 1.0, -torch.inf, torch.inf])))[1])
@@ -155,133 +161,97 @@ def test_a_parameter_at_its_physical_limit_is_found_there():
     assert (result.distribution.sample(200, torch.Generator().manual_seed(0)) >= 0).all()
 
 
-def asked_values(make: Callable[[Objective], Optimizer], objective: Objective) -> tuple[np.ndarray, Optimizer]:
-    optimizer = make(objective)
-    values = []
-    while optimizer.stop_reason is None:
-        request = optimizer.ask()
-        values.append(request.values)
-        optimizer.tell(answered(objective, request))
-    return np.concatenate(values), optimizer
+def of_settings(**options: Any) -> MakeOptimizer:
+    """A maker of the fit's own optimizers."""
+    return lambda objective, seed: make_optimizer(objective, FitSettings(seed=seed, **options))
 
 
-@pytest.mark.parametrize("make", [fisher, small_cma])
-@pytest.mark.parametrize("target", [[-5.0, 4.0], [50.0, 4.0], [1.2, 0.0], [1.2, 90.0]])
-def test_no_mean_leaves_the_box_and_no_sample_the_physical_limits(make, target):
-    space = ParameterSpace(
-        None, {"a": {"bounds": [0.0, 3.0], "limits": [0.0, 4.0]}, "b": {"bounds": [1.0, 9.0], "limits": [0.5, 10.0]}}
+def simopt(objective: Objective, seed: int) -> SimOptOptimizer:
+    log, settings = objective.transitions, SimOptSettings(samples=60, iterations=12)
+    replay = Replay(log.states, log.controls, log.measured[:, None])
+    return SimOptOptimizer(
+        objective.simulator.parameters, replay, column_scales(objective), settings=settings, seed=seed
     )
-    data = spread_data(50) + (np.array(target) - [1.2, 4.0]) * GAINS
-    objective = linear_objective(LinearSimulator(space, np.diag(GAINS)), data, epsilon=EPSILON)
-    values, optimizer = asked_values(make, objective)
-    assert (values >= space.limits[:, 0] - 1e-9).all()
-    assert (values <= space.limits[:, 1] + 1e-9).all()
-    for mean, std in optimizer.candidates():
-        assert (mean >= space.low).all()
-        assert (mean <= space.high).all()
-        assert (std >= 0.999 * objective.box.min_std).all()
-        assert (std <= 1.001 * objective.box.max_std).all()
-    if make is fisher:
-        expected = np.clip(target, space.low, space.high)
-        np.testing.assert_allclose(optimizer.candidates()[0][0], expected, atol=0.3)
 
 
-def curved_objective(noise: float | None = None) -> Objective:
-    """A simulator that bends within the distribution, so that Fisher scoring goes on over samples."""
-    simulator = LinearSimulator(linear_space(), np.diag(GAINS), transform=lambda v: (v - 1).square())
-    data = (np.random.default_rng(0).normal([1.2, 4.0], [0.3, 0.4], (40, 2)) - 1) ** 2 * GAINS
-    return linear_objective(simulator, data, epsilon=EPSILON, noise=noise)
+def droid(objective: Objective, seed: int) -> DroidOptimizer:
+    return DroidOptimizer(objective.simulator.parameters, settings=DroidSettings(budget=150), seed=seed)
 
 
-ROUTES: dict[str, tuple[Callable[[Objective], Optimizer], Callable[[], Objective]]] = {
-    "fisher": (fisher, spread_objective),
-    "fisher, noisy": (fisher, lambda: spread_objective(noise=0.05)),
-    "fisher, sampled": (lambda o: fisher(o, samples=30), curved_objective),
-    "cma": (small_cma, spread_objective),
-    "cma, noisy": (small_cma, lambda: spread_objective(noise=0.05)),
-    "cma, common": (lambda o: small_cma(o, common_random_numbers=True), spread_objective),
+def bayessim(objective: Objective, seed: int) -> BayesSimOptimizer:
+    log = objective.transitions
+    pairs = [x.reshape(-1, 2, x.shape[-1]) for x in (log.controls[:, 0], log.measured)]
+    return BayesSimOptimizer(
+        objective.simulator.parameters, Replay(log.states[::2], *pairs), 2,
+        settings=BayesSimSettings(simulations=60, hidden=8, epochs=3), seed=seed,
+    )  # fmt: skip
+
+
+#: Every optimizer and baseline: how it is made, and how near the truth it comes; see ``check_optimizer``.
+SEARCHES: dict[str, tuple[MakeOptimizer, dict[str, float | None]]] = {
+    "fisher": (of_settings(samples=30), {"mean": 1e-4, "std": 0.01}),
+    "fisher, entropy": (of_settings(samples=30, entropy=1.0), {"mean": 1e-3, "std": 0.1}),
+    "correlated": (of_settings(samples=30, covariance="full"), {"mean": 1e-3, "std": 0.02}),
+    "cma": (of_settings(optimizer="cma", samples=12, budget=200), {"mean": 0.1, "std": None}),
+    "cma, common": (
+        of_settings(optimizer="cma", samples=12, budget=200, common_random_numbers=True),
+        {"mean": 0.1, "std": 0.8},
+    ),
+    "adam": (
+        of_settings(optimizer="adam", adam=AdamSettings(steps=30, batch=20, samples=8)),
+        {"mean": 0.02, "std": None},
+    ),
+    "laplace": (lambda o, seed: LaplaceOptimizer(o), {"mean": 1e-3, "std": None}),
+    "droid": (droid, {"mean": 0.01, "std": None}),
+    "simopt": (simopt, {"mean": 0.05, "std": None}),
+    "bayessim": (bayessim, {"mean": None, "std": None}),
+    "udr": (
+        lambda o, seed: UdrOptimizer(o.simulator.parameters, settings=UdrSettings(), seed=seed),
+        {"mean": None, "std": None},
+    ),
 }
 
 
-@pytest.fixture(params=ROUTES)
-def route(request: pytest.FixtureRequest) -> tuple[Callable[[Objective], Optimizer], Objective]:
-    make, objective = ROUTES[request.param]
-    return make, objective()
+def moving_objective() -> Objective:
+    """Two parameters whose replays differ in how they move."""
+    simulator = LinearSimulator(linear_space(), np.diag(GAINS), transition=0.5 * np.eye(2))
+    return linear_objective(simulator, spread_data(40), epsilon=EPSILON)
 
 
-def flat(candidates: list[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    return np.array([np.concatenate(c) for c in candidates])
+PROBLEMS = {
+    "moving": KnownProblem("moving", moving_objective, np.full(2, np.nan), np.full(2, np.nan)),
+    "linear": linear_problem(),
+    "noisy": linear_problem(40, noise=0.05),
+    "curved": linear_problem(40, transform=lambda v: (v - 1).square()),
+    "truth below the box": linear_problem(40, box=((0.0, 3.0), (4.5, 9.0))),
+    "truth above the box": linear_problem(40, box=((0.0, 1.0), (1.0, 9.0))),
+}
+BEYOND = [(s, p) for s in ("fisher", "correlated", "cma", "adam") for p in PROBLEMS if p not in ("linear", "moving")]
+LAWS = [("bayessim", "moving"), ("laplace", "noisy"), *((s, "linear") for s in SEARCHES if s != "bayessim"), *BEYOND]
 
 
-def test_asking_twice_gives_the_same_request(route):
-    make, objective = route
-    optimizer = make(objective)
-    while optimizer.stop_reason is None:
-        first, second = optimizer.ask(), optimizer.ask()
-        np.testing.assert_array_equal(first.values, second.values)
-        assert first.evaluations == second.evaluations
-        assert (first.linearise_at is None) == (objective.noise is None)
-        np.testing.assert_array_equal(first.linearise_at, second.linearise_at)
-        sums = answered(objective, first)
-        np.testing.assert_array_equal(sums, answered(objective, second))
-        optimizer.tell(sums)
-
-
-def test_restored_at_any_step_it_goes_on_as_if_never_interrupted(route):
-    make, objective = route
-    whole = make(objective)
-    states, requests, answers = [pickle.dumps(whole.state())], [], []
-    while whole.stop_reason is None:
-        request = whole.ask()
-        requests.append(request.values)
-        if len(requests) % 2:  # a checkpoint may also come between ask and tell
-            states[-1] = pickle.dumps(whole.state())
-        answers.append(answered(objective, request))
-        whole.tell(answers[-1])
-        states.append(pickle.dumps(whole.state()))
-    assert len(requests) > 3
-    used = make(objective)
-    drive(used, objective)
-    for step in range(len(states) - 1):
-        other = used if step == 1 else make(objective)
-        other.restore(pickle.loads(states[step]))
-        for expected, answer in zip(requests[step:], answers[step:], strict=True):
-            np.testing.assert_array_equal(other.ask().values, expected)
-            other.tell(answer)
-        assert other.stop_reason == whole.stop_reason
-        np.testing.assert_array_equal(flat(other.candidates()), flat(whole.candidates()))
+@pytest.mark.parametrize(("search", "problem"), LAWS)
+def test_optimizers_keep_their_laws(search: str, problem: str) -> None:
+    make, accuracy = SEARCHES[search]
+    if "truth" in problem and accuracy["mean"] is not None:
+        accuracy = {"mean": max(accuracy["mean"], 0.02), "std": None}
+    check_optimizer(make, problem=PROBLEMS[problem], **accuracy)
 
 
 def test_the_curved_route_ends_in_sampling_and_the_straight_one_does_not():
     stages = []
-    for make, build in (ROUTES["fisher"], ROUTES["fisher, sampled"]):
-        objective = build()
-        optimizer = make(objective)
+    for name in ("linear", "curved"):
+        objective = PROBLEMS[name].objective()
+        optimizer = fisher(objective)
         drive(optimizer, objective)
         stages.append(optimizer.progress.stage)
     assert stages == ["Fisher scoring on sigma points", "Fisher scoring on samples"]
 
 
-def test_the_same_seed_gives_the_same_fit_and_another_seed_another():
-    found = {seed: [] for seed in (0, 1)}
-    for seed in (0, 0, 1):
-        objective = spread_objective()
-        optimizer = small_cma(objective, seed=seed)
-        np.random.default_rng().normal()
-        drive(optimizer, objective)
-        found[seed].append(flat(optimizer.candidates()))
-    np.testing.assert_array_equal(*found[0])
-    assert (found[0][0] != found[1][0]).any()
-
-
-def test_a_simulator_that_always_fails_stops_the_search_with_a_reason():
-    objective = linear_objective(
-        LinearSimulator(linear_space(), np.diag(GAINS), transform=lambda v: v * torch.nan), spread_data(5)
-    )
-    for optimizer in (fisher(objective), small_cma(objective)):
-        drive(optimizer, objective)
-        assert optimizer.stop_reason
-        assert np.isfinite(flat(optimizer.candidates())).all()
+def test_another_seed_gives_another_search():
+    objectives = [spread_objective() for _ in range(2)]
+    found = [small_cma(o, seed=seed).ask().values for seed, o in enumerate(objectives)]
+    assert (found[0] != found[1]).any()
 
 
 def stage_gradient(make_stage: Callable[[np.ndarray, np.ndarray], object], objective: Objective, *phi: np.ndarray):

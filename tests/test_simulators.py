@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import os
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import gymnasium
 import mujoco
@@ -32,6 +32,7 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.stepper import make_stepper
 from dropo_torch.simulators import GymnasiumSimulator, MujocoEnvAdapter, MujocoSimulator, Simulator, make_simulator
 from dropo_torch.simulators.warp import WarpSimulator
+from dropo_torch.testing import Tolerance, check_simulator, mujoco_reference
 
 
 class PlainEnv:
@@ -66,13 +67,13 @@ class Backend:
     Attributes:
         make: from a parameter space and a frame skip, with any of ``options``.
         options: constructor options that must not change a result.
-        rtol: 0 where results are C MuJoCo's to the bit.
+        tolerance: how near to C MuJoCo, by default to the bit.
         settles_filters: whether first-order filters start settled at their control.
     """
 
     make: Callable[..., Simulator]
     options: tuple[Mapping[str, int], ...] = ({},)
-    rtol: float = 0.0
+    tolerance: Tolerance = field(default_factory=Tolerance)
     settles_filters: bool = True
 
 
@@ -88,9 +89,9 @@ BACKENDS = {
             space.model, parameters=space, frame_skip=frame_skip, **options
         ),
         options=({"num_threads": 1}, {"num_threads": 2}, {"chunk_size": 1}, {"chunk_size": 7}),
-        rtol=1e-6,
+        tolerance=Tolerance(states=1e-6, gradient=1e-4, most=np.inf),  # gradients have a suite of their own
     ),
-    "gymnasium": Backend(plain_gymnasium, rtol=1e-14, settles_filters=False),
+    "gymnasium": Backend(plain_gymnasium, tolerance=Tolerance(states=1e-14), settles_filters=False),
 }
 
 
@@ -103,6 +104,7 @@ class Case:
     states: torch.Tensor
     controls: torch.Tensor
     values: torch.Tensor
+    idle: tuple[str, ...] = ()
 
 
 def case_of(space: ParameterSpace, frame_skip: int, states: torch.Tensor, lag: int = 3, num_values: int = 4) -> Case:
@@ -159,140 +161,71 @@ def tendon_case() -> Case:
 CASES = {"hopper": hopper_case, "box": box_case, "arm": arm_case, "tendon": tendon_case}
 
 
-@pytest.fixture(params=CASES)
-def case(request: pytest.FixtureRequest) -> Case:
-    return CASES[request.param]()
+def made(backend: Backend, case: Case, **options: int) -> Simulator:
+    try:
+        return backend.make(case.space, case.frame_skip, **options)
+    except InputError as error:
+        if "backend warp does not simulate" not in str(error):
+            raise
+        pytest.skip(str(error))  # the subset stands in docs/warp.md; what is in it has suites of its own
+
+
+def turned(space: ParameterSpace) -> ParameterSpace:
+    """The same parameters in the reverse order."""
+    other = copy.copy(space)
+    other.parameters = space.parameters[::-1]
+    other.__dict__.pop("nominal", None)
+    return other
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_backends_keep_the_laws_of_a_simulator(backend: str, case: str) -> None:
+    kind, on = BACKENDS[backend], CASES[case]()
+    simulator = made(kind, on)
+    controls = on.controls
+    if on.space.model.na and not kind.settles_filters:
+        controls = torch.zeros_like(controls)
+    variants = [made(kind, on, **options) for options in kind.options]
+    report = check_simulator(
+        simulator,
+        on.states,
+        controls,
+        on.values,
+        variants=[*variants, made(kind, replace(on, space=turned(on.space)))],
+        reference=mujoco_reference(on.space, on.frame_skip),
+        tolerance=kind.tolerance,
+        diverging=torch.full_like(on.values[:1], torch.nan),
+        idle=on.idle,
+    )
+    assert not set(report.skipped) - {"gradients are those of central differences"}
+    assert simulator.timestep == pytest.approx(on.frame_skip * on.space.model.opt.timestep)
 
 
 @pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS.keys())
-class TestBackend:
-    def make(self, backend: Backend, case: Case, **options: int) -> Simulator:
-        try:
-            return backend.make(case.space, case.frame_skip, **options)
-        except InputError as error:
-            if "backend warp does not simulate" not in str(error):
-                raise
-            pytest.skip(str(error))  # the subset stands in docs/warp.md; what is in it has suites of its own
+def test_every_entry_of_a_result_is_written(backend: Backend, monkeypatch: pytest.MonkeyPatch) -> None:
+    case = CASES["hopper"]()
+    simulator = made(backend, case)
+    expected = simulator.simulate(case.states, case.controls, case.values)
+    monkeypatch.setattr(np, "empty", lambda shape, *a, **k: np.full(shape, 1e99, *a, **k))
+    torch.testing.assert_close(simulator.simulate(case.states, case.controls, case.values), expected, rtol=0, atol=0)
 
-    def same(self, backend: Backend, ours: torch.Tensor | np.ndarray, theirs: torch.Tensor | np.ndarray) -> None:
-        if backend.rtol:
-            np.testing.assert_allclose(ours, theirs, rtol=backend.rtol, atol=backend.rtol)
-        else:
-            np.testing.assert_array_equal(ours, theirs)
 
-    def test_transitions_are_those_of_mj_step(self, backend, case):
-        if case.space.model.na and not backend.settles_filters:
-            case = Case(case.space, case.frame_skip, case.states, torch.zeros_like(case.controls), case.values)
-        ours = self.make(backend, case).rollout(case.states, case.controls, case.values)
-        models = [case.space.apply(v) for v in case.values.numpy()]
-        theirs = [
-            [settled_rollout(m, s, u, case.frame_skip) for m in models]
-            for s, u in zip(case.states.numpy(), case.controls.numpy(), strict=True)
-        ]
-        assert ours.dtype == torch.float64
-        assert ours.shape == (len(case.states), len(case.values), 3, case.space.model.nq + case.space.model.nv)
-        self.same(backend, ours, np.array(theirs))
-        assert (ours[:, 0] != ours[:, 1]).any()
-
-    def test_simulate_is_the_last_of_a_rollout(self, backend, case):
-        simulator = self.make(backend, case)
-        every = simulator.rollout(case.states, case.controls, case.values)
-        torch.testing.assert_close(
-            simulator.simulate(case.states, case.controls, case.values), every[:, :, -1], rtol=0, atol=0
-        )
-        first = simulator.simulate(case.states, case.controls[:, :1], case.values)
-        torch.testing.assert_close(first, every[:, :, 0], rtol=0, atol=0)
-
-    def test_threads_and_chunks_do_not_change_a_result(self, backend, case):
-        expected = self.make(backend, case).simulate(case.states, case.controls, case.values)
-        for options in backend.options:
-            ours = self.make(backend, case, **options).simulate(case.states, case.controls, case.values)
-            torch.testing.assert_close(ours, expected, rtol=0, atol=0, msg=str(options))
-
-    def test_nothing_is_left_of_what_was_simulated_before(self, backend, case):
-        simulator = self.make(backend, case)
-        expected = self.make(backend, case).simulate(case.states, case.controls, case.values)
-        simulator.simulate(case.states.flip(0), case.controls, case.values[:1])
-        simulator.simulate(case.states[:1], case.controls[:1, :1], torch.cat([case.values] * 3))
-        simulator.rollout(torch.full_like(case.states, 1e7), case.controls, case.values)
-        simulator.simulate(case.states[:2], case.controls[:2], torch.full_like(case.values, torch.nan))
-        for _ in range(2):
-            again = simulator.simulate(case.states, case.controls, case.values)
-            torch.testing.assert_close(again, expected, rtol=0, atol=0)
-
-    def test_the_order_of_transitions_and_values_does_not_matter(self, backend, case):
-        simulator = self.make(backend, case)
-        expected = simulator.simulate(case.states, case.controls, case.values)
-        rows, columns = torch.randperm(len(case.states)), torch.tensor([2, 0, 3, 1])
-        ours = simulator.simulate(case.states[rows], case.controls[rows], case.values[columns])
-        torch.testing.assert_close(ours, expected[rows][:, columns], rtol=0, atol=0)
-        alone = simulator.simulate(case.states[3:4], case.controls[3:4], case.values[1:2])
-        torch.testing.assert_close(alone[0, 0], expected[3, 1], rtol=0, atol=0)
-
-    def test_a_result_belongs_to_the_caller_and_every_entry_is_written(self, backend, case, monkeypatch):
-        simulator = self.make(backend, case)
-        expected = simulator.simulate(case.states, case.controls, case.values).clone()
-        simulator.simulate(case.states, case.controls, case.values).fill_(1e3)
-        given = [x.clone() for x in (case.states, case.controls, case.values)]
-        monkeypatch.setattr(np, "empty", lambda shape, *a, **k: np.full(shape, 1e99, *a, **k))
-        torch.testing.assert_close(simulator.simulate(*given), expected, rtol=0, atol=0)
-        for mine, theirs in zip(given, (case.states, case.controls, case.values), strict=True):
-            assert torch.equal(mine, theirs)
-
-    def test_empty_batches_give_empty_results(self, backend, case):
-        simulator = self.make(backend, case)
-        width = simulator.num_states
-        assert simulator.simulate(case.states[:0], case.controls[:0], case.values).shape == (0, 4, width)
-        assert simulator.simulate(case.states, case.controls, case.values[:0]).shape == (len(case.states), 0, width)
-
-    def test_a_value_that_diverges_is_nan_and_takes_no_other_with_it(self, backend, tmp_path, monkeypatch, capfd):
-        monkeypatch.chdir(tmp_path)
-        model = mujoco.MjModel.from_xml_path(str(HOPPER))
-        space = ParameterSpace(model, {"damping": {"field": "dof_damping", "name": "leg_joint", "bounds": [0.1, 5]}})
-        simulator = backend.make(space, 4)
-        states, controls = hopper_states(model, 5), random_controls(model, 5, 12)
-        good = simulator.rollout(states, controls, torch.tensor([[1.0], [2.0]], dtype=torch.float64))
-        ours = simulator.rollout(states, controls, torch.tensor([[1.0], [-1e7], [2.0], [-1e3]], dtype=torch.float64))
-        assert torch.isnan(ours[:, [1, 3]]).all()  # at once, and in the course of the window
-        torch.testing.assert_close(ours[:, [0, 2]], good, rtol=0, atol=0)
-        assert os.listdir(tmp_path) == []
-        captured = capfd.readouterr()
-        assert captured.out + captured.err == ""
-
-    def test_a_state_that_diverges_is_nan_and_takes_no_other_with_it(self, backend, tmp_path, monkeypatch):
-        monkeypatch.chdir(tmp_path)
-        case = hopper_case()
-        simulator = self.make(backend, case)
-        good = simulator.simulate(case.states, case.controls, case.values)
-        states = case.states.clone()
-        states[3, -3:] = 1e9
-        states[5, 2] = torch.nan
-        ours = simulator.simulate(states, case.controls, case.values)
-        assert torch.isnan(ours[[3, 5]]).all()
-        rest = [i for i in range(len(states)) if i not in (3, 5)]
-        torch.testing.assert_close(ours[rest], good[rest], rtol=0, atol=0)
-        assert os.listdir(tmp_path) == []
-
-    def test_shapes_that_do_not_fit_are_named(self, backend):
-        case = hopper_case()
-        simulator = self.make(backend, case)
-        for arguments, message in (
-            ((case.states[:, 1:], case.controls, case.values), r"states: shape \(12, 11\) given.*12 columns"),
-            (
-                (case.states, case.controls[:, 0], case.values),
-                r"controls: shape \(12, 3\) given; expected \(T, lag, nu\)",
-            ),
-            ((case.states, case.controls, case.values[0]), r"values: shape \(4,\) given"),
-            ((case.states[:5], case.controls, case.values), "controls: 12 rows given for 5 states"),
-            ((case.states, case.controls[:, :0], case.values), "no logged step given"),
-        ):
-            with pytest.raises(InputError, match=message):
-                simulator.simulate(*arguments)
-
-    def test_the_timestep_is_that_of_a_logged_transition(self, backend, case):
-        simulator = self.make(backend, case)
-        assert simulator.timestep == pytest.approx(case.frame_skip * case.space.model.opt.timestep)
-        assert (simulator.num_states, simulator.num_controls) == (case.states.shape[1], case.controls.shape[2])
+@pytest.mark.parametrize("backend", BACKENDS.values(), ids=BACKENDS.keys())
+def test_what_diverges_says_nothing_and_writes_no_file(backend: Backend, tmp_path, monkeypatch, capfd) -> None:
+    monkeypatch.chdir(tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(HOPPER))
+    space = ParameterSpace(model, {"damping": {"field": "dof_damping", "name": "leg_joint", "bounds": [0.1, 5]}})
+    simulator = backend.make(space, 4)
+    states, controls = hopper_states(model, 5), random_controls(model, 5, 12)
+    values = torch.tensor([[1.0], [2.0]], dtype=torch.float64)
+    wild = torch.tensor([[-1e7], [-1e3]], dtype=torch.float64)  # at once, and in the course of the window
+    check_simulator(simulator, states, controls, values, diverging=wild, tolerance=Tolerance(gradient=1.0, most=np.inf))
+    states[3, -3:] = 1e9
+    assert torch.isnan(simulator.simulate(states, controls, values)[3]).all()
+    assert os.listdir(tmp_path) == []
+    captured = capfd.readouterr()
+    assert captured.out + captured.err == ""
 
 
 def test_the_given_model_is_left_alone():

@@ -17,28 +17,9 @@ import torch
 
 from dropo_torch.parameters import ParameterSpace, object_names
 from dropo_torch.simulators.warp import WarpSimulator
+from dropo_torch.testing import Tolerance, check_simulator, converged, mujoco_reference
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
-POISON = 1e300
-
-
-def reference(space: ParameterSpace, states: np.ndarray, controls: np.ndarray, values: np.ndarray, skip: int):
-    """States after the transitions ``(T, n)`` of states ``(T, n)``, controls ``(T, lag, nu)`` under one vector."""
-    model = space.apply(values)
-    model.opt.tolerance, model.opt.ls_tolerance = 0.0, 1e-12
-    model.opt.iterations, model.opt.ls_iterations = 200, 200
-    data = mujoco.MjData(model)
-    out = np.full(states.shape, POISON)
-    for i in range(len(states)):
-        mujoco.mj_resetData(model, data)
-        data.qpos[:], data.qvel[:] = states[i, : model.nq], states[i, model.nq :]
-        for control in controls[i]:
-            data.ctrl[:] = control
-            for _ in range(skip):
-                mujoco.mj_step(model, data)
-        out[i] = np.r_[data.qpos, data.qvel]
-    assert not np.any(out == POISON)
-    return out
 
 
 def rollouts(
@@ -72,50 +53,6 @@ def rollouts(
 
 
 @dataclass(frozen=True)
-class Gradients:
-    """Gradients of random functions of the end states, per transition: ``(T, ...)`` each."""
-
-    values: np.ndarray
-    states: np.ndarray
-    controls: np.ndarray
-
-
-def of_warp(simulator: WarpSimulator, states, controls, values, weights) -> Gradients:
-    rows = []
-    for s, u, w in zip(states, controls, weights, strict=True):
-        leaves = [torch.tensor(x[None], requires_grad=True) for x in (s, u, values)]
-        (simulator.simulate(*leaves) * torch.tensor(w)).sum().backward()
-        rows.append([leaf.grad[0].numpy() for leaf in leaves])
-    return Gradients(*(np.array([r[i] for r in rows]) for i in (2, 0, 1)))
-
-
-def of_reference(space: ParameterSpace, states, controls, values, weights, skip: int, eps: float) -> Gradients:
-    def slope(at) -> np.ndarray:
-        plus, minus = (reference(space, *at(sign), skip) for sign in (1, -1))
-        return ((plus - minus) * weights).sum(1)
-
-    def unit(array: np.ndarray, j: int, size: float) -> np.ndarray:
-        out = np.zeros_like(array)
-        out[..., j] = size
-        return out
-
-    columns = []
-    for j in range(len(values)):
-        size = eps * (abs(values[j]) or 0.1)
-        columns.append(slope(lambda g, j=j, z=size: (states, controls, values + g * unit(values, j, z))) / (2 * size))
-    wrt_values = np.stack(columns, 1) if columns else np.zeros((len(states), 0))
-    wrt_states = [
-        slope(lambda g, j=j: (states + g * unit(states, j, eps), controls, values)) for j in range(states.shape[1])
-    ]
-    wrt_controls = [
-        slope(lambda g, j=j: (states, controls + g * unit(controls, j, eps), values)) for j in range(controls.shape[2])
-    ]
-    shape = (len(states), 1, controls.shape[2])
-    controls_bar = np.stack(wrt_controls, 1).reshape(shape) if wrt_controls else np.zeros(shape)
-    return Gradients(wrt_values, np.stack(wrt_states, 1) / (2 * eps), controls_bar / (2 * eps))
-
-
-@dataclass(frozen=True)
 class Case:
     """A system, what varies, and how closely it must agree."""
 
@@ -130,7 +67,6 @@ class Case:
     push: float = 1.0
     length: int = 25
     seed: int = 0
-    floor: float = 1e-6
     idle: tuple[str, ...] = ()  # parameters without effect on this motion
 
     def model(self) -> mujoco.MjModel:
@@ -139,36 +75,21 @@ class Case:
         return mujoco.MjModel.from_xml_string(self.xml)
 
 
-def check(case: Case, count: int = 12, eps: float = 1e-5) -> None:
+def check(case: Case, count: int = 12) -> None:
     model = case.model()
     space = ParameterSpace(model, case.parameters)
     states, controls = rollouts(model, count, spread=case.spread, push=case.push, length=case.length, seed=case.seed)
     simulator = WarpSimulator(model, parameters=space, frame_skip=case.skip, num_threads=1)
-    values = space.nominal
-    got = simulator.simulate(*(torch.tensor(x) for x in (states, controls, values[None])))[:, 0].numpy()
-    want = reference(space, states, controls, values, case.skip)
-    error = np.abs(got - want).max(1)
-    assert np.quantile(error, 0.9) < case.states, f"states {error}"
-    assert error.max() < 1e3 * case.states, f"states {error}"
-    weights = np.random.default_rng(1).normal(size=states.shape)
-    ours = of_warp(simulator, states, controls, values, weights)
-    theirs = of_reference(space, states, controls, values, weights, case.skip, eps)
-    for name in ("values", "states", "controls"):
-        a, b = getattr(ours, name), getattr(theirs, name)
-        if not a.size:
-            continue
-        scale = np.abs(b) + case.floor * (1 + np.abs(b).max(0))
-        relative = np.abs(a - b) / scale
-        labels = space.names if name == "values" else range(a.shape[-1])
-        report = dict(zip(labels, np.median(relative, 0).reshape(-1), strict=True))
-        assert np.median(relative) < case.median, f"{name}: {report}"
-        assert np.quantile(relative, 0.9) < case.most, f"{name}: {np.quantile(relative, 0.9)} {report}"
-        if name == "values":
-            for column, label in enumerate(space.names):
-                assert np.median(relative[:, column]) < 30 * case.median, f"{label}: {report}"
-                assert label in case.idle or np.abs(b[:, column]).max() > 0, (
-                    f"{label} has no effect in the reference: a test of nothing"
-                )
+    report = check_simulator(
+        simulator,
+        torch.from_numpy(states),
+        torch.from_numpy(controls),
+        torch.from_numpy(space.nominal[None]),
+        reference=mujoco_reference(converged(space), case.skip),
+        tolerance=Tolerance(states=case.states, worst=1e3 * case.states, gradient=case.median, most=case.most),
+        idle=case.idle,
+    )
+    assert "gradients are those of central differences" in report.checked
 
 
 def gym_parameters(file: str) -> dict:

@@ -98,7 +98,7 @@ class LaplaceOptimizer(Optimizer):
     def _posterior(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard errors ``(d,)`` and correlations ``(d, d)``."""
         d = len(self._space)
-        if self._means.hessian.shape != (d, d):  # nothing has been simulated yet, or nothing survived
+        if not self._means.hessian.any():  # nothing has been simulated yet, or nothing survived
             return self._box.width.copy(), np.eye(d)
         width = np.outer(self._box.width, self._box.width)
         scale = self._means.reduced_chi2

@@ -91,6 +91,9 @@ class CorrelatedOptimizer(FisherOptimizer):
             super().tell(sums, gradient)
             return
         gram, force = (torch.cat(parts) for parts in zip(*self._gathered, strict=True))
+        if not len(gram):  # every simulation diverges here
+            self._center, self._rounds = self._at, _ROUNDS
+            return
         scale = torch.from_numpy(self._box.width)  # parameters of very different size, as shares of their boxes
         start = self._covariance if self._covariance is not None else self._first_guess()
         found, shift = random_effects(
