@@ -84,7 +84,7 @@ def _dispatch(given: list[str]) -> None:
             _silence()
 
     with claimed(parsed.out):
-        parsed.run(parsed, parse_overrides(rest), Output())
+        parsed.run(parsed, parse_overrides(rest), Output(highlight=False))
 
 
 def _parser(called: str) -> argparse.ArgumentParser:
