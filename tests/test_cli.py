@@ -20,6 +20,7 @@ import yaml
 from arm import ADAPTER, CONFIG, PARAMETERS, XML, Folder, record
 
 from dropo_torch.commands.cli import COMMANDS, main
+from dropo_torch.commands.folder import claimed
 from dropo_torch.config import KEYS
 
 RESULTS = {"fit.json", "report.html", "distribution.yaml", "fitted_config.yaml", "model.xml", "checkpoint.pkl"}
@@ -315,6 +316,15 @@ def test_two_runs_do_not_share_a_folder(folder: Folder, refused: Callable[..., s
     assert {p.name for p in out.iterdir()} == RESULTS | {"previous-1"}
 
 
+def test_a_folder_that_cannot_be_locked_is_left_to_whoever_writes_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("filelock.lock_descriptor", lambda *_, **__: os.fstat(-1))  # as on NFS, a bad descriptor
+    with claimed(tmp_path / "new" / "one"):
+        assert (tmp_path / "new" / "one").is_dir()
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_a_refused_run_leaves_no_empty_folder(refused: Callable[..., str], tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     for out in ("there/new/one", "there"):
@@ -428,6 +438,11 @@ def test_every_key_of_the_config_is_in_the_help(capsys: pytest.CaptureFixture[st
         assert stop.value.code == 0
         text = capsys.readouterr().out
         assert all(f"--{key} " in text for key in KEYS)
+
+
+def test_the_version_is_told(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out.startswith("dropo_torch ")
 
 
 def test_without_a_command_there_is_help(capsys: pytest.CaptureFixture[str]) -> None:

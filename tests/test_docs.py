@@ -240,7 +240,7 @@ def test_command_parses(command: str) -> None:
     words = shlex.split(command)[1:]
     assert words[0] in cli.COMMANDS
     if len(words) > 1 or words[0] == "demo":  # otherwise it is named in passing
-        _, rest = cli._parser().parse_known_args(words)
+        _, rest = cli._parser(words[0]).parse_known_args(words)
         parse_overrides(rest)
 
 

@@ -38,6 +38,5 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     console.print(table)
     console.print(
         f"{found.transitions} transitions; next states differ from MuJoCo's by at most {found.state_error:.1e}",
-        highlight=False,
     )
     found.check()

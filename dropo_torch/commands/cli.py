@@ -7,7 +7,7 @@ and ``run(given, overrides, console)``: the arguments, the config's keys that we
 from __future__ import annotations
 
 import argparse
-import importlib
+import importlib.metadata
 import io
 import os
 import sys
@@ -65,15 +65,22 @@ def _silence() -> None:
 
 def _dispatch(given: list[str]) -> None:
     command = given[0] if given else ""
-    if command.startswith("-") and command not in ("-h", "--help", "--version"):
-        raise InputError(f"{command} stands before a command; expected {'|'.join(COMMANDS)} first")
-    if command and not command.startswith("-") and command not in COMMANDS:
+    if command not in (*COMMANDS, "", "-h", "--help", "--version"):
+        if command.startswith("-"):
+            raise InputError(f"{command} stands before a command; expected {'|'.join(COMMANDS)} first")
         raise InputError(f"unknown command {command!r}" + choices(command, COMMANDS))
     parser = _parser(command)
     parsed, rest = parser.parse_known_args(given)
-    if parsed.command is None:
+    if parsed.version:
+        print(f"dropo_torch {importlib.metadata.version('dropo_torch')}")
+    elif parsed.command is None:
         parser.print_help()
-        return
+    else:
+        _run(parsed, rest)
+
+
+def _run(parsed: argparse.Namespace, rest: list[str]) -> None:
+    """Run the command that was given; ``rest`` are overrides of its config."""
     from rich.console import Console
 
     from dropo_torch.commands.folder import claimed
@@ -84,7 +91,7 @@ def _dispatch(given: list[str]) -> None:
             _silence()
 
     with claimed(parsed.out):
-        parsed.run(parsed, parse_overrides(rest), Output())
+        parsed.run(parsed, parse_overrides(rest), Output(highlight=False))
 
 
 def _parser(called: str) -> argparse.ArgumentParser:
@@ -94,7 +101,7 @@ def _parser(called: str) -> argparse.ArgumentParser:
         description="Fit a distribution over a simulator's parameters to a log of the real robot.",
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+    parser.add_argument("--version", action="store_true", help="show the version and exit")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     for name, (module, summary) in COMMANDS.items():
         command = commands.add_parser(
@@ -106,14 +113,6 @@ def _parser(called: str) -> argparse.ArgumentParser:
             verb.add_arguments(command)
             command.set_defaults(run=verb.run)
     return parser
-
-
-class _Version(argparse.Action):
-    def __call__(self, parser: argparse.ArgumentParser, *_: object) -> None:
-        from importlib.metadata import version
-
-        print(f"dropo_torch {version('dropo_torch')}")
-        parser.exit()
 
 
 if __name__ == "__main__":

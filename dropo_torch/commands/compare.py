@@ -50,7 +50,6 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         console.print(
             f"{run.method}, seed {run.seed}: log-likelihood {run.log_likelihood:.1f}, "
             f"{run.simulated_transitions} simulated transitions, {run.seconds:.1f} s",
-            highlight=False,
         )
 
     truth = bundled_sim(config.sim).truth if config.sim and config.data is None else {}

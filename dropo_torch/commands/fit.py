@@ -135,7 +135,6 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
         f"{len(problem.objective)} windows, {result.simulated_transitions} simulated transitions, "
         f"{result.seconds:.1f} s; stopped because {result.stop_reason}",
         soft_wrap=True,
-        highlight=False,
     )
     if result.diverged:
         share = 100 * result.diverged / (len(problem.objective) * result.samples)
@@ -145,4 +144,4 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
 
 def show_report(out: Path, console: Console) -> None:
     """Print where the report is."""
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True, highlight=False, markup=False)
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True, markup=False)

@@ -104,10 +104,10 @@ def _show(result: Training, out: Path, console: Console) -> None:
         f"{result.steps} steps, {result.episodes} episodes, {result.seconds:.1f} s, {result.steps / busy:.0f} steps a "
         f"second ({100 * result.simulating / busy:.0f} % of it simulating)"
         + (f"; {result.diverged} simulations diverged" if result.diverged else ""),
-        soft_wrap=True, highlight=False,
+        soft_wrap=True,
     )  # fmt: skip
     for path in (out / "policy.pt", out / "report.html"):
-        console.print(f"{path.stem}: {path}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"{path.stem}: {path}", soft_wrap=True, markup=False)
 
 
 class _Curves:

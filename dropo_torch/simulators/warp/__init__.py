@@ -1,6 +1,6 @@
 """MuJoCo's physics as NVIDIA Warp kernels, differentiable in states, controls and model parameters.
 
-:class:`~dropo_torch.simulators.warp.simulator.WarpSimulator` is the backend; importing it needs ``warp-lang``.
+:class:`~dropo_torch.simulators.warp.simulator.WarpSimulator` is the backend; importing it needs the extra ``warp``.
 
 Where things stand: ``support`` decides what is simulated, ``tables`` and ``fields`` turn a model and parameter
 vectors into arrays, ``kinematics``, ``forces``, ``fluid``, ``rows``, ``collide``, ``contact``, ``cone`` and ``solver``
