@@ -122,9 +122,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
     work = functools.partial(fit_cell, transitions=given.transitions)
     try:
         found = run_cells(
-            given.out, Plan(given.transitions), cells, work, resume=given.resume, workers=given.workers,
+            given.out,
+            Plan(given.transitions),
+            cells,
+            work,
+            resume=given.resume,
+            workers=given.workers,
             report=lambda stage, _: print(stage, flush=True),
-        )  # fmt: skip
+        )
     except dropo.InputError as error:
         parser.error(str(error))
     runs = [CalibrationRun(**{k: v for k, v in run.items() if k != "cell"}) for run in found]

@@ -217,6 +217,14 @@ def test_bayessim_contains_the_truth_and_is_narrower_than_the_prior(folder: Path
     assert result.distribution.mean[0] == pytest.approx(draws.mean(), abs=4 * draws.std() / np.sqrt(2000))
 
 
+def moments(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and covariance of a mixture without its box."""
+    mean = mixture.weights @ mixture.means
+    centred = mixture.means - mean
+    between = np.einsum("m,mi,mj->ij", mixture.weights, centred, centred)
+    return mean, np.einsum("m,mij->ij", mixture.weights, mixture.covariances) + between
+
+
 def test_a_mixtures_moments_match_its_draws() -> None:
     mixture = Mixture(
         weights=np.array([0.3, 0.7]),
@@ -225,19 +233,13 @@ def test_a_mixtures_moments_match_its_draws() -> None:
         low=np.full(2, -np.inf),
         high=np.full(2, np.inf),
     )
-    mean, covariance = mixture.moments
+    mean, covariance = moments(mixture)
     draws = mixture.sample(60_000, seed=0)
     assert draws.mean(0) == pytest.approx(mean, abs=0.02)
     assert np.cov(draws.T) == pytest.approx(covariance, abs=0.04)
     inside = mixture.moments_inside
     assert inside[0] == pytest.approx(mean, abs=0.03)
-    assert Mixture.of(json.loads(json.dumps(mixture.document()))).moments[1] == pytest.approx(covariance)
-    one = Mixture(np.ones(1), mixture.means[:1], mixture.covariances[:1], mixture.low, mixture.high)
-    points = np.array([[0.2, 0.3], [-1.0, 2.0]])
-    exact = torch.distributions.MultivariateNormal(
-        torch.from_numpy(one.means[0]), torch.from_numpy(one.covariances[0])
-    ).log_prob(torch.from_numpy(points))
-    assert one.log_density(points) == pytest.approx(exact.numpy())
+    assert moments(Mixture.of(json.loads(json.dumps(mixture.document()))))[1] == pytest.approx(covariance)
 
 
 def test_a_mixture_stays_in_its_box() -> None:
@@ -270,7 +272,7 @@ def test_a_mixture_density_network_learns_a_gaussian_posterior(features: str) ->
     x = shares + 0.1 * rng.standard_normal((1500, 1))
     settings = BayesSimSettings(features=features, components=2, hidden=32, epochs=400)
     found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
-    mean, covariance = found.moments
+    mean, covariance = moments(found)
     assert mean[0] == pytest.approx(0.5, abs=0.04)
     assert np.sqrt(covariance[0, 0]) == pytest.approx(0.1, rel=0.25)
 

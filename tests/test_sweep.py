@@ -97,7 +97,9 @@ def test_an_interrupted_sweep_repeats_no_finished_fit(tmp_path: Path) -> None:
     assert resumed == whole
 
 
-@pytest.mark.parametrize("content", ["", "{", "[]", '{"points": 3}', '{"fingerprint": "f", "points": [{"x": 1}]}'])
+@pytest.mark.parametrize(
+    "content", ["", "{", "[]", '{"results": 3}', '{"fingerprint": "f", "results": {"1e-08": {"x": 1}}}']
+)
 def test_a_damaged_record_is_refused(content: str, tmp_path: Path) -> None:
     (tmp_path / "store").write_text(content)
     with pytest.raises(InputError, match="cannot be read as the record of a sweep"):

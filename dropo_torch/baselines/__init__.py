@@ -52,10 +52,10 @@ def make_search(problem: Problem) -> Optimizer | None:
         return LaplaceOptimizer(objective)
     if isinstance(settings, SimOptSettings | BayesSimSettings):
         history = objective.transitions.history
+        relative = isinstance(settings, BayesSimSettings)
         replay = make_replay(
-            problem.trajectories, problem.observation, settings.horizon, history=history,
-            about_start=isinstance(settings, BayesSimSettings),
-        )  # fmt: skip
+            problem.trajectories, problem.observation, settings.horizon, history=history, about_start=relative
+        )
         if isinstance(settings, SimOptSettings):
             return SimOptOptimizer(space, replay, column_scales(objective), settings=settings, seed=seed)
         if replay.horizon < 2:

@@ -50,7 +50,7 @@ def summaries(sums: np.ndarray, columns: int, count: int) -> np.ndarray:
 class BayesSimOptimizer(Optimizer):
     """Simulation-based inference from a uniform prior over the search box.
 
-    The log is cut into windows of ``horizon`` steps, which are replayed *open loop* from their logged starts with the
+    The log is cut into windows of ``horizon`` steps, which are replayed *open loop* from their logged states with the
     logged actions, under parameter vectors of the prior. A replay is summarised by mean and variance of the columns'
     changes per step and their correlation with the controls, over all windows together. A network learns the
     parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
@@ -141,7 +141,7 @@ class BayesSimOptimizer(Optimizer):
         return Progress("BayesSim", float("nan"), min(1.0, len(self._sums) * _BATCH / self._settings.simulations))
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return mean and deviations of the posterior, before it is known the prior's."""
+        """Return mean and standard deviations of the posterior, before it is known the prior's."""
         if self._mixture is None:
             return [(self._box.middle, self._box.width / np.sqrt(12))]
         mean, covariance = self._mixture.moments_inside
@@ -155,7 +155,7 @@ class BayesSimOptimizer(Optimizer):
         spread = np.where(spread > 0, spread, 1.0)  # nothing correlates with what is pressed to the box's side
         correlation = covariance / np.outer(spread, spread)
         np.fill_diagonal(correlation, 1.0)
-        # draws end two σ from the mean: so wide that theirs have the posterior's deviation
+        # draws end two σ from the mean: so wide that theirs have the posterior's standard deviation
         return [Distribution.over(space, mean, std / DRAWN_STD, correlation=correlation)]
 
     def extras(self) -> dict[str, Any]:

@@ -37,9 +37,9 @@ _NEIGHBOURS = 5
 _FLAT, _ROWS_PER_DIRECTION = 1e-2, 5
 #: Interquartile range of a standard normal.
 _QUARTILES = 1.349
-#: Added to the precisions, as by the network itself: no component is wider than a hundred deviations of the prior.
+#: Added to the precisions, as by the network itself: no component is wider than a hundred σ of the prior.
 _PRECISION_FLOOR = 1e-4
-#: Deviation of a share that is uniform in [0, 1].
+#: Standard deviation of a share that is uniform in [0, 1].
 _UNIFORM = 12**-0.5
 
 
@@ -150,7 +150,7 @@ def unlikeness(inputs: np.ndarray, at: np.ndarray) -> float:
 
 
 def _standard(inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Median and robust deviation of each column, which a few wild simulations do not move, and which columns vary."""
+    """Median and robust σ of each column, which a few wild simulations do not move, and which columns vary."""
     center = np.median(inputs, axis=0)
     quartiles = np.diff(np.quantile(inputs, [0.25, 0.75], axis=0), axis=0)[0] / _QUARTILES
     scale = np.where(quartiles > 0, quartiles, inputs.std(0))

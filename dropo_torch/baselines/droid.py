@@ -28,7 +28,7 @@ def squared_errors(features: torch.Tensor, measured: torch.Tensor, covariance: t
 class DroidOptimizer(Optimizer):
     """CMA-ES over parameter vectors, scaled to [0, 4], first step 1, start in the middle.
 
-    Each logged transition (window of λ steps) is replayed from its logged start; the error is the squared L2 distance
+    Each logged transition (window of λ steps) is replayed from its logged state; the error is the squared L2 distance
     in the compared columns, summed. The distribution is the search's normal after the last generation: it says
     how far the search had contracted when it stopped, and nothing about the log.
 
@@ -96,7 +96,7 @@ class DroidOptimizer(Optimizer):
         return Progress("DROID", float("nan"), min(1.0, self._search.countevals / self._settings.budget))
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return mean and deviations of the search distribution."""
+        """Return mean and standard deviations of the search distribution."""
         d, scale = len(self._space), self._box.width / SearchBox.WIDTH
         mean = self._coordinates(np.asarray(self._search.result.xfavorite)[None])[0]
         std = np.asarray(self._search.result.stds)[:d] * scale

@@ -1,4 +1,4 @@
-"""The Laplace posterior of the point estimate: how well the log pins down *one* vector of parameters."""
+"""The Laplace posterior of the point estimate: how well the log identifies *one* vector of parameters."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from dropo_torch.parameters import ParameterSpace
 class LaplaceOptimizer(Optimizer):
     """Gauss-Newton on the means, and the normal of the likelihood's curvature there.
 
-    The transitions of the log are simulated one by one from their logged starts, as for DROPO. The covariance is
+    The transitions of the log are simulated one by one from their logged states, as for DROPO. The covariance is
     s² (ΣJᵀC⁻¹J)⁻¹ with C of ε and the noise, and s² the reduced χ² of the residuals: ε only weighs the columns, the
-    size of the residuals is the log's own. A normal of the box's width is its prior, for what the log does not tell. It
-    says how uncertain a fixed vector is, not how much parameters vary.
+    size of the residuals is the log's own. A normal of the box's width is its prior, for what the log does not
+    identify. It says how uncertain a fixed vector is, not how much parameters vary.
 
     Args:
         objective: gives the reduction and the size of the log; it is not evaluated here.
@@ -50,7 +50,7 @@ class LaplaceOptimizer(Optimizer):
         )
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
-        """Hand the sums to the means; start anew around noise propagated at them until they rest."""
+        """Hand the sums to the means; start anew around noise propagated at them until convergence."""
         self._means.tell(sums)
         before = self._linearised
         if self._means.reason is None or before is None or self._round >= NOISY_ROUNDS:
@@ -102,6 +102,6 @@ class LaplaceOptimizer(Optimizer):
             return self._box.width.copy(), np.eye(d)
         width = np.outer(self._box.width, self._box.width)
         scale = self._means.reduced_chi2
-        shared = self._means.hessian * width + scale * np.eye(d)  # in widths, where the prior has the deviation 1
+        shared = self._means.hessian * width + scale * np.eye(d)  # in widths: the prior has σ = 1
         error, correlation = estimates(shared)
         return np.sqrt(scale) * error * self._box.width, correlation

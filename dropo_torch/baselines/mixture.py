@@ -72,17 +72,6 @@ class Mixture:
     def _inside(self, draws: np.ndarray) -> np.ndarray:
         return np.all((draws >= self.low) & (draws <= self.high), axis=1)
 
-    def log_density(self, points: np.ndarray) -> np.ndarray:
-        """Return the log-density of the mixture without its box at points ``(n, d)``, ``(n,)``."""
-        d = self.means.shape[1]
-        parts = []
-        for weight, mean, covariance in zip(self.weights, self.means, self.covariances, strict=True):
-            root = np.linalg.cholesky(covariance)
-            white = np.linalg.solve(root, (points - mean).T)
-            log_det = np.log(np.diag(root)).sum()
-            parts.append(np.log(weight + 1e-300) - 0.5 * (white**2).sum(0) - log_det - 0.5 * d * np.log(2 * np.pi))
-        return np.asarray(np.logaddexp.reduce(parts, axis=0))
-
     def marginal_density(self, index: int, points: np.ndarray) -> np.ndarray:
         """Return the density of one coordinate, without its box, at points ``(n,)``, ``(n,)``."""
         std = np.sqrt(self.covariances[:, index, index])
@@ -96,14 +85,6 @@ class Mixture:
         found, about = scipy.signal.find_peaks(density, prominence=0)
         clear = (about["prominences"] >= 0.5 * density[found]) & (density[found] > 0.1 * density.max())
         return np.asarray(points[found[clear] - 1])
-
-    @property
-    def moments(self) -> tuple[np.ndarray, np.ndarray]:
-        """Mean ``(d,)`` and covariance ``(d, d)`` of the mixture without its box, exact."""
-        mean = self.weights @ self.means
-        centred = self.means - mean
-        between = np.einsum("m,mi,mj->ij", self.weights, centred, centred)
-        return mean, np.einsum("m,mij->ij", self.weights, self.covariances) + between
 
     @property
     def moments_inside(self) -> tuple[np.ndarray, np.ndarray]:

@@ -60,11 +60,11 @@ def reps_weights(costs: np.ndarray, kl: float) -> np.ndarray:
 class SimOptOptimizer(Optimizer):
     """Moves a normal with full covariance, in coordinates, towards replays that look like the log.
 
-    The log is cut into windows of ``horizon`` steps. Each is replayed *open loop* from its logged start with its
+    The log is cut into windows of ``horizon`` steps. Each is replayed *open loop* from its logged state with its
     logged actions, so errors add up along it. The discrepancy is the sum of the L1 and squared L2 errors over all
-    steps, in columns scaled by their deviation over the log. (SimOpt also filters the error in time, for robots whose
-    clock drifts against the simulation's; a log and its replay share theirs.) The first distribution is the search
-    box's middle with a quarter of its width. Each iteration fits the normal to its samples, weighted by
+    steps, in columns scaled by their standard deviation over the log. (SimOpt also filters the error in time, for
+    robots whose clock drifts against the simulation's; a log and its replay share theirs.) The first distribution is
+    the search box's middle with a quarter of its width. Each iteration fits the normal to its samples, weighted by
     :func:`reps_weights`.
 
     Args:
@@ -124,7 +124,7 @@ class SimOptOptimizer(Optimizer):
     def stop_reason(self) -> str | None:
         """Iterations spent, or nothing left to shrink."""
         if self._iteration and (np.sqrt(np.diag(self._covariance)) < self._settings.tolerance).all():
-            return f"every deviation is below {self._settings.tolerance:g} of the search width"
+            return f"every standard deviation is below {self._settings.tolerance:g} of the search width"
         if self._iteration >= self._settings.iterations:
             return f"{self._settings.iterations} iterations of relative-entropy policy search"
         return None
@@ -135,7 +135,7 @@ class SimOptOptimizer(Optimizer):
         return Progress("SimOpt", float("nan"), self._iteration / self._settings.iterations)
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return mean and deviations of the current distribution."""
+        """Return mean and standard deviations of the current distribution."""
         mean = np.clip(self._box.low + self._mean * self._box.width, self._box.low, self._box.high)
         return [(mean, np.maximum(np.sqrt(np.diag(self._covariance)) * self._box.width, self._box.min_std))]
 
@@ -144,7 +144,7 @@ class SimOptOptimizer(Optimizer):
         mean, std = self.candidates()[0]
         spread = np.sqrt(np.diag(self._covariance))
         correlation = self._covariance / np.outer(spread, spread)
-        # draws end two σ from the mean: so wide that theirs have the search's deviation
+        # draws end two σ from the mean: so wide that theirs have the search's standard deviation
         return [Distribution.over(space, mean, std / DRAWN_STD, correlation=correlation)]
 
     def extras(self) -> dict[str, Any]:
@@ -174,6 +174,6 @@ class SimOptOptimizer(Optimizer):
 
 
 def column_scales(objective: Objective) -> torch.Tensor:
-    """Return the deviation of each compared column over the log, 1 where it never moves, ``(m,)``."""
-    deviation = objective.measured.std(0, unbiased=False)
-    return torch.where(deviation > 1e-12, deviation, torch.ones_like(deviation))
+    """Return the standard deviation of each compared column over the log, 1 where it never moves, ``(m,)``."""
+    std = objective.measured.std(0, unbiased=False)
+    return torch.where(std > 1e-12, std, torch.ones_like(std))

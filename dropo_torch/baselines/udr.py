@@ -53,7 +53,7 @@ class UdrOptimizer(Optimizer):
         return Progress("drawing boxes", float("nan"), 1.0)
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return mean and deviation of the chosen box."""
+        """Return mean and standard deviation of the chosen box."""
         low, high = self._ends[self._chosen]
         return [(0.5 * (low + high), (high - low) / np.sqrt(12))]
 

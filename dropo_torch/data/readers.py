@@ -113,19 +113,8 @@ def read_trajectories(
     Raises:
         InputError: a file, name or value that cannot be used; its one line says which.
     """
-    options = ReadOptions(
-        observations=observations,
-        next_observations=next_observations,
-        actions=actions,
-        time=time,
-        episode=episode,
-        terminals=terminals,
-        dt=dt,
-        tolerance=tolerance,
-        group=group,
-        separator=separator,
-        preprocess=preprocess,
-    )
+    given = locals()
+    options = ReadOptions(**{field.name: given[field.name] for field in fields(ReadOptions)})
     return concatenate(_read(source, options, Path(base or ".")))
 
 

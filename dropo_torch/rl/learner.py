@@ -29,13 +29,15 @@ class Learner(ABC):
         settings: how it learns.
     """
 
-    #: Numbers that further learning depends on, beside :meth:`parts`.
+    #: Numbers that further learning depends on, beside the networks, optimizers and the like.
     counters: tuple[str, ...] = ("skipped", "in_a_row")
 
     def __init__(self, policy: Policy, num_parameters: int, settings: TrainSettings) -> None:
         self.policy = policy
         self._device = policy.low.device
         self._seen = Normalizer(num_parameters if settings.privileged_critic else 0).to(self._device)
+        #: What holds state, by name: each has ``state_dict`` and ``load_state_dict``.
+        self._parts: dict[str, Any] = {"policy": policy, "seen": self._seen}
         self.skipped = 0
         self.in_a_row = 0
 
@@ -54,24 +56,17 @@ class Learner(ABC):
     def update(self, rollout: TensorDict, share: float) -> dict[str, float]:
         """Learn from steps ``(N, horizon)``; ``share`` of the run is done. Return scalars to look at."""
 
-    @abstractmethod
-    def parts(self) -> dict[str, Any]:
-        """Return what holds state, by name: each has ``state_dict`` and ``load_state_dict``."""
-
     def state_dict(self) -> dict[str, Any]:
         """Return everything that further learning depends on."""
-        parts = {name: part.state_dict() for name, part in self._every_part().items()}
+        parts = {name: part.state_dict() for name, part in self._parts.items()}
         return {**parts, "counters": {name: getattr(self, name) for name in self.counters}}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that :meth:`state_dict` returned."""
-        for name, part in self._every_part().items():
+        for name, part in self._parts.items():
             part.load_state_dict(state[name])
         for name, count in state["counters"].items():
             setattr(self, name, count)
-
-    def _every_part(self) -> dict[str, Any]:
-        return {**self.parts(), "policy": self.policy, "seen": self._seen}
 
     def _actor(self, distribution: type) -> ProbabilisticActor:
         """The policy's network as the losses take it, with actions of the given distribution."""

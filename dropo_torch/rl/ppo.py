@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -61,6 +60,7 @@ class PPO(Learner):
             [*policy.actor.parameters(), *network.parameters()], lr=settings.learning_rate, eps=1e-5, fused=True
         )
         self._scale = ReturnScale(settings.num_envs, settings.gamma).to(self._device)
+        self._parts |= {"critic": self._critic, "optimizer": self._optimizer, "scale": self._scale}
 
     def act(
         self, observation: torch.Tensor, parameters: torch.Tensor
@@ -79,10 +79,6 @@ class PPO(Learner):
         self._take_in(rollout)
         std = float(self.policy.actor.log_std.detach().exp().mean())
         return {**scalars, "reward_scale": float(self._scale.factor), "std": std}
-
-    def parts(self) -> dict[str, Any]:
-        """Return what holds state beside the policy."""
-        return {"critic": self._critic, "optimizer": self._optimizer, "scale": self._scale}
 
     @torch.no_grad()
     def _prepared(self, rollout: TensorDict) -> TensorDict:

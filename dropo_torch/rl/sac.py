@@ -46,6 +46,7 @@ class SAC(Learner):
         self._targets = SoftUpdate(self._loss, tau=settings.tau)
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=settings.learning_rate, fused=True)
         self._memory = Memory(min(settings.buffer, max(settings.steps, 1)), settings.minibatch)
+        self._parts |= {"loss": self._loss, "optimizer": self._optimizer, "memory": self._memory}
         self.seen_steps = 0
         self.owed = 0.0
 
@@ -73,10 +74,6 @@ class SAC(Learner):
             losses = self._gradient().detach()
         entries = {"loss_policy": "loss_actor", "loss_critic": "loss_qvalue", "alpha": "alpha", "entropy": "entropy"}
         return {name: float(losses[key]) for name, key in entries.items()} if updates else {}
-
-    def parts(self) -> dict[str, Any]:
-        """Return what holds state beside the policy."""
-        return {"loss": self._loss, "optimizer": self._optimizer, "memory": self._memory}
 
     def _critic(self) -> TensorDictModule:
         network = ActionValue(

@@ -109,7 +109,7 @@ def compare(
     for method in methods:
         if method not in METHODS:
             raise InputError(f"methods: unknown {method!r}" + choices(method, METHODS))
-    kept = Store(store, fingerprint, "comparison")
+    kept: Store[dict[str, Any]] = Store(store, fingerprint, "comparison", dict)
 
     def run(method: str, seed: int) -> dict[str, Any]:
         optimizer, backend = method.split("-")

@@ -5,6 +5,7 @@ Or, where initial states are as noisy as the ends of transitions: raise the nois
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -210,12 +211,8 @@ def sweep_epsilon(
         InputError: fewer than three values, or one that is not positive.
     """
     values = rising(epsilons)
-    kept = Store(store, fingerprint + ("-noisy-starts" if noisy_starts else ""), "sweep")
-
-    def point(value: float) -> SweepPoint:
-        return SweepPoint(**kept.get(repr(value), lambda: asdict(point_at(value))))
-
-    points = tuple(map(point, values))
+    kept = Store(store, fingerprint + ("-noisy-starts" if noisy_starts else ""), "sweep", SweepPoint)
+    points = tuple(kept.get(repr(value), functools.partial(point_at, value)) for value in values)
     if noisy_starts:
         robust = [math.nan if p.robust_log_likelihood is None else p.robust_log_likelihood for p in points]
         chosen, reason = likeliest(values, robust)

@@ -130,7 +130,8 @@ def size_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
     rows = []
     groups = grouped(pick(results, "size"), lambda r: (r["cell"]["variant"], r["cell"]["size"]))
     for (variant, size), group in groups.items():
-        for parameter, truth in group[0]["truth"].items():
+        for parameter in group[0]["fit"]["parameters"]:
+            truth = group[0]["truth"][parameter]
             row: dict[str, Any] = {
                 "case": CASES[variant],
                 "transitions": size,
