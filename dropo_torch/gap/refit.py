@@ -211,4 +211,5 @@ def _move(here: _Point, limits: Limits, damping: float) -> np.ndarray:
         return np.zeros(0)
     flat, residual = ((x * here.factor[:, None]).reshape(*x.shape[:-2], -1) for x in (here.slope, here.residual))
     low, high = limits.moves(here.hypothesis.vector)
-    return np.clip(bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, RIDGE), -LONGEST, LONGEST)
+    step = bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, RIDGE, np.ones(len(flat)))
+    return np.clip(step, -LONGEST, LONGEST)

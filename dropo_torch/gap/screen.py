@@ -155,14 +155,14 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
 
 def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:
     """Least-squares move whose last entries, those of the candidate's own ``values``, stay within bounds."""
-    normal, force = columns @ columns.T, -(columns @ residual)
-    shared = len(force) - len(values)
-    free = np.ones(len(force), dtype=bool)
-    move = damped_step(normal, force, free, DAMPING, RIDGE)
+    normal, shared = columns @ columns.T, len(columns) - len(values)
+    diagonal = np.diag(normal)
+    damped = normal + np.diag(DAMPING * diagonal + RIDGE * diagonal.max(initial=1e-300))
+    move = np.linalg.solve(damped, -(columns @ residual))
     own = np.clip(move[shared:], *limits.moves(values))
     if not np.array_equal(own, move[shared:]):
-        free[shared:] = False
-        move = damped_step(normal, force - normal[:, shared:] @ own, free, DAMPING, RIDGE)
+        rest = residual + own @ columns[shared:]
+        move[:shared] = np.linalg.solve(damped[:shared, :shared], -(columns[:shared] @ rest))
         move[shared:] = own
     return move
 

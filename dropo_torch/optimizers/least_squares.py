@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import numpy as np
 
-#: Diagonal entries below this, relative to the largest, count as this: a column without influence stays solvable.
-FLOOR = 1e-14
+#: What a diagonal entry of 0 counts as, relative to the largest: a column without influence stays solvable.
+FLOOR = 1e-12
 
 
 def damped_step(
-    normal: np.ndarray, force: np.ndarray, free: np.ndarray, damping: float, ridge: float = 0.0
-) -> np.ndarray:
+    normal: np.ndarray, force: np.ndarray, free: np.ndarray, damping: float, ridge: float = 0.0,
+    units: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Solve (A + damping · diag A + ridge · max(diag A) · I) δ = force for the free entries; the others get 0.
 
     The damping is Marquardt's, for which the units of the entries do not matter; the ridge keeps entries without
-    influence beside the others where they are. The system is solved with its diagonal scaled to 1.
+    influence beside the others where they are.
 
     Args:
         normal: A = JᵀJ or another positive semidefinite matrix, ``(q, q)``.
@@ -22,21 +23,26 @@ def damped_step(
         free: which entries move, ``(q,)`` bool.
         damping: relative to each diagonal entry.
         ridge: relative to the largest one.
+        units: sizes in which the entries are solved for, ``(q,)``; by default those that scale the diagonal to 1.
     """
     step = np.zeros(len(force))
     if not free.any():
         return step
-    part, diagonal = normal[np.ix_(free, free)], np.diag(normal)
+    part = normal[np.ix_(free, free)]
+    diagonal = np.diag(part)
     largest = max(float(diagonal.max()), 1e-300)
-    scale = np.sqrt(np.maximum(diagonal[free], FLOOR * largest))
-    damped = part / np.outer(scale, scale) + np.diag(damping + ridge * largest / scale**2)
+    diagonal = np.where(diagonal > 0, diagonal, FLOOR * largest)
+    square = diagonal if units is None else 1 / units[free] ** 2
+    scale = np.sqrt(square)
+    damped = part / np.outer(scale, scale) + np.diag(damping * (diagonal / square) + ridge * (largest / square))
     step[free] = np.linalg.lstsq(damped, force[free] / scale, rcond=1e-14)[0] / scale
     return step
 
 
 def bounded_step(
-    normal: np.ndarray, force: np.ndarray, low: np.ndarray, high: np.ndarray, damping: float, ridge: float = 0.0
-) -> np.ndarray:
+    normal: np.ndarray, force: np.ndarray, low: np.ndarray, high: np.ndarray, damping: float, ridge: float = 0.0,
+    units: np.ndarray | None = None,
+) -> np.ndarray:  # fmt: skip
     """Return :func:`damped_step` with an active set: what would leave its bounds from a bound stays there.
 
     At a bound, entries whose force points out are held, and so are those that the step of all free entries together
@@ -44,12 +50,12 @@ def bounded_step(
     inside its bounds may step beyond them: the caller clips, and it is at the bound in the next iteration.
 
     Args:
-        normal, force, damping, ridge: of :func:`damped_step`.
+        normal, force, damping, ridge, units: of :func:`damped_step`.
         low, high: the smallest and the largest move within bounds, ``(q,)`` each; ``low <= 0 <= high``.
     """
     free = ~_leaves(force, low, high)
     while True:
-        step = damped_step(normal, force, free, damping, ridge)
+        step = damped_step(normal, force, free, damping, ridge, units)
         stuck = free & _leaves(step, low, high)
         if not stuck.any():
             return step
