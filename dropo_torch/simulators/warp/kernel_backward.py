@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 @wp.kernel(enable_backward=False)
 def adjoint_kernel(
     m: Tables, w: World, chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints, out_bar: Reals2,
-    state_bar: Reals2, control_bar: Reals2, theta_bar: Reals2,
+    theta_bar: Reals2, state_bar: Reals2, control_bar: Reals2,
 ):  # fmt: skip
     """Adjoints of initial state, controls and the θ ``columns`` of each world, from that of its output."""
     tid = wp.tid()
