@@ -34,6 +34,7 @@ from dropo_torch.simulators.warp.spatial import (
     cross_motion,
     inertia_mul,
     join,
+    lin,
     nothing,
     theta_vec3,
     wrench,
@@ -113,8 +114,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         contacts_adjoint(m, w, ncon)
     carry_in(m, w, posed)
     if softening == 0:
-        for i in range(3):
-            w.grad[w.t, m.o_gravity + i] -= w.f_accel[w.t, 0][3 + i]
+        add_vec3(w.grad, w.t, m.o_gravity, -lin(w.f_accel[w.t, 0]))
 
 
 @wp.func(inline=True)
@@ -144,18 +144,13 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
     """
     _late = wp.grad(nothing)(ONE)
     zero = vec6()
-    w.f_velocity[w.t, 0] = zero
-    w.f_accel[w.t, 0] = zero
-    w.f_dual[w.t, 0] = zero
-    if posed != 0:
-        for b in range(m.nb):
+    for b in range(m.nb):
+        w.f_velocity[w.t, b] = zero
+        w.f_accel[w.t, b] = zero
+        w.f_dual[w.t, b] = zero
+        if posed != 0:
             w.f_total[w.t, b] = zero
             w.f_pose[w.t, b] = zero
-    for b in range(1, m.nb):
-        if m.body_massive[b] == 0:
-            w.f_velocity[w.t, b] = zero
-            w.f_accel[w.t, b] = zero
-            w.f_dual[w.t, b] = zero
         if m.body_massive[b] != 0:
             i = w.inertia[w.t, b]
             dual = w.dual[w.t, b]
@@ -170,13 +165,11 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
                     a += g * gc
                     w.grad[w.t, m.o_gravcomp + b] += wp.dot(fa, g)
                     w.f_pose[w.t, b] = cross_force(g, fa) * -gc
-                    for k in range(3):
-                        w.grad[w.t, m.o_gravity + k] += gc * fa[3 + k]
+                    add_vec3(w.grad, w.t, m.o_gravity, lin(fa) * gc)
                 iv = inertia_mul(i, v)
                 w.f_velocity[w.t, b] = inertia_mul(i, lv) - cross_force(dual, iv)
                 w.f_dual[w.t, b] = inertia_mul(i, a) + cross_force(v, iv)
             else:
-                w.f_velocity[w.t, b] = zero
                 w.f_dual[w.t, b] = inertia_mul(i, a)
             w.f_accel[w.t, b] = fa
             if m.want_inertial != 0:
@@ -205,8 +198,7 @@ def _inertia_adjoint(m: Tables, w: World, b: int, x: vec6, y: vec6, z: vec6, v: 
         yw = frame * ang(y)
         zw = frame * ang(z)
         vw = frame * ang(v)
-        for k in range(3):
-            w.grad[w.t, m.o_inertia + 3 * b + k] += xw[k] * yw[k] + zw[k] * vw[k]
+        add_vec3(w.grad, w.t, m.o_inertia + 3 * b, wp.cw_mul(xw, yw) + wp.cw_mul(zw, vw))
 
 
 @wp.func(inline=True)

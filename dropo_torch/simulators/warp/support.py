@@ -58,13 +58,11 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
         | disable.mjDSBL_REFSAFE | disable.mjDSBL_SENSOR | disable.mjDSBL_MIDPHASE | disable.mjDSBL_EULERDAMP
         | disable.mjDSBL_AUTORESET | disable.mjDSBL_NATIVECCD | disable.mjDSBL_ISLAND | disable.mjDSBL_MULTICCD
     )  # fmt: skip
-    for bit in disable.__members__.values():
-        if opt.disableflags & int(bit) & ~int(harmless) and bit != disable.mjNDISABLE:
-            yield f"flag {bit.name[7:].lower()} disabled"
-    inert = int(enable.mjENBL_ENERGY) | int(enable.mjENBL_FWDINV)
-    for bit in enable.__members__.values():
-        if bit.name != "mjNENABLE" and opt.enableflags & int(bit) & ~inert:
-            yield f"flag {bit.name[7:].lower()} enabled"
+    inert = enable.mjENBL_ENERGY | enable.mjENBL_FWDINV
+    for kind, flags in ((disable, opt.disableflags & ~int(harmless)), (enable, opt.enableflags & ~int(inert))):
+        for bit in kind.__members__.values():
+            if flags & int(bit) and not bit.name.startswith("mjN"):
+                yield f"flag {bit.name[7:].lower()} {'disabled' if kind is disable else 'enabled'}"
     if opt.disableactuator:
         yield "option actuatorgroupdisable"
     if (opt.density or opt.viscosity) and opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
@@ -80,16 +78,11 @@ def _structure(model: mujoco.MjModel) -> Iterator[str]:
             yield f"{what} ({number})"
     if not (model.nu == model.nactuator == model.nout):
         yield "actuators with several controls or outputs"
-    for flag, what in (("flg_surfacevel", "surface velocity"), ("flg_adhesion", "adhesion")):
-        if getattr(model, flag, False):
-            yield f"geom {what}"
+    flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
+    yield from (f"geom {what}" for flag, what in flags.items() if getattr(model, flag, False))
     for i in range(model.ntendon):
-        acts = (
-            model.tendon_limited[i] or model.tendon_stiffness[i] or model.tendon_damping[i]
-            or model.tendon_frictionloss[i] or model.tendon_armature[i] or model.tendon_stiffnesspoly[i].any()
-            or model.tendon_dampingpoly[i].any()
-        )  # fmt: skip
-        if acts:
+        fields = ("limited", "stiffness", "damping", "frictionloss", "armature", "stiffnesspoly", "dampingpoly")
+        if any(np.any(getattr(model, f"tendon_{field}")[i]) for field in fields):
             yield f"tendon {model.tendon(i).name or i!r}"
     for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
         yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[g]!r}"

@@ -97,7 +97,7 @@ Tables: Any = _struct(
         **dict.fromkeys(_VECTORS, Vec3s),
         **dict.fromkeys(_ROTATIONS, Mats),
         "dof_parent": Ints2,  # row 0 the parent in the tree, row 1 the previous dof (dense elimination)
-        "origin_base": vec3,  # of the sweep, which travels along origin_axis with the root's translations
+        "origin_base": vec3,  # of the sweep; the origin travels along origin_axis with the root's translations
         **dict.fromkeys(("link_ref", "eq_ref", "pair_bound"), Reals),
         **dict.fromkeys(("h", "impratio"), wp.float64),
     },
