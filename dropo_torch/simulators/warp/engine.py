@@ -109,9 +109,9 @@ class Engine:
 
     def row_bytes(self, lag: int) -> int:
         """Bytes that one world keeps for its backward."""
-        m = self.tables
-        implicit = m.nv + m.nh if m.implicit else 0
-        return 8 * (lag * self.skip + 1) * m.nstage * (m.nq + 3 * m.nv + m.nh + implicit)
+        fields = TRAJECTORY | IMPLICIT if self.tables.implicit else TRAJECTORY
+        width = sum(self._sizes[size] for _, size in fields.values())
+        return 8 * (lag * self.skip + 1) * self.tables.nstage * width
 
     def simulate(self, batch: Batch, keep: bool) -> tuple[torch.Tensor, list[Trace]]:
         """Return the states after each logged step ``(T·K·lag, nq + nv)``, and the traces of the chunks if kept."""

@@ -24,18 +24,7 @@ from dropo_torch.simulators.warp.spatial import (
     vec3_at,
     vec4_at,
 )
-from dropo_torch.simulators.warp.types import (
-    HINGE,
-    MINVAL,
-    SLIDE,
-    TRANSLATION,
-    ZERO,
-    Tables,
-    World,
-    vec3,
-    vec6,
-    vec10,
-)
+from dropo_torch.simulators.warp.types import HINGE, MINVAL, SLIDE, TRANSLATION, ZERO, Tables, World, vec3, vec6, vec10
 
 
 @wp.func

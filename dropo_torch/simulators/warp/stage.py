@@ -15,14 +15,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make_contacts
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
-from dropo_torch.simulators.warp.forces import (
-    actuators_adjoint,
-    add_actuators,
-    add_dampers,
-    add_springs,
-    dampers_adjoint,
-    springs_adjoint,
-)
+from dropo_torch.simulators.warp.forces import add_forces, forces_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.solver import factor, newton, solve
@@ -40,14 +33,7 @@ from dropo_torch.simulators.warp.spatial import (
     wrench,
 )
 from dropo_torch.simulators.warp.touch import find_contacts
-from dropo_torch.simulators.warp.types import (
-    MINVAL,
-    ONE,
-    Tables,
-    World,
-    vec3,
-    vec6,
-)
+from dropo_torch.simulators.warp.types import MINVAL, ONE, Tables, World, vec3, vec6
 
 
 @wp.func(inline=True)
@@ -56,11 +42,7 @@ def accelerate(m: Tables, w: World, r: int):
     sweep_out(m, w, r)
     inertial_forces(m, w)
     sweep_in(m, w)
-    if m.has_damper != 0:
-        add_dampers(m, w, r)
-    if m.has_spring != 0:
-        add_springs(m, w, r)
-    add_actuators(m, w, r)
+    add_forces(m, w, r)
     nrow = make_rows(m, w, r, 1)
     ncon = find_contacts(m, w)
     w.held[r] = wp.min(nrow, 1) + 2 * wp.min(ncon, 1)
@@ -105,11 +87,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     for i in range(m.nv):
         w.grad[w.t, m.o_armature + i] += w.lam[w.t, i] * w.qacc[w.t, i]
     if softening == 0:
-        if m.has_damper != 0:
-            dampers_adjoint(m, w, r)
-        if m.has_spring != 0:
-            springs_adjoint(m, w, r)
-        actuators_adjoint(m, w, r)
+        forces_adjoint(m, w, r)
         rows_adjoint(m, w, r, nrow)
         contacts_adjoint(m, w, ncon)
     carry_in(m, w, posed)

@@ -12,18 +12,7 @@ from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp import collide
 from dropo_torch.simulators.warp.layout import FIELDS, Layout
 from dropo_torch.simulators.warp.pairs import condim, joins_branches
-from dropo_torch.simulators.warp.types import (
-    BALL,
-    EULER,
-    HINGE,
-    IMPLICITFAST,
-    RK4,
-    SLIDE,
-    TRANSLATION,
-    Tables,
-    mat33,
-    vec3,
-)
+from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables
 
 _JNT, _GEOM, _DISABLE = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit
 _INTEGRATOR = {
@@ -75,7 +64,7 @@ def _to_warp(array: np.ndarray, device: str) -> Any:
     """A Warp array: integers, reals, or vectors and matrices of three by the shape of a row."""
     if array.dtype.kind in "iub":
         return wp.array(array.astype(np.int32), dtype=wp.int32, device=device)
-    dtype = {(): wp.float64, (3,): vec3, (3, 3): mat33}[array.shape[1:]]
+    dtype = {(): wp.float64, (3,): wp.vec3d, (3, 3): wp.mat33d}[array.shape[1:]]
     return wp.array(np.ascontiguousarray(array, dtype=np.float64), dtype=dtype, device=device)
 
 
@@ -156,7 +145,7 @@ def _origin(model: mujoco.MjModel, links: dict[str, Any]) -> dict[str, Any]:
             break
     return {
         "norigin": len(origin), "origin_qpos": np.array([q for q, _ in origin], dtype=int),
-        "origin_axis": np.array([axis for _, axis in origin]).reshape(-1, 3), "origin_base": vec3(*base),
+        "origin_axis": np.array([axis for _, axis in origin]).reshape(-1, 3), "origin_base": wp.vec3d(*base),
     }  # fmt: skip
 
 
