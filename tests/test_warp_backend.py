@@ -17,8 +17,8 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import WarpSimulator, engine
 from dropo_torch.simulators.warp.fields import Fields
+from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.pairs import candidate_pairs
-from dropo_torch.simulators.warp.support import DIFFERENTIABLE
 
 HOPPER = Path(gymnasium.__file__).parent / "envs/mujoco/assets/hopper.xml"
 
@@ -280,7 +280,7 @@ def test_no_differentiable_field_is_dead(model):
         )
     )
     names = {"body": "c", "jnt": "h", "dof": "h", "qpos": "h", "actuator": "h", "eq": "e", "geom": "g1", "pair": "p"}
-    for field in sorted(DIFFERENTIABLE):
+    for field in sorted(FIELDS):
         entry: dict = {"field": field, "bounds": [0.5, 1.0]}
         if not field.startswith("opt."):
             entry["name"] = names[field.split("_")[0]]

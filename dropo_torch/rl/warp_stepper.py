@@ -70,9 +70,9 @@ class WarpStepper(BatchStepper):
     def step(self, controls: torch.Tensor) -> torch.Tensor:
         """Make an environment step; see :meth:`BatchStepper.step`."""
         count = controls.shape[1]
-        batch = Batch(self.num_envs, self.num_envs, count, self.frame_skip * self._finer // count, paired=True)
         given = controls.to(self._device, torch.float64).contiguous()
-        flat, _ = self._engine.simulate(batch, self._theta, self._states, given, keep=False)
+        skip = self.frame_skip * self._finer // count
+        flat, _ = self._engine.simulate(Batch(self._theta, self._states, given, skip, paired=True), keep=False)
         path = flat.view(self.num_envs, count, self.num_states)
         self._states = path[:, -1].contiguous()
         return path

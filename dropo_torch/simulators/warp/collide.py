@@ -16,7 +16,7 @@ from typing import Any
 
 import warp as wp
 
-from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, PARALLEL, ZERO, f64, mat33, vec2, vec3
+from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, ZERO, f64, mat33, vec2, vec3
 
 #: distance, point, normal
 vec7: Any = wp.types.vector(7, wp.float64)
@@ -29,6 +29,8 @@ PLANE_ELLIPSOID = wp.constant(4)
 ROUND = wp.constant(5)  # spheres and capsules among themselves
 CAPSULE_BOX = wp.constant(6)  # a sphere too
 
+#: Squared sine of the angle below which MuJoCo 4 takes two capsules for parallel.
+PARALLEL = wp.constant(wp.float64(1.0e-8))
 #: Where on its axis a capsule touches a box: one of its ends, where it passes a corner, where it passes an edge.
 END = wp.constant(0)  # the end at −1; 1 is that at +1
 AT_CORNER = wp.constant(2)

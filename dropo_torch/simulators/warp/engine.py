@@ -6,6 +6,7 @@ import contextlib
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
@@ -22,32 +23,54 @@ KEEP_BYTES = 1 << 30
 
 @dataclass(frozen=True)
 class Batch:
-    """One call: how many transitions, parameter vectors, logged steps and physics steps of each.
+    """What one call simulates: transitions under parameter vectors, each simulation a world.
 
-    Paired, each transition has a parameter vector of its own; otherwise each is simulated under all of them.
+    Attributes:
+        theta: parameter vectors as θ, ``(K, P)``.
+        states: initial states, ``(T, nq + nv)``.
+        controls: controls of every logged step, ``(T, lag, nu)``.
+        skip: physics steps of a logged step.
+        paired: whether each transition has a parameter vector of its own (``T = K``); otherwise each is simulated
+            under all of them.
     """
 
-    transitions: int
-    parameters: int
-    lag: int
+    theta: torch.Tensor
+    states: torch.Tensor
+    controls: torch.Tensor
     skip: int
     paired: bool = False
 
     @property
+    def lag(self) -> int:
+        """Number of logged steps."""
+        return self.controls.shape[1]
+
+    @property
     def each(self) -> int:
         """Number of simulations of a transition."""
-        return 1 if self.paired else self.parameters
+        return 1 if self.paired else len(self.theta)
 
     @property
     def worlds(self) -> int:
         """Number of simulations."""
-        return self.transitions * self.each
+        return len(self.states) * self.each
+
+    @cached_property
+    def arrays(self) -> list[Any]:
+        """θ, states and controls (a row per logged step) as Warp arrays."""
+        return [wp.from_torch(x.detach()) for x in (self.theta, self.states, _flat(self.controls))]
+
+    def empty(self, *shape: int) -> torch.Tensor:
+        """Memory for results."""
+        return torch.empty(*shape, dtype=torch.float64, device=self.states.device)
 
 
 @dataclass(frozen=True)
 class Trace:
-    """What the backward needs of a chunk that was simulated."""
+    """What the backward needs of a chunk that was simulated: which worlds, their stages, and which are still finite."""
 
+    first: int
+    count: int
     memory: dict[str, Any]
     alive: Any
 
@@ -69,211 +92,181 @@ class Engine:
         self, tables: Tables, size: int, wanted: np.ndarray, *, skip: int, chunk_size: int, num_threads: int,
         device: str,
     ) -> None:  # fmt: skip
-        self.tables, self.size, self.skip = tables, size, skip
-        self.chunk_size, self.device = chunk_size, device
+        m = self.tables = tables
+        self.skip, self.chunk_size, self.device = skip, chunk_size, device
         self.is_cpu = wp.get_device(device).is_cpu
         self.num_threads = num_threads if self.is_cpu else 1
         self.columns = wp.array(wanted, dtype=wp.int32, device=device)
         self.wanted = torch.from_numpy(wanted.astype(np.int64))
-        m = tables
         self._sizes = {
             "qpos": m.nq, "dof": m.nv, "triangle": m.nh, "body": m.nb, "row": m.maxrow, "contact": m.maxcon,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": size,
         }  # fmt: skip
-        self._scratch: dict[tuple[int, bool], dict[str, Any]] = {}
+        self._worlds: dict[tuple[int, bool], World] = {}
         self._free: list[dict[str, Any]] = []
         self._lock = threading.RLock()  # one call at a time in the scratch memory
         self._loaded: set[str] = set()
 
     def row_bytes(self, lag: int) -> int:
         """Bytes that one world keeps for its backward."""
-        m = self.tables
-        implicit = m.nv + m.nh if m.implicit else 0
-        return 8 * (lag * self.skip + 1) * m.nstage * (m.nq + 3 * m.nv + m.nh + implicit)
+        fields = TRAJECTORY | IMPLICIT if self.tables.implicit else TRAJECTORY
+        width = sum(self._sizes[size] for _, size in fields.values())
+        return 8 * (lag * self.skip + 1) * self.tables.nstage * width
 
-    def chunks(self, worlds: int) -> list[tuple[int, int]]:
-        """``(first, count)`` of the chunks of worlds."""
-        return [(i, min(self.chunk_size, worlds - i)) for i in range(0, worlds, self.chunk_size)]
-
-    def simulate(
-        self, batch: Batch, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor, keep: bool
-    ) -> tuple[torch.Tensor, list[Trace]]:
+    def simulate(self, batch: Batch, keep: bool) -> tuple[torch.Tensor, list[Trace]]:
         """Return the states after each logged step ``(T·K·lag, nq + nv)``, and the traces of the chunks if kept."""
-        out = torch.empty(batch.worlds * batch.lag, states.shape[1], dtype=torch.float64, device=states.device)
-        inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
+        out = batch.empty(batch.worlds * batch.lag, batch.states.shape[1])
         traces = []
-        with self._lock, self._stream(states):
-            for first, count in self.chunks(batch.worlds):
-                part = wp.from_torch(out[first * batch.lag : (first + count) * batch.lag])
-                trace = self._forward(batch, inputs, part, first, count, keep)
+        with self._lock, self._stream(batch):
+            for first, count in self._chunks(batch):
+                trace = self._forward(batch, out[first * batch.lag : (first + count) * batch.lag], first, count, keep)
                 if keep:
                     traces.append(trace)
         return out, traces
 
     def adjoint(
-        self, batch: Batch, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor,
-        out_bar: torch.Tensor, traces: list[Trace],
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+        self, batch: Batch, out_bar: torch.Tensor, traces: list[Trace]
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return the adjoints of θ, states and controls; simulates again where there are no traces."""
-        flat = _flat(controls)
-        inputs = [wp.from_torch(x.detach()) for x in (theta, states, flat)]
-        columns = torch.zeros(batch.parameters, len(self.wanted), dtype=torch.float64, device=states.device)
-        state_bar, control_bar = torch.zeros_like(states), torch.zeros_like(flat)
-        totals = [wp.from_torch(x) for x in (columns, state_bar, control_bar)]
-        with self._lock, self._stream(states):
-            for number, (first, count) in enumerate(self.chunks(batch.worlds)):
-                rows = slice(first * batch.lag, (first + count) * batch.lag)
-                if traces:
-                    trace = traces[number]
-                else:
-                    part = wp.empty((count * batch.lag, states.shape[1]), dtype=wp.float64, device=self.device)
-                    trace = self._forward(batch, inputs, part, first, count, keep=True)
-                self._backward(batch, inputs, trace, wp.from_torch(out_bar[rows]), totals, first, count)
+        columns = batch.empty(len(batch.theta), len(self.wanted)).zero_()
+        state_bar, control_bar = torch.zeros_like(batch.states), torch.zeros_like(batch.controls)
+        totals = [wp.from_torch(x) for x in (columns, state_bar, _flat(control_bar))]
+        with self._lock, self._stream(batch):
+            for number, (first, count) in enumerate(self._chunks(batch)):
+                bar = out_bar[first * batch.lag : (first + count) * batch.lag]
+                trace = traces[number] if traces else self._forward(batch, torch.empty_like(bar), first, count, True)
+                self._add(batch, trace, self._backward(batch, trace, bar), totals)
                 if not traces:
                     self.release([trace])
-        theta_bar = torch.zeros_like(theta)
-        theta_bar[:, self.wanted.to(theta.device)] = columns
-        return theta_bar, state_bar, control_bar.reshape(controls.shape)
+        theta_bar = torch.zeros_like(batch.theta)
+        theta_bar[:, self.wanted.to(theta_bar.device)] = columns
+        return theta_bar, state_bar, control_bar
 
-    def per_world(
-        self, batch: Batch, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor,
-        directions: torch.Tensor,
-    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
+    def per_world(self, batch: Batch, directions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
         """Return last states and, of every world on its own, vector-Jacobian products.
 
         Args:
-            batch: with ``lag`` logged steps.
-            theta, states, controls: as for :meth:`simulate`.
+            batch: what is simulated.
             directions: covectors of the last states, ``(J, nq + nv)``, the same for every world.
 
         Returns:
             States ``(T·K, nq + nv)``, and products with the Jacobians by the wanted columns of θ
-            ``(T·K, J, wanted)`` and by the start states ``(T·K, J, nq + nv)``.
+            ``(T·K, J, wanted)`` and by the initial states ``(T·K, J, nq + nv)``.
         """
-        inputs = [wp.from_torch(x.detach()) for x in (theta, states, _flat(controls))]
-        width, lag = states.shape[1], batch.lag
+        last = slice(batch.lag - 1, None, batch.lag)
         after, by_theta, by_state = [], [], []
-        with self._lock, self._stream(states):
-            for first, count in self.chunks(batch.worlds):
-                out = torch.empty(count * lag, width, dtype=torch.float64, device=states.device)
-                trace = self._forward(batch, inputs, wp.from_torch(out), first, count, keep=True)
-                after.append(out[lag - 1 :: lag])
-                columns = []
+        with self._lock, self._stream(batch):
+            for first, count in self._chunks(batch):
+                out = batch.empty(count * batch.lag, batch.states.shape[1])
+                trace = self._forward(batch, out, first, count, True)
+                after.append(out[last])
+                bars = []
                 for direction in directions:
                     bar = torch.zeros_like(out)
-                    bar[lag - 1 :: lag] = direction
-                    theta_bar, state_bar, _ = self._worlds(batch, inputs, trace, wp.from_torch(bar), first, count)
-                    columns.append((wp.to_torch(theta_bar).clone(), wp.to_torch(state_bar).clone()))
+                    bar[last] = direction
+                    bars.append([wp.to_torch(x).clone() for x in self._backward(batch, trace, bar)[:2]])
                 self.release([trace])
-                by_theta.append(torch.stack([c[0] for c in columns], 1))
-                by_state.append(torch.stack([c[1] for c in columns], 1))
+                by_theta.append(torch.stack([b[0] for b in bars], 1))
+                by_state.append(torch.stack([b[1] for b in bars], 1))
         return torch.cat(after), torch.cat(by_theta), torch.cat(by_state)
-
-    def _forward(self, batch: Batch, inputs: list[Any], out: Any, first: int, count: int, keep: bool) -> Trace:
-        period = batch.lag * batch.skip + 1 if keep else 2
-        memory = self._trajectory((count if keep else self._slots(count)) * period * self.tables.nstage)
-        alive = wp.empty(count, dtype=wp.int32, device=self.device)
-        arguments = [*inputs, alive, out]
-        self._launch(
-            kernel_forward.simulate_kernel, batch, memory, arguments, first, count, period=period, keep=keep,
-            adjoint=False,
-        )  # fmt: skip
-        return Trace(memory, alive)
-
-    def _backward(
-        self, batch: Batch, inputs: list[Any], trace: Trace, out_bar: Any, totals: list[Any], first: int,
-        count: int,
-    ) -> None:  # fmt: skip
-        lag, parameters = batch.lag, batch.parameters
-        theta_bar, state_bar, control_bar = self._worlds(batch, inputs, trace, out_bar, first, count)
-        touched = (first + count - 1) // parameters - first // parameters + 1
-        wp.launch(
-            kernel_backward.sum_over_transitions, dim=(parameters, len(self.wanted)), device=self.device,
-            inputs=[theta_bar, totals[0], first, count, parameters],
-        )  # fmt: skip
-        for bar, total, width in ((state_bar, totals[1], 1), (control_bar, totals[2], lag)):
-            wp.launch(
-                kernel_backward.sum_over_parameters, dim=(touched, width, bar.shape[1]), device=self.device,
-                inputs=[bar, total, first, count, parameters, width],
-            )  # fmt: skip
-
-    def _worlds(
-        self, batch: Batch, inputs: list[Any], trace: Trace, out_bar: Any, first: int, count: int
-    ) -> tuple[Any, Any, Any]:
-        """Adjoints of θ, states and controls, a row for every world (and logged step) of a chunk."""
-        theta, states, controls = inputs
-        lag = batch.lag
-        state_bar = wp.empty((count, states.shape[1]), dtype=wp.float64, device=self.device)
-        control_bar = wp.zeros((count * lag, controls.shape[1]), dtype=wp.float64, device=self.device)
-        theta_bar = wp.empty((count, len(self.wanted)), dtype=wp.float64, device=self.device)
-        arguments = [theta, controls, trace.alive, self.columns, out_bar, state_bar, control_bar, theta_bar]
-        self._launch(
-            kernel_backward.adjoint_kernel, batch, trace.memory, arguments, first, count,
-            period=lag * batch.skip + 1, keep=True, adjoint=True,
-        )  # fmt: skip
-        return theta_bar, state_bar, control_bar
-
-    def _launch(
-        self, kernel: Any, batch: Batch, memory: dict[str, Any], arguments: list[Any], first: int, count: int, *,
-        period: int, keep: bool, adjoint: bool,
-    ) -> None:  # fmt: skip
-        """Launch a kernel on the worlds of a chunk: on a CPU one contiguous slice for each thread.
-
-        A launch on a CPU releases Python's lock.
-        """
-        if kernel.module.name not in self._loaded:  # compiled or loaded before threads launch it
-            wp.load_module(kernel.module.name, device=self.device)
-            self._loaded.add(kernel.module.name)
-        world = _struct(World, self._working(self._slots(count), adjoint) | memory)
-
-        def launch(local: int, number: int, slot: int) -> None:
-            chunk = _struct(Chunk, {
-                "first": first + local, "local": local, "nparam": batch.parameters, "each": batch.each,
-                "lag": batch.lag, "skip": batch.skip, "period": period, "slot": slot,
-                "slot_stride": int(not self.is_cpu), "keep": int(keep),
-            })  # fmt: skip
-            wp.launch(kernel, dim=number, inputs=[self.tables, world, chunk, *arguments], device=self.device)
-
-        threads = self._slots(count) if self.is_cpu else 1
-        if threads == 1:
-            launch(0, count, 0)
-            return
-        bounds = [count * i // threads for i in range(threads + 1)]
-        with ThreadPoolExecutor(threads) as pool:
-            for job in [pool.submit(launch, a, b - a, i) for i, (a, b) in enumerate(pairwise(bounds))]:
-                job.result()
-
-    def _slots(self, count: int) -> int:
-        return min(self.num_threads, count) if self.is_cpu else count
-
-    def _trajectory(self, rows: int) -> dict[str, Any]:
-        """Memory of a number of stages, from those that a backward has given back."""
-        for i, memory in enumerate(self._free):
-            if len(memory["qpos"]) == rows:
-                return self._free.pop(i)
-        memory = self._allocate(TRAJECTORY, rows) | self._allocate(IMPLICIT, rows if self.tables.implicit else 1)
-        if not self.tables.has_ball:  # then a rate is a velocity
-            memory["rate"] = memory["qvel"]
-        return memory | {"held": wp.empty(rows, dtype=wp.int32, device=self.device)}
 
     def release(self, traces: list[Trace]) -> None:
         """Take the memory of traces back for the next call."""
         with self._lock:
             self._free = [t.memory for t in traces]
 
-    def _stream(self, like: torch.Tensor) -> Any:
+    def _forward(self, batch: Batch, out: torch.Tensor, first: int, count: int, keep: bool) -> Trace:
+        """Simulate a chunk into the rows ``out`` of its logged steps."""
+        worlds = count if keep else self._slots(count)
+        memory = self._trajectory(worlds * _period(batch, keep) * self.tables.nstage)
+        trace = Trace(first, count, memory, wp.empty(count, dtype=wp.int32, device=self.device))
+        self._launch(
+            kernel_forward.simulate_kernel, batch, trace, [*batch.arrays, trace.alive, wp.from_torch(out)], keep
+        )
+        return trace
+
+    def _backward(self, batch: Batch, trace: Trace, out_bar: torch.Tensor) -> list[Any]:
+        """Adjoints of θ, states and controls, a row for every world (and logged step) of a chunk."""
+        theta, states, controls = batch.arrays
+        shapes = ((trace.count, len(self.wanted)), (trace.count, states.shape[1]))
+        bars = [wp.empty(shape, dtype=wp.float64, device=self.device) for shape in shapes]
+        bars.append(wp.zeros((trace.count * batch.lag, controls.shape[1]), dtype=wp.float64, device=self.device))
+        arguments = [theta, controls, trace.alive, self.columns, wp.from_torch(out_bar), *bars]
+        self._launch(kernel_backward.adjoint_kernel, batch, trace, arguments, True)
+        return bars
+
+    def _add(self, batch: Batch, trace: Trace, bars: list[Any], totals: list[Any]) -> None:
+        """Add the adjoints of a chunk's worlds to those of parameter vectors, states and controls."""
+        first, count, parameters = trace.first, trace.count, len(batch.theta)
+        wp.launch(
+            kernel_backward.sum_over_transitions, dim=(parameters, len(self.wanted)), device=self.device,
+            inputs=[bars[0], totals[0], first, count, parameters],
+        )  # fmt: skip
+        touched = (first + count - 1) // parameters - first // parameters + 1
+        for bar, total, width in zip(bars[1:], totals[1:], (1, batch.lag), strict=True):
+            wp.launch(
+                kernel_backward.sum_over_parameters, dim=(touched, width, bar.shape[1]), device=self.device,
+                inputs=[bar, total, first, count, parameters, width],
+            )  # fmt: skip
+
+    def _launch(self, kernel: Any, batch: Batch, trace: Trace, arguments: list[Any], keep: bool) -> None:
+        """Launch a kernel on the worlds of a chunk: on a CPU one contiguous slice for each thread.
+
+        A launch on a CPU releases Python's lock.
+        """
+        if kernel.key not in self._loaded:  # compiled or loaded before threads launch it
+            wp.load_module(kernel.module.name, device=self.device)
+            self._loaded.add(kernel.key)
+        slots = self._slots(trace.count)
+        world = self._world(slots, trace.memory, kernel is kernel_backward.adjoint_kernel)
+
+        def launch(local: int, number: int, slot: int) -> None:
+            chunk = _fill(Chunk(), {
+                "first": trace.first + local, "local": local, "nparam": len(batch.theta), "each": batch.each,
+                "lag": batch.lag, "skip": batch.skip, "period": _period(batch, keep), "slot": slot,
+                "slot_stride": int(not self.is_cpu), "keep": int(keep),
+            })  # fmt: skip
+            wp.launch(kernel, dim=number, inputs=[self.tables, world, chunk, *arguments], device=self.device)
+
+        threads = slots if self.is_cpu else 1
+        if threads == 1:
+            launch(0, trace.count, 0)
+            return
+        bounds = [trace.count * i // threads for i in range(threads + 1)]
+        with ThreadPoolExecutor(threads) as pool:
+            for job in [pool.submit(launch, a, b - a, i) for i, (a, b) in enumerate(pairwise(bounds))]:
+                job.result()
+
+    def _chunks(self, batch: Batch) -> list[tuple[int, int]]:
+        """``(first, count)`` of the chunks of worlds."""
+        return [(i, min(self.chunk_size, batch.worlds - i)) for i in range(0, batch.worlds, self.chunk_size)]
+
+    def _slots(self, count: int) -> int:
+        return min(self.num_threads, count) if self.is_cpu else count
+
+    def _stream(self, batch: Batch) -> Any:
         """PyTorch's stream of a GPU as Warp's, so that kernels wait for tensors and tensors for kernels."""
         if self.is_cpu:
             return contextlib.nullcontext()
-        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(like.device)))
+        return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(batch.states.device)))
 
-    def _working(self, slots: int, adjoint: bool) -> dict[str, Any]:
-        """Scratch memory of a number of slots, made once."""
+    def _trajectory(self, rows: int) -> dict[str, Any]:
+        """Memory of a number of stages, from those that a backward has given back."""
+        for i, memory in enumerate(self._free):
+            if len(memory["held"]) == rows:
+                return self._free.pop(i)
+        memory = self._allocate(TRAJECTORY, rows) | self._allocate(IMPLICIT, rows if self.tables.implicit else 1)
+        if not self.tables.has_ball:  # then a rate is a velocity
+            memory["rate"] = memory["qvel"]
+        return memory | {"held": wp.empty(rows, dtype=wp.int32, device=self.device)}
+
+    def _world(self, slots: int, memory: dict[str, Any], adjoint: bool) -> World:
+        """Working memory of a number of slots, made once, with that of the trajectories."""
         key = (slots, adjoint)
-        if key not in self._scratch:
+        if key not in self._worlds:
             # a gap between slots, so that no two threads write one cache line
-            self._scratch[key] = self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16)
-        return self._scratch[key]
+            self._worlds[key] = _fill(World(), self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16))
+        return _fill(self._worlds[key], memory)
 
     def _allocate(self, fields: dict[str, tuple[Any, str]], rows: int, gap: int = 0) -> dict[str, Any]:
         """Arrays of fields of a world, with a number of rows."""
@@ -284,9 +277,13 @@ class Engine:
         return arrays
 
 
-def _struct(kind: Any, fields: dict[str, Any]) -> Any:
+def _period(batch: Batch, keep: bool) -> int:
+    """Steps of a trajectory that are in memory."""
+    return batch.lag * batch.skip + 1 if keep else 2
+
+
+def _fill(struct: Any, fields: dict[str, Any]) -> Any:
     """A Warp struct with fields set."""
-    struct = kind()
     for name, value in fields.items():
         setattr(struct, name, value)
     return struct
@@ -305,21 +302,21 @@ class Simulate(torch.autograd.Function):
         ctx: Any, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor, engine: Engine
     ) -> torch.Tensor:
         """Return ``(T, K, lag, nq + nv)`` of θ ``(K, P)``, states ``(T, nq + nv)`` and controls ``(T, lag, nu)``."""
-        batch = Batch(len(states), len(theta), controls.shape[1], engine.skip)
+        batch = Batch(theta, states, controls, engine.skip)
         wanted = any(ctx.needs_input_grad[:3])
         keep = wanted and batch.worlds * engine.row_bytes(batch.lag) <= KEEP_BYTES
-        out, traces = engine.simulate(batch, theta, states, controls, keep)
+        out, traces = engine.simulate(batch, keep)
         ctx.save_for_backward(theta, states, controls)
-        ctx.engine, ctx.batch, ctx.traces = engine, batch, traces
-        return out.view(batch.transitions, batch.parameters, batch.lag, -1)
+        ctx.engine, ctx.traces = engine, traces
+        return out.view(len(states), len(theta), batch.lag, -1)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, out_bar: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
         """Return the adjoints of the inputs."""
         theta, states, controls = ctx.saved_tensors
-        flat = _flat(out_bar).contiguous()
-        bars = ctx.engine.adjoint(ctx.batch, theta, states, controls, flat, ctx.traces)
+        batch = Batch(theta, states, controls, ctx.engine.skip)
+        bars = ctx.engine.adjoint(batch, _flat(out_bar).contiguous(), ctx.traces)
         # a second backward through the same graph simulates again
         ctx.engine.release(ctx.traces)
         ctx.traces = []

@@ -55,26 +55,20 @@ class Fields:
 
     def _targets(self, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
         """Columns that the parameters write, and those of θ whose gradient is wanted."""
-        written, factors, sources, fields = [], [], [], set()
-        for source, parameter in enumerate(space.parameters):
-            for target in parameter.targets:
-                written.append(int(columns[target.field][target.index]))
-                factors.append(target.factor)
-                sources.append(source)
-                fields.add(target.field)
-        self._written = torch.tensor(written, dtype=torch.long)
-        self._factors = torch.tensor(factors, dtype=torch.float64)
-        self._sources = torch.tensor(sources, dtype=torch.long)
+        targets = [(source, target) for source, p in enumerate(space.parameters) for target in p.targets]
+        fields = {target.field for _, target in targets}
+        self._written = torch.tensor([int(columns[t.field][t.index]) for _, t in targets], dtype=torch.long)
+        self._factors = torch.tensor([t.factor for _, t in targets], dtype=torch.float64)
+        self._sources = torch.tensor([source for source, _ in targets], dtype=torch.long)
         self._mixes = bool(fields & set(MIXED))
         self._weighs = bool(fields & _INERTIAL)
-        wanted = [c for c in written if c < self._direct]
-        if self._mixes:
-            wanted += [int(c) for n in list(PAIR)[:-1] for c in self.layout.columns(f"pair_{n}")]
-        if self._weighs:
-            wanted += [int(c) for n in ("pair_invweight", "dof_invweight") for c in self.layout.columns(n)]
-        self.wanted = np.array(sorted(set(wanted)), dtype=np.int32)
+        derived = [f"pair_{name}" for name in PAIR if name != "invweight"] if self._mixes else []
+        derived += ["pair_invweight", "dof_invweight"] if self._weighs else []
+        direct = self._written[self._written < self._direct].numpy()
+        wanted = np.concatenate([direct, *(self.layout.columns(name) for name in derived)])
+        self.wanted = np.unique(wanted).astype(np.int32)
         with torch.no_grad():
-            self._constant = self._derive(self._raw[None])
+            self._constant = self._mix(self._raw[None]), self._weigh(self._raw[None])
 
     def with_derivative(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return θ ``(K, P)`` and the derivative of its wanted columns by each of the values ``(K, wanted, d)``."""
@@ -87,10 +81,6 @@ class Fields:
     def constant(self) -> np.ndarray:
         """Return θ of the model itself, ``(1, P)``."""
         return torch.cat([self._raw[None, : self._direct], *self._constant], dim=1).numpy()
-
-    def _derive(self, raw: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Contact parameters and inverse weights of raw fields ``(K, ...)``."""
-        return self._mix(raw), self._weigh(raw)
 
     def _section(self, raw: torch.Tensor, name: str, width: int) -> torch.Tensor:
         start, size = self._raw_sections[name]

@@ -20,11 +20,15 @@ def _edge(a: f64, b: f64, c: f64, mass: f64) -> f64:
 
 
 @wp.func
+def _edges(x: vec3, mass: f64):
+    """Edges of the box with moments ``x``."""
+    return _edge(x[1], x[2], x[0], mass), _edge(x[0], x[2], x[1], mass), _edge(x[0], x[1], x[2], mass)
+
+
+@wp.func
 def box_force(v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3:
     """Force in the inertial frame of a box with moments ``x`` that moves at ``v`` through the medium."""
-    b0 = _edge(x[1], x[2], x[0], mass)
-    b1 = _edge(x[0], x[2], x[1], mass)
-    b2 = _edge(x[0], x[1], x[2], mass)
+    b0, b1, b2 = _edges(x, mass)
     k = THREE * PI * (b0 + b1 + b2) / THREE * viscosity
     q = HALF * density
     return vec3(
@@ -37,9 +41,7 @@ def box_force(v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3
 @wp.func
 def box_torque(w: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3:
     """Torque in the inertial frame of a box with moments ``x`` that turns at ``w``."""
-    b0 = _edge(x[1], x[2], x[0], mass)
-    b1 = _edge(x[0], x[2], x[1], mass)
-    b2 = _edge(x[0], x[1], x[2], mass)
+    b0, b1, b2 = _edges(x, mass)
     d = (b0 + b1 + b2) / THREE
     k = PI * d * d * d * viscosity
     p0 = b0 * b0 * b0 * b0

@@ -12,20 +12,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.spatial import add_vec3, inverse_right_jacobian_t, quat_log, quat_mul, vec3_at, vec4_at
-from dropo_torch.simulators.warp.types import (
-    BALL,
-    MINVAL,
-    SLIDE,
-    THREE,
-    TRANSLATION,
-    TWO,
-    ZERO,
-    Tables,
-    World,
-    f64,
-    vec3,
-    vec4,
-)
+from dropo_torch.simulators.warp.types import BALL, MINVAL, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
 
 
 @wp.func(inline=True)
@@ -38,7 +25,7 @@ def spring_deflection(m: Tables, w: World, r: int, k: int) -> vec3:
         q = vec4_at(w.qpos, r, iq)
         ref = vec4(w.th[o], -w.th[o + 1], -w.th[o + 2], -w.th[o + 3])
         return quat_log(quat_mul(ref, q / wp.length(q)))
-    if kind == TRANSLATION:
+    if m.link_ndof[k] == 3:
         return vec3(w.qpos[r, iq] - w.th[o], w.qpos[r, iq + 1] - w.th[o + 1], w.qpos[r, iq + 2] - w.th[o + 2])
     return vec3(w.qpos[r, iq] - w.th[o], ZERO, ZERO)
 
@@ -54,8 +41,7 @@ def add_springs(m: Tables, w: World, r: int):
         if stiff != ZERO or p0 != ZERO or p1 != ZERO:
             d = m.link_dof[k]
             x = spring_deflection(m, w, r, k)
-            kind = m.link_kind[k]
-            if kind <= SLIDE:
+            if m.link_ndof[k] == 1:
                 w.load[w.t, d] += x[0] * (stiff + x[0] * (p0 + x[0] * p1))
             else:
                 n = wp.length(x)
@@ -75,7 +61,7 @@ def springs_adjoint(m: Tables, w: World, r: int):
         d = m.link_dof[k]
         x = spring_deflection(m, w, r, k)
         kind = m.link_kind[k]
-        if kind <= SLIDE:
+        if m.link_ndof[k] == 1:
             y = x[0]
             jl = w.lam[w.t, d]
             slope = jl * (stiff + y * (TWO * p0 + y * THREE * p1))
@@ -94,7 +80,7 @@ def springs_adjoint(m: Tables, w: World, r: int):
             g = lam * (stiff + n * (p0 + n * p1))
             if n > MINVAL:
                 g += x * (lx * (p0 + TWO * n * p1) / n)
-            if kind == TRANSLATION:
+            if kind != BALL:
                 add_vec3(w.tangent, w.t, d, g)
                 add_vec3(w.grad, w.t, m.o_spring + m.link_qpos[k], -g)
             else:
@@ -215,7 +201,7 @@ def add_actuators(m: Tables, w: World, r: int):
     else:
         sum_forces(m, w, r)
         for j in range(m.nlink):
-            if m.link_kind[j] <= SLIDE:
+            if m.link_ndof[j] == 1:
                 d = m.link_dof[j]
                 f = w.work[w.t, d]
                 if m.link_frclimited[j] != 0:
@@ -232,7 +218,7 @@ def actuators_adjoint(m: Tables, w: World, r: int):
             d = m.link_dof[j]
             if m.link_frclimited[j] != 0:
                 w.work[w.t, d] = clamp_adjoint(w, m.o_actfrcrange + 2 * m.link_jnt[j], w.work[w.t, d], -w.lam[w.t, d])
-            elif m.link_kind[j] <= SLIDE:
+            elif m.link_ndof[j] == 1:
                 w.work[w.t, d] = -w.lam[w.t, d]
     else:
         for i in range(m.nv):
@@ -303,3 +289,23 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
             o = m.o_gain + 3 * a + 2
             w.grad[w.t, o] += bar * gear * gear * control(m, w, a)
             control_adjoint(m, w, a, bar * gear * gear * w.th[o])
+
+
+@wp.func(inline=True)
+def add_forces(m: Tables, w: World, r: int):
+    """Load from dampers, springs and actuators."""
+    if m.has_damper != 0:
+        add_dampers(m, w, r)
+    if m.has_spring != 0:
+        add_springs(m, w, r)
+    add_actuators(m, w, r)
+
+
+@wp.func(inline=True)
+def forces_adjoint(m: Tables, w: World, r: int):
+    """Adjoint of :func:`add_forces`."""
+    if m.has_damper != 0:
+        dampers_adjoint(m, w, r)
+    if m.has_spring != 0:
+        springs_adjoint(m, w, r)
+    actuators_adjoint(m, w, r)

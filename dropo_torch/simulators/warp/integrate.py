@@ -25,20 +25,7 @@ from dropo_torch.simulators.warp.spatial import (
     vec4_at,
 )
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
-from dropo_torch.simulators.warp.types import (
-    BALL,
-    HALF,
-    ONE,
-    RK4,
-    THREE,
-    TWO,
-    ZERO,
-    Reals2,
-    Tables,
-    World,
-    f64,
-    vec4,
-)
+from dropo_torch.simulators.warp.types import BALL, HALF, ONE, RK4, THREE, TWO, ZERO, Reals2, Tables, World, f64, vec4
 
 LARGE = wp.constant(wp.float64(1.0e10))  # mjMAXVAL
 

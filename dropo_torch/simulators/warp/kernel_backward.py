@@ -16,10 +16,10 @@ from dropo_torch.simulators.warp.types import (
     ZERO,
     Chunk,
     Ints,
+    Reals,
     Reals2,
     Tables,
     World,
-    f64,
     mat33,
     vec2,
     vec3,
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=n
 @wp.kernel(enable_backward=False)
 def adjoint_kernel(
     m: Tables, w: World, chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints, out_bar: Reals2,
-    state_bar: Reals2, control_bar: Reals2, theta_bar: Reals2,
+    theta_bar: Reals2, state_bar: Reals2, control_bar: Reals2,
 ):  # fmt: skip
     """Adjoints of initial state, controls and the θ ``columns`` of each world, from that of its output."""
     tid = wp.tid()
@@ -46,17 +46,21 @@ def adjoint_kernel(
     w.ctrl_bar = control_bar
     w.t = chunk.slot + tid * chunk.slot_stride
     base = i * chunk.period * m.nstage
-    for j in range(columns.shape[0]):  # whatever else is added up is never read
-        w.grad[w.t, columns[j]] = ZERO
-    for j in range(m.nv):
-        w.pos_bar[w.t, j] = ZERO
-        w.rate_bar[w.t, j] = ZERO
     seen = ZERO
     for row in range(i * chunk.lag, (i + 1) * chunk.lag):
-        for k in range(m.nu):
-            control_bar[row, k] = ZERO
         for k in range(m.nq + m.nv):
             seen += wp.abs(out_bar[row, k])
+    blank = ZERO
+    if alive[i] == 0 and seen != ZERO:  # a gradient that arrives at a simulation that diverged
+        blank = wp.float64(wp.nan)
+    for j in range(columns.shape[0]):  # whatever else is added up is never read
+        w.grad[w.t, columns[j]] = blank
+    for j in range(m.nv):
+        w.pos_bar[w.t, j] = blank
+        w.rate_bar[w.t, j] = blank
+    for row in range(i * chunk.lag, (i + 1) * chunk.lag):
+        for k in range(m.nu):
+            control_bar[row, k] = blank
     if alive[i] != 0 and seen != ZERO:
         for back in range(chunk.lag):
             logged = chunk.lag - 1 - back
@@ -74,19 +78,10 @@ def adjoint_kernel(
         state_bar[i, m.nq + j] = w.rate_bar[w.t, j]
     for j in range(columns.shape[0]):
         theta_bar[i, j] = w.grad[w.t, columns[j]]
-    if alive[i] == 0 and seen != ZERO:
-        nan = f64(wp.nan)
-        for j in range(m.nq + m.nv):
-            state_bar[i, j] = nan
-        for j in range(columns.shape[0]):
-            theta_bar[i, j] = nan
-        for row in range(i * chunk.lag, (i + 1) * chunk.lag):
-            for k in range(m.nu):
-                control_bar[row, k] = nan
 
 
 @wp.kernel(enable_backward=True)
-def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: wp.array(dtype=f64)):
+def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     """Never launched: makes Warp emit the adjoints of the leaves and of all that they call.
 
     A function that ``wp.grad`` meets after the forward code has used what it calls gets no adjoint of those, and its

@@ -24,18 +24,7 @@ from dropo_torch.simulators.warp.spatial import (
     vec3_at,
     vec4_at,
 )
-from dropo_torch.simulators.warp.types import (
-    HINGE,
-    MINVAL,
-    SLIDE,
-    TRANSLATION,
-    ZERO,
-    Tables,
-    World,
-    vec3,
-    vec6,
-    vec10,
-)
+from dropo_torch.simulators.warp.types import HINGE, MINVAL, SLIDE, TRANSLATION, ZERO, Tables, World, vec3, vec6, vec10
 
 
 @wp.func
@@ -66,6 +55,7 @@ def sweep_out(m: Tables, w: World, r: int):
             kind = m.link_kind[k]
             d = m.link_dof[k]
             iq = m.link_qpos[k]
+            sv = vec6()
             if kind == HINGE:
                 axis = rot * m.link_axis[k]
                 anchor = pos + rot * m.link_pos[k]
@@ -74,35 +64,30 @@ def sweep_out(m: Tables, w: World, r: int):
                 sd = join(axis, wp.cross(anchor, axis))
                 w.motion[w.t, d] = sd
                 sv = sd * w.qvel[r, d]
-                a += cross_motion(v, sv)
-                v += sv
             elif kind == SLIDE:
                 axis = rot * m.link_axis[k]
                 pos += axis * (w.qpos[r, iq] - m.link_ref[k])
                 sd = join(vec3(), axis)
                 w.motion[w.t, d] = sd
                 sv = sd * w.qvel[r, d]
-                a += cross_motion(v, sv)
-                v += sv
             elif kind == TRANSLATION:
                 pos = vec3_at(w.qpos, r, iq) - o
                 for i in range(3):
                     e = vec3()
                     e[i] = wp.float64(1.0)
                     w.motion[w.t, d + i] = join(vec3(), e)
-                v += join(vec3(), vec3_at(w.qvel, r, d))
+                sv = join(vec3(), vec3_at(w.qvel, r, d))
             else:
                 anchor = pos + rot * m.link_pos[k]
                 rot = rot * quat_matrix(vec4_at(w.qpos, r, iq))
                 pos = anchor - rot * m.link_pos[k]
-                sv = vec6()
                 for i in range(3):
                     axis = vec3(rot[0, i], rot[1, i], rot[2, i])
                     sd = join(axis, wp.cross(anchor, axis))
                     w.motion[w.t, d + i] = sd
                     sv += sd * w.qvel[r, d + i]
-                a += cross_motion(v, sv)
-                v += sv
+            a += cross_motion(v, sv)
+            v += sv
         w.xpos[w.t, b] = pos
         w.xmat[w.t, b] = rot
         w.velocity[w.t, b] = v

@@ -26,6 +26,8 @@ MIXED = (
 )  # fmt: skip
 #: Numbers of a pair of geoms: what is mixed, and the sum of the two bodies' inverse weights.
 PAIR = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 1, "invweight": 1}
+#: Fields that θ is made of: those that a parameter may write and the adjoint differentiates.
+FIELDS = (*(field for _, field, _ in DIRECT), *MIXED)
 #: All sections of θ, in order.
 SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight")
 

@@ -79,17 +79,8 @@ def condim(model: mujoco.MjModel, g1: int, g2: int, pair: int) -> int:
 
 def mixing(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> np.ndarray:
     """Weight of the first geom in each pair's solref and solimp, ``(n,)``."""
-    weights = []
-    for g1, g2, _pair in pairs:
-        p1, p2 = model.geom_priority[g1], model.geom_priority[g2]
-        s1, s2 = float(model.geom_solmix[g1]), float(model.geom_solmix[g2])
-        tiny = 1e-15
-        if p1 != p2:
-            weights.append(float(p1 > p2))
-        elif s1 >= tiny and s2 >= tiny:
-            weights.append(s1 / (s1 + s2))
-        elif s1 < tiny and s2 < tiny:
-            weights.append(0.5)
-        else:
-            weights.append(float(s1 >= tiny))
-    return np.array(weights)
+    table = np.array(pairs, dtype=int).reshape(-1, 3)
+    (p1, p2), (s1, s2) = model.geom_priority[table[:, :2]].T, model.geom_solmix[table[:, :2]].T
+    first, second = s1 >= 1e-15, s2 >= 1e-15
+    mixed = s1 / np.where(first & second, s1 + s2, 1.0)
+    return np.select([p1 != p2, first & second, ~first & ~second], [p1 > p2, mixed, 0.5], first).astype(float)

@@ -15,25 +15,13 @@ import warp as wp
 from dropo_torch.simulators.warp.impedance import regularisation
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
 from dropo_torch.simulators.warp.spatial import add_vec3, inverse_right_jacobian_t, nothing, quat_log, vec3_at, vec4_at
-from dropo_torch.simulators.warp.types import (
-    BALL,
-    MINVAL,
-    ONE,
-    ROW_EQUALITY,
-    ROW_FRICTION,
-    ROW_LIMIT,
-    THREE,
-    TWO,
-    ZERO,
-    Reals2,
-    Tables,
-    World,
-    f64,
-    vec3,
-    vec3i,
-)
+from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, TWO, ZERO, Reals2, Tables, World, f64, vec3, vec3i
 
 FOUR = wp.constant(wp.float64(4.0))
+#: Kinds of row.
+ROW_EQUALITY = wp.constant(0)
+ROW_FRICTION = wp.constant(1)
+ROW_LIMIT = wp.constant(2)
 
 
 @wp.func
@@ -72,7 +60,7 @@ def equality_position(m: Tables, w: World, r: int, e: int) -> vec3:
     if m.eq_dof[2 * e + 1] >= 0:
         y = w.qpos[r, m.eq_qpos[2 * e + 1]] - m.eq_ref[2 * e + 1]
         x -= y * (w.th[c + 1] + y * (w.th[c + 2] + y * (w.th[c + 3] + y * w.th[c + 4])))
-        slope = w.th[c + 1] + y * (TWO * w.th[c + 2] + y * (THREE * w.th[c + 3] + y * FOUR * w.th[c + 4]))
+        slope = w.th[c + 1] + y * (TWO * w.th[c + 2] + y * (f64(3.0) * w.th[c + 3] + y * FOUR * w.th[c + 4]))
         curve = TWO * w.th[c + 2] + y * (f64(6.0) * w.th[c + 3] + y * f64(12.0) * w.th[c + 4])
     return vec3(x, slope, curve)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import os
-import threading
 from typing import ClassVar
 
 import mujoco
@@ -17,12 +16,9 @@ from dropo_torch.simulators.base import DIVERGED, Simulator
 from dropo_torch.simulators.warp.engine import Batch, Engine, Simulate
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
-from dropo_torch.simulators.warp.start import start_warp
+from dropo_torch.simulators.warp.start import LOADING, start_warp
 from dropo_torch.simulators.warp.support import check_support
 from dropo_torch.simulators.warp.tables import build_tables
-
-#: Held while a device is looked up or tables are made.
-LOADING = threading.Lock()
 
 
 class WarpSimulator(Simulator):
@@ -111,14 +107,12 @@ class WarpSimulator(Simulator):
             ``(T, K, J, d)`` and by the start states ``(T, K, J, nq + nv)``.
         """
         self.check_arguments(states, controls, values)
-        width, num_values = self.num_states, len(values)
-        rows = torch.eye(width, dtype=torch.float64) if directions is None else directions
+        rows = torch.eye(self.num_states, dtype=torch.float64) if directions is None else directions
         theta, slope = self._fields.with_derivative(values.detach().to("cpu", torch.float64))
         start, inputs = (x.detach().to(self._device, torch.float64).contiguous() for x in (states, controls))
-        batch = Batch(len(states), num_values, controls.shape[1], self.frame_skip)
-        moved = [x.to(self._device).contiguous() for x in (theta, rows)]
-        after, by_theta, by_state = self._engine.per_world(batch, moved[0], start, inputs, moved[1])
-        shape = (len(states), num_values)
+        theta, rows = (x.to(self._device).contiguous() for x in (theta, rows))
+        after, by_theta, by_state = self._engine.per_world(Batch(theta, start, inputs, self.frame_skip), rows)
+        shape = (len(states), len(values))
         by_values = torch.einsum("tkjw,kwd->tkjd", by_theta.cpu().unflatten(0, shape), slope)
         return after.cpu().unflatten(0, shape), by_values, by_state.cpu().unflatten(0, shape)
 

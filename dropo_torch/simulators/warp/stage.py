@@ -15,14 +15,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make_contacts
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
-from dropo_torch.simulators.warp.forces import (
-    actuators_adjoint,
-    add_actuators,
-    add_dampers,
-    add_springs,
-    dampers_adjoint,
-    springs_adjoint,
-)
+from dropo_torch.simulators.warp.forces import add_forces, forces_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.solver import factor, newton, solve
@@ -34,19 +27,13 @@ from dropo_torch.simulators.warp.spatial import (
     cross_motion,
     inertia_mul,
     join,
+    lin,
     nothing,
     theta_vec3,
     wrench,
 )
 from dropo_torch.simulators.warp.touch import find_contacts
-from dropo_torch.simulators.warp.types import (
-    MINVAL,
-    ONE,
-    Tables,
-    World,
-    vec3,
-    vec6,
-)
+from dropo_torch.simulators.warp.types import MINVAL, ONE, Tables, World, vec3, vec6
 
 
 @wp.func(inline=True)
@@ -55,11 +42,7 @@ def accelerate(m: Tables, w: World, r: int):
     sweep_out(m, w, r)
     inertial_forces(m, w)
     sweep_in(m, w)
-    if m.has_damper != 0:
-        add_dampers(m, w, r)
-    if m.has_spring != 0:
-        add_springs(m, w, r)
-    add_actuators(m, w, r)
+    add_forces(m, w, r)
     nrow = make_rows(m, w, r, 1)
     ncon = find_contacts(m, w)
     w.held[r] = wp.min(nrow, 1) + 2 * wp.min(ncon, 1)
@@ -104,17 +87,12 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     for i in range(m.nv):
         w.grad[w.t, m.o_armature + i] += w.lam[w.t, i] * w.qacc[w.t, i]
     if softening == 0:
-        if m.has_damper != 0:
-            dampers_adjoint(m, w, r)
-        if m.has_spring != 0:
-            springs_adjoint(m, w, r)
-        actuators_adjoint(m, w, r)
+        forces_adjoint(m, w, r)
         rows_adjoint(m, w, r, nrow)
         contacts_adjoint(m, w, ncon)
     carry_in(m, w, posed)
     if softening == 0:
-        for i in range(3):
-            w.grad[w.t, m.o_gravity + i] -= w.f_accel[w.t, 0][3 + i]
+        add_vec3(w.grad, w.t, m.o_gravity, -lin(w.f_accel[w.t, 0]))
 
 
 @wp.func(inline=True)
@@ -144,18 +122,13 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
     """
     _late = wp.grad(nothing)(ONE)
     zero = vec6()
-    w.f_velocity[w.t, 0] = zero
-    w.f_accel[w.t, 0] = zero
-    w.f_dual[w.t, 0] = zero
-    if posed != 0:
-        for b in range(m.nb):
+    for b in range(m.nb):
+        w.f_velocity[w.t, b] = zero
+        w.f_accel[w.t, b] = zero
+        w.f_dual[w.t, b] = zero
+        if posed != 0:
             w.f_total[w.t, b] = zero
             w.f_pose[w.t, b] = zero
-    for b in range(1, m.nb):
-        if m.body_massive[b] == 0:
-            w.f_velocity[w.t, b] = zero
-            w.f_accel[w.t, b] = zero
-            w.f_dual[w.t, b] = zero
         if m.body_massive[b] != 0:
             i = w.inertia[w.t, b]
             dual = w.dual[w.t, b]
@@ -170,13 +143,11 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
                     a += g * gc
                     w.grad[w.t, m.o_gravcomp + b] += wp.dot(fa, g)
                     w.f_pose[w.t, b] = cross_force(g, fa) * -gc
-                    for k in range(3):
-                        w.grad[w.t, m.o_gravity + k] += gc * fa[3 + k]
+                    add_vec3(w.grad, w.t, m.o_gravity, lin(fa) * gc)
                 iv = inertia_mul(i, v)
                 w.f_velocity[w.t, b] = inertia_mul(i, lv) - cross_force(dual, iv)
                 w.f_dual[w.t, b] = inertia_mul(i, a) + cross_force(v, iv)
             else:
-                w.f_velocity[w.t, b] = zero
                 w.f_dual[w.t, b] = inertia_mul(i, a)
             w.f_accel[w.t, b] = fa
             if m.want_inertial != 0:
@@ -205,8 +176,7 @@ def _inertia_adjoint(m: Tables, w: World, b: int, x: vec6, y: vec6, z: vec6, v: 
         yw = frame * ang(y)
         zw = frame * ang(z)
         vw = frame * ang(v)
-        for k in range(3):
-            w.grad[w.t, m.o_inertia + 3 * b + k] += xw[k] * yw[k] + zw[k] * vw[k]
+        add_vec3(w.grad, w.t, m.o_inertia + 3 * b, wp.cw_mul(xw, yw) + wp.cw_mul(zw, vw))
 
 
 @wp.func(inline=True)

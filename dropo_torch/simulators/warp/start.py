@@ -9,7 +9,8 @@ import threading
 
 import warp as wp
 
-_LOADING = threading.Lock()
+#: Held while Warp starts, a device is looked up or tables are made.
+LOADING = threading.Lock()
 _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
@@ -19,7 +20,7 @@ def start_warp() -> None:
     Its C code writes straight to the process's standard error; what it says there is passed on, but for the line
     that a CPU-only machine always gets.
     """
-    with _LOADING:
+    with LOADING:
         sys.stderr.flush()
         kept = os.dup(2)
         with tempfile.TemporaryFile() as said:

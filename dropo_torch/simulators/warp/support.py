@@ -9,32 +9,16 @@ import numpy as np
 
 from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
+from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
+from dropo_torch.simulators.warp.tables import KINDS
 
-#: θ fields that a parameter may write and the adjoint differentiates.
-DIFFERENTIABLE = frozenset(
-    {
-        "opt.gravity", "opt.density", "opt.viscosity", "opt.wind", "body_mass", "body_inertia", "body_ipos",
-        "body_gravcomp", "jnt_stiffness", "jnt_stiffnesspoly", "qpos_spring", "jnt_range", "jnt_margin", "jnt_solref",
-        "jnt_solimp", "jnt_actfrcrange", "dof_damping", "dof_dampingpoly", "dof_armature", "dof_frictionloss",
-        "dof_solref", "dof_solimp", "actuator_gainprm", "actuator_biasprm", "actuator_gear", "actuator_forcerange",
-        "actuator_ctrlrange", "eq_data", "eq_solref", "eq_solimp", "geom_friction", "geom_solref", "geom_solimp",
-        "geom_margin", "pair_friction", "pair_solref", "pair_solreffriction", "pair_solimp", "pair_margin",
-    }
-)  # fmt: skip
+#: Fields of which only the first columns act, and how many.
+_KEPT = {field: keep for _, field, keep in DIRECT if keep}
 # compared with numpy integers, which do not equal MuJoCo's enumerations from the right
 _TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
-_GEOM = mujoco.mjtGeom
-_ROUND = (int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CAPSULE))
-#: Pairs of geom types, the smaller first, that the backend collides.
-COLLIDES = frozenset(
-    {(int(_GEOM.mjGEOM_PLANE), int(g)) for g in (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX,
-                                                 _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_ELLIPSOID)}
-    | {(a, b) for a in _ROUND for b in _ROUND if a <= b}
-    | {(a, int(_GEOM.mjGEOM_BOX)) for a in _ROUND}
-)  # fmt: skip
 
 
 def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> None:
@@ -74,13 +58,11 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
         | disable.mjDSBL_REFSAFE | disable.mjDSBL_SENSOR | disable.mjDSBL_MIDPHASE | disable.mjDSBL_EULERDAMP
         | disable.mjDSBL_AUTORESET | disable.mjDSBL_NATIVECCD | disable.mjDSBL_ISLAND | disable.mjDSBL_MULTICCD
     )  # fmt: skip
-    for bit in disable.__members__.values():
-        if opt.disableflags & int(bit) & ~int(harmless) and bit != disable.mjNDISABLE:
-            yield f"flag {bit.name[7:].lower()} disabled"
-    inert = int(enable.mjENBL_ENERGY) | int(enable.mjENBL_FWDINV)
-    for bit in enable.__members__.values():
-        if bit.name != "mjNENABLE" and opt.enableflags & int(bit) & ~inert:
-            yield f"flag {bit.name[7:].lower()} enabled"
+    inert = enable.mjENBL_ENERGY | enable.mjENBL_FWDINV
+    for kind, flags in ((disable, opt.disableflags & ~int(harmless)), (enable, opt.enableflags & ~int(inert))):
+        for bit in kind.__members__.values():
+            if flags & int(bit) and not bit.name.startswith("mjN"):
+                yield f"flag {bit.name[7:].lower()} {'disabled' if kind is disable else 'enabled'}"
     if opt.disableactuator:
         yield "option actuatorgroupdisable"
     if (opt.density or opt.viscosity) and opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
@@ -96,16 +78,11 @@ def _structure(model: mujoco.MjModel) -> Iterator[str]:
             yield f"{what} ({number})"
     if not (model.nu == model.nactuator == model.nout):
         yield "actuators with several controls or outputs"
-    for flag, what in (("flg_surfacevel", "surface velocity"), ("flg_adhesion", "adhesion")):
-        if getattr(model, flag, False):
-            yield f"geom {what}"
+    flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
+    yield from (f"geom {what}" for flag, what in flags.items() if getattr(model, flag, False))
     for i in range(model.ntendon):
-        acts = (
-            model.tendon_limited[i] or model.tendon_stiffness[i] or model.tendon_damping[i]
-            or model.tendon_frictionloss[i] or model.tendon_armature[i] or model.tendon_stiffnesspoly[i].any()
-            or model.tendon_dampingpoly[i].any()
-        )  # fmt: skip
-        if acts:
+        fields = ("limited", "stiffness", "damping", "frictionloss", "armature", "stiffnesspoly", "dampingpoly")
+        if any(np.any(getattr(model, f"tendon_{field}")[i]) for field in fields):
             yield f"tendon {model.tendon(i).name or i!r}"
     for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
         yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[g]!r}"
@@ -181,16 +158,16 @@ def _equalities(model: mujoco.MjModel) -> Iterator[str]:
 def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Iterator[str]:
     names = object_names(model, "geom")
     for g1, g2, _pair in pairs:
-        kinds = (int(model.geom_type[g1]), int(model.geom_type[g2]))
-        if kinds not in COLLIDES:
-            a, b = (_GEOM(k).name[7:].lower() for k in kinds)
+        kinds = tuple(mujoco.mjtGeom(model.geom_type[g]) for g in (g1, g2))
+        if kinds not in KINDS:
+            a, b = (kind.name[7:].lower() for kind in kinds)
             yield f"contact of {a} {names[g1]!r} with {b} {names[g2]!r}"
 
 
 def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[str]:
     for parameter in space.parameters:
         for field in {t.field for t in parameter.targets}:
-            if field not in DIFFERENTIABLE:
+            if field not in FIELDS:
                 yield f"parameter {parameter.name!r}: {field} has no gradient here"
         for target in parameter.targets:
             reason = _dead(model, target.field, target.index)
@@ -201,16 +178,12 @@ def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[str]:
 
 def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
     """Why the number cannot reach the dynamics here, or an empty string."""
-    if field not in DIFFERENTIABLE:
+    if field not in FIELDS:
         return ""
     width = max(1, int(np.prod(read_field(model, field).shape[1:], dtype=int)))
     column = index % width
-    if field in ("actuator_gainprm", "actuator_biasprm") and column > 2:
-        return f"{field}[{column}] is not used by fixed or affine actuators"
-    if field == "actuator_gear" and column > 0:
-        return "only gear[0] of a joint's actuator acts"
-    if field == "eq_data" and column > 4:
-        return f"eq_data[{column}] is not used by joint equalities"
+    if column >= _KEPT.get(field, width):
+        return f"{field}[{column}] is not used by what is simulated"
     if field == "qpos_spring":
         for j in range(model.njnt):
             start = model.jnt_qposadr[j]

@@ -8,21 +8,24 @@ import mujoco
 import numpy as np
 import warp as wp
 
-from dropo_torch.parameters import ParameterSpace
+from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp import collide
-from dropo_torch.simulators.warp.layout import Layout
+from dropo_torch.simulators.warp.layout import FIELDS, Layout
 from dropo_torch.simulators.warp.pairs import condim, joins_branches
-from dropo_torch.simulators.warp.types import Tables, mat33, vec3
+from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables
 
 _JNT, _GEOM, _DISABLE = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit
 _INTEGRATOR = {
-    mujoco.mjtIntegrator.mjINT_EULER: 0, mujoco.mjtIntegrator.mjINT_RK4: 1, mujoco.mjtIntegrator.mjINT_IMPLICITFAST: 2,
+    mujoco.mjtIntegrator.mjINT_EULER: EULER, mujoco.mjtIntegrator.mjINT_RK4: RK4,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: IMPLICITFAST,
 }  # fmt: skip
-#: Fields of how soft a constraint is.
-SOFT = (
-    "jnt_solref", "jnt_solimp", "dof_solref", "dof_solimp", "eq_solref", "eq_solimp", "geom_solref", "geom_solimp",
-    "pair_solref", "pair_solreffriction", "pair_solimp",
-)  # fmt: skip
+#: Links of a joint: kind, and how far after the joint's first dof and position the link's are.
+_LINKS = {
+    _JNT.mjJNT_HINGE: ((HINGE, 0),),
+    _JNT.mjJNT_SLIDE: ((SLIDE, 0),),
+    _JNT.mjJNT_BALL: ((BALL, 0),),
+    _JNT.mjJNT_FREE: ((TRANSLATION, 0), (BALL, 3)),
+}
 #: Kinds of pairs by the geoms' types, the smaller first: constant of the kernels, points that may touch, most contacts.
 KINDS = {
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE): (collide.PLANE_SPHERE, 1, 1),
@@ -61,12 +64,12 @@ def _to_warp(array: np.ndarray, device: str) -> Any:
     """A Warp array: integers, reals, or vectors and matrices of three by the shape of a row."""
     if array.dtype.kind in "iub":
         return wp.array(array.astype(np.int32), dtype=wp.int32, device=device)
-    dtype = {(): wp.float64, (3,): vec3, (3, 3): mat33}[array.shape[1:]]
+    dtype = {(): wp.float64, (3,): wp.vec3d, (3, 3): wp.mat33d}[array.shape[1:]]
     return wp.array(np.ascontiguousarray(array, dtype=np.float64), dtype=dtype, device=device)
 
 
 def _disabled(model: mujoco.MjModel, *bits: Any) -> bool:
-    return any(model.opt.disableflags & int(b) for b in (*bits, 0))
+    return any(model.opt.disableflags & int(b) for b in bits)
 
 
 def _matrices(quats: np.ndarray) -> np.ndarray:
@@ -97,47 +100,52 @@ def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _link_table(model: mujoco.MjModel) -> np.ndarray:
+    """Kind, joint, dof and position of each link, ``(4, n)``."""
+    rows = [
+        (kind, j, model.jnt_dofadr[j] + offset, model.jnt_qposadr[j] + offset)
+        for j in range(model.njnt)
+        for kind, offset in _LINKS[_JNT(model.jnt_type[j])]
+    ]
+    return np.array(rows, dtype=int).reshape(-1, 4).T
+
+
 def _links(model: mujoco.MjModel) -> dict[str, Any]:
-    rows: list[tuple[Any, ...]] = []  # kind, joint, dof, qpos, axis, pos, ref
-    first, count = np.zeros(model.nbody, int), np.zeros(model.nbody, int)
+    kinds, joints, dofs, qs = _link_table(model)
+    bodies = model.jnt_bodyid[joints]
+    scalar, free = kinds <= SLIDE, model.jnt_type[joints] == _JNT.mjJNT_FREE
+    table = {
+        "nlink": len(kinds), "has_ball": int(bool(np.any(kinds == BALL))), "link_body": bodies, "link_kind": kinds,
+        "body_link": np.searchsorted(bodies, np.arange(model.nbody)),
+        "body_nlink": np.bincount(bodies, minlength=model.nbody),
+        "link_dof": dofs, "link_ndof": np.where(scalar, 1, 3), "link_qpos": qs, "link_jnt": joints,
+        "link_frclimited": model.jnt_actfrclimited[joints], "link_axis": model.jnt_axis[joints],
+        "link_pos": np.where(free[:, None], 0.0, model.jnt_pos[joints]),
+        "link_ref": np.where(scalar, model.qpos0[qs], 0.0),
+    }  # fmt: skip
+    return table | _origin(model, table)
+
+
+def _origin(model: mujoco.MjModel, links: dict[str, Any]) -> dict[str, Any]:
+    """Where the origin of the sweep is: it travels with the translations of the first body that moves."""
     origin: list[tuple[int, np.ndarray]] = []
     base = np.zeros(3)
-    for b in range(model.nbody):
-        first[b] = len(rows)
-        for j in range(model.body_jntadr[b], model.body_jntadr[b] + model.body_jntnum[b]):
-            kind, d, q = model.jnt_type[j], int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
-            axis, pos = model.jnt_axis[j], model.jnt_pos[j]
-            if kind == _JNT.mjJNT_FREE:
-                rows.append((2, j, d, q, axis, np.zeros(3), 0.0))
-                rows.append((3, j, d + 3, q + 3, axis, np.zeros(3), 0.0))
-            else:
-                number = {_JNT.mjJNT_HINGE: 0, _JNT.mjJNT_SLIDE: 1, _JNT.mjJNT_BALL: 3}[_JNT(kind)]
-                rows.append((number, j, d, q, axis, pos, model.qpos0[q] if number < 2 else 0.0))
-        count[b] = len(rows) - first[b]
-    moving = [b for b in range(model.nbody) if model.body_weldid[b]]
-    if moving:
-        b = moving[0]
-        turned = _matrices(model.body_quat[b : b + 1])[0]
-        base = model.body_pos[b].copy() if model.body_parentid[b] == 0 else base
-        for kind, _j, _d, q, axis, _p, ref in rows[first[b] : first[b] + count[b]]:
-            if kind == 2:
-                origin, base = [(q + i, np.eye(3)[i]) for i in range(3)], np.zeros(3)
-            elif kind == 1 and model.body_parentid[b] == 0:
-                origin.append((q, turned @ axis))
-                base = base - turned @ axis * ref
-            else:
-                break
-    kinds, joints, dofs, qs = (np.array([r[i] for r in rows], dtype=int) for i in range(4))
+    body = int(np.argmax(model.body_weldid != 0))  # 0 where none moves
+    if body and model.body_parentid[body] == 0:
+        base = model.body_pos[body].copy()
+    turned = _matrices(model.body_quat[body : body + 1])[0]
+    for k in np.flatnonzero(links["link_body"] == body) if body else ():
+        q, axis = int(links["link_qpos"][k]), turned @ links["link_axis"][k]
+        if links["link_kind"][k] == TRANSLATION:
+            origin, base = [(q + i, np.eye(3)[i]) for i in range(3)], np.zeros(3)
+        elif links["link_kind"][k] == SLIDE and model.body_parentid[body] == 0:
+            origin.append((q, axis))
+            base = base - axis * links["link_ref"][k]
+        else:
+            break
     return {
-        "nlink": len(rows), "has_ball": int(bool(np.any(kinds == 3))), "body_link": first, "body_nlink": count,
-        "link_kind": kinds, "link_dof": dofs, "link_ndof": np.where(kinds < 2, 1, 3), "link_qpos": qs,
-        "link_jnt": joints, "link_body": model.jnt_bodyid[joints] if len(rows) else joints,
-        "link_frclimited": model.jnt_actfrclimited[joints].astype(int) if len(rows) else joints,
-        "link_axis": np.array([r[4] for r in rows]).reshape(-1, 3),
-        "link_pos": np.array([r[5] for r in rows]).reshape(-1, 3),
-        "link_ref": np.array([r[6] for r in rows], dtype=float),
-        "norigin": len(origin), "origin_qpos": np.array([q for q, _a in origin], dtype=int),
-        "origin_axis": np.array([a for _q, a in origin]).reshape(-1, 3), "origin_base": vec3(*base),
+        "norigin": len(origin), "origin_qpos": np.array([q for q, _ in origin], dtype=int),
+        "origin_axis": np.array([axis for _, axis in origin]).reshape(-1, 3), "origin_base": wp.vec3d(*base),
     }  # fmt: skip
 
 
@@ -160,29 +168,25 @@ def _targets(space: ParameterSpace, field: str) -> set[int]:
 
 
 def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
-    off = _disabled(model, _DISABLE.mjDSBL_CONSTRAINT)
+    def on(bit: Any) -> bool:
+        return not _disabled(model, _DISABLE.mjDSBL_CONSTRAINT, bit)
+
     loses = (model.dof_frictionloss > 0) | np.isin(np.arange(model.nv), list(_targets(space, "dof_frictionloss")))
-    friction = np.flatnonzero(loses) if not off and not _disabled(model, _DISABLE.mjDSBL_FRICTIONLOSS) else np.zeros(0)
-    limited = []
-    k = 0
-    for j in range(model.njnt):
-        if model.jnt_limited[j] and not off and not _disabled(model, _DISABLE.mjDSBL_LIMIT):
-            limited.append(k)
-        k += 2 if model.jnt_type[j] == _JNT.mjJNT_FREE else 1
-    active = model.eq_active0.astype(bool) & (not off and not _disabled(model, _DISABLE.mjDSBL_EQUALITY))
-    ids = np.flatnonzero(active)
-    pairs = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1).reshape(-1)
-    dofs = np.where(pairs >= 0, model.jnt_dofadr[pairs], -1) if len(pairs) else np.zeros(0, int)
-    qs = np.where(pairs >= 0, model.jnt_qposadr[pairs], 0) if len(pairs) else np.zeros(0, int)
-    dense = any(
-        b >= 0 and joins_branches(model, int(model.jnt_bodyid[a]), int(model.jnt_bodyid[b]))
-        for a, b in pairs.reshape(-1, 2)
-    )
+    friction = np.flatnonzero(loses & on(_DISABLE.mjDSBL_FRICTIONLOSS))
+    limited = np.flatnonzero(model.jnt_limited.astype(bool) & on(_DISABLE.mjDSBL_LIMIT))
+    ids = np.flatnonzero(model.eq_active0.astype(bool) & on(_DISABLE.mjDSBL_EQUALITY))
+    joints = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
+    first, second = model.jnt_bodyid[joints].T
+    coupled = [
+        joins_branches(model, int(a), int(b)) for a, b, j in zip(first, second, joints[:, 1], strict=True) if j >= 0
+    ]
+    pairs = joints.reshape(-1)
+    qs = np.where(pairs >= 0, model.jnt_qposadr[pairs], 0)
     return {
-        "nfriction": len(friction), "friction_dof": friction.astype(int), "nlimit": len(limited),
-        "limit_link": np.array(limited, dtype=int), "neq": len(ids), "eq_id": ids, "eq_dof": dofs, "eq_qpos": qs,
-        "eq_ref": model.qpos0[qs] if len(qs) else np.zeros(0), "always_dense": int(dense),
-        "maxrow": len(ids) + len(friction) + 2 * len(limited),
+        "nfriction": len(friction), "friction_dof": friction, "nlimit": len(limited),
+        "limit_link": np.searchsorted(_link_table(model)[1], limited), "neq": len(ids), "eq_id": ids,
+        "eq_dof": np.where(pairs >= 0, model.jnt_dofadr[pairs], -1), "eq_qpos": qs, "eq_ref": model.qpos0[qs],
+        "always_dense": int(any(coupled)), "maxrow": len(ids) + len(friction) + 2 * len(limited),
     }  # fmt: skip
 
 
@@ -206,27 +210,28 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str
 
 def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
     integrator = _INTEGRATOR[mujoco.mjtIntegrator(model.opt.integrator)]
+    damped, sprung = (not _disabled(model, bit) for bit in (_DISABLE.mjDSBL_DAMPER, _DISABLE.mjDSBL_SPRING))
 
-    def acts(field: str, array: np.ndarray) -> bool:
-        return bool(np.any(array)) or bool(_targets(space, field))
+    def wanted(*fields: str) -> bool:
+        return any(_targets(space, field) for field in fields)
 
-    damper = acts("dof_damping", model.dof_damping) or acts("dof_dampingpoly", model.dof_dampingpoly)
-    damper = damper and not _disabled(model, _DISABLE.mjDSBL_DAMPER)
-    spring = acts("jnt_stiffness", model.jnt_stiffness) or acts("jnt_stiffnesspoly", model.jnt_stiffnesspoly)
-    fluid = acts("opt.density", np.array(model.opt.density)) or acts("opt.viscosity", np.array(model.opt.viscosity))
-    # without springs and dampers MuJoCo leaves out all passive forces
-    passive = not (_disabled(model, _DISABLE.mjDSBL_SPRING) and _disabled(model, _DISABLE.mjDSBL_DAMPER))
-    implicit = integrator == 2 or (integrator == 0 and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP))
-    return {
-        "want_inertial": int(any(_targets(space, f) for f in ("body_mass", "body_inertia", "body_ipos"))),
-        "want_inertia": int(bool(_targets(space, "body_inertia"))),
-        "want_ipos": int(bool(_targets(space, "body_ipos"))),
-        "want_soft": int(any(_targets(space, f) for f in SOFT)),
-        "integrator": integrator, "nstage": 4 if integrator == 1 else 1, "h": model.opt.timestep,
-        "impratio": max(model.opt.impratio, 1e-15), "elliptic": int(model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC),
-        "refsafe": int(not _disabled(model, _DISABLE.mjDSBL_REFSAFE)), "implicit": int(implicit),
-        "implicit_actuators": int(integrator == 2), "has_damper": int(damper),
-        "has_spring": int(spring and not _disabled(model, _DISABLE.mjDSBL_SPRING)),
-        "has_gravcomp": int(passive and acts("body_gravcomp", model.body_gravcomp)),
-        "has_fluid": int(passive and fluid),
+    def acts(*fields: str) -> bool:
+        return wanted(*fields) or any(np.any(read_field(model, field)) for field in fields)
+
+    damper = damped and acts("dof_damping", "dof_dampingpoly")
+    implicit_damper = integrator == EULER and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP)
+    passive = damped or sprung  # without springs and dampers MuJoCo leaves out all passive forces
+    switches = {
+        "want_inertial": wanted("body_mass", "body_inertia", "body_ipos"), "want_inertia": wanted("body_inertia"),
+        "want_ipos": wanted("body_ipos"), "want_soft": wanted(*(f for f in FIELDS if "_sol" in f)),
+        "elliptic": model.opt.cone == mujoco.mjtCone.mjCONE_ELLIPTIC,
+        "refsafe": not _disabled(model, _DISABLE.mjDSBL_REFSAFE), "implicit_actuators": integrator == IMPLICITFAST,
+        "implicit": integrator == IMPLICITFAST or implicit_damper, "has_damper": damper,
+        "has_spring": sprung and acts("jnt_stiffness", "jnt_stiffnesspoly"),
+        "has_gravcomp": passive and acts("body_gravcomp"),
+        "has_fluid": passive and acts("opt.density", "opt.viscosity"),
+    }  # fmt: skip
+    return {name: int(on) for name, on in switches.items()} | {
+        "integrator": integrator, "nstage": 4 if integrator == RK4 else 1, "h": model.opt.timestep,
+        "impratio": max(model.opt.impratio, 1e-15),
     }  # fmt: skip

@@ -36,19 +36,12 @@ ONE = wp.constant(wp.float64(1.0))
 TWO = wp.constant(wp.float64(2.0))
 THREE = wp.constant(wp.float64(3.0))
 MINVAL = wp.constant(wp.float64(1.0e-15))  # mjMINVAL
-#: Squared sine of the angle below which MuJoCo 4 takes two capsules for parallel.
-PARALLEL = wp.constant(wp.float64(1.0e-8))
 
 #: Kinds of link: a joint, or one of the two halves of a free joint.
 HINGE = wp.constant(0)
 SLIDE = wp.constant(1)
 TRANSLATION = wp.constant(2)
 BALL = wp.constant(3)
-
-#: Kinds of scalar constraint row.
-ROW_EQUALITY = wp.constant(0)
-ROW_FRICTION = wp.constant(1)
-ROW_LIMIT = wp.constant(2)
 
 #: Integrators.
 EULER = wp.constant(0)
@@ -97,7 +90,7 @@ Tables: Any = _struct(
         **dict.fromkeys(_VECTORS, Vec3s),
         **dict.fromkeys(_ROTATIONS, Mats),
         "dof_parent": Ints2,  # row 0 the parent in the tree, row 1 the previous dof (dense elimination)
-        "origin_base": vec3,  # of the sweep, which travels along origin_axis with the root's translations
+        "origin_base": vec3,  # of the sweep; the origin travels along origin_axis with the root's translations
         **dict.fromkeys(("link_ref", "eq_ref", "pair_bound"), Reals),
         **dict.fromkeys(("h", "impratio"), wp.float64),
     },

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -14,22 +13,12 @@ from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.fields import Fields
-from dropo_torch.simulators.warp.layout import DIRECT, MIXED
+from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.pairs import candidate_pairs
-from dropo_torch.simulators.warp.simulator import LOADING
-from dropo_torch.simulators.warp.start import start_warp
-from dropo_torch.simulators.warp.support import check_support
-from dropo_torch.simulators.warp.tables import build_tables
+from dropo_torch.simulators.warp.simulator import make_engine
 
 #: Engines that are kept.
 KEPT = 64
-
-
-@dataclass(frozen=True)
-class Structure:
-    """What of a model stands in an engine's tables, as bytes; models that share it share an engine."""
-
-    content: bytes
 
 
 class Variants:
@@ -44,7 +33,7 @@ class Variants:
     def __init__(self, space: ParameterSpace, *, num_threads: int = 0, device: str = "cpu") -> None:
         self._space, self._device = space, device
         self._threads = num_threads or os.cpu_count() or 1
-        self._engines: dict[Structure, Engine | None] = {}
+        self._engines: dict[bytes, Engine | None] = {}
 
     def rollout(self, model: mujoco.MjModel, starts: np.ndarray, controls: np.ndarray) -> np.ndarray | None:
         """Return the states after every physics step ``(W, S, nq + nv)``, NaN throughout where one diverged.
@@ -65,39 +54,29 @@ class Variants:
         engine = self._engines[structure]
         if engine is None:
             return None
-        pairs = candidate_pairs(model)
-        theta = Fields(model, self._space, pairs).constant()
-        batch = Batch(len(starts), 1, controls.shape[1], 1)
+        theta = Fields(model, self._space, candidate_pairs(model)).constant()
         inputs = [torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, starts, controls)]
-        flat, _ = engine.simulate(batch, inputs[0], inputs[1], inputs[2], keep=False)
+        flat, _ = engine.simulate(Batch(inputs[0], inputs[1], inputs[2], skip=1), keep=False)
         out = flat.numpy().reshape(len(starts), controls.shape[1], starts.shape[1])
         with np.errstate(invalid="ignore"):
             out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
         return out
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
-        pairs = candidate_pairs(model)
         try:
-            check_support(model, self._space, pairs)
+            engine, _ = make_engine(
+                model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device
+            )
         except InputError:
             return None
-        fields = Fields(model, self._space, pairs)
-        start_warp()
-        with LOADING:
-            return Engine(
-                build_tables(model, self._space, pairs, fields.layout, self._device), fields.layout.size, fields.wanted,
-                skip=1, chunk_size=4096, num_threads=self._threads, device=self._device,
-            )  # fmt: skip
+        return engine
 
 
-def _structure(model: mujoco.MjModel) -> Structure:
-    """Everything but the numbers in θ, of which only stands whether each is zero."""
-    numbers = {field for _, field, _ in DIRECT} | set(MIXED)
-    parts = []
-    for field in sorted({*numbers, *_TABLED}):
-        array = np.asarray(read_field(model, field))
-        parts.append((array != 0).tobytes() if field in numbers else array.tobytes())
-    return Structure(b"|".join(parts))
+def _structure(model: mujoco.MjModel) -> bytes:
+    """Everything but the numbers in θ, of which only stands whether each is zero; what it is in, an engine serves."""
+    numbers = [np.asarray(read_field(model, field)) != 0 for field in sorted(set(FIELDS))]
+    tabled = [np.asarray(read_field(model, field)) for field in _TABLED if field not in FIELDS]
+    return b"|".join(array.tobytes() for array in (*numbers, *tabled))
 
 
 #: Fields that an effect may change and that stand in an engine's tables.
