@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -228,9 +229,7 @@ def _convergence(fit: Fit) -> dict[str, Any]:
     cost = np.array([float(entry.simulated_transitions) for entry in history])
     seconds = np.array([entry.seconds for entry in history])
     changes = [0.0 if i == 0 else float(cost[i - 1]) for i in begins]
-
-    def panel(lines: np.ndarray, palette: Sequence[str], **options: Any) -> Any:
-        return figures.progress_panel(cost, seconds, lines, palette, changes, **options)
+    panel = partial(figures.progress_panel, cost, seconds, changes)
 
     return {
         "stages": [(chr(ord("A") + n % 26), history[a].stage, b - a) for n, (a, b) in enumerate(spans)],

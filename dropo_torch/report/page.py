@@ -68,6 +68,4 @@ def _svg(figure: Any, grow: bool = True) -> Markup:
 
 def _plain_data(value: Any) -> Any:
     """JSON for what JSON does not know."""
-    if isinstance(value, (np.ndarray, np.generic)):
-        return value.tolist()
-    return list(value) if isinstance(value, (set, frozenset)) else str(value)
+    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)

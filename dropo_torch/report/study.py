@@ -29,6 +29,5 @@ def write_study_report(
         figures: heading of the table that a figure stands above → SVG.
         versions: name → version of what the results depend on.
     """
-    drawn = {heading: Markup(svg) for heading, svg in figures.items()}
-    content = {"lead": lead, "tables": list(tables), "figures": drawn}
+    content = {"lead": lead, "tables": tables, "figures": {heading: Markup(svg) for heading, svg in figures.items()}}
     write_page(path, "study.html", title, content, config=None, versions=versions)

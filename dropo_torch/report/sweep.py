@@ -34,8 +34,7 @@ def write_sweep_report(
         title: of the page.
     """
     values = [p.robust_log_likelihood if sweep.noisy_starts else p.log_likelihood for p in sweep.points]
-    of = (([p.epsilon for p in sweep.points]), [p.mse for p in sweep.points], values)
-    epsilon, mse, likelihood = (np.array(v, dtype=float) for v in of)
+    epsilon, mse, likelihood = np.array([[p.epsilon, p.mse, v] for p, v in zip(sweep.points, values, strict=True)]).T
     content = {
         "use": yaml.safe_dump(dict(use), sort_keys=False, allow_unicode=True).strip(),
         "sweep": sweep,

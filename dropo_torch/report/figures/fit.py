@@ -119,9 +119,9 @@ def residual_panel(position: np.ndarray, standardised: np.ndarray) -> Any:
 def progress_panel(
     cost: np.ndarray,
     seconds: np.ndarray,
+    changes: Sequence[float],
     lines: np.ndarray,
     colours: Sequence[str],
-    changes: Sequence[float],
     *,
     label: str,
     log: bool = False,
@@ -133,9 +133,9 @@ def progress_panel(
 
     Args:
         cost, seconds: ``(n,)`` each, ascending.
+        changes: ``cost`` at which stages begin; they are lettered A, B, ...
         lines: ``(n, lines)``; not drawn where not finite.
         colours: one a line.
-        changes: ``cost`` at which stages begin; they are lettered A, B, ...
         label: of the vertical axis.
         log, upside_down: of the vertical axis.
         limits: of the vertical axis.
