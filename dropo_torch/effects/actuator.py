@@ -209,10 +209,11 @@ class ActuatorLag(ActuatorEffect):
         tau = values[:, :1]
         absent = tau <= 1e-6 * step
         tau = torch.where(absent, step, tau)
-        decay = torch.where(absent, 0.0, torch.exp(-step / tau))
+        passed = torch.full_like(tau, -step) / tau
+        decay = torch.where(absent, 0.0, torch.exp(passed))
         after = first_order(signal, decay, state)
         before = torch.cat([state, after[:, :-1]], 1)
-        mean = signal + (before - signal) * (tau / step) * -torch.expm1(-step / tau)
+        mean = signal + (before - signal) * (tau / step) * -torch.expm1(passed)
         return torch.where(absent, signal, mean), after[:, -1:]
 
 
