@@ -2,8 +2,8 @@
 
     python examples/own_effect.py       # records a log; finds what is missing; fits it: out/door/*/report.html
 
-The class :class:`MagneticCatch` is all that the package has to know of the effect, in search, fit and training alike; ``own_effects`` in the config
-names it, so that ``dropo gap out/door/door.yaml --out DIR`` does the same.
+The class :class:`MagneticCatch` is all that the package has to know of the effect, in search, fit and training alike;
+``own_effects`` in the config names it, so that ``dropo gap out/door/door.yaml --out DIR`` does the same.
 """
 
 from __future__ import annotations
