@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -15,10 +15,11 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.filters import (
     Filter,
-    command_filters,
     extended,
     filtered,
+    filters_of,
     observed_rates,
+    placed_filters,
     rate_columns,
     sensed,
     unsensed,
@@ -33,19 +34,10 @@ from dropo_torch.simulators.base import Simulator
 LONGEST_HISTORY = 200
 
 
-class Engine(Protocol):
-    """Simulates true states under commands of every physics step."""
-
-    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Return states ``(K, T, S, n)`` or, not fine, ``(K, T, S / skip, n)``, NaN where diverged.
-
-        Args:
-            values: parameter vectors, ``(K, d)``.
-            starts: true states, ``(K, T, n)``.
-            signals: commands as they act, ``(K, T, S, nu)``.
-            fine: states after every physics step instead of every logged one.
-        """
-        ...
+#: Simulates true states under commands of every physics step: of parameter vectors ``(K, d)``, states at the start
+#: ``(K, T, n)``, commands as they act ``(K, T, S, nu)`` and whether the result is fine. Returns the states after every
+#: physics step ``(K, T, S, n)`` or, not fine, after every logged one ``(K, T, S / skip, n)``, NaN where diverged.
+Engine = Callable[[np.ndarray, np.ndarray, np.ndarray, bool], np.ndarray]
 
 
 class InnerEngine:
@@ -55,7 +47,7 @@ class InnerEngine:
         self._engine, self._effects = VariantEngine(effects.setting, space, num_threads=num_threads), effects
 
     def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Simulate; see :class:`Engine`."""
+        """Simulate; see :data:`Engine`."""
         variants = [Variant(tuple(v.tolist()), self._effects.at(v)) for v in values]
         return self._engine.paths(variants, self._engine.models(variants), starts, signals, fine=fine)
 
@@ -67,7 +59,7 @@ class OuterEngine:
         self._inner, self._effects, self._skip = inner, effects, effects.setting.frame_skip
 
     def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Simulate; parameter vectors whose effects are the same go together. See :class:`Engine`."""
+        """Simulate; parameter vectors whose effects are the same go together. See :data:`Engine`."""
         first, kind = self._effects.kinds(values)
         every = 1 if fine else self._skip
         out = np.empty((len(values), starts.shape[1], signals.shape[2] // every, starts.shape[2]))
@@ -159,7 +151,8 @@ class EffectSimulator(Simulator):
         rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0)], values)
         index, known = self._setting.observation.index, self._rates >= 0
         shown = starts[..., index].copy()
-        sensors = self._sensor_filters(values, len(start))
+        numbers = ((e, torch.from_numpy(e.values(values).repeat(len(start), 0))) for e in self._sensors.entries)
+        sensors = filters_of(((e.effect, e.target, own) for e, own in numbers), "sense", self._setting)
         flat, slope = (torch.from_numpy(x[..., index].reshape(-1, len(index))) for x in (starts, rates))
         starts[..., index] = unsensed(flat, slope, sensors).numpy().reshape(shown.shape)
         if self._late:  # with the velocities now true, and changing, the past shows what is missing
@@ -175,17 +168,8 @@ class EffectSimulator(Simulator):
         """Return commands as they act in every physics step, ``(K, T, (history + lag)·skip, nu)``."""
         plain = np.repeat(control, self.frame_skip, axis=1)
         first, kind = self._commands.kinds(values)
-        found = [
-            filtered(plain, command_filters(self._commands.at(values[k]), self._setting), self._step) for k in first
-        ]
-        return np.stack(found)[kind]
-
-    def _sensor_filters(self, values: np.ndarray, windows: int) -> list[Filter]:
-        """Return the effects on measurements, with the numbers of K·T rows."""
-        return [
-            Filter(e.effect, self._setting.column(e.target), torch.from_numpy(e.values(values).repeat(windows, 0)))
-            for e in self._sensors.entries
-        ]
+        filters = [placed_filters(self._commands.at(values[k]), "command", self._setting) for k in first]
+        return np.stack([filtered(plain, f, self._step) for f in filters])[kind]
 
     def _start_rates(self, starts: np.ndarray, command: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return time derivatives of the states at the starts, ``(K, T, num_states)``, just before them.
@@ -289,8 +273,8 @@ def effect_simulator(
     """
     setting = effects.setting
     native, outer = effects.native, effects.outer
-    if needs_mujoco(effects, space):
-        check_backend(backend, effects, space)
+    check_backend(backend, effects, space)
+    if obstacle(backend, effects, space) is not None:
         make(setting.model, setting.frame_skip, space)  # for what it refuses
         engine: Engine = InnerEngine(effects, space, num_threads)
         kept = effects
@@ -317,35 +301,29 @@ def effect_simulator(
     ), history  # fmt: skip
 
 
-def needs_mujoco(effects: EffectSet, space: ParameterSpace) -> bool:
-    """Whether effects are forces in the simulation or change its model from one parameter vector to another."""
-    native = effects.native
-    inside = any(not (e.effect.native or e.effect.outer) for e in effects.entries)
-    return inside or any(e.varies for e in native.entries) or overlap(native, space) is not None
+def obstacle(backend: str, effects: EffectSet, space: ParameterSpace) -> str | None:
+    """Return why a backend other than MuJoCo cannot have the effects: forces, or a model that varies; or ``None``."""
+    for entry in effects.entries:
+        if not (entry.effect.native or entry.effect.outer):
+            return f"backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
+    for entry in effects.native.entries:
+        if entry.varies:
+            return (
+                f"{entry.place} has a number that varies, which backend {backend} cannot; "
+                "vary a field of the model instead, or use backend: mujoco"
+            )
+    shared = overlap(effects.native, space)
+    return None if shared is None else (
+        f"{shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
+        f"which backend {backend} cannot; leave one of them out, or use backend: mujoco"
+    )  # fmt: skip
 
 
 def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> None:
     """Raise an :class:`InputError` for an effect that a backend cannot have; it says what could."""
-    if backend == "mujoco":
-        return
-    for entry in effects.entries:
-        if not (entry.effect.native or entry.effect.outer):
-            raise InputError(
-                f"effects: backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
-            )
-    native = effects.native
-    for entry in native.entries:
-        if entry.varies:
-            raise InputError(
-                f"effects: {entry.place} has a number that varies, which backend {backend} cannot; "
-                "vary a field of the model instead, or use backend: mujoco"
-            )
-    shared = overlap(native, space)
-    if shared is not None:
-        raise InputError(
-            f"effects: {shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
-            f"which backend {backend} cannot; leave one of them out, or use backend: mujoco"
-        )
+    reason = obstacle(backend, effects, space)
+    if backend != "mujoco" and reason is not None:
+        raise InputError(f"effects: {reason}")
 
 
 def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSet) -> int:
