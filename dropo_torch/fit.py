@@ -262,14 +262,12 @@ class _Checkpoint:
 
     def save(self, search: Optimizer, state: _State) -> None:
         """Write the state, whole or not at all."""
-        initial = state.initial
         content = {
-            "fingerprint": self.fingerprint,
-            "optimizer": search.name,
-            "state": search.state(),
+            "owner": self._owner(search),
+            "optimizer": search.state(),
             "history": [vars(entry) for entry in state.history],
             "simulated_transitions": state.simulated_transitions,
-            "linearised": None if initial is None else (initial.mean, initial.std),
+            "linearised": None if state.initial is None else (state.initial.mean, state.initial.std),
         }
         write_atomically(self.path, pickle.dumps(content))
 
@@ -279,14 +277,11 @@ class _Checkpoint:
             return None
         try:
             content = pickle.loads(self.path.read_bytes())
-            is_own = (content["fingerprint"], content["optimizer"]) == (self.fingerprint, search.name)
+            is_own, linearised = content["owner"] == self._owner(search), content["linearised"]
+            history = [HistoryEntry(**entry) for entry in content["history"]]
+            state = _State(content["simulated_transitions"], history)
             if is_own:
-                search.restore(content["state"])
-                state = _State(
-                    simulated_transitions=content["simulated_transitions"],
-                    history=[HistoryEntry(**entry) for entry in content["history"]],
-                )
-                linearised = content["linearised"]
+                search.restore(content["optimizer"])
         except Exception as error:
             raise InputError(
                 f"resume: {self.path} is no checkpoint of a fit ({error}); start again without --resume"
@@ -299,6 +294,9 @@ class _Checkpoint:
         if linearised is not None:
             state.initial = objective.initial_noise(*linearised)  # already counted
         return state
+
+    def _owner(self, search: Optimizer) -> tuple[str, str]:
+        return self.fingerprint, search.name
 
 
 def without_history(result: Fit) -> Fit:

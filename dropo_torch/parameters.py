@@ -47,6 +47,7 @@ _OBJECTS = {
     "flex": ("nflex", "flex"),
 }  # fmt: skip
 _KEYS = ("field", "name", "index", "bounds", "limits", "unit", "scale", "relative", "scale_inertia", "effect")
+_UNBOUNDED = (-np.inf, np.inf)
 #: Keys of a parameter that is a number of an effect.
 _EFFECT_KEYS = ("effect", "name", "index", "bounds", "limits", "unit", "scale")
 
@@ -58,6 +59,10 @@ class Target:
     field: str
     index: int
     factor: float = 1.0
+
+    def read(self, model: mujoco.MjModel) -> float:
+        """Return the number that a model has there."""
+        return float(read_field(model, self.field).reshape(-1)[self.index])
 
 
 @dataclass(frozen=True)
@@ -154,7 +159,7 @@ class ParameterSpace:
         """Upper search bounds, ``(d,)``."""
         return np.array([p.high for p in self.parameters])
 
-    @cached_property
+    @property
     def limits(self) -> np.ndarray:
         """Physical limits, ``(d, 2)``."""
         return np.array([p.limits for p in self.parameters]).reshape(-1, 2)
@@ -169,7 +174,7 @@ class ParameterSpace:
         """The model fields that the parameters write."""
         return tuple(dict.fromkeys(t.field for p in self.parameters for t in p.targets))
 
-    @cached_property
+    @property
     def nominal(self) -> np.ndarray:
         """The model's own values, ``(d,)``; NaN for a parameter outside the model."""
         return np.array([_nominal(self.model, p) for p in self.parameters])
@@ -183,15 +188,14 @@ class ParameterSpace:
         for name in values:
             if name not in self.names:
                 raise InputError(f"parameters: unknown name {name!r}" + choices(name, self.names))
-        missing = [n for n in self.names if n not in values]
-        if missing:
-            raise InputError(f"parameters: no value given for {missing[0]!r}")
+        for name in self.names:
+            if name not in values:
+                raise InputError(f"parameters: no value given for {name!r}")
         return np.array([float(values[n]) for n in self.names])
 
     def with_limits(self, low: np.ndarray) -> ParameterSpace:
         """Return the same space with the lower physical limits ``(d,)`` raised to those given."""
         other = copy.copy(self)
-        other.__dict__.pop("limits", None)
         other.parameters = tuple(
             replace(p, limits=(max(p.limits[0], float(least)), p.limits[1]))
             for p, least in zip(self.parameters, low, strict=True)
@@ -201,7 +205,6 @@ class ParameterSpace:
     def on(self, model: mujoco.MjModel) -> ParameterSpace:
         """Return the same parameters, with the same targets and factors, of another model of the same robot."""
         other = copy.copy(self)
-        other.__dict__.pop("nominal", None)
         other.model = model
         return other
 
@@ -305,36 +308,19 @@ def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> 
     for key in ("relative", "scale_inertia"):
         if not isinstance(spec.get(key, False), bool):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected true or false")
-    if "effect" in spec:
-        return _parse_effect(where, name, spec)
-    field, index = _field_and_index(where, spec)
-    if model is None and field:
-        raise InputError(f"{where}: field {field!r} needs a MuJoCo model; this simulator has none")
-    if model is not None and not field:
-        raise InputError(f"{where}: no field given; expected one of MjModel's, such as field: body_mass")
     scale = spec.get("scale", "linear")
     if scale not in ("linear", "log"):
         raise InputError(f"{where}: scale is {scale!r}; expected linear or log")
-    targets, objects, index = _targets(model, where, field, index, spec) if model is not None else ((), (), None)
-    relative = bool(spec.get("relative", False))
-    if relative:
-        if model is None:
-            raise InputError(f"{where}: relative needs a MuJoCo model whose value it multiplies")
-        targets = tuple(_scaled(model, where, t) for t in targets)
-    if spec.get("scale_inertia", False):
-        targets = _with_inertia(model, where, field, targets, relative)
+    found = _at_effect(where, name, spec) if "effect" in spec else _at_field(model, where, name, spec)
     low, high = _interval(where, "bounds", spec.get("bounds"))
-    limits = _limits(where, field, relative, spec, low, high)
+    limits = _limits(where, found.field, spec, low, high)
     if scale == "log" and low <= 0:
         raise InputError(f"{where}: scale log needs positive bounds, got [{low:g}, {high:g}]")
-    return Parameter(
-        name=name, low=low, high=high, field=field, objects=objects, index=index,
-        unit=str(spec.get("unit", "") or ""), limits=limits, scale=scale, targets=targets,
-    )  # fmt: skip
+    return replace(found, low=low, high=high, unit=str(spec.get("unit", "") or ""), limits=limits, scale=scale)
 
 
-def _parse_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
-    """An entry that is a number of an effect; whether there is such an effect is checked where they are known."""
+def _at_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
+    """A number of an effect, without bounds; whether there is such an effect is checked where they are known."""
     for key in spec:
         if key not in _EFFECT_KEYS:
             raise InputError(
@@ -343,18 +329,29 @@ def _parse_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
     for key in ("effect", "name", "index"):
         if not isinstance(spec.get(key, ""), str | None):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected a name")
-    scale = spec.get("scale", "linear")
-    if scale not in ("linear", "log"):
-        raise InputError(f"{where}: scale is {scale!r}; expected linear or log")
-    low, high = _interval(where, "bounds", spec.get("bounds"))
-    limits = _limits(where, "", False, spec, low, high)
-    if scale == "log" and low <= 0:
-        raise InputError(f"{where}: scale log needs positive bounds, got [{low:g}, {high:g}]")
-    return Parameter(
-        name=name, low=low, high=high, objects=(spec["name"],) if spec.get("name") else (),
-        unit=str(spec.get("unit", "") or ""), limits=limits, scale=scale, effect=str(spec["effect"]),
-        quantity=spec.get("index") or "",
-    )  # fmt: skip
+    objects = (spec["name"],) if spec.get("name") else ()
+    return Parameter(name, *_UNBOUNDED, objects=objects, effect=str(spec["effect"]), quantity=spec.get("index") or "")
+
+
+def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
+    """The numbers of the model that a field, its objects and component stand for, without bounds."""
+    field, index = _field_and_index(where, spec)
+    if model is None:
+        if field:
+            raise InputError(f"{where}: field {field!r} needs a MuJoCo model; this simulator has none")
+        if spec.get("relative"):
+            raise InputError(f"{where}: relative needs a MuJoCo model whose value it multiplies")
+        if spec.get("scale_inertia"):
+            raise InputError(f"{where}: scale_inertia is for field body_mass, not {field!r}")
+        return Parameter(name, *_UNBOUNDED)
+    if not field:
+        raise InputError(f"{where}: no field given; expected one of MjModel's, such as field: body_mass")
+    targets, objects, index = _targets(model, where, field, index, spec)
+    if spec.get("relative"):
+        targets = tuple(_scaled(model, where, t) for t in targets)
+    if spec.get("scale_inertia"):
+        targets = _with_inertia(model, where, field, targets, bool(spec.get("relative")))
+    return Parameter(name, *_UNBOUNDED, field=field, objects=objects, index=index, targets=targets)
 
 
 def _field_and_index(where: str, spec: Mapping[str, Any]) -> tuple[str, int | None]:
@@ -450,11 +447,9 @@ def _select_objects(where: str, spec: Mapping[str, Any], names: Sequence[str], k
 def _rows(model: mujoco.MjModel, prefix: str, number: int) -> list[int]:
     """Rows of a field for one object: a joint's may be several degrees of freedom."""
     if prefix == "dof":
-        start = int(model.jnt_dofadr[number])
-        return list(range(start, start + {0: 6, 1: 3}.get(int(model.jnt_type[number]), 1)))
+        return np.flatnonzero(model.dof_jntid == number).tolist()
     if prefix in ("qpos0", "qpos"):
-        start = int(model.jnt_qposadr[number])
-        return list(range(start, start + {0: 7, 1: 4}.get(int(model.jnt_type[number]), 1)))
+        return list(range(model.jnt_qposadr[number], [*model.jnt_qposadr, model.nq][number + 1]))
     return [number]
 
 
@@ -470,27 +465,24 @@ def _component(where: str, field: str, index: int | None, size: int) -> int:
 
 def _scaled(model: mujoco.MjModel, where: str, target: Target) -> Target:
     """The target of a relative parameter: its factor is the model's own value."""
-    own = float(read_field(model, target.field).reshape(-1)[target.index])
+    own = target.read(model)
     if own == 0:
         raise InputError(f"{where}: relative, but the model's {target.field} is 0 there; give absolute bounds")
     return Target(target.field, target.index, own)
 
 
 def _with_inertia(
-    model: mujoco.MjModel | None, where: str, field: str, targets: tuple[Target, ...], relative: bool
+    model: mujoco.MjModel, where: str, field: str, targets: tuple[Target, ...], relative: bool
 ) -> tuple[Target, ...]:
     """Add the principal moments of inertia, in proportion to the mass."""
-    if model is None or field != "body_mass":
+    if field != "body_mass":
         raise InputError(f"{where}: scale_inertia is for field body_mass, not {field!r}")
     extra = []
-    for target in targets:
-        mass = 1.0 if relative else float(model.body_mass[target.index])
+    for body in (target.index for target in targets):
+        mass = 1.0 if relative else float(model.body_mass[body])
         if mass <= 0:
             raise InputError(f"{where}: scale_inertia needs a body whose mass in the model is positive")
-        extra += [
-            Target("body_inertia", 3 * target.index + i, float(model.body_inertia[target.index, i]) / mass)
-            for i in range(3)
-        ]
+        extra += [Target("body_inertia", 3 * body + i, float(model.body_inertia[body, i]) / mass) for i in range(3)]
     return targets + tuple(extra)
 
 
@@ -509,18 +501,16 @@ def _interval(where: str, key: str, pair: Any) -> tuple[float, float]:
     return low, high
 
 
-def _limits(
-    where: str, field: str, relative: bool, spec: Mapping[str, Any], low: float, high: float
-) -> tuple[float, float]:
+def _limits(where: str, field: str, spec: Mapping[str, Any], low: float, high: float) -> tuple[float, float]:
     """Physical limits: what the field allows, narrowed by the entry's own ``limits``."""
     positive = field in POSITIVE_FIELDS
     floor = 0.0 if positive or field in NONNEGATIVE_FIELDS else -np.inf
-    what = "value" if relative else field.replace("opt.", "").split("_")[-1]
+    what = "value" if spec.get("relative") else field.replace("opt.", "").split("_")[-1]
     if positive and low <= 0:
         raise InputError(f"{where}: bounds [{low:g}, {high:g}] allow a {what} that is not positive; start above 0")
     if low < floor:
         raise InputError(f"{where}: bounds [{low:g}, {high:g}] allow a negative {what}; start at 0 or above")
-    if "limits" in spec and spec["limits"] is not None:
+    if spec.get("limits") is not None:
         smallest, largest = _interval(where, "limits", spec["limits"])
         if smallest > low or largest < high:
             raise InputError(f"{where}: limits [{smallest:g}, {largest:g}] do not contain bounds [{low:g}, {high:g}]")
@@ -536,8 +526,7 @@ def _nominal(model: mujoco.MjModel | None, parameter: Parameter) -> float:
     if model is None or not parameter.targets:
         return float("nan")
     target = parameter.targets[0]
-    own = float(read_field(model, target.field).reshape(-1)[target.index])
-    return own / target.factor if target.factor else float("nan")
+    return target.read(model) / target.factor if target.factor else float("nan")
 
 
 def _refuse_derived(space: ParameterSpace) -> None:
@@ -551,8 +540,7 @@ def _refuse_derived(space: ParameterSpace) -> None:
         ) from None
     for column, p in enumerate(space.parameters):
         for t in p.targets:
-            found = read_field(model, t.field).reshape(-1)[t.index]
-            if not np.isclose(found, t.factor * values[column], rtol=1e-6):
+            if not np.isclose(t.read(model), t.factor * values[column], rtol=1e-6):
                 raise InputError(f"parameters.{p.name}: MuJoCo derives {t.field} from other fields; vary those instead")
 
 

@@ -23,7 +23,7 @@ from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.errors import InputError
-from dropo_torch.models.bundled import BundledSim, bundled_sim
+from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
@@ -73,28 +73,27 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     Raises:
         InputError: anything that does not fit, by key.
     """
-    sim = None if config.sim is None else bundled_sim(config.sim)
+    given, config = config, _completed(config)
     load_effects(config.own_effects, config.path)
     if config.backend == "gymnasium":
-        model_path, space, source = _gymnasium_source(config, sim)
+        model_path, space, source = _gymnasium_source(config)
     else:
-        if config.environment is not None:
-            raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
-        model_path = _model_path(config, sim)
-        space = _space(load_model(model_path, general=general or config.moves_centres), config, sim)
+        model_path = config.path(str(config.model))
+        space = _space(load_model(model_path, general=general or config.moves_centres), config)
         source = space.model
-    trajectories = _log(config, sim, space.model)
-    frame_skip = _frame_skip(config, sim, space.model, trajectories)
+    trajectories = _log(config, space.model)
+    frame_skip = _frame_skip(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
     effects, history = None, 0
     if config.has_effects:
-        observation = _observation(config, sim, space.model, _num_states(config, source), width)
+        num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
+        observation = _observation(config, space.model, num_states, width)
         space, effects = _effects(config, space, observation, frame_skip)
         simulator, history = _with_effects(config, source, effects, space, trajectories)
     else:
         simulator = _backend(config, source, frame_skip, space)
     _check_log(trajectories, simulator, frame_skip)
-    observation = _observation(config, sim, space.model, simulator.num_states, width)
+    observation = _observation(config, space.model, simulator.num_states, width)
     objective = Objective(
         simulator,
         make_transitions(trajectories, observation, lag=config.lag, history=history),
@@ -105,16 +104,43 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         scaling=config.scaling,
     )
     return Problem(
-        config=config,
+        config=given,
         model_path=model_path,
         space=space,
         simulator=simulator,
         trajectories=trajectories,
         observation=observation,
         objective=objective,
-        fingerprint=_fingerprint(config, space.model, trajectories),
+        fingerprint=_fingerprint(given, space.model, trajectories),
         effects=effects,
     )
+
+
+def _completed(config: Config) -> Config:
+    """The config with what its bundled simulation says of the keys that it leaves out.
+
+    An environment has a model and a step of its own, an adapter without a model names of its own, too.
+    """
+    sim = None if config.sim is None else bundled_sim(config.sim)
+    own: dict[str, Any] = {}
+    if sim is not None:
+        own["data"] = str(sim.log)
+        if config.backend != "gymnasium" or _is_registered(config.environment) or config.model is not None:
+            own |= {"parameters": dict(sim.parameters), "observation": list(sim.observation)}
+    if config.backend != "gymnasium":
+        if config.environment is not None:
+            raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
+        if (config.model is None) == (sim is None):
+            both = "both model and sim are" if sim else "neither model nor sim is"
+            raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
+        if sim is not None:
+            own |= {"model": str(sim.model), "frame_skip": sim.frame_skip}
+    return config.model_copy(update={key: value for key, value in own.items() if getattr(config, key) is None})
+
+
+def _is_registered(environment: str | None) -> bool:
+    """Whether the name is one of Gymnasium's ids, and no adapter."""
+    return environment is not None and re.search(r"-v\d+$", environment) is not None
 
 
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
@@ -140,10 +166,6 @@ def _effects(
     return space.with_limits(lowest(effects, space)), effects
 
 
-def _num_states(config: Config, source: Any) -> int:
-    return int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
-
-
 def _with_effects(
     config: Config, source: Any, effects: EffectSet, space: ParameterSpace, trajectories: Trajectories
 ) -> tuple[Simulator, int]:
@@ -165,28 +187,20 @@ def _with_effects(
     )  # fmt: skip
 
 
-def _model_path(config: Config, sim: BundledSim | None) -> Path:
-    if (config.model is None) == (sim is None):
-        both = "both model and sim are" if sim else "neither model nor sim is"
-        raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
-    return sim.model if sim is not None else config.path(str(config.model))
-
-
-def _space(model: mujoco.MjModel | None, config: Config, sim: BundledSim | None) -> ParameterSpace:
-    given = config.parameters if config.parameters is not None else (sim.parameters if sim else None)
-    if given is None:
+def _space(model: mujoco.MjModel | None, config: Config) -> ParameterSpace:
+    if config.parameters is None:
         raise InputError(
             "config: no parameters given; expected name: {field: body_mass, name: BODY, bounds: [low, high]}"
         )
-    return ParameterSpace(model, given)
+    return ParameterSpace(model, config.parameters)
 
 
-def _gymnasium_source(config: Config, sim: BundledSim | None) -> tuple[Path | None, ParameterSpace, Any]:
+def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]:
     """The parameter space and the adapter (or its maker) of a Gymnasium environment or of the user's own."""
     name = config.environment
     if name is None:
         raise InputError("config: backend gymnasium needs environment: an id such as Hopper-v5, or file.py:function")
-    if re.search(r"-v\d+$", name):
+    if _is_registered(name):
         if config.model is not None:
             raise InputError(f"config: both model and environment {name} are given; the environment has its own model")
         try:
@@ -194,14 +208,14 @@ def _gymnasium_source(config: Config, sim: BundledSim | None) -> tuple[Path | No
                 environment = gymnasium.make(name)
         except Exception as error:  # whatever the maker of a registered environment raises
             raise InputError(f"environment: Gymnasium cannot make {name!r}: {error}") from None
-        space = _space(getattr(environment.unwrapped, "model", None), config, sim)
+        space = _space(getattr(environment.unwrapped, "model", None), config)
         return None, space, MujocoEnvAdapter(environment, space)
     maker = load_callable(
         "environment", name, path=config.path, what="function {} that makes an adapter",
         example="an id such as Hopper-v5, or file.py:function of an adapter",
     )  # fmt: skip
     path = None if config.model is None else config.path(config.model)
-    space = _space(None if path is None else load_model(path), config, sim if path is not None else None)
+    space = _space(None if path is None else load_model(path), config)
     with _user_code(name):
         adapter = maker(space)
     return path, space, _CheckedAdapter(adapter, name)
@@ -257,8 +271,8 @@ def _user_code(name: str) -> AbstractContextManager[None]:
     return user_code("environment", name)
 
 
-def _log(config: Config, sim: BundledSim | None, model: mujoco.MjModel | None) -> Trajectories:
-    source = config.data if config.data is not None else (str(sim.log) if sim else None)
+def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:
+    source = config.data
     if source is None:
         raise InputError("config: no data given; expected the path of a log, such as data: log.npz")
     if isinstance(source, dict) and isinstance(source.get("preprocess"), dict) and "dt" not in source["preprocess"]:
@@ -275,16 +289,12 @@ def _log(config: Config, sim: BundledSim | None, model: mujoco.MjModel | None) -
     return log.select_episodes(range(wanted) if isinstance(wanted, int) else wanted)
 
 
-def _frame_skip(
-    config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, trajectories: Trajectories
-) -> int:
+def _frame_skip(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> int:
     """``frame_skip`` as given, or as the log's time step says."""
     if config.frame_skip is not None:
         return config.frame_skip
     if config.backend == "gymnasium":
         return 1  # an environment's step is what its designer calls one
-    if sim is not None:
-        return sim.frame_skip
     assert model is not None
     step = float(model.opt.timestep)
     if trajectories.dt is None:
@@ -327,12 +337,9 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
     )
 
 
-def _observation(
-    config: Config, sim: BundledSim | None, model: mujoco.MjModel | None, num_states: int, width: int
-) -> Observation:
+def _observation(config: Config, model: mujoco.MjModel | None, num_states: int, width: int) -> Observation:
     if model is not None and num_states == model.nq + model.nv:
-        entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
-        return parse_observation(model, entries, width)
+        return parse_observation(model, config.observation, width)
     if config.observation is not None:
         raise InputError("observation: this simulator's states have no names; leave the key out")
     if width != num_states:
@@ -342,13 +349,8 @@ def _observation(
 
 def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> str:
     digest = hashlib.sha256(config.fingerprint(*TRAINING_KEYS).encode())
-    for array in (
-        trajectories.observations,
-        trajectories.next_observations,
-        trajectories.actions,
-        trajectories.terminals,
-    ):
-        digest.update(np.ascontiguousarray(array).tobytes())
+    for name in ("observations", "next_observations", "actions", "terminals"):
+        digest.update(np.ascontiguousarray(getattr(trajectories, name)).tobytes())
     where, _, _ = (config.environment or "").rpartition(":")
     if where.endswith(".py"):
         digest.update(config.path(where).read_bytes())

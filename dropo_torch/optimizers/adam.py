@@ -9,7 +9,6 @@ step along an eigenvector is longer than Newton's, gradient / eigenvalue.
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
 import torch
@@ -53,6 +52,7 @@ class AdamOptimizer(LikelihoodOptimizer):
     """
 
     name = "adam"
+    STATE = ("_phi", "_first", "_second", "_basis", "_curvature", "_refreshed", "_step", "_smoothed", "_linearised")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         if not objective.simulator.differentiable:
@@ -118,15 +118,6 @@ class AdamOptimizer(LikelihoodOptimizer):
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the last φ."""
         return [self._box.denormalise(self._phi)]
-
-    def state(self) -> dict[str, Any]:
-        """Return everything that changes, as plain data."""
-        return {name: getattr(self, name) for name in _STATE}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        for name in _STATE:
-            setattr(self, name, state[name])
 
     @property
     def _is_joint(self) -> bool:
@@ -232,6 +223,3 @@ class AdamOptimizer(LikelihoodOptimizer):
         epoch, part = divmod(self._step, max(1, total // self._batch))
         order = np.random.default_rng((self._settings.seed, 6, epoch)).permutation(total)
         return np.sort(order[part * self._batch : (part + 1) * self._batch])
-
-
-_STATE = ("_phi", "_first", "_second", "_basis", "_curvature", "_refreshed", "_step", "_smoothed", "_linearised")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import abc
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -96,10 +96,6 @@ class Ascent(abc.ABC):
         added[1 + d : 1 + 2 * d] += weight
         added[1 + 2 * d + d * d : 1 + 2 * d + 2 * d * d].view(d, d).diagonal().add_(2 * weight)
         return added
-
-    def state(self) -> dict[str, Any]:
-        """Return everything that changes, as plain data."""
-        return {k: v for k, v in vars(self).items() if k not in ("box", "uniforms")}
 
 
 def scoring_step(

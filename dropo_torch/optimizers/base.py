@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import abc
+import copy
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -78,6 +79,8 @@ class Optimizer(abc.ABC):
     name: ClassVar[str]
     #: What stands as ``method`` in ``fit.json``.
     method: ClassVar[str] = "dropo"
+    #: Names of the attributes that change.
+    STATE: ClassVar[tuple[str, ...]] = ()
 
     @abc.abstractmethod
     def ask(self) -> Request:
@@ -118,13 +121,14 @@ class Optimizer(abc.ABC):
         """Return what the method found beside a distribution, as plain data for ``fit.json``."""
         return {}
 
-    @abc.abstractmethod
     def state(self) -> dict[str, Any]:
         """Return everything needed to go on, as plain data."""
+        return copy.deepcopy({name: getattr(self, name) for name in self.STATE})
 
-    @abc.abstractmethod
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
+        for name, value in state.items():
+            setattr(self, name, value)
 
 
 class LikelihoodOptimizer(Optimizer):

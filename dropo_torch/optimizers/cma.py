@@ -36,6 +36,7 @@ class CMAOptimizer(LikelihoodOptimizer):
     """
 
     name = "cma"
+    STATE = ("_asked", "_best", "_best_phi")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
@@ -116,17 +117,11 @@ class CMAOptimizer(LikelihoodOptimizer):
 
     def state(self) -> dict[str, Any]:
         """Return pycma's own pickle and what stands beside it."""
-        return {
-            "search": self._search.pickle_dumps(),
-            "asked": self._asked,
-            "best": self._best,
-            "best_phi": self._best_phi,
-        }
+        return super().state() | {"_search": self._search.pickle_dumps()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
-        self._search = pickle.loads(state["search"])
-        self._asked, self._best, self._best_phi = state["asked"], state["best"], state["best_phi"]
+        super().restore(state | {"_search": pickle.loads(state["_search"])})
 
     def _center(self) -> np.ndarray:
         """Return μ of the search distribution, in coordinates."""

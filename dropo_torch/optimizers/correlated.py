@@ -7,8 +7,6 @@ g_t = A_tᵀΣ_t⁻¹r_t alone, which one stencil gives for every transition.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 
@@ -62,6 +60,8 @@ def random_effects(
 
 class CorrelatedOptimizer(FisherOptimizer):
     """Fisher scoring with independent parameters, then their full covariance; the likelier of both is the result."""
+
+    STATE = (*FisherOptimizer.STATE, "_center", "_covariance", "_rounds")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
@@ -129,17 +129,6 @@ class CorrelatedOptimizer(FisherOptimizer):
         correlation = self._covariance / np.outer(drawn, drawn)
         bounded = np.clip(drawn / DRAWN_STD, self._box.min_std, self._box.max_std)  # the cut takes its share again
         return [*independent, Distribution.over(space, self._at, bounded, correlation=correlation)]
-
-    def state(self) -> dict[str, Any]:
-        """Return all stages as plain data."""
-        own = {"center": self._center, "covariance": self._covariance, "rounds": self._rounds}
-        return {**super().state(), "correlated": own}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        super().restore(state)
-        own = state["correlated"]
-        self._center, self._covariance, self._rounds = own["center"], own["covariance"], own["rounds"]
 
     @property
     def _at(self) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -43,6 +43,7 @@ class FisherOptimizer(LikelihoodOptimizer):
     """
 
     name = "fisher"
+    STATE: ClassVar[tuple[str, ...]] = ("_means", "_scoring", "_round", "_linearised", "_explained", "_spread_round")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
@@ -107,29 +108,6 @@ class FisherOptimizer(LikelihoodOptimizer):
         """Return the φ at which the last stage stopped."""
         stage = self._scoring
         return [(self._means.point, self._box.min_std) if stage is None else (stage.mean, stage.std)]
-
-    def state(self) -> dict[str, Any]:
-        """Return all stages as plain data."""
-        return {
-            "means": dict(vars(self._means)),
-            "scoring": None if self._scoring is None else self._scoring.state(),
-            "is_sampled": isinstance(self._scoring, SampledStage),
-            "round": self._round,
-            "linearised": self._linearised,
-            "explained": self._explained,
-            "spread_round": self._spread_round,
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self._means = MeansStage(**state["means"])
-        self._scoring = None
-        if state["is_sampled"]:
-            self._scoring = SampledStage(self._box, uniforms=self._uniforms, **state["scoring"])
-        elif state["scoring"] is not None:
-            self._scoring = SigmaPointStage(self._box, **state["scoring"])
-        self._round, self._linearised = state["round"], state["linearised"]
-        self._spread_round, self._explained = state["spread_round"], state["explained"]
 
     def _after_means(self) -> None:
         """Refit the means around the noise propagated at them until convergence, then go on to σ."""
