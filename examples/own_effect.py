@@ -2,8 +2,8 @@
 
     python examples/own_effect.py       # records a log; finds what is missing; fits it: out/door/*/report.html
 
-The class :class:`MagneticCatch` is all that the package has to know of the effect; ``own_effects`` in the config
-names it, so that ``dropo gap out/door/door.yaml --out DIR`` does the same.
+The class :class:`MagneticCatch` is all that the package has to know of the effect, in search, fit and training alike;
+``own_effects`` in the config names it, so that ``dropo gap out/door/door.yaml --out DIR`` does the same.
 """
 
 from __future__ import annotations
@@ -43,7 +43,6 @@ class MagneticCatch(JointEffect):
 
     name = "magnetic_catch"
     sentence = "a magnet catches {target} where its position is zero"
-    native = False  # MJCF has nothing like it: it lives in the config
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         """Return its numbers; ``scale`` is a size that matters, ``neutral`` where the effect is absent."""
@@ -56,9 +55,9 @@ class MagneticCatch(JointEffect):
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        """Return generalised forces, one row a state."""
+        """Return generalised forces, one row a state; each may have numbers of its own, or all share one row."""
         out = np.zeros_like(velocity)
-        torque, reach = values
+        torque, reach = values.T
         away = position[:, setting.coordinate(str(target))] / reach
         out[:, setting.dof(str(target))] = -torque * away * np.exp(0.5 - 0.5 * away**2)  # largest one reach away
         return out

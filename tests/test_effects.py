@@ -19,12 +19,17 @@ from dropo_torch.config import load_config, make_config
 from dropo_torch.data.observation import generic_observation, parse_observation
 from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
+from dropo_torch.effects.actuator import ActuatorDeadband
 from dropo_torch.effects.base import Setting
-from dropo_torch.effects.export import search_box, write_config, write_model
+from dropo_torch.effects.export import write_model
+from dropo_torch.effects.filters import Filter, extended, filtered, sensed
+from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import lowest, place_effects, plain_setting
+from dropo_torch.effects.sensor import SensorScale
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
+from dropo_torch.gap.config import search_box, write_config
 from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
@@ -403,6 +408,92 @@ def test_each_parameter_vector_has_its_own_numbers() -> None:
     shifted = np.concatenate([np.repeat(COMMAND[:1], 2), COMMAND[:-2]])
     np.testing.assert_allclose(forces(path[0, 1].numpy(), 3.0), shifted, atol=1e-9)
     np.testing.assert_allclose(forces(path[0, 2].numpy(), 3.0), shifted - 0.3, atol=1e-3)
+
+
+# Laws of the kernels
+
+
+class Mean(ActuatorDeadband):
+    """A user's own filter: the mean of the last three commands, times a number."""
+
+    name = "own_mean"
+
+    def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:
+        return command.expand(-1, 2)
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        known = torch.cat([state, signal], 1)
+        return known.unfold(1, 3, 1).sum(-1) * (values[:, :1] / 3), known[:, -2:]
+
+
+class Mixed(SensorScale):
+    """A user's own sensor, late and scaled."""
+
+    name = "own_mixed"
+
+    def memory(self, values: np.ndarray) -> float:
+        return 0.5 * float(values[0])
+
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        return values[:, :1] * path.ago(column, 0.5 * values[:, :1])
+
+
+def filters_of(method: str) -> list[Any]:
+    own: list[Effect] = [Mean() if method == "command" else Mixed()]
+    return [pytest.param(e, id=e.name) for e in [*VOCABULARY.values(), *own] if e.has(method)]
+
+
+def drawn(rows: int, high: float) -> torch.Tensor:
+    values = high * torch.rand(rows, 1, generator=torch.Generator().manual_seed(rows), dtype=torch.float64)
+    values[0] = 0.0 if rows > 1 else 0.3 * high
+    return values
+
+
+@pytest.mark.parametrize("alike", [False, True])
+@pytest.mark.parametrize("effect", filters_of("command"))
+def test_commands_of_an_episode_are_those_of_its_steps(effect: Effect, alike: bool) -> None:
+    """At once, in parts of any length with the state handed on, or a row at a time."""
+    rows, steps = 5, 130
+    signal = torch.from_numpy(np.random.default_rng(2).standard_normal((rows, steps)))
+    values = drawn(1 if alike else rows, 0.06)
+    whole, _ = effect.command(signal, values, STEP, effect.settled(signal[:, :1], values, STEP))
+    for lengths in ((1,), (4,), (7, 1, 30)):
+        state, parts, at = effect.settled(signal[:, :1], values, STEP), [], 0
+        while at < steps:
+            part = signal[:, at : at + lengths[len(parts) % len(lengths)]]
+            out, state = effect.command(part, values, STEP, state)
+            parts.append(out)
+            at += part.shape[1]
+        torch.testing.assert_close(torch.cat(parts, 1), whole, rtol=0, atol=1e-13)
+    own = values.expand(rows, -1)
+    alone = [
+        filtered(signal[i : i + 1, :, None].numpy(), [Filter(effect, 0, own[i : i + 1])], STEP) for i in range(rows)
+    ]
+    np.testing.assert_allclose(np.concatenate(alone)[..., 0], whole.numpy(), rtol=0, atol=1e-13)
+    held = torch.ones(rows, 9, dtype=torch.float64)
+    out, _ = effect.command(held, values, STEP, effect.settled(held[:, :1], values, STEP))
+    torch.testing.assert_close(out, out[:, :1].expand(-1, 9), rtol=0, atol=1e-13)  # what has settled stays
+
+
+@pytest.mark.parametrize("alike", [False, True])
+@pytest.mark.parametrize("effect", filters_of("sense"))
+def test_what_sensors_show_of_an_episode_is_what_they_show_in_its_steps(effect: Effect, alike: bool) -> None:
+    rows, instants, rates = 4, 12, (1, -1)
+    rng = np.random.default_rng(3)
+    truth = torch.from_numpy(rng.standard_normal((rows, SKIP * instants + 1, 2)).cumsum(1))
+    values = drawn(1 if alike else rows, 0.07)
+    fine = extended(truth, torch.from_numpy(rng.standard_normal((rows, 2))), 0.0, 5 * SKIP, STEP)
+    sensors = [Filter(effect, 0, values)]
+    whole = sensed(SensedPath.of(fine, instants + 1, SKIP, STEP, rates), sensors)
+    for t in range(instants + 1):
+        past = fine[:, t * SKIP : 5 * SKIP + t * SKIP + 1]  # as long as the longest delay
+        now = sensed(SensedPath.of(past, 1, SKIP, STEP, rates), sensors)
+        torch.testing.assert_close(now[:, 0], whole[:, t], rtol=0, atol=1e-12)
+    known = SensedPath.of(truth, instants + 1, SKIP, STEP, rates).known(effect.memory(np.array([0.03])))
+    late = 0 if effect.memory(np.array([0.03])) == 0 else int(np.ceil(effect.memory(np.array([0.03])) / STEP / SKIP))
+    assert known.tolist() == [t >= late for t in range(instants + 1)]
 
 
 # In configs

@@ -12,11 +12,6 @@ from dropo_torch.effects.base import Effect, Quantity, Setting, object_number
 _NONE, _AFFINE = int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE)
 
 
-def actuator_number(model: mujoco.MjModel, target: str | None) -> int:
-    """Return the number of an actuator by its name; one without a name is called by its joint's."""
-    return object_number(model, "actuator", target)
-
-
 class ActuatorEffect(Effect):
     """An effect of one actuator that is commanded in the log."""
 
@@ -32,9 +27,9 @@ class ActuatorEffect(Effect):
     @staticmethod
     def force_scale(setting: Setting, target: str | None) -> float:
         """Return the typical force of an actuator, in its own units."""
-        m, i = setting.model, actuator_number(setting.model, target)
+        m, i = setting.model, object_number(setting.model, "actuator", target)
         gain = abs(float(m.actuator_gainprm[i, 0]))
-        command = float(setting.signals.command[m.actuator_ctrladr[i]])
+        command = float(setting.signals.command[setting.command_column(target)])
         if m.actuator_biasprm[i, 1] != 0 or m.actuator_biasprm[i, 2] != 0:  # a servo's force is of the error
             dof = transmission_dof(m, i)
             if dof is not None:
@@ -44,7 +39,7 @@ class ActuatorEffect(Effect):
     @staticmethod
     def command_scale(setting: Setting, target: str | None) -> float:
         """Return the largest command of the log."""
-        return float(setting.signals.command[setting.model.actuator_ctrladr[actuator_number(setting.model, target)]])
+        return float(setting.signals.command[setting.command_column(target)])
 
 
 def transmission_dof(model: mujoco.MjModel, actuator: int) -> int | None:
@@ -55,7 +50,7 @@ def transmission_dof(model: mujoco.MjModel, actuator: int) -> int | None:
 
 
 def _unit(setting: Setting, target: str | None, hinge: str, slide: str) -> str:
-    m, i = setting.model, actuator_number(setting.model, target)
+    m, i = setting.model, object_number(setting.model, "actuator", target)
     slides = (
         m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
         and m.jnt_type[m.actuator_trnid[i, 0]] == mujoco.mjtJoint.mjJNT_SLIDE
@@ -80,7 +75,7 @@ class ActuatorGain(ActuatorEffect):
         return (Quantity("gain", "-", 1.0, 0.05, 10.0, 0.5),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        i = actuator_number(model, target)
+        i = object_number(model, "actuator", target)
         model.actuator_gainprm[i, :3] *= values[0]
         model.actuator_biasprm[i, :3] *= values[0]
 
@@ -96,7 +91,7 @@ class ActuatorBias(ActuatorEffect):
         return (Quantity("force", _unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        i = actuator_number(model, target)
+        i = object_number(model, "actuator", target)
         make_affine(model, i)
         model.actuator_biasprm[i, 0] += values[0]
 
@@ -108,7 +103,7 @@ class ActuatorDamping(ActuatorEffect):
     sentence = "actuator {target} brakes in proportion to its velocity, such as by back-EMF"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        m, i = setting.model, actuator_number(setting.model, target)
+        m, i = setting.model, object_number(setting.model, "actuator", target)
         dof = transmission_dof(m, i)
         gear = max(abs(float(m.actuator_gear[i, 0])), 1e-9)
         speed = gear * float(setting.signals.speed[dof if dof is not None else 0])
@@ -120,10 +115,10 @@ class ActuatorDamping(ActuatorEffect):
     def targets(self, setting: Setting) -> list[str | None]:
         m = setting.model
         found = super().targets(setting)
-        return [t for t in found if transmission_dof(m, actuator_number(m, t)) is not None]
+        return [t for t in found if transmission_dof(m, object_number(m, "actuator", t)) is not None]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        i = actuator_number(model, target)
+        i = object_number(model, "actuator", target)
         make_affine(model, i)
         model.actuator_biasprm[i, 2] -= values[0]
 
@@ -138,7 +133,7 @@ class ActuatorSaturation(ActuatorEffect):
     def targets(self, setting: Setting) -> list[str | None]:
         m = setting.model
         found = super().targets(setting)
-        return [t for t in found if not m.actuator_forcelimited[actuator_number(m, t)]]
+        return [t for t in found if not m.actuator_forcelimited[object_number(m, "actuator", t)]]
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         largest = self.largest(setting, target)
@@ -147,13 +142,13 @@ class ActuatorSaturation(ActuatorEffect):
 
     def largest(self, setting: Setting, target: str | None) -> float:
         """Return the largest force that the log asks for, roughly."""
-        m, i = setting.model, actuator_number(setting.model, target)
+        m, i = setting.model, object_number(setting.model, "actuator", target)
         if m.actuator_biasprm[i, 1] != 0:
             return 3 * self.force_scale(setting, target)
         return abs(float(m.actuator_gainprm[i, 0])) * self.command_scale(setting, target)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        i = actuator_number(model, target)
+        i = object_number(model, "actuator", target)
         model.actuator_forcelimited[i] = 1
         model.actuator_forcerange[i] = (-values[0], values[0])
 
@@ -209,10 +204,11 @@ class ActuatorLag(ActuatorEffect):
         tau = values[:, :1]
         absent = tau <= 1e-6 * step
         tau = torch.where(absent, step, tau)
-        decay = torch.where(absent, 0.0, torch.exp(-step / tau))
+        passed = torch.full_like(tau, -step) / tau
+        decay = torch.where(absent, 0.0, torch.exp(passed))
         after = first_order(signal, decay, state)
         before = torch.cat([state, after[:, :-1]], 1)
-        mean = signal + (before - signal) * (tau / step) * -torch.expm1(-step / tau)
+        mean = signal + (before - signal) * (tau / step) * -torch.expm1(passed)
         return torch.where(absent, signal, mean), after[:, -1:]
 
 

@@ -95,6 +95,10 @@ class Setting:
         """Return whether a joint slides, so that its force is in newtons."""
         return bool(self.model.jnt_type[self.joint(name)] == mujoco.mjtJoint.mjJNT_SLIDE)
 
+    def command_column(self, name: str | None) -> int:
+        """Return the command of an actuator, by the actuator's name."""
+        return int(self.model.actuator_ctrladr[object_number(self.model, "actuator", name)])
+
     def column(self, name: str | None) -> int:
         """Return the number of an observed column."""
         return self.observation.labels.index(str(name))

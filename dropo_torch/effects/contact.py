@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Quantity, Setting
-from dropo_torch.parameters import object_names
-
-
-def geom_number(model: mujoco.MjModel, target: str | None) -> int:
-    """Return the number of a geom by its name, or ``geom2`` for an unnamed one."""
-    return object_names(model, "geom").index(str(target))
+from dropo_torch.effects.base import Effect, Quantity, Setting, object_number
 
 
 class ContactEffect(Effect):
@@ -68,7 +64,7 @@ class ContactFriction(ContactEffect):
 
     def own(self, model: mujoco.MjModel, target: str | None) -> float:
         """Return the friction that the model's contacts of this geom have."""
-        geom = geom_number(model, target)
+        geom = object_number(model, "geom", target)
         same = [geom, *self.partners(model, geom)]
         top = model.geom_priority[same].max()
         return float(max(model.geom_friction[g, 0] for g in same if model.geom_priority[g] == top))
@@ -78,7 +74,7 @@ class ContactFriction(ContactEffect):
         return [np.array([0.9 * own]), np.array([0.6 * own]), np.array([1.4 * own])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        geom = geom_number(model, target)
+        geom = object_number(model, "geom", target)
         take_over(model, geom, self.partners(model, geom))
         model.geom_friction[geom, 0] = values[0]
 
@@ -95,10 +91,10 @@ class ContactStiffness(ContactEffect):
 
     def own(self, model: mujoco.MjModel, target: str | None) -> np.ndarray:
         """Return the time constant and damping ratio that the model's contacts of this geom have."""
-        geom = geom_number(model, target)
-        copy = _shallow(model)
-        take_over(copy, geom, self.partners(model, geom))
-        return copy.geom_solref[geom].copy()
+        geom = object_number(model, "geom", target)
+        alone = copy.copy(model)
+        take_over(alone, geom, self.partners(model, geom))
+        return alone.geom_solref[geom].copy()
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         time, ratio = (float(x) for x in self.own(setting.model, target))
@@ -113,7 +109,7 @@ class ContactStiffness(ContactEffect):
         return [np.array([1.15 * time, ratio]), np.array([2 * time, ratio])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        geom = geom_number(model, target)
+        geom = object_number(model, "geom", target)
         take_over(model, geom, self.partners(model, geom))
         model.geom_solref[geom] = values
 
@@ -123,22 +119,13 @@ class ContactMargin(ContactEffect):
 
     name = "contact_margin"
     sentence = "contacts of {target} act from a distance on, as if it were larger than in the model"
+    shares = (0.3, 1.5)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m = setting.model
-        size = float(m.geom_rbound[geom_number(m, target)]) or 0.1
-        own = float(m.geom_margin[geom_number(m, target)])
+        size = float(m.geom_rbound[object_number(m, "geom", target)]) or 0.1
+        own = float(m.geom_margin[object_number(m, "geom", target)])
         return (Quantity("margin", "m", 0.0, -own, 0.5 * size, 0.02 * size),)
 
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        scale = self.quantities(setting, target)[0].scale
-        return [np.array([0.3 * scale]), np.array([1.5 * scale])]
-
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.geom_margin[geom_number(model, target)] += values[0]
-
-
-def _shallow(model: mujoco.MjModel) -> mujoco.MjModel:
-    import copy
-
-    return copy.copy(model)
+        model.geom_margin[object_number(model, "geom", target)] += values[0]

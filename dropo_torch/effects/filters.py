@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.effects.base import Effect, Placed, Setting, object_number
+from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.path import SensedPath
 
 
@@ -28,27 +29,18 @@ class Filter:
     values: torch.Tensor
 
 
-def command_column(model: mujoco.MjModel, target: str | None) -> int:
-    """Return the command of an actuator by the actuator's name."""
-    return int(model.actuator_ctrladr[object_number(model, "actuator", target)])
+def filters_of(
+    acting: Iterable[tuple[Effect, str | None, torch.Tensor]], method: Literal["command", "sense"], setting: Setting
+) -> list[Filter]:
+    """Return the effects, each at its target and with its values, that act by a method, in order."""
+    find = setting.command_column if method == "command" else setting.column
+    return [Filter(effect, find(target), values) for effect, target, values in acting if effect.has(method)]
 
 
-def command_filters(placed: Iterable[Placed], setting: Setting) -> list[Filter]:
-    """Return the effects on commands, with the same numbers in all rows."""
-    return [
-        Filter(p.effect, command_column(setting.model, p.target), torch.tensor([p.values], dtype=torch.float64))
-        for p in placed
-        if p.effect.has("command")
-    ]
-
-
-def sensor_filters(placed: Iterable[Placed], setting: Setting) -> list[Filter]:
-    """Return the effects on measurements, with the same numbers in all rows."""
-    return [
-        Filter(p.effect, setting.column(p.target), torch.tensor([p.values], dtype=torch.float64))
-        for p in placed
-        if p.effect.has("sense")
-    ]
+def placed_filters(placed: Iterable[Placed], method: Literal["command", "sense"], setting: Setting) -> list[Filter]:
+    """Return the effects that act by a method, with the same numbers in all rows."""
+    acting = ((p.effect, p.target, torch.tensor([p.values], dtype=torch.float64)) for p in placed)
+    return filters_of(acting, method, setting)
 
 
 def filtered(signal: np.ndarray, filters: Iterable[Filter], step: float) -> np.ndarray:

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import mujoco
 import numpy as np
 
 from dropo_torch.data.observation import joint_name
-from dropo_torch.effects.base import Effect, Placed, Quantity, Setting
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals, object_number
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
 
 def unit(setting: Setting, target: str | None, hinge: str, slide: str) -> str:
     """Return the unit of a joint's quantity."""
-    return slide if setting.is_slide(str(target)) else hinge
+    return slide if setting.is_slide(target) else hinge
 
 
 class JointEffect(Effect):
@@ -33,45 +35,58 @@ class JointEffect(Effect):
     @staticmethod
     def dof(model: mujoco.MjModel, target: str | None) -> int:
         """Return the joint's degree of freedom."""
-        return int(model.jnt_dofadr[joint_number(model, target)])
+        return int(model.jnt_dofadr[object_number(model, "jnt", target)])
 
 
-def joint_number(model: mujoco.MjModel, target: str | None) -> int:
-    """Return the number of a joint by its name."""
-    return [joint_name(model, j) for j in range(model.njnt)].index(str(target))
+class AddedToJoint(JointEffect):
+    """A number of a degree of freedom that is added to the model's own.
+
+    Attributes:
+        field: where the model has it.
+        quantity: its name, its units for a hinge and a slide, and how many scales it may reach.
+        power: of the speed in the force that it makes.
+    """
+
+    field: ClassVar[str]
+    quantity: ClassVar[tuple[str, str, str, float]]
+    power: ClassVar[int] = 0
+
+    def scale(self, signals: Signals, dof: int) -> float:
+        """Return a size that matters, by which it makes the typical force at the typical speed."""
+        return float(signals.force[dof] / signals.speed[dof] ** self.power)
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        name, hinge, slide, reach = self.quantity
+        scale = self.scale(setting.signals, setting.dof(target))
+        own = float(self.own(setting.model, target)[0])
+        return (Quantity(name, unit(setting, target, hinge, slide), 0.0, -own, reach * scale, scale),)
+
+    def own(self, model: mujoco.MjModel, target: str | None) -> np.ndarray:
+        """Return the model's numbers of the degree of freedom, a view."""
+        return np.reshape(getattr(model, self.field), (model.nv, -1))[self.dof(model, target)]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        self.own(model, target)[0] += values[0]
 
 
-class JointDamping(JointEffect):
+class JointDamping(AddedToJoint):
     """Viscous friction: a torque against the velocity, in proportion to it."""
 
     name = "joint_damping"
     sentence = "viscous friction in {target}: a force against the velocity, in proportion to it"
-
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
-        scale = setting.signals.force[dof] / setting.signals.speed[dof]
-        own = float(setting.model.dof_damping[dof])
-        return (Quantity("damping", unit(setting, target, "N·m·s/rad", "N·s/m"), 0.0, -own, 30 * scale, scale),)
-
-    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.dof_damping[self.dof(model, target)] += values[0]
+    field = "dof_damping"
+    quantity = ("damping", "N·m·s/rad", "N·s/m", 30.0)
+    power = 1
 
 
-class JointQuadraticDamping(JointEffect):
+class JointQuadraticDamping(AddedToJoint):
     """Friction that grows with the square of the velocity."""
 
     name = "joint_quadratic_damping"
     sentence = "friction in {target} that grows with the square of the velocity"
-
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
-        scale = setting.signals.force[dof] / setting.signals.speed[dof] ** 2
-        own = float(setting.model.dof_dampingpoly[dof, 0])
-        name = unit(setting, target, "N·m·s²/rad²", "N·s²/m²")
-        return (Quantity("coefficient", name, 0.0, -own, 30 * scale, scale),)
-
-    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.dof_dampingpoly[self.dof(model, target), 0] += values[0]
+    field = "dof_dampingpoly"
+    quantity = ("coefficient", "N·m·s²/rad²", "N·s²/m²", 30.0)
+    power = 2
 
 
 #: Impedance of dry friction that hardly creeps, and its time constant in physics steps.
@@ -86,21 +101,14 @@ def add_friction(model: mujoco.MjModel, dof: int, friction: float) -> None:
     model.dof_frictionloss[dof] += friction
 
 
-class JointFriction(JointEffect):
+class JointFriction(AddedToJoint):
     """Coulomb friction: a constant force against the motion, which also holds at rest."""
 
     name = "joint_friction"
     sentence = "dry (Coulomb) friction in {target}: a constant force against any motion"
-
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
-        scale = float(setting.signals.force[dof])
-        own = float(setting.model.dof_frictionloss[dof])
-        return (Quantity("friction", unit(setting, target, "N·m", "N"), 0.0, -own, 10 * scale, scale),)
-
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        scale = self.quantities(setting, target)[0].scale
-        return [np.array([0.02 * scale]), np.array([0.2 * scale])]
+    shares = (0.02, 0.2)
+    field = "dof_frictionloss"
+    quantity = ("friction", "N·m", "N", 10.0)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         add_friction(model, self.dof(model, target), values[0])
@@ -117,7 +125,7 @@ class JointStribeck(JointEffect):
     sentence = "dry friction in {target} that is larger at rest than in motion (Stribeck)"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
+        dof = setting.dof(target)
         scale, speed = float(setting.signals.force[dof]), float(setting.signals.speed[dof])
         force = unit(setting, target, "N·m", "N")
         return (
@@ -142,7 +150,7 @@ class JointStribeck(JointEffect):
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        dof = setting.dof(str(target))
+        dof = setting.dof(target)
         v = velocity[:, dof]
         out = np.zeros_like(velocity)
         coulomb, static, speed = values.T
@@ -157,11 +165,11 @@ class JointStiffness(JointEffect):
     sentence = "a spring at {target}, such as a cable harness, that pulls it towards a rest position"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof, coordinate = setting.dof(str(target)), setting.coordinate(str(target))
+        dof, coordinate = setting.dof(target), setting.coordinate(target)
         low, high = setting.signals.position[coordinate]
         span = max(high - low, 1e-9)
         scale = setting.signals.force[dof] / span
-        own = float(setting.model.jnt_stiffness[setting.joint(str(target))])
+        own = float(setting.model.jnt_stiffness[setting.joint(target)])
         rest = float(setting.model.qpos_spring[coordinate])
         angle = unit(setting, target, "rad", "m")
         return (
@@ -171,14 +179,14 @@ class JointStiffness(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         stiffness, reference = self.quantities(setting, target)
-        middle = float(np.mean(setting.signals.position[setting.coordinate(str(target))]))
+        middle = float(np.mean(setting.signals.position[setting.coordinate(target)]))
         begin = [reference.neutral] if abs(reference.neutral - middle) < 0.2 * reference.scale else [
             reference.neutral, middle,
         ]  # fmt: skip
         return [np.array([0.05 * stiffness.scale, at]) for at in begin]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        joint = joint_number(model, target)
+        joint = object_number(model, "jnt", target)
         own, coordinate = float(model.jnt_stiffness[joint]), int(model.jnt_qposadr[joint])
         rest = float(model.qpos_spring[coordinate])
         total = own + values[0]
@@ -197,7 +205,7 @@ class JointCogging(JointEffect):
     POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
+        dof = setting.dof(target)
         scale = float(setting.signals.force[dof])
         return (
             Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),
@@ -206,9 +214,9 @@ class JointCogging(JointEffect):
         )
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        low, high = setting.signals.position[setting.coordinate(str(target))]
+        low, high = setting.signals.position[setting.coordinate(target)]
         amplitude = 0.1 * self.quantities(setting, target)[0].scale
-        if setting.is_slide(str(target)):  # so dense that no ripple is half a wave off over the whole range
+        if setting.is_slide(target):  # so dense that no ripple is half a wave off over the whole range
             poles = [float(np.pi * n / max(high - low, 1e-9)) for n in range(2, 2 + self.WAVES)]
         else:
             poles = [float(n) for n in self.POLES if n * (high - low) > 2 * np.pi]
@@ -227,25 +235,21 @@ class JointCogging(JointEffect):
     ) -> np.ndarray:
         out = np.zeros_like(velocity)
         amplitude, poles, phase = values.T
-        angle = poles * position[:, setting.coordinate(str(target))] + phase
-        out[:, setting.dof(str(target))] = amplitude * np.sin(angle)
+        angle = poles * position[:, setting.coordinate(target)] + phase
+        out[:, setting.dof(target)] = amplitude * np.sin(angle)
         return out
 
 
-class Armature(JointEffect):
+class Armature(AddedToJoint):
     """Inertia of a rotor or gear, seen at the joint."""
 
     name = "armature"
     sentence = "a rotor's or gear's inertia at {target}, on top of the links'"
+    field = "dof_armature"
+    quantity = ("armature", "kg·m²", "kg", 5.0)
 
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
-        scale = float(setting.signals.inertia[dof])
-        own = float(setting.model.dof_armature[dof])
-        return (Quantity("armature", unit(setting, target, "kg·m²", "kg"), 0.0, -own, 5 * scale, scale),)
-
-    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.dof_armature[self.dof(model, target)] += values[0]
+    def scale(self, signals: Signals, dof: int) -> float:
+        return float(signals.inertia[dof])
 
 
 class JointLimit(JointEffect):
@@ -259,21 +263,21 @@ class JointLimit(JointEffect):
         return [t for t in super().targets(setting) if m.jnt_limited[setting.joint(str(t))]]
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        low, high = setting.model.jnt_range[setting.joint(str(target))]
+        low, high = setting.model.jnt_range[setting.joint(target)]
         width, angle = float(high - low), unit(setting, target, "rad", "m")
         return tuple(Quantity(n, angle, 0.0, -0.45 * width, 0.45 * width, 0.1 * width) for n in ("lower", "upper"))
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         """Begin at the model's stops and at the ends of the measured motion."""
-        low, high = setting.model.jnt_range[setting.joint(str(target))]
-        seen = setting.signals.position[setting.coordinate(str(target))]
+        low, high = setting.model.jnt_range[setting.joint(target)]
+        seen = setting.signals.position[setting.coordinate(target)]
         out, inwards = 0.2 * (high - low), 0.4 * (high - low)
         lower = float(np.clip(seen[0] - low, -out, inwards))
         upper = float(np.clip(seen[1] - high, -inwards, out))
         return [np.array(s) for s in ((0.0, 0.0), (lower, 0.0), (0.0, upper), (lower, upper))]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        model.jnt_range[joint_number(model, target)] += values
+        model.jnt_range[object_number(model, "jnt", target)] += values
 
 
 class JointCoupling(JointEffect):
@@ -288,7 +292,7 @@ class JointCoupling(JointEffect):
     @staticmethod
     def partner(setting: Setting, target: str | None) -> int | None:
         """Return the nearest hinge or slide joint above, of the same kind."""
-        m, joint = setting.model, setting.joint(str(target))
+        m, joint = setting.model, setting.joint(target)
         before = [j for j in range(joint) if m.jnt_bodyid[j] == m.jnt_bodyid[joint]]
         body = int(m.body_parentid[m.jnt_bodyid[joint]])
         while not before and body > 0:
@@ -297,8 +301,8 @@ class JointCoupling(JointEffect):
         return before[-1] if before and m.jnt_type[before[-1]] == m.jnt_type[joint] else None
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(str(target))
-        low, high = setting.signals.position[setting.coordinate(str(target))]
+        dof = setting.dof(target)
+        low, high = setting.signals.position[setting.coordinate(target)]
         scale = float(setting.signals.force[dof] / max(high - low, 1e-9))
         return (Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), 0.0, -30 * scale, 30 * scale, scale),)
 
@@ -307,8 +311,8 @@ class JointCoupling(JointEffect):
     ) -> np.ndarray:
         m, other = setting.model, self.partner(setting, target)
         assert other is not None
-        stretch = position[:, setting.coordinate(str(target))] - position[:, m.jnt_qposadr[other]]
+        stretch = position[:, setting.coordinate(target)] - position[:, m.jnt_qposadr[other]]
         out = np.zeros_like(velocity)
-        out[:, setting.dof(str(target))] = -values[:, 0] * stretch
+        out[:, setting.dof(target)] = -values[:, 0] * stretch
         out[:, m.jnt_dofadr[other]] += values[:, 0] * stretch
         return out

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Iterator
-from typing import ClassVar, Protocol
+from typing import ClassVar
 
 import mujoco
 import numpy as np
@@ -15,10 +15,11 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.filters import (
     Filter,
-    command_filters,
     extended,
     filtered,
+    filters_of,
     observed_rates,
+    placed_filters,
     rate_columns,
     sensed,
     unsensed,
@@ -33,19 +34,10 @@ from dropo_torch.simulators.base import Simulator
 LONGEST_HISTORY = 200
 
 
-class Engine(Protocol):
-    """Simulates true states under commands of every physics step."""
-
-    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Return states ``(K, T, S, n)`` or, not fine, ``(K, T, S / skip, n)``, NaN where diverged.
-
-        Args:
-            values: parameter vectors, ``(K, d)``.
-            starts: true states, ``(K, T, n)``.
-            signals: commands as they act, ``(K, T, S, nu)``.
-            fine: states after every physics step instead of every logged one.
-        """
-        ...
+#: Simulates true states under commands of every physics step: of parameter vectors ``(K, d)``, states at the start
+#: ``(K, T, n)``, commands as they act ``(K, T, S, nu)`` and whether the result is fine. Returns the states after every
+#: physics step ``(K, T, S, n)`` or, not fine, after every logged one ``(K, T, S / skip, n)``, NaN where diverged.
+Engine = Callable[[np.ndarray, np.ndarray, np.ndarray, bool], np.ndarray]
 
 
 class InnerEngine:
@@ -55,7 +47,7 @@ class InnerEngine:
         self._engine, self._effects = VariantEngine(effects.setting, space, num_threads=num_threads), effects
 
     def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Simulate; see :class:`Engine`."""
+        """Simulate; see :data:`Engine`."""
         variants = [Variant(tuple(v.tolist()), self._effects.at(v)) for v in values]
         return self._engine.paths(variants, self._engine.models(variants), starts, signals, fine=fine)
 
@@ -67,7 +59,7 @@ class OuterEngine:
         self._inner, self._effects, self._skip = inner, effects, effects.setting.frame_skip
 
     def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Simulate; parameter vectors whose effects are the same go together. See :class:`Engine`."""
+        """Simulate; parameter vectors whose effects are the same go together. See :data:`Engine`."""
         first, kind = self._effects.kinds(values)
         every = 1 if fine else self._skip
         out = np.empty((len(values), starts.shape[1], signals.shape[2] // every, starts.shape[2]))
@@ -159,7 +151,8 @@ class EffectSimulator(Simulator):
         rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0)], values)
         index, known = self._setting.observation.index, self._rates >= 0
         shown = starts[..., index].copy()
-        sensors = self._sensor_filters(values, len(start))
+        numbers = ((e, torch.from_numpy(e.values(values).repeat(len(start), 0))) for e in self._sensors.entries)
+        sensors = filters_of(((e.effect, e.target, own) for e, own in numbers), "sense", self._setting)
         flat, slope = (torch.from_numpy(x[..., index].reshape(-1, len(index))) for x in (starts, rates))
         starts[..., index] = unsensed(flat, slope, sensors).numpy().reshape(shown.shape)
         if self._late:  # with the velocities now true, and changing, the past shows what is missing
@@ -175,17 +168,8 @@ class EffectSimulator(Simulator):
         """Return commands as they act in every physics step, ``(K, T, (history + lag)·skip, nu)``."""
         plain = np.repeat(control, self.frame_skip, axis=1)
         first, kind = self._commands.kinds(values)
-        found = [
-            filtered(plain, command_filters(self._commands.at(values[k]), self._setting), self._step) for k in first
-        ]
-        return np.stack(found)[kind]
-
-    def _sensor_filters(self, values: np.ndarray, windows: int) -> list[Filter]:
-        """Return the effects on measurements, with the numbers of K·T rows."""
-        return [
-            Filter(e.effect, self._setting.column(e.target), torch.from_numpy(e.values(values).repeat(windows, 0)))
-            for e in self._sensors.entries
-        ]
+        filters = [placed_filters(self._commands.at(values[k]), "command", self._setting) for k in first]
+        return np.stack([filtered(plain, f, self._step) for f in filters])[kind]
 
     def _start_rates(self, starts: np.ndarray, command: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return time derivatives of the states at the starts, ``(K, T, num_states)``, just before them.

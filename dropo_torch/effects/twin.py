@@ -12,7 +12,7 @@ import torch
 
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.engine import Variant, VariantEngine
-from dropo_torch.effects.filters import command_filters, filtered, observed_rates, sensed, sensor_filters, unsensed
+from dropo_torch.effects.filters import filtered, observed_rates, placed_filters, sensed, unsensed
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.parameters import ParameterSpace
 
@@ -144,7 +144,7 @@ class Twin:
         """Return what a variant's sensors show of true paths ``(W, ·, n)``, and what is known: nothing lies before."""
         skip, step = (path.shape[1] - 1) // length, float(self.setting.model.opt.timestep)
         truth = SensedPath.of(torch.from_numpy(path), length + 1, skip, step, tuple(self.rates))
-        sensors = sensor_filters(variant.placed, self.setting)
+        sensors = placed_filters(variant.placed, "sense", self.setting)
         valid = np.ones(truth.shown.shape, dtype=bool)
         for f in sensors:
             valid[..., f.column] &= truth.known(f.effect.memory(f.values[0].numpy())).numpy()
@@ -152,7 +152,7 @@ class Twin:
 
     def _states(self, variant: Variant, shown: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return states ``(W, nq + nv)`` of which the sensors show ``shown``."""
-        sensors, observation = sensor_filters(variant.placed, self.setting), self.setting.observation
+        sensors, observation = placed_filters(variant.placed, "sense", self.setting), self.setting.observation
         states = np.tile(np.array(observation.default_state), (len(shown), 1))
         states[:, observation.index] = unsensed(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy()
         for q in observation.quaternions:
@@ -169,7 +169,7 @@ class Twin:
         if key not in self._filtered:
             if len(self._filtered) > 64:
                 self._filtered.clear()
-            filters = command_filters(variant.placed, self.setting)
+            filters = placed_filters(variant.placed, "command", self.setting)
             step = float(self.setting.model.opt.timestep)
             self._filtered[key] = filtered(np.repeat(windows.commands, skip, axis=1), filters, step)
         at = windows.steps[:, None] * skip + np.arange(length * skip)

@@ -25,11 +25,14 @@ class WorldEffect(Effect):
         return [None]
 
 
-def _angles(*names: str) -> tuple[Quantity, ...]:
-    return tuple(Quantity(n, "rad", 0.0, -0.7, 0.7, 0.1) for n in names)
+class TiltEffect(WorldEffect):
+    """Something that is turned about the world's x and y axes."""
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return tuple(Quantity(name, "rad", 0.0, -0.7, 0.7, 0.1) for name in ("roll", "pitch"))
 
 
-class GravityTilt(WorldEffect):
+class GravityTilt(TiltEffect):
     """A base that does not stand level: gravity is turned about the world's x and y axes."""
 
     name = "gravity_tilt"
@@ -38,14 +41,11 @@ class GravityTilt(WorldEffect):
     def targets(self, setting: Setting) -> list[str | None]:
         return [None] if np.linalg.norm(setting.model.opt.gravity) > 0 else []
 
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        return _angles("roll", "pitch")
-
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         model.opt.gravity = _turn(*values) @ model.opt.gravity
 
 
-class GroundSlope(WorldEffect):
+class GroundSlope(TiltEffect):
     """A ground that is not level: every plane of the world is turned about the world's x and y axes."""
 
     name = "ground_slope"
@@ -53,9 +53,6 @@ class GroundSlope(WorldEffect):
 
     def targets(self, setting: Setting) -> list[str | None]:
         return [None] if any(setting.signals.contacts[g] for g in _planes(setting.model)) else []
-
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        return _angles("roll", "pitch")
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         turned = np.empty(4)
@@ -80,13 +77,11 @@ class Integration(WorldEffect):
 
     #: How many times finer the step becomes, and its integrator.
     FINER = 8
+    shares = (1 / FINER,)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         step = float(setting.model.opt.timestep)
         return (Quantity("timestep", "s", step, step / self.FINER, step, step),)
-
-    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([float(setting.model.opt.timestep) / self.FINER])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] == model.opt.timestep:

@@ -9,8 +9,9 @@ import numpy as np
 from dropo_torch.data.features import Features
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed, Setting
-from dropo_torch.effects.export import write_config, write_model
+from dropo_torch.effects.export import write_model
 from dropo_torch.errors import InputError
+from dropo_torch.gap.config import write_config
 from dropo_torch.gap.log import make_setting
 from dropo_torch.gap.result import FAMILY, Gap
 from dropo_torch.problem import Problem

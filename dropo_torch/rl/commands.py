@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch.nn.functional import pad
 
-from dropo_torch.effects.filters import command_column
 from dropo_torch.effects.placing import EffectSet
 
 
@@ -25,7 +24,7 @@ class Commands:
         setting = effects.setting
         self._entries = effects.having("command").entries
         self._skip, self._step = setting.frame_skip, float(setting.model.opt.timestep)
-        self._columns = [command_column(setting.model, e.target) for e in self._entries]
+        self._columns = [setting.command_column(e.target) for e in self._entries]
         self._values = [torch.zeros(num_envs, len(e.fixed), dtype=torch.float64, device=device) for e in self._entries]
         self._states = [torch.zeros(num_envs, 0, dtype=torch.float64, device=device) for _ in self._entries]
         self._fresh, self._any_fresh = torch.ones(num_envs, 1, dtype=torch.bool, device=device), True
