@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
-from conftest import space_of
+from conftest import WHOLE, space_of
 
 from dropo_torch.distribution import Distribution
 from dropo_torch.effects import Effect, Quantity, Setting, find_effect, register
@@ -573,3 +574,12 @@ def test_what_raises_in_a_law_is_told_with_it() -> None:
     with pytest.raises(ConformanceError, match=r"it: broken law 'nothing is divided by zero': found ZeroDivisionError"):
         try_laws("it", 0, [_nothing_is_divided_by_zero])
     assert try_laws("it", 1, [_nothing_is_divided_by_zero]).checked == ("nothing is divided by zero",)
+
+
+# Tiers
+
+
+def test_what_is_left_out_of_every_commit_exists() -> None:
+    for file, names in WHOLE.items():
+        text = (Path(__file__).parent / file).read_text()
+        assert [n for n in names if n and f"def {n}(" not in text] == [], file
