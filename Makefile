@@ -5,14 +5,25 @@ PYTHON ?= python3
 VENV ?= .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+# Tests run in as many processes at a time, each on its share of the processors.
+WORKERS ?= 2
+PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: demo test study-reduced test-slow lint format benchmarks clean
+.PHONY: demo check test coverage study-reduced test-slow lint format benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/dropo demo --out out/demo
 
+# For every commit: two minutes on two processors.
+check: lint
+	$(PYTEST) -m 'not slow and not whole' --durations=3
+
+# What every change must pass.
 test: lint
-	$(BIN)/python -m pytest --durations=8
+	$(PYTEST) --durations=8
+
+coverage: $(STAMP)
+	$(PYTEST) --cov --cov-report=term-missing
 
 study-reduced: $(STAMP)
 	$(BIN)/dropo reproduce hopper --reduced --out out/study-reduced

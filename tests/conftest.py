@@ -1,9 +1,12 @@
-"""Models, an analytic simulator and reference implementations shared by the tests."""
+"""Models and small helpers shared by the tests; which tests are too long for every commit; workers side by side."""
 
 from __future__ import annotations
 
+import fcntl
+import os
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import gymnasium
 import hypothesis
@@ -21,6 +24,77 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.testing.linear import LinearSimulator as LinearSimulator
 from dropo_torch.testing.linear import linear_objective as linear_objective
 from dropo_torch.testing.simulators import stepped as settled_rollout  # noqa: F401
+
+#: Tests that take a second of a processor or more, by file and name, or all of a file: what ``make check`` leaves out.
+WHOLE = {
+    "test_adam.py": ("test_adam_approaches_the_masses_and_continues_from_any_state",
+                     "test_adam_finds_what_fisher_scoring_finds"),
+    "test_baselines.py": ("test_a_few_wild_simulations_do_not_blind_the_network",
+                          "test_a_mixture_density_network_learns_a_gaussian_posterior",
+                          "test_bayessim_contains_the_truth_and_is_narrower_than_the_prior",
+                          "test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one",
+                          "test_several_explanations_are_told",
+                          "test_the_hopper_study_resumes_and_says_what_it_found",
+                          "test_what_varies_is_no_outlier_where_the_starts_are_noisy"),
+    "test_cli.py": ("test_a_reader_that_has_seen_enough_does_not_stop_a_fit",
+                    "test_ctrl_c_ends_with_130_and_one_line",
+                    "test_the_demo_finds_four_masses_within_two_percent", "test_the_demo_takes_other_parameters",
+                    "test_two_runs_do_not_share_a_folder"),
+    "test_compare.py": ("test_a_comparison_runs_every_method_on_one_log",
+                        "test_an_interrupted_comparison_repeats_no_finished_run"),
+    "test_docs.py": ("test_crane", "test_demo_figure", "test_gradient_vs_gradient_free", "test_own_effect",
+                     "test_python_runs", "test_transfer_hopper"),
+    "test_fit.py": ("test_a_fit_killed_at_any_moment_resumes_to_the_same_result",),
+    "test_gap.py": ("",),
+    "test_optimizers.py": ("test_optimizers_keep_their_laws",),
+    "test_parallel.py": ("",),
+    "test_rl_train.py": ("",),
+    "test_sweep.py": ("test_the_noise_of_every_measurement_is_found",),
+    "test_warp_backend.py": ("test_the_library_does_not_need_warp",),
+    "test_warp_collide.py": ("test_geoms_touch_where_mujoco_says",),
+    "test_warp_conformance.py": ("test_contacts", "test_gymnasium_models", "test_hopper_through_four_substeps"),
+}  # fmt: skip
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what is too long for every commit."""
+    for item in items:
+        names = WHOLE.get(item.path.name, ())
+        if not all(names) or item.name.split("[")[0] in names:
+            item.add_marker(pytest.mark.whole)
+
+
+def share_processors() -> None:
+    """Give each of several workers processors of its own: whatever counts them makes no more threads than those."""
+    own, count = int(os.environ["PYTEST_XDIST_WORKER"].lstrip("gw")), int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+    every = sorted(os.sched_getaffinity(0))
+    os.sched_setaffinity(0, every[own % len(every) :: count] or every)
+    torch.set_num_threads(max(1, len(every) // count))
+
+
+WORKS_ALONE = "PYTEST_XDIST_WORKER" not in os.environ
+if not WORKS_ALONE and hasattr(os, "sched_setaffinity"):
+    share_processors()
+
+
+@pytest.fixture(autouse=True, scope="session")
+def kernels_are_compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Of several workers, one compiles a kernel while the others wait, and then find it on disk."""
+    if WORKS_ALONE:
+        yield
+        return
+    warp = pytest.importorskip("warp")
+    load, lock = warp.load_module, tmp_path_factory.getbasetemp().parent / "kernels.lock"
+
+    def load_in_turn(*arguments: Any, **options: Any) -> Any:
+        with lock.open("w") as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            return load(*arguments, **options)
+
+    warp.load_module = load_in_turn
+    yield
+    warp.load_module = load
+
 
 hypothesis.settings.register_profile("tests", deadline=None, derandomize=True, max_examples=60, database=None)
 hypothesis.settings.load_profile("tests")

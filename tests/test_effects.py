@@ -31,38 +31,13 @@ from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
-from dropo_torch.optimizers import FitSettings
 from dropo_torch.gap.config import search_box, write_config
+from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
-from dropo_torch.simulators import MujocoSimulator, make_simulator
+from dropo_torch.simulators import make_simulator
+from dropo_torch.testing.effects import RIG, check_effect
 
-#: A chain of two links, a free ball on a floor, a slide without friction.
-RIG = """
-<mujoco>
-  <option timestep="0.005"/>
-  <worldbody>
-    <geom name="floor" type="plane" size="5 5 .1"/>
-    <body name="upper" pos="0 0 1">
-      <joint name="shoulder" type="hinge" axis="0 1 0" damping=".1" limited="true" range="-60 60"/>
-      <geom name="upper" type="capsule" size=".03" fromto="0 0 0 .1 0 -.4" mass="1.2"/>
-      <body name="lower" pos=".1 0 -.4">
-        <joint name="elbow" type="hinge" axis="0 1 0" stiffness=".3" springref="20"/>
-        <geom name="lower" type="capsule" size=".03" fromto="0 0 0 .05 0 -.3" mass=".7"/>
-      </body>
-    </body>
-    <body name="ball" pos="1 0 .099">
-      <freejoint name="root"/><geom name="ball" type="sphere" size=".1" mass="1"/>
-    </body>
-    <body name="cart" pos="-2 0 1">
-      <joint name="rail" type="slide" axis="1 0 0"/><geom name="cart" type="box" size=".1 .1 .1" mass="2"/>
-    </body>
-  </worldbody>
-  <actuator>
-    <motor name="lift" joint="shoulder" gear="3"/><position name="bend" joint="elbow" kp="5"/>
-    <motor name="push" joint="rail" gear="2"/>
-  </actuator>
-</mujoco>"""
 SKIP = 4
 STEP = 0.005
 COLUMNS = ("shoulder", "elbow", "root", "rail")
@@ -130,64 +105,20 @@ def placements() -> list[Any]:
     ]
 
 
-def rolled(model: mujoco.MjModel, entries: list[dict], steps: int = 12) -> np.ndarray:
-    simulator, history = simulator_of(model, entries)
-    controls = some_controls(model, history + steps)[:, -(history + steps) :]
-    controls[:, :history] = controls[:, history : history + 1]
-    fixed = some_controls(model, steps)
-    controls[:, history:] = fixed
-    controls[:, :history] = fixed[:, :1]
-    return simulator.rollout(some_states(model), controls, torch.full((1, 1), 0.1, dtype=torch.float64)).numpy()
+#: Places where an effect does nothing: what does not turn has no use for its centre or inertia, no force depends on
+#: where something is, and a geom may touch nothing.
+IDLE: dict[str, tuple[str, ...]] = {
+    "center_of_mass": ("cart",), "inertia": ("cart",),
+    "sensor_bias": ("root.position[x]", "root.position[y]", "rail.position"),
+    **dict.fromkeys(("contact_friction", "contact_stiffness", "contact_margin"), ("upper", "lower", "cart")),
+}  # fmt: skip
+#: Numbers at which an effect acts on the rig, where those from which a search begins are too small for it.
+NUMBERS = {"joint_limit": {"lower": 0.8, "upper": -0.8}}
 
 
-@pytest.fixture(scope="module")
-def plain_path() -> np.ndarray:
-    model = general()
-    space = ParameterSpace(model, {"d": {"field": "dof_damping", "name": "rail", "bounds": [0.0, 1.0]}})
-    simulator = MujocoSimulator(model, parameters=space, frame_skip=SKIP, num_threads=1)
-    values = torch.full((1, 1), 0.1, dtype=torch.float64)
-    return simulator.rollout(some_states(model), some_controls(model, 12), values).numpy()
-
-
-def test_every_effect_is_tried() -> None:
-    assert {p.values[0].name for p in placements()} == set(VOCABULARY)
-
-
-@pytest.mark.parametrize(("effect", "target"), placements())
-def test_neutral_values_change_nothing(effect: Effect, target: str | None, plain_path: np.ndarray) -> None:
-    model = general()
-    setting = setting_of(model)
-    neutral = np.array([q.neutral for q in effect.quantities(setting, target)])
-    if effect.name == "actuator_saturation":
-        neutral[:] = 1e6  # what the log asks for is not known here
-    np.testing.assert_allclose(rolled(model, [entry(effect, target, neutral, setting)]), plain_path, rtol=0, atol=1e-9)
-
-
-#: What does not turn has no use for its centre or inertia; no force depends on where it is.
-_INVARIANT = (
-    ("center_of_mass", "cart"), ("inertia", "cart"), ("sensor_bias", "root.position[x]"),
-    ("sensor_bias", "root.position[y]"), ("sensor_bias", "rail.position"),
-)  # fmt: skip
-
-
-@pytest.mark.parametrize(("effect", "target"), placements())
-def test_values_that_matter_change_the_simulation(effect: Effect, target: str | None, plain_path: np.ndarray) -> None:
-    model = general()
-    setting = setting_of(model)
-    quantities = effect.quantities(setting, target)
-    values = effect.starts(setting, target)[-1]
-    for i, q in enumerate(quantities):
-        if values[i] == q.neutral and (len(quantities) == 1 or effect.name not in ("payload", "joint_stiffness")):
-            values[i] = np.clip(q.neutral + 0.3 * q.scale, q.low, q.high)
-    if effect.name == "joint_limit":
-        values = np.array([0.8, -0.8]) * 1.04
-    if target in ("upper", "lower", "cart") and effect.kind == "geom":
-        pytest.skip("touches nothing here")
-    path = rolled(model, [entry(effect, target, values, setting)])
-    if (effect.name, target) in _INVARIANT:
-        np.testing.assert_allclose(path, plain_path, atol=1e-9)
-        return
-    assert np.abs(np.nan_to_num(path, nan=1e3) - plain_path).max() > 1e-6
+@pytest.mark.parametrize("name", VOCABULARY)
+def test_every_effect_keeps_its_laws(name: str) -> None:
+    check_effect(VOCABULARY[name], idle=IDLE.get(name, ()), numbers=NUMBERS.get(name))
 
 
 def applied(xml: str, name: str, target: str | None, *values: float) -> tuple[mujoco.MjModel, mujoco.MjData]:

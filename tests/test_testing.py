@@ -4,26 +4,35 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch
-from conftest import space_of
+from conftest import WHOLE, space_of
 
 from dropo_torch.distribution import Distribution
+from dropo_torch.effects import Effect, Quantity, Setting, find_effect, register
+from dropo_torch.effects.actuator import ActuatorEffect
+from dropo_torch.effects.joint import JointEffect
+from dropo_torch.effects.path import SensedPath
+from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FisherOptimizer, FitSettings, Progress, Request
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.rl.inside import RowForces
 from dropo_torch.testing import (
     ConformanceError,
     LinearSimulator,
     Tolerance,
+    check_effect,
     check_optimizer,
     check_simulator,
     linear_problem,
 )
+from dropo_torch.testing import effects as effect_laws
 from dropo_torch.testing import optimizers as optimizer_laws
 from dropo_torch.testing import simulators as simulator_laws
 from dropo_torch.testing.laws import Report, try_laws
@@ -352,6 +361,209 @@ def test_a_broken_optimizer_is_told_which_law(law: str, kind: type[Fisher], monk
     assert caught.value.law == law
 
 
+# Effects
+
+
+class Drag(JointEffect):
+    """A sound effect: a force against the motion."""
+
+    name = "drag_test"
+    sentence = "{target} is braked"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("damping", "N·m·s/rad", 0.0, 0.0, 10.0, 1.0),)
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        out = np.zeros_like(velocity)
+        out[:, setting.dof(target)] = -values[:, 0] * velocity[:, setting.dof(target)]
+        return out
+
+
+class Smoothed(ActuatorEffect):
+    """A sound filter: each step takes a share of the difference to the command."""
+
+    name = "smoothed_test"
+    sentence = "{target} follows late"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("share", "-", 0.0, 0.0, 0.9, 1.0),)
+
+    def memory(self, values: np.ndarray) -> float:
+        return 0.2
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        out, last = [], state
+        for now in signal.split(1, 1):
+            last = values[:, :1] * last + (1 - values[:, :1]) * now
+            out.append(last)
+        return torch.cat(out, 1), last
+
+
+class Shifted(SensorEffect):
+    """A sound sensor, that is off by a constant."""
+
+    name = "shifted_test"
+    sentence = "{target} is off"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("shift", "rad", 0.0, -1.0, 1.0, 0.1),)
+
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        return path.shown[..., column] + values[:, :1]
+
+    def unsense(self, shown: torch.Tensor, rates: torch.Tensor, column: int, values: torch.Tensor) -> torch.Tensor:
+        return shown[:, column] - values[:, 0]
+
+
+class Silent(Drag):
+    sentence = "something is braked"
+
+
+class Nowhere(Drag):
+    def targets(self, setting: Setting) -> list[str | None]:
+        return ["knee"]
+
+
+class Upside(Drag):
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("damping", "N·m·s/rad", 0.0, 0.5, 10.0, 1.0),)
+
+
+class FarOff(Drag):
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        return [np.array([11.0])]
+
+
+class Twin(Drag):
+    """Pickled, it is another."""
+
+    name = "twin_test"
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return find_effect, ("joint_damping",)
+
+
+class Rough(Drag):
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        velocity *= 1.0001
+        return super().force(setting, target, values, position, velocity)
+
+
+class Tired(Drag):
+    """It weakens with every use."""
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        self.used = getattr(self, "used", 0) + 1
+        return super().force(setting, target, values, position, velocity) / self.used
+
+
+class OneForAll(Drag):
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        return super().force(setting, target, values[:1], position, velocity)
+
+
+class Amnesic(Smoothed):
+    """What it remembers is lost between two calls."""
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        return super().command(signal, values, step, state)[0], state
+
+
+class Unsettled(Smoothed):
+    def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:
+        return torch.zeros_like(command)
+
+
+class LongMemory(Smoothed):
+    def memory(self, values: np.ndarray) -> float:
+        return 0.0
+
+
+class Averaging(Shifted):
+    """A measurement depends on how many there are."""
+
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        return super().sense(path, column, values) + values[:, :1] * path.shown[..., column].mean(1, keepdim=True)
+
+
+class OneWay(Shifted):
+    def unsense(self, shown: torch.Tensor, rates: torch.Tensor, column: int, values: torch.Tensor) -> torch.Tensor:
+        return shown[:, column]
+
+
+class NeverNeutral(Drag):
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        return super().force(setting, target, values + 0.01, position, velocity)
+
+
+class Powerless(Drag):
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        return np.zeros_like(velocity)
+
+
+BROKEN_EFFECTS: dict[str, Effect] = {
+    "it says what it is": Silent(),
+    "it has places": Nowhere(),
+    "its numbers are consistent": Upside(),
+    "searches begin within the bounds": FarOff(),
+    "it pickles by name": Twin(),
+    "the same numbers do the same and nothing given is changed": Rough(),
+    "rows do not depend on each other": OneForAll(),
+    "commands in pieces are those in one": Amnesic(),
+    "a settled filter is steady": Unsettled(),
+    "what lies beyond its memory does not matter": LongMemory(),
+    "measurements in pieces are those in one": Averaging(),
+    "true states are found from shown ones": OneWay(),
+    "neutral numbers change nothing": NeverNeutral(),
+    "numbers that matter change the simulation": Powerless(),
+}
+#: What makes environments of their own of an effect, and so may disagree, is no part of an effect.
+OTHERS = {"fit and training agree"}
+
+
+@pytest.mark.parametrize("effect", [Drag(), Smoothed(), Shifted()], ids=lambda e: e.name)
+def test_a_sound_effect_keeps_every_law(effect: Effect) -> None:
+    places = ("root.position[x]", "root.position[y]", "rail.position") if isinstance(effect, Shifted) else ()
+    report = check_effect(effect, idle=places)
+    assert report.skipped["it pickles by name"] == "the effect is not registered"
+    assert {*report.checked, *report.skipped} == law_names(effect_laws.LAWS) == {*BROKEN_EFFECTS, *OTHERS}
+
+
+@pytest.mark.parametrize(
+    ("law", "effect"),
+    [*BROKEN_EFFECTS.items(), ("the same numbers do the same and nothing given is changed", Tired())],
+    ids=lambda x: x if isinstance(x, str) else type(x).__name__,
+)
+def test_a_broken_effect_is_told_which_law(law: str, effect: Effect) -> None:
+    if isinstance(effect, Twin):
+        register(effect)
+    with pytest.raises(ConformanceError) as caught:
+        check_effect(effect)
+    assert caught.value.law == law
+
+
+def test_a_training_that_disagrees_with_a_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RowForces, "restart", lambda self, ids: None)
+    with pytest.raises(ConformanceError, match="broken law 'fit and training agree': found states of a training at"):
+        check_effect(Drag())
+
+
 def test_what_raises_in_a_law_is_told_with_it() -> None:
     counter = itertools.count()
 
@@ -362,3 +574,12 @@ def test_what_raises_in_a_law_is_told_with_it() -> None:
     with pytest.raises(ConformanceError, match=r"it: broken law 'nothing is divided by zero': found ZeroDivisionError"):
         try_laws("it", 0, [_nothing_is_divided_by_zero])
     assert try_laws("it", 1, [_nothing_is_divided_by_zero]).checked == ("nothing is divided by zero",)
+
+
+# Tiers
+
+
+def test_what_is_left_out_of_every_commit_exists() -> None:
+    for file, names in WHOLE.items():
+        text = (Path(__file__).parent / file).read_text()
+        assert [n for n in names if n and f"def {n}(" not in text] == [], file

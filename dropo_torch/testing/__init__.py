@@ -4,6 +4,7 @@ Each is one call, which raises a :class:`ConformanceError` for the first law tha
 :class:`Report` of those that do. Nothing else in the package imports this.
 """
 
+from dropo_torch.testing.effects import check_effect
 from dropo_torch.testing.laws import ConformanceError, Report
 from dropo_torch.testing.linear import LinearSimulator, linear_objective
 from dropo_torch.testing.optimizers import KnownProblem, check_optimizer, linear_problem
@@ -15,6 +16,7 @@ __all__ = [
     "LinearSimulator",
     "Report",
     "Tolerance",
+    "check_effect",
     "check_optimizer",
     "check_simulator",
     "converged",

@@ -73,7 +73,7 @@ def require_same(found: torch.Tensor, expected: torch.Tensor, what: str, like: s
         at = tuple(int(i) for i in (~same).nonzero()[0])
         raise Broken(
             f"{what} that differs in {int((~same).sum())} of {same.numel()} numbers, first at {list(at)}: "
-            f"{float(found[at]):.17g} and {float(expected[at]):.17g}",
+            f"{float(found[at])!r} and {float(expected[at])!r}",
             f"{like}, to the bit",
         )
 

@@ -1,6 +1,6 @@
 """A simulator of one's own, fitted: a driven pendulum in plain numpy.
 
-    python examples/own_simulator/pendulum.py       # records a log, fits it, writes out/pendulum/fit/report.html
+    python examples/own_simulator/pendulum.py       # checks it, records a log, fits it, ends with a report
 
 The config pendulum.yaml names this file's :func:`make`. Replace the class by a wrapper of your simulator.
 """
@@ -13,9 +13,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
+import yaml
 
 import dropo_torch as dropo
 from dropo_torch.commands import cli
+from dropo_torch.testing import Report, check_simulator
 
 TIMESTEP = 0.02
 LENGTH = 0.5
@@ -65,6 +68,15 @@ def make(parameters: dropo.ParameterSpace) -> Pendulum:
     return Pendulum()
 
 
+def check(config: Path) -> Report:
+    """Try the laws that a fit relies on, on states as varied as a log's."""
+    space = dropo.ParameterSpace(None, yaml.safe_load(config.read_text())["parameters"])
+    simulator = dropo.make_simulator("gymnasium", make, parameters=space)
+    rng = np.random.default_rng(0)
+    states, torques = rng.uniform(-2, 2, (8, 2)), rng.uniform(-3, 3, (8, 3, 1))
+    return check_simulator(simulator, torch.from_numpy(states), torch.from_numpy(torques))
+
+
 def record(path: Path, samples: int = 200) -> None:
     """Write a log as a robot's logger would: one row a sample, the command that is in force from it on."""
     pendulum = Pendulum()
@@ -83,9 +95,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("out/pendulum"))
     parser.add_argument("--samples", type=int, default=200, help="rows of the log")
     given = parser.parse_args(arguments)
+    config = Path(__file__).with_name("pendulum.yaml")
+    print(check(config))
     log = given.out / "log.csv"
     record(log, given.samples)
-    config = Path(__file__).with_name("pendulum.yaml")
     if cli.main(["fit", str(config), "--out", str(given.out / "fit"), "--data.path", str(log.resolve())]):
         raise SystemExit(2)
     print("recorded with:", ", ".join(f"{name} {value:g}" for name, value in TRUTH.items()))
