@@ -82,12 +82,10 @@ def cone_piece(cone: Cone, w: vec6) -> int:
         mu = cone.mu[0] / wp.sqrt(cone.impratio)
         tan = _tangential(cone, w)
         n = w[0] * mu
-        if n >= mu * tan or (tan <= ZERO and n >= ZERO):
-            piece = int(0)
-        elif mu * n + tan <= ZERO or (tan <= ZERO and n < ZERO):
-            piece = int(1)
-        else:
+        if not (n >= mu * tan or (tan <= ZERO and n >= ZERO)):
             piece = CURVED
+            if mu * n + tan <= ZERO or tan <= ZERO:
+                piece = int(1)
     return piece
 
 

@@ -136,10 +136,12 @@ class _Mixing:
 
     def __call__(
         self, friction: torch.Tensor, solref: torch.Tensor, solimp: torch.Tensor, margin: torch.Tensor,
-        pair_friction: torch.Tensor, pair_solref: torch.Tensor, pair_solreffriction: torch.Tensor,
-        pair_solimp: torch.Tensor, pair_margin: torch.Tensor,
+        *given: torch.Tensor,
     ) -> torch.Tensor:  # fmt: skip
-        """Return friction, solref, solreffriction, solimp and margin of the pairs, ``(K, 15 n)``."""
+        """Return friction, solref, solreffriction, solimp and margin of the pairs, ``(K, 15 n)``.
+
+        The geoms' numbers come first, then those same five as they are ``given`` for explicit pairs.
+        """
         f1, f2 = friction[:, self.g1], friction[:, self.g2]
         mu = torch.maximum(f1, f2)
         mu = torch.where(self.first[:, None], f1, torch.where(self.second[:, None], f2, mu))
@@ -150,15 +152,11 @@ class _Mixing:
         ref = torch.where(standard, blend, torch.minimum(r1, r2))
         imp = self.weight * solimp[:, self.g1] + (1 - self.weight) * solimp[:, self.g2]
         inflation = margin[:, self.g1] + margin[:, self.g2]
-        fref = torch.zeros_like(ref)
+        parts = [mu, ref, torch.zeros_like(ref), imp, inflation]
         if self.explicit.any():
             own = self.explicit[:, None]
-            mu = torch.where(own, pair_friction[:, self.pair], mu)
-            ref = torch.where(own, pair_solref[:, self.pair], ref)
-            fref = torch.where(own, pair_solreffriction[:, self.pair], fref)
-            imp = torch.where(own, pair_solimp[:, self.pair], imp)
-            inflation = torch.where(own, pair_margin[:, self.pair], inflation)
-        parts = (mu.clamp(min=_MINMU), ref, fref, imp, inflation)
+            parts = [torch.where(own, g[:, self.pair], part) for g, part in zip(given, parts, strict=True)]
+        parts[0] = parts[0].clamp(min=_MINMU)
         return torch.cat([p.flatten(1) for p in parts], dim=1)
 
 

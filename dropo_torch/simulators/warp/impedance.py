@@ -60,10 +60,9 @@ def impedance(x: f64, solimp: vec5) -> f64:
 @wp.func
 def _plain_power(x: f64, p: f64) -> f64:
     """x to the power p without the logarithm that a derivative in p would want."""
-    y = x
-    if p != ONE:
-        y = wp.pow(x, p)
-    return y
+    if p == ONE:
+        return x
+    return wp.pow(x, p)
 
 
 @wp.func

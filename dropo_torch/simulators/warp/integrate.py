@@ -94,16 +94,19 @@ def chart_rates_adjoint(m: Tables, w: World, r: int, c: f64, o: int):
 
 
 @wp.func(inline=True)
-def good(m: Tables, w: World, r: int) -> int:
-    """1 while every number of a state is finite and below MuJoCo's limit."""
+def finite(x: Reals2, r: int, n: int) -> int:
+    """1 while all ``n`` numbers of a row are below MuJoCo's limit."""
     ok = int(1)
-    for i in range(m.nq):
-        if not (wp.abs(w.qpos[r, i]) < LARGE):
-            ok = 0
-    for i in range(m.nv):
-        if not (wp.abs(w.qvel[r, i]) < LARGE):
+    for i in range(n):
+        if not (wp.abs(x[r, i]) < LARGE):
             ok = 0
     return ok
+
+
+@wp.func(inline=True)
+def good(m: Tables, w: World, r: int) -> int:
+    """1 while every number of a state is finite and below MuJoCo's limit."""
+    return finite(w.qpos, r, m.nq) * finite(w.qvel, r, m.nv)
 
 
 @wp.func(inline=True)
@@ -182,9 +185,7 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
                     w.rate[r, i] = w.qvel[r, i]
             accelerate(m, w, r + k)
             if k == 0:
-                for i in range(m.nv):
-                    if not (wp.abs(w.acc[r, i]) < LARGE):
-                        ok = 0
+                ok = finite(w.acc, r, m.nv)
     if ok != 0:
         if m.integrator == RK4:
             for i in range(m.nv):
@@ -194,9 +195,7 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
             if m.implicit != 0:
                 soften(m, w, r)
             for i in range(m.nv):
-                a = w.acc[r, i]
-                if m.implicit != 0:
-                    a = w.soft[r, i]
+                a = w.soft[r, i] if m.implicit != 0 else w.acc[r, i]
                 v = w.qvel[r, i] + h * a
                 w.qvel[nxt, i] = v
                 w.work[w.t, i] = v
@@ -279,9 +278,7 @@ def _end_adjoint(m: Tables, w: World, r: int, nxt: int):
         if m.integrator == RK4:
             abar = w.rate_bar[w.t, i] * h / f64(6.0)
             for k in range(4):
-                weight = TWO
-                if k == 0 or k == 3:
-                    weight = ONE
+                weight = wp.where(k == 0 or k == 3, ONE, TWO)
                 w.stage_rate_bar[w.t, k * nv + i] = weight * g / f64(6.0)
                 w.stage_acc_bar[w.t, k * nv + i] = weight * abar
         else:

@@ -11,21 +11,8 @@ from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, su
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
-from dropo_torch.simulators.warp.spatial import chart_rate_dual
-from dropo_torch.simulators.warp.types import (
-    ZERO,
-    Chunk,
-    Ints,
-    Reals,
-    Reals2,
-    Tables,
-    World,
-    mat33,
-    vec2,
-    vec3,
-    vec5,
-    vec6,
-)
+from dropo_torch.simulators.warp.spatial import chart_rate_dual, theta_vec2, theta_vec3, theta_vec5
+from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals, Reals2, Tables, World, mat33, vec6
 
 # LLVM's own thresholds: what must be inlined says so, and more makes this kernel slower
 wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
@@ -88,10 +75,10 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     gradient is silently zero. A kernel with a backward marks them whatever the order.
     """
     a = x[0]
-    v = vec3(a[0], a[1], a[2])
-    v2 = vec2(a[0], a[1])
-    v5 = vec5(a[0], a[1], a[2], a[3], a[4])
-    s = a[0]
+    v = theta_vec3(y, 0)
+    v2 = theta_vec2(y, 0)
+    v5 = theta_vec5(y, 0)
+    s = y[0]
     y[1] = elliptic_power(3, a, a, a, s, s, v5, v2, v2, v5, s, s, s, 1)
     y[8] = contact_scalars(3, s, s, s, v2, v5, s, s, s, 1, s, s, s)
     y[2] = box_power(v, v, v, v, v, s, s, s)

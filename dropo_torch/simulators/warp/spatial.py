@@ -136,23 +136,16 @@ def inertia_about_origin(mass: f64, c: vec3, rot: mat33, moments: vec3) -> vec10
 @wp.func
 def inertia_mul(i: vec10, x: vec6) -> vec6:
     """I x: the momentum of a body moving with ``x``."""
-    m = i[0]
-    hx = i[1]
-    hy = i[2]
-    hz = i[3]
-    wx = x[0]
-    wy = x[1]
-    wz = x[2]
-    vx = x[3]
-    vy = x[4]
-    vz = x[5]
+    h = vec3(i[1], i[2], i[3])
+    w = ang(x)
+    v = lin(x)
     return vec6(
-        i[4] * wx + i[7] * wy + i[8] * wz + hy * vz - hz * vy,
-        i[7] * wx + i[5] * wy + i[9] * wz + hz * vx - hx * vz,
-        i[8] * wx + i[9] * wy + i[6] * wz + hx * vy - hy * vx,
-        m * vx + wy * hz - wz * hy,
-        m * vy + wz * hx - wx * hz,
-        m * vz + wx * hy - wy * hx,
+        i[4] * w[0] + i[7] * w[1] + i[8] * w[2] + h[1] * v[2] - h[2] * v[1],
+        i[7] * w[0] + i[5] * w[1] + i[9] * w[2] + h[2] * v[0] - h[0] * v[2],
+        i[8] * w[0] + i[9] * w[1] + i[6] * w[2] + h[0] * v[1] - h[1] * v[0],
+        i[0] * v[0] + w[1] * h[2] - w[2] * h[1],
+        i[0] * v[1] + w[2] * h[0] - w[0] * h[2],
+        i[0] * v[2] + w[0] * h[1] - w[1] * h[0],
     )
 
 
@@ -176,15 +169,13 @@ def rotation(axis: vec3, angle: f64) -> mat33:
 def quat_matrix(q: vec4) -> mat33:
     """Rotation of the quaternion (w, x, y, z), which need not be normalised; the zero quaternion is identity."""
     n = wp.length(q)
-    w = ONE
-    x = ZERO
-    y = ZERO
-    z = ZERO
+    unit = vec4(ONE, ZERO, ZERO, ZERO)
     if n > MINVAL:
-        w = q[0] / n
-        x = q[1] / n
-        y = q[2] / n
-        z = q[3] / n
+        unit = q / n
+    w = unit[0]
+    x = unit[1]
+    y = unit[2]
+    z = unit[3]
     return mat33(
         w * w + x * x - y * y - z * z, TWO * (x * y - w * z), TWO * (x * z + w * y),
         TWO * (x * y + w * z), w * w - x * x + y * y - z * z, TWO * (y * z - w * x),

@@ -183,7 +183,7 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
     width = max(1, int(np.prod(read_field(model, field).shape[1:], dtype=int)))
     column = index % width
     if column >= _KEPT.get(field, width):
-        return f"{field}[{column}] is not used by what is simulated"
+        return f"{field}[{column}] does not act, only " + ", ".join(f"{field}[{i}]" for i in range(_KEPT[field]))
     if field == "qpos_spring":
         for j in range(model.njnt):
             start = model.jnt_qposadr[j]
