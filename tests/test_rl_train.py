@@ -416,7 +416,9 @@ def test_kill_9_and_resume_give_the_policy_of_a_run_never_interrupted(folder: Pa
     more = ["--train.steps=3200", "--train.checkpoint_seconds=0"]
     assert main(command(folder, tmp_path / "whole", *more)) == 0
     arguments = command(folder, tmp_path / "pieces", *more, "--resume")
-    process = subprocess.Popen([sys.executable, "-m", "dropo_torch", *arguments], stdout=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [sys.executable, "-m", "dropo_torch", *arguments], stdout=subprocess.DEVNULL
+    )
     deadline = time.monotonic() + 100
     while not (tmp_path / "pieces" / "train-progress.pt").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
