@@ -54,7 +54,7 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(code: str) -> None:
 
 
 PUBLIC = {
-    "Config", "Diagnostics", "Distribution", "Effect", "Fit", "InputError", "Objective", "Observation", "Parameter",
+    "Config", "Diagnostics", "Distribution", "Effect", "Fit", "FitSettings", "InputError", "Objective", "Observation", "Parameter",
     "ParameterSpace", "Placed", "Preprocess", "Problem", "Quantity", "Recording", "Simulator", "Trajectories",
     "Transitions", "baselines", "diagnose", "export_model", "fit", "gap", "load_config", "load_policy",
     "log_likelihood", "make_config", "make_problem", "make_simulator", "make_transitions", "parse_observation",
@@ -86,7 +86,7 @@ LAYERS = (
     "errors", "support", "models.load", "models.bundled", "models",
     "parameters", "models.export", "data",
     "distribution", "likelihood", "simulators",
-    "objective",
+    "evaluator", "initial_noise", "objective", "excitation",
     "optimizers",
     "certify", "fit",
     "config",
@@ -96,6 +96,7 @@ LAYERS = (
     "studies",
     "report",
     "commands", "__main__",
+    "testing",
 )  # fmt: skip
 
 #: Imports against that order, each with its reason; none may be one at module level.
