@@ -18,13 +18,12 @@ from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.evidence import Evidence, cost_of
 from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
-from dropo_torch.optimizers.least_squares import damped_step
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
 #: A candidate that moves the screened windows by fewer standard deviations of the noise cannot be judged by them.
 DEAD = 1.5
-#: Damping and ridge of the predicted moves; damping where only χ² is predicted.
+#: Damping and ridge of the predicted moves; ridge, of columns of length 1, where only χ² is predicted.
 DAMPING, RIDGE, FAINT = 1e-6, 1e-10, 1e-9
 #: Candidates that one batch of simulations holds.
 BATCH = 24
@@ -193,5 +192,8 @@ def _left(focus: Focus, members: Sequence[Candidate]) -> float:
     """χ² that is left beside the shared numbers, the members' numbers, and the steps to the members' starts."""
     before = focus.residual
     columns = np.stack([*focus.slope, *(s for c in members for s in c.slope), *(c.residual - before for c in members)])
-    gradient, free = columns @ before, np.ones(len(columns), dtype=bool)
-    return float(before @ before - gradient @ damped_step(columns @ columns.T, gradient, free, FAINT))
+    norm = np.sqrt((columns**2).sum(1))
+    columns = columns[norm > 0] / norm[norm > 0, None]
+    gradient = columns @ before
+    normal = columns @ columns.T + FAINT * np.eye(len(columns))
+    return float(before @ before - gradient @ np.linalg.solve(normal, gradient))
