@@ -55,8 +55,8 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(code: str) -> None:
 
 PUBLIC = {
     "Config", "Diagnostics", "Distribution", "Effect", "Fit", "FitSettings", "InputError", "Objective", "Observation",
-    "Parameter", "ParameterSpace", "Placed", "Preprocess", "Problem", "Quantity", "Recording", "Simulator", "Trajectories",
-    "Transitions", "baselines", "diagnose", "export_model", "fit", "gap", "load_config", "load_policy",
+    "Parameter", "ParameterSpace", "Placed", "Preprocess", "Problem", "Quantity", "Recording", "Simulator",
+    "Trajectories", "Transitions", "baselines", "diagnose", "export_model", "fit", "gap", "load_config", "load_policy",
     "log_likelihood", "make_config", "make_problem", "make_simulator", "make_transitions", "parse_observation",
     "preprocess", "read_recording", "read_trajectories",
 }  # fmt: skip

@@ -104,7 +104,7 @@ class WarpSimulator(Simulator):
 
         Returns:
             States ``(T, K, nq + nv)``, and the directions' products with the derivatives by the values
-            ``(T, K, J, d)`` and by the start states ``(T, K, J, nq + nv)``.
+            ``(T, K, J, d)`` and by the initial states ``(T, K, J, nq + nv)``.
         """
         self.check_arguments(states, controls, values)
         rows = torch.eye(self.num_states, dtype=torch.float64) if directions is None else directions

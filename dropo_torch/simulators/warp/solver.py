@@ -200,21 +200,25 @@ def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
     for i in range(m.nv):
         linear += w.product[w.t, i] * w.step[w.t, i]
         quad += w.work[w.t, i] * w.step[w.t, i]
-    start, _curve = _slopes(m, w, nrow, ncon, ZERO, linear, quad)
+    start = f64(0.0)
     low = ZERO
     high = f64(-1.0)
-    alpha = ONE
-    for _k in range(LINE_STEPS):
+    alpha = f64(0.0)
+    for k in range(LINE_STEPS + 1):
         d1, d2 = _slopes(m, w, nrow, ncon, alpha, linear, quad)
-        if wp.abs(d1) <= f64(1.0e-15) * wp.abs(start):
-            break
-        if d1 < ZERO:
-            low = alpha
+        nxt = ONE
+        if k == 0:
+            start = d1
         else:
-            high = alpha
-        nxt = alpha - d1 / d2
-        if nxt <= low or (high > ZERO and nxt >= high):
-            nxt = f64(0.5) * (low + high) if high > ZERO else f64(2.0) * alpha
+            if wp.abs(d1) <= f64(1.0e-15) * wp.abs(start):
+                break
+            if d1 < ZERO:
+                low = alpha
+            else:
+                high = alpha
+            nxt = alpha - d1 / d2
+            if nxt <= low or (high > ZERO and nxt >= high):
+                nxt = f64(0.5) * (low + high) if high > ZERO else f64(2.0) * alpha
         if nxt == alpha:
             break
         alpha = nxt

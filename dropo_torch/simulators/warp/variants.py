@@ -40,7 +40,7 @@ class Variants:
 
         Args:
             model: the variant, with its derived constants.
-            starts: start states ``(W, nq + nv)``.
+            starts: initial states ``(W, nq + nv)``.
             controls: controls of every physics step ``(W, S, nu)``.
 
         Returns:
