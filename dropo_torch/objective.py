@@ -82,6 +82,7 @@ class Objective:
         scaling: bool = False,
         chunk_size: int = 20_000,
     ) -> None:
+        self.simulator, self.transitions, self.observation = simulator, transitions, observation
         every = Features.of(observation, masked_columns(observation, mask))
         self._every_feature = every.scaled(transitions.measured) if scaling else every
         self.features = self._every_feature.compared()
@@ -90,31 +91,18 @@ class Objective:
         self.epsilon = _per_entry("epsilon", epsilon, self.features.size, "feature", self.features.labels)
         given = None if noise is None else _per_entry("noise", noise, observation.size, "column", observation.labels)
         self.noise = given if given is not None and bool(given.any()) else None  # with 0 in all columns there is none
+        end = self.feature_noise
+        self._fixed = torch.diag(self.epsilon) + (0.0 if end is None else torch.diag(end**2))
 
     def on(self, transitions: Transitions) -> Objective:
         """Return the same objective over other transitions of the same log."""
         other = copy.copy(self)
-        other.evaluator = replace(self.evaluator, transitions=transitions)
+        other.transitions, other.evaluator = transitions, replace(self.evaluator, transitions=transitions)
         return other
 
     def __len__(self) -> int:
         """Return the number of transitions T."""
         return len(self.transitions)
-
-    @property
-    def simulator(self) -> Simulator:
-        """What simulates the transitions."""
-        return self.evaluator.simulator
-
-    @property
-    def transitions(self) -> Transitions:
-        """The log's windows."""
-        return self.evaluator.transitions
-
-    @property
-    def observation(self) -> Observation:
-        """What the log's columns are."""
-        return self.evaluator.observation
 
     @property
     def measured(self) -> torch.Tensor:
@@ -163,12 +151,6 @@ class Objective:
             return torch.diag(self.epsilon) + initial.covariance[rows]
         return self._fixed.expand(len(self.measured[rows]), -1, -1)
 
-    @property
-    def _fixed(self) -> torch.Tensor:
-        """ε and the noise of the measured next states alone, ``(m, m)``."""
-        fixed = torch.diag(self.epsilon)
-        return fixed if self.feature_noise is None else fixed + torch.diag(self.feature_noise**2)
-
     def comparing(self, reduce: Reduce, initial: InitialStateNoise | None = None) -> Visit:
         """Return what an evaluator is to make of simulated features, so that they are compared with the log."""
         return lambda features, rows: reduce(features, self.target(rows, initial), self.base_covariance(rows, initial))
@@ -215,19 +197,21 @@ class Objective:
             for value, squared, kept, lost in sums.total.reshape(4, len(values)).T.tolist()
         ]
 
-    def robust_log_likelihood(self, mean: np.ndarray, values: torch.Tensor) -> float:
-        """Return the log-likelihood of φ under Student's t distribution, with the noise as it is given.
 
-        The Gaussian one widens what the noise does not explain, window by window, and so hardly tells a noise that is
-        too small; this one may be compared between noises.
+def robust_log_likelihood(objective: Objective, mean: np.ndarray, values: torch.Tensor) -> float:
+    """Return the log-likelihood of φ under Student's t distribution, with the noise as it is given.
 
-        Args:
-            mean: μ in coordinates, ``(d,)``, at which the initial states' noise is propagated.
-            values: samples of φ, ``(K, d)``, in units.
-        """
-        as_given = self.initial_noise(mean, widen=lambda residual, _: torch.ones(len(residual), dtype=residual.dtype))
-        reduction = likelihood_reduction(self.features, 1, student_log_density)
-        return float(self.map(values, reduction, initial=as_given).total[0])
+    The Gaussian one widens what the noise does not explain, window by window, and so hardly tells a noise that is
+    too small; this one may be compared between noises.
+
+    Args:
+        objective: the likelihood of the log.
+        mean: μ in coordinates, ``(d,)``, at which the initial states' noise is propagated.
+        values: samples of φ, ``(K, d)``, in units.
+    """
+    as_given = objective.initial_noise(mean, widen=lambda residual, _: torch.ones(len(residual), dtype=residual.dtype))
+    reduction = likelihood_reduction(objective.features, 1, student_log_density)
+    return float(objective.map(values, reduction, initial=as_given).total[0])
 
 
 def likelihood_reduction(features: Features, num_phi: int, log_density: LogDensity = gaussian_log_density) -> Reduce:

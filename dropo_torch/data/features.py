@@ -11,12 +11,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from scipy.spatial.transform import Rotation
 
 from dropo_torch.data.observation import Observation
 from dropo_torch.errors import InputError, choices
-
-_UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,10 +92,7 @@ class Features:
     def difference(self, measured: np.ndarray, simulated: np.ndarray) -> np.ndarray:
         """Return measured minus simulated features, ``(..., m)``, of columns ``(..., n)``; shapes broadcast."""
         parts = [(measured - simulated)[..., list(self.plain)]]
-        for q in self.quaternions:
-            start, end = np.broadcast_arrays(simulated[..., list(q)], measured[..., list(q)])
-            turn = (_orientations(start).inv() * _orientations(end)).as_rotvec().reshape(*start.shape[:-1], 3)
-            parts.append(np.where(np.isfinite(start + end).all(-1, keepdims=True), turn, np.nan))
+        parts += [_rotation(simulated[..., list(q)], measured[..., list(q)]) for q in self.quaternions]
         return np.concatenate(parts, -1) / self.scale
 
     def move(self, columns: np.ndarray, delta: np.ndarray) -> np.ndarray:
@@ -108,9 +102,7 @@ class Features:
         plain, turns = np.split(delta, [len(self.plain)], -1)
         out[..., list(self.plain)] += plain
         for i, q in enumerate(self.quaternions):
-            turn = Rotation.from_rotvec(turns[..., 3 * i : 3 * i + 3].reshape(-1, 3))
-            quaternion = out[..., list(q)]
-            out[..., list(q)] = (_orientations(quaternion) * turn).as_quat(scalar_first=True).reshape(quaternion.shape)
+            out[..., list(q)] = _turned(out[..., list(q)], turns[..., 3 * i : 3 * i + 3])
         return out
 
     def known(self, valid: np.ndarray) -> np.ndarray:
@@ -135,10 +127,40 @@ class Features:
         return columns
 
 
-def _orientations(quaternions: np.ndarray) -> Rotation:
-    """Orientations of quaternions (w, x, y, z) ``(..., 4)``, in one row; upright where there is none."""
-    rows = quaternions.reshape(-1, 4)
-    return Rotation.from_quat(np.where((rows**2).sum(-1, keepdims=True) > 0, rows, _UPRIGHT), scalar_first=True)
+def _rotation(start: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """Do what :func:`rotation_vector` does for arrays of many windows; SciPy's takes seven times as long."""
+    w0, x0, y0, z0 = np.moveaxis(start, -1, 0)
+    w1, x1, y1, z1 = np.moveaxis(end, -1, 0)
+    w = w0 * w1 + x0 * x1 + y0 * y1 + z0 * z1
+    v = np.stack(
+        [
+            w0 * x1 - x0 * w1 - y0 * z1 + z0 * y1,
+            w0 * y1 - y0 * w1 - z0 * x1 + x0 * z1,
+            w0 * z1 - z0 * w1 - x0 * y1 + y0 * x1,
+        ],
+        -1,
+    )
+    v, w = np.where(w[..., None] < 0, -v, v), np.abs(w)
+    sine = np.linalg.norm(v, axis=-1)
+    angle = 2 * np.arctan2(sine, w)
+    return v * np.where(sine > 1e-12, angle / np.maximum(sine, 1e-300), 2.0)[..., None]
+
+
+def _turned(quaternion: np.ndarray, turn: np.ndarray) -> np.ndarray:
+    """Quaternion turned by a rotation vector in the body's frame."""
+    angle = np.linalg.norm(turn, axis=-1, keepdims=True)
+    share = np.where(angle > 1e-12, np.sin(angle / 2) / np.maximum(angle, 1e-300), 0.5)
+    w1, (x1, y1, z1) = np.cos(angle / 2)[..., 0], np.moveaxis(turn * share, -1, 0)
+    w0, x0, y0, z0 = np.moveaxis(quaternion, -1, 0)
+    return np.stack(
+        [
+            w0 * w1 - x0 * x1 - y0 * y1 - z0 * z1,
+            w0 * x1 + x0 * w1 + y0 * z1 - z0 * y1,
+            w0 * y1 + y0 * w1 + z0 * x1 - x0 * z1,
+            w0 * z1 + z0 * w1 + x0 * y1 - y0 * x1,
+        ],
+        -1,
+    )
 
 
 def rotation_vector(start: torch.Tensor, end: torch.Tensor) -> torch.Tensor:

@@ -27,24 +27,24 @@ _BETAS = (0.8, 0.9)
 _TINY = 1e-300
 #: Steps before the gradient's running size is trusted.
 _WARM_UP = 10
-#: Standard errors by which residuals must exceed their covariance for deviations to leave their floor at once.
+#: Standard errors by which residuals must exceed their covariance for σ to leave its floor at once.
 _SIGNIFICANCE = 3.0
-#: Steps between two refreshes of the start noise at the current μ.
+#: Steps after which the noise of the initial states is propagated anew, at the current μ.
 _RELINEARISE = 100
 
 
 class AdamOptimizer(LikelihoodOptimizer):
     """Stochastic gradient ascent of the sampled likelihood over minibatches of transitions, in two stages.
 
-    First the means alone, with deviations at their floor: weighted least squares, one simulation a transition. The
-    residuals that are left give a first guess of the deviations. Then both on samples. With m and v the running
+    First the means alone, with σ at its floor: weighted least squares, one simulation a transition. The
+    residuals that are left give a first guess of σ. Then both on samples. With m and v the running
     mean and mean square of the gradient (as in Adam, bias corrected), λ an eigenvalue of the minibatch's
     Gauss-Newton matrix per transition, α the learning rate and α₀ its setting, the means move along an
     eigenvector by α m / max(√v, α₀ λ): Adam's bounded step far away, a damped Newton step near by. The matrix is
     computed anew every few steps from a stencil of d + 1 points on a minibatch, and the moments turn along.
 
-    The deviations move by their logarithms, but Adam sees the gradients of their variances: those do not vanish
-    towards the floor, so that a deviation can leave it and reach it again.
+    σ moves by its logarithm, but Adam sees the gradient of its square, which does not vanish
+    towards the floor, so that σ can leave it and reach it again.
 
     Args:
         objective: its reduction and its simulator's gradients are used; it is not evaluated here.
@@ -112,7 +112,7 @@ class AdamOptimizer(LikelihoodOptimizer):
     @property
     def progress(self) -> Progress:
         """Smoothed log-likelihood of the whole log, and the share of steps taken."""
-        stage = "Adam on means and deviations" if self._is_joint else "Adam on the means"
+        stage = "Adam on means and standard deviations" if self._is_joint else "Adam on the means"
         return Progress(stage, self._smoothed * len(self._objective), self._step / (2 * self._adam.steps))
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -121,7 +121,7 @@ class AdamOptimizer(LikelihoodOptimizer):
 
     @property
     def _is_joint(self) -> bool:
-        """Whether deviations move too."""
+        """Whether σ moves too."""
         return self._step >= self._adam.steps
 
     @property
@@ -131,7 +131,7 @@ class AdamOptimizer(LikelihoodOptimizer):
 
     @property
     def _is_new_stage(self) -> bool:
-        """Whether the deviations are about to move for the first time."""
+        """Whether σ is about to move for the first time."""
         return self._step == self._adam.steps
 
     @property
@@ -156,7 +156,7 @@ class AdamOptimizer(LikelihoodOptimizer):
         self._step += 1
 
     def _to_basis(self, force: np.ndarray) -> np.ndarray:
-        """A gradient by φ with its means in the basis, and variances in the place of logarithmic deviations."""
+        """A gradient by φ with its means in the basis, and variances in the place of log σ."""
         d, ratio = len(self._space), np.log(self._box.max_std / self._box.min_std)
         if not self._is_joint:
             return np.concatenate([self._basis.T @ force[:d], np.zeros(d)])
@@ -166,7 +166,7 @@ class AdamOptimizer(LikelihoodOptimizer):
     def _refresh(self, sums: torch.Tensor) -> None:
         """Take eigenvectors and eigenvalues of the Gauss-Newton matrix, and turn the moments along.
 
-        Where the deviations begin to move, it gives their first guess too.
+        Where σ begins to move, it gives its first guess too.
         """
         d, stage = len(self._space), self._means_stage()
         stage.tell(sums)
@@ -178,12 +178,12 @@ class AdamOptimizer(LikelihoodOptimizer):
         self._second = np.concatenate([turn**2 @ self._second[:d], self._second[d:]])
         if self._is_new_stage:
             self._first, self._second, self._smoothed = np.zeros(2 * d), np.zeros(2 * d), float("nan")
-            guess = stage.deviations(self._box, significance=_SIGNIFICANCE)
+            guess = stage.first_std(self._box, significance=_SIGNIFICANCE)
             self._phi = np.concatenate([self._phi[:d], self._box.normalise(stage.point, guess)[d:]])
         self._basis, self._refreshed = basis, self._step
 
     def _values(self, phi: torch.Tensor) -> torch.Tensor:
-        """Parameter values ``(K, d)``, in units, of scaled φ; differentiable. μ alone while deviations rest."""
+        """Parameter values ``(K, d)``, in units, of scaled φ; differentiable. μ alone in the first stage."""
         box, d = self._box, len(self._space)
         low, width, least, most = (torch.as_tensor(x) for x in (box.low, box.width, box.min_std, box.max_std))
         mean = low + phi[:d] / SearchBox.WIDTH * width
@@ -204,7 +204,7 @@ class AdamOptimizer(LikelihoodOptimizer):
         return MeansStage(self._box.low, self._box.high, self._box.denormalise(self._phi)[0])
 
     def _normal_equations(self, stage: MeansStage) -> Reduce:
-        """The stencil's reduction; deviations that move count as covariance, by the linear model."""
+        """The stencil's reduction; a σ that moves counts as covariance, by the linear model."""
         plain = stage.reduction()
         if not self._is_joint or self._is_new_stage:
             return plain

@@ -104,8 +104,8 @@ class CorrelatedOptimizer(FisherOptimizer):
         )
         self._covariance = (found * torch.outer(scale, scale)).numpy()
         moved = np.clip(self._at + (shift * scale).numpy(), self._box.low, self._box.high)
-        rests = bool((np.abs(moved - self._at) <= _AT_REST * self._box.width).all())
-        self._center, self._rounds = moved, (_ROUNDS if rests else self._rounds + 1)
+        converged = bool((np.abs(moved - self._at) <= _AT_REST * self._box.width).all())
+        self._center, self._rounds = moved, (_ROUNDS if converged else self._rounds + 1)
 
     @property
     def stop_reason(self) -> str | None:

@@ -22,7 +22,7 @@ NOISY_ROUNDS = 6
 AT_REST = 1e-3
 #: Change of σ, as a share of it or of 1/20 of the search width, below which it has converged; and how often it is
 #: fitted anew.
-RESTS = 0.1
+CONVERGED = 0.1
 SPREAD_ROUNDS = 3
 
 
@@ -114,12 +114,12 @@ class FisherOptimizer(LikelihoodOptimizer):
         point, before = self._means.point, self._linearised
         if before is not None:
             self._linearised = point
-            rests = bool((np.abs(point - before) <= AT_REST * self._box.width).all())
-            if self._round < NOISY_ROUNDS and not rests:
+            converged = bool((np.abs(point - before) <= AT_REST * self._box.width).all())
+            if self._round < NOISY_ROUNDS and not converged:
                 self._round += 1
                 self._means = MeansStage(self._box.low, self._box.high, point)
                 return
-        self._scoring = SigmaPointStage(self._box, point, self._means.deviations(self._box))
+        self._scoring = SigmaPointStage(self._box, point, self._means.first_std(self._box))
 
     def _refit_if_moved(self, stage: Ascent) -> None:
         """Refit around noise whose windows are widened for what σ does not explain either, until σ has converged.
@@ -128,8 +128,8 @@ class FisherOptimizer(LikelihoodOptimizer):
         from there it grows.
         """
         before = self._box.min_std if self._explained is None else self._explained
-        rests = bool((np.abs(stage.std - before) <= RESTS * np.maximum(stage.std, self._box.width / 20)).all())
-        if self._spread_round < SPREAD_ROUNDS and not rests:
+        converged = bool((np.abs(stage.std - before) <= CONVERGED * np.maximum(stage.std, self._box.width / 20)).all())
+        if self._spread_round < SPREAD_ROUNDS and not converged:
             self._spread_round += 1
             self._linearised, self._explained = stage.mean, stage.std
             self._scoring = SigmaPointStage(self._box, stage.mean, stage.std)

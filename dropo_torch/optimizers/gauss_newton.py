@@ -87,12 +87,12 @@ class MeansStage:
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
 
-    def deviations(self, box: SearchBox, significance: float = 0.0) -> np.ndarray:
+    def first_std(self, box: SearchBox, significance: float = 0.0) -> np.ndarray:
         """Return a first guess of σ, ``(d,)``: the variances that explain the residuals' excess over C.
 
         One scoring step from σ = 0 in the linear model, with variances kept non-negative. Where the
         residuals do not exceed C, by ``significance`` standard errors, there is nothing to explain, and σ
-        starts at its floor; else no lower than a hundredth of the width, from which it can still go either way.
+        begins at its floor; else no lower than a hundredth of the width, from which it can still go either way.
         """
         if not len(self.excess):
             return np.clip(box.width / 40, box.min_std, box.max_std)

@@ -18,7 +18,7 @@ class AdamSettings:
     """How Adam steps, in φ scaled to [0, 4] as for CMA-ES.
 
     Attributes:
-        steps: of each of its two stages: the means alone, then means and deviations.
+        steps: of each of its two stages: μ alone, then μ and σ.
         batch: transitions of a minibatch while μ and σ move, twice as many for the means alone;
             the whole log where that is shorter.
         samples: parameter vectors of each step of the second stage; the first simulates μ only.

@@ -17,6 +17,7 @@ import numpy as np
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
+from dropo_torch.objective import robust_log_likelihood as student_log_likelihood
 from dropo_torch.support.files import write_atomically
 from dropo_torch.support.random import draw_uniforms
 
@@ -167,7 +168,7 @@ def noise_keys(objective: Objective, variance: float) -> dict[str, Any]:
 def robust_log_likelihood(objective: Objective, fit: Fit) -> float:
     """Return a fit's log-likelihood that may be compared between noises, in nats."""
     uniforms = draw_uniforms(fit.samples, len(fit.distribution.names), fit.seed, 0)
-    return objective.robust_log_likelihood(fit.distribution.mean, fit.distribution.rsample(uniforms))
+    return student_log_likelihood(objective, fit.distribution.mean, fit.distribution.rsample(uniforms))
 
 
 def default_epsilons(measured: np.ndarray) -> list[float]:
