@@ -11,8 +11,8 @@ import pytest
 import torch
 import yaml
 from conftest import HOPPER
-
 from dropo_sims.hopper import SIM
+
 from dropo_torch.certify import certify
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config, make_config
@@ -21,12 +21,14 @@ from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
 from dropo_torch.effects.actuator import ActuatorDeadband
 from dropo_torch.effects.base import Setting
+from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.export import write_model
-from dropo_torch.effects.filters import Filter, extended, filtered, sensed
+from dropo_torch.effects.filters import Filter, extended, filtered, observed_rates, sensed
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import lowest, place_effects, plain_setting
 from dropo_torch.effects.sensor import SensorScale
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
+from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
 from dropo_torch.gap.config import search_box, write_config
@@ -494,6 +496,31 @@ def test_what_sensors_show_of_an_episode_is_what_they_show_in_its_steps(effect: 
     known = SensedPath.of(truth, instants + 1, SKIP, STEP, rates).known(effect.memory(np.array([0.03])))
     late = 0 if effect.memory(np.array([0.03])) == 0 else int(np.ceil(effect.memory(np.array([0.03])) / STEP / SKIP))
     assert known.tolist() == [t >= late for t in range(instants + 1)]
+
+
+def test_search_and_fit_know_the_velocities_of_the_same_columns() -> None:
+    setting = setting_of(general())
+    labels = setting.observation.labels
+    found = {labels[i]: labels[rate] for i, rate in enumerate(observed_rates(setting)) if rate >= 0}
+    simple = {f"{joint}.position": f"{joint}.velocity" for joint in ("shoulder", "elbow", "rail")}
+    assert found == simple | {f"root.position[{x}]": f"root.velocity[v{x}]" for x in "xyz"}
+    assert Twin(setting, ParameterSpace.empty(setting.model)).rates.tolist() == list(observed_rates(setting))
+
+
+@pytest.mark.parametrize("delay", [0.4 * STEP, 3.7 * STEP])
+def test_search_and_fit_show_the_same_late_measurement(delay: float) -> None:
+    """Once both know it: without acceleration before the window, a late sensor shows the same in both."""
+    model = general(SLIDE)
+    simulator, history = simulator_of(model, [{"effect": "sensor_delay", "target": "rail.position", "delay": delay}])
+    space, setting = ParameterSpace.empty(model), setting_of(model)
+    start, command = np.array([[0.2, 1.0]]), np.concatenate([[0.0], COMMAND[:9]])[None, :, None]
+    fitted = simulator.rollout(*(torch.from_numpy(x) for x in (start, command, np.zeros((1, 1)))))[0, 0].numpy()
+    windows = Windows(np.repeat(start[None], 10, 1), start[:, ::-1] * [1.0, 0.0], np.array([0]), np.array([1]), command)
+    placed = Placed(find_effect("sensor_delay"), "rail.position", (delay,))
+    found, valid = Twin(setting, space).predict([Variant((), (placed,))], windows)
+    assert history == 1
+    assert valid[0, 0, 1:].all()
+    np.testing.assert_allclose(found[0, 0, 1:], fitted, rtol=0, atol=1e-12)
 
 
 # In configs

@@ -5,13 +5,12 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Placed, Quantity, Setting
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, object_number
 
 
 def body_number(model: mujoco.MjModel, target: str | None) -> int:
     """Return the number of a body by its name, or ``body3`` for an unnamed one."""
-    names = [model.body(b).name or f"body{b}" for b in range(model.nbody)]
-    return names.index(str(target))
+    return object_number(model, "body", target)
 
 
 class BodyEffect(Effect):
@@ -218,14 +217,11 @@ class FluidDrag(BodyEffect):
 
 def _largest_section(model: mujoco.MjModel, geom: int) -> float:
     """Return the largest section of the ellipsoid by which MuJoCo computes a geom's drag, in m²."""
-    kind, size = int(model.geom_type[geom]), model.geom_size[geom]
-    if kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-        axes = np.repeat(size[0], 3)
-    elif kind == mujoco.mjtGeom.mjGEOM_CAPSULE:
-        axes = np.array([size[0], size[0], size[1] + size[0]])
-    elif kind == mujoco.mjtGeom.mjGEOM_CYLINDER:
-        axes = np.array([size[0], size[0], size[1]])
-    else:
-        axes = np.array(size[:3])
-    largest = np.sort(axes)[1:]
-    return float(np.pi * largest[0] * largest[1])
+    radius, length, _ = size = model.geom_size[geom]
+    axes = {
+        int(mujoco.mjtGeom.mjGEOM_SPHERE): (radius, radius, radius),
+        int(mujoco.mjtGeom.mjGEOM_CAPSULE): (radius, radius, length + radius),
+        int(mujoco.mjtGeom.mjGEOM_CYLINDER): (radius, radius, length),
+    }.get(int(model.geom_type[geom]), size)
+    _, middle, largest = np.sort(axes)
+    return float(np.pi * middle * largest)

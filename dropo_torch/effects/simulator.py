@@ -273,8 +273,8 @@ def effect_simulator(
     """
     setting = effects.setting
     native, outer = effects.native, effects.outer
-    if needs_mujoco(effects, space):
-        check_backend(backend, effects, space)
+    check_backend(backend, effects, space)
+    if obstacle(backend, effects, space) is not None:
         make(setting.model, setting.frame_skip, space)  # for what it refuses
         engine: Engine = InnerEngine(effects, space, num_threads)
         kept = effects
@@ -301,35 +301,29 @@ def effect_simulator(
     ), history  # fmt: skip
 
 
-def needs_mujoco(effects: EffectSet, space: ParameterSpace) -> bool:
-    """Whether effects are forces in the simulation or change its model from one parameter vector to another."""
-    native = effects.native
-    inside = any(not (e.effect.native or e.effect.outer) for e in effects.entries)
-    return inside or any(e.varies for e in native.entries) or overlap(native, space) is not None
+def obstacle(backend: str, effects: EffectSet, space: ParameterSpace) -> str | None:
+    """Return why a backend other than MuJoCo cannot have the effects: forces, or a model that varies; or ``None``."""
+    for entry in effects.entries:
+        if not (entry.effect.native or entry.effect.outer):
+            return f"backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
+    for entry in effects.native.entries:
+        if entry.varies:
+            return (
+                f"{entry.place} has a number that varies, which backend {backend} cannot; "
+                "vary a field of the model instead, or use backend: mujoco"
+            )
+    shared = overlap(effects.native, space)
+    return None if shared is None else (
+        f"{shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
+        f"which backend {backend} cannot; leave one of them out, or use backend: mujoco"
+    )  # fmt: skip
 
 
 def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> None:
     """Raise an :class:`InputError` for an effect that a backend cannot have; it says what could."""
-    if backend == "mujoco":
-        return
-    for entry in effects.entries:
-        if not (entry.effect.native or entry.effect.outer):
-            raise InputError(
-                f"effects: backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
-            )
-    native = effects.native
-    for entry in native.entries:
-        if entry.varies:
-            raise InputError(
-                f"effects: {entry.place} has a number that varies, which backend {backend} cannot; "
-                "vary a field of the model instead, or use backend: mujoco"
-            )
-    shared = overlap(native, space)
-    if shared is not None:
-        raise InputError(
-            f"effects: {shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
-            f"which backend {backend} cannot; leave one of them out, or use backend: mujoco"
-        )
+    reason = obstacle(backend, effects, space)
+    if backend != "mujoco" and reason is not None:
+        raise InputError(f"effects: {reason}")
 
 
 def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSet) -> int:
