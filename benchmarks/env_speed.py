@@ -21,10 +21,10 @@ import gymnasium
 import mujoco.batch
 import numpy as np
 import torch
-from torchrl.envs import EnvBase, HopperEnv
-
 from dropo_sims.hopper import SIM
 from dropo_sims.hopper.task import HopperTask
+from torchrl.envs import EnvBase, HopperEnv
+
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl import MujocoStepper, RandomizedEnv
 

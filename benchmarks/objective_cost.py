@@ -14,10 +14,10 @@ from collections.abc import Callable, Sequence
 import mujoco.batch
 import numpy as np
 import torch
-
-import dropo_torch as dropo
 from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import record
+
+import dropo_torch as dropo
 from dropo_torch.support.random import draw_uniforms
 
 

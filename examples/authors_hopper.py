@@ -15,9 +15,9 @@ from pathlib import Path
 
 import mujoco
 import numpy as np
+from dropo_sims.hopper import LINKS, SIM
 
 import dropo_torch as dropo
-from dropo_sims.hopper import LINKS, SIM
 
 #: kg, as published.
 MASSES = {"torso": 3.534, "thigh": 3.927, "leg": 2.714, "foot": 5.089}

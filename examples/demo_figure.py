@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from dropo_sims.hopper import SIM
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 import dropo_torch as dropo
-from dropo_sims.hopper import SIM
 
 BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#9aa0a6"
 

@@ -22,6 +22,7 @@ import gymnasium
 import mujoco
 import numpy as np
 import torch
+from dropo_sims.hopper import SIM
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
@@ -29,7 +30,6 @@ from rich.console import Console
 from rich.table import Table
 
 import dropo_torch as dropo
-from dropo_sims.hopper import SIM
 from dropo_torch.commands.folder import versions
 from dropo_torch.optimizers import AdamSettings
 from dropo_torch.report import write_compare_report

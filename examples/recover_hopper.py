@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-
-import dropo_torch as dropo
 from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import NOISE_VARIANCE, SPREAD, record
+
+import dropo_torch as dropo
 
 #: Standard deviation of a normal of deviation 1 that is truncated at plus and minus 2.
 TRUNCATED = 0.8796

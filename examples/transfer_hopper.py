@@ -28,10 +28,10 @@ from typing import Any
 import matplotlib
 import numpy as np
 import scipy.stats
-
-import dropo_torch as dropo
 from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import nominal_masses, record
+
+import dropo_torch as dropo
 from dropo_torch.rl.problem import make_training
 from dropo_torch.rl.train import EvaluationPoint, TrainEntry, train
 from dropo_torch.support.files import write_atomically

@@ -5,10 +5,10 @@ import pickle
 import numpy as np
 import pytest
 import torch
-
-import dropo_torch as dropo
 from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import record
+
+import dropo_torch as dropo
 from dropo_torch.certify import certify
 from dropo_torch.errors import InputError
 from dropo_torch.fit import answer

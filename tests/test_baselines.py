@@ -14,8 +14,8 @@ import pytest
 import torch
 import yaml
 from conftest import LinearSimulator, generic_observation, linear_objective, space_of
-
 from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
+
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
 from dropo_torch.baselines.density import fit_mixture, unlikeness

@@ -11,8 +11,8 @@ import pytest
 import torch
 import yaml
 from conftest import HOPPER
-
 from dropo_sims.hopper import SIM
+
 from dropo_torch.certify import certify
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config, make_config

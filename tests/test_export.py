@@ -9,8 +9,8 @@ import mujoco
 import numpy as np
 import pytest
 from arm import Folder
-
 from dropo_sims.hopper import SIM
+
 from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
 from dropo_torch.models.export import export_model

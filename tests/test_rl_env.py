@@ -15,11 +15,11 @@ import numpy as np
 import pytest
 import torch
 from cartpole import CART_POLE, CartPole
+from dropo_sims.hopper import SIM
+from dropo_sims.hopper.task import HopperTask
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 from torchrl.envs.utils import check_env_specs
 
-from dropo_sims.hopper import SIM
-from dropo_sims.hopper.task import HopperTask
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.distribution import Distribution
 from dropo_torch.effects import VOCABULARY, find_effect, register

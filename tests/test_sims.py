@@ -8,9 +8,9 @@ import mujoco
 import numpy as np
 import pytest
 from conftest import HOPPER
-
 from dropo_sims.hopper import LINKS, SIM
 from dropo_sims.hopper.record import HOLD, NOISE_VARIANCE, SPREAD, VARIANTS, main, nominal_masses, record
+
 from dropo_torch.data.readers import read_trajectories
 from dropo_torch.errors import InputError
 from dropo_torch.models.bundled import bundled_sim

@@ -6,9 +6,9 @@ from dataclasses import asdict
 from typing import Any
 
 import pytest
-
 from dropo_sims.hopper.study import Cell
 from dropo_sims.hopper.study_tables import all_findings, sections, size_rows, sweep_rows, table_rows
+
 from dropo_torch.distribution import DRAWN_STD
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from arm import Folder
-
 from dropo_sims.hopper.record import record
+
 from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
 from dropo_torch.studies.sweep import SweepPoint, default_epsilons, elbow, epsilon_keys, likeliest, sweep_epsilon
