@@ -1,0 +1,85 @@
+"""Variants of a model on Warp, as a gap search simulates them: MuJoCo's states, and MuJoCo itself where Warp cannot."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+
+from dropo_torch.data.observation import parse_observation
+from dropo_torch.effects import Placed, find_effect
+from dropo_torch.effects.engine import Variant, VariantEngine
+from dropo_torch.effects.placing import plain_setting
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.warp.variants import Variants
+from dropo_torch.testing.effects import RIG
+
+pytest.importorskip("warp")
+
+#: The rig with a sphere in the place of the cart's box, which no other geom could touch on Warp.
+ROUND = RIG.replace('name="cart" type="box" size=".1 .1 .1"', 'name="cart" type="sphere" size=".1"')
+SKIP, WINDOWS, STEPS = 2, 3, 12
+MASS = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.3]}}
+NATIVE: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
+    (),
+    (("joint_friction", "elbow", (0.2,)),),
+    (("gravity_tilt", None, (0.1, 0.05)),),
+    (("integration", None, (0.0025,)),),
+    (("actuator_gain", "lift", (0.7,)), ("armature", "elbow", (0.05,))),
+]
+
+
+def engines() -> tuple[VariantEngine, VariantEngine]:
+    model = mujoco.MjModel.from_xml_string(ROUND)
+    setting = plain_setting(model, parse_observation(model, None), SKIP)
+    space = ParameterSpace(model, MASS)
+    return VariantEngine(setting, space, num_threads=1, warp=True), VariantEngine(setting, space, num_threads=1)
+
+
+def variant(effects: tuple[tuple[str, str | None, tuple[float, ...]], ...], mass: float) -> Variant:
+    return Variant((mass,), tuple(Placed(find_effect(name), target, values) for name, target, values in effects))
+
+
+def simulated(engine: VariantEngine, variants: list[Variant], fine: bool = False) -> np.ndarray:
+    rng, model = np.random.default_rng(0), engine.model(variants[0])
+    starts = np.tile(np.concatenate([model.qpos0, np.zeros(model.nv)]), (WINDOWS, 1))
+    starts[:, [0, 1, 9]] += rng.uniform(-0.5, 0.5, (WINDOWS, 3))
+    starts[:, model.nq :] += rng.normal(0, 0.5, (WINDOWS, model.nv))
+    signals = np.repeat(rng.uniform(-1, 1, (WINDOWS, STEPS // SKIP, model.nu)), SKIP, 1)
+    shape = (len(variants), 1, 1, 1)
+    return engine.paths(
+        variants, engine.models(variants), np.tile(starts, shape[:3]), np.tile(signals, shape), fine=fine
+    )
+
+
+@pytest.mark.parametrize("fine", [False, True])
+def test_variants_are_those_of_mujoco(fine: bool) -> None:
+    variants = [variant(effects, mass) for effects in NATIVE for mass in (0.7, 1.1)]
+    ours, theirs = (simulated(engine, variants, fine) for engine in engines())
+    assert ours.shape == (len(variants), WINDOWS, STEPS if fine else STEPS // SKIP, 9 + 8 + 2)
+    np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8)
+    assert np.abs(ours - ours[:1]).max((1, 2, 3))[1:].min() > 1e-6
+
+
+def test_what_is_simulated_with_warp_is(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Forces and models outside the subset go to MuJoCo; an engine serves all variants of a structure."""
+    asked: list[bool] = []
+    rollout = Variants.rollout
+
+    def counted(self: Variants, *arguments: object) -> np.ndarray | None:
+        found = rollout(self, *arguments)  # type: ignore[arg-type]
+        asked.append(found is not None)
+        return found
+
+    monkeypatch.setattr(Variants, "rollout", counted)
+    ours, theirs = engines()
+    pushed = variant((("external_force", "cart", (1.0, 0.0, 0.0)),), 0.7)
+    np.testing.assert_array_equal(simulated(ours, [pushed]), simulated(theirs, [pushed]))
+    assert asked == []
+    dragged = variant((("fluid_drag", "cart", (0.5,)),), 0.7)
+    np.testing.assert_array_equal(simulated(ours, [dragged]), simulated(theirs, [dragged]))
+    assert asked == [False]
+    plain = [variant((), mass) for mass in (0.5, 0.9)]
+    simulated(ours, plain)
+    assert asked == [False, True, True]
+    assert sum(e is not None for e in ours._warp._engines.values()) == 1
