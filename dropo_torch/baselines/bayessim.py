@@ -11,8 +11,10 @@ from dropo_torch.baselines.density import fit_mixture, require_sbi, unlikeness
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
+from dropo_torch.distribution import DRAWN_STD, Distribution, to_values
+from dropo_torch.errors import InputError
 from dropo_torch.evaluator import ReplayReduce
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.support.random import derived_seed, draw_uniforms
@@ -55,35 +57,29 @@ class BayesSimOptimizer(Optimizer):
     changes per step and their correlation with the controls, over all windows together. A network learns the
     parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
     posterior. The result is the normal whose draws have the posterior's mean and covariance inside the box, its
-    correlation included; the mixture is kept beside it. With ``noise``, replays are measured as the log was.
+    correlation included; the mixture is kept beside it. Where the log has noise, replays are measured as the log was.
 
     Args:
-        space: what varies.
-        replay: the windows.
-        num_columns: compared columns m.
-        noise: standard deviation of the measurement in each of them, ``(m,)``, or ``None``.
+        objective: gives what varies, the compared columns and their noise.
+        replay: the windows, of two steps or more.
         settings: features, simulations and size of the network.
         seed: seeds simulations and network.
+
+    Raises:
+        InputError: windows of one step; ``sbi`` is not installed.
     """
 
     name = "mixture-density network"
     method = "bayessim"
+    STATE = ("_sums", "_logged", "_mixture", "_distance")
 
-    def __init__(
-        self,
-        space: ParameterSpace,
-        replay: Replay,
-        num_columns: int,
-        *,
-        settings: BayesSimSettings,
-        seed: int,
-        noise: torch.Tensor | None = None,
-    ) -> None:
+    def __init__(self, objective: Objective, replay: Replay, *, settings: BayesSimSettings, seed: int) -> None:
         require_sbi()
-        self._noise = noise
-        self._space, self._replay, self._settings, self._seed = space, replay, settings, seed
-        self._num_columns = num_columns
-        self._box = SearchBox.of(space)
+        if replay.horizon < 2:
+            raise InputError("method: bayessim needs an episode of two transitions or more; this log has none")
+        self._space, self._box, self._noise = objective.simulator.parameters, objective.box, objective.feature_noise
+        self._replay, self._settings, self._seed = replay, settings, seed
+        self._num_columns = objective.features.size
         self._sums: list[np.ndarray] = []  # of each batch, (n, q)
         self._logged = np.zeros(0)
         self._mixture: Mixture | None = None
@@ -171,16 +167,6 @@ class BayesSimOptimizer(Optimizer):
             "horizon": self._replay.horizon,
             "simulations": self._settings.simulations,
         }
-
-    def state(self) -> dict[str, Any]:
-        """Return the summaries so far, and the mixture."""
-        mixture = None if self._mixture is None else self._mixture.document()
-        return {"sums": self._sums, "logged": self._logged, "mixture": mixture, "distance": self._distance}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self._sums, self._logged, self._distance = list(state["sums"]), state["logged"], state["distance"]
-        self._mixture = None if state["mixture"] is None else Mixture.of(state["mixture"])
 
     def _measured(self, batch: int) -> ReplayReduce:
         """The sums of a batch's summaries, noise added to what is simulated."""

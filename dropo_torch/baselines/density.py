@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import math
 import warnings
@@ -160,10 +161,7 @@ def _standard(inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _train(x: torch.Tensor, theta: torch.Tensor, settings: BayesSimSettings, seed: int) -> MixtureDensityEstimator:
     """The network, trained on all pairs but those held out; the weights that are best on those are kept."""
-
-    def build(theta: torch.Tensor, x: torch.Tensor) -> MixtureDensityEstimator:
-        return _estimator(theta, x, settings, seed)
-
+    build = functools.partial(_estimator, settings=settings, seed=seed)
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")  # that ``epochs`` came first, and imports of old names
         from sbi.inference import NPE

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from dropo_torch.baselines.settings import UdrSettings
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.distribution import Distribution, to_values
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 
@@ -20,7 +21,7 @@ class UdrOptimizer(Optimizer):
     ``method_options.box`` from 0 to ``boxes`` − 1 gives them all.
 
     Args:
-        space: what varies.
+        objective: gives what varies.
         settings: how many boxes, and which.
         seed: seeds the boxes.
     """
@@ -28,8 +29,8 @@ class UdrOptimizer(Optimizer):
     name = "udr"
     method = "udr"
 
-    def __init__(self, space: ParameterSpace, *, settings: UdrSettings, seed: int) -> None:
-        box = SearchBox.of(space)
+    def __init__(self, objective: Objective, *, settings: UdrSettings, seed: int) -> None:
+        space, box = objective.simulator.parameters, objective.box
         ends = np.random.default_rng(seed).uniform(size=(settings.boxes, 2, len(space)))
         self._ends = box.low + np.sort(ends, axis=1) * box.width  # (boxes, 2, d), coordinates
         self._space, self._chosen = space, settings.box
@@ -70,10 +71,3 @@ class UdrOptimizer(Optimizer):
             for low, high in values
         ]
         return {"boxes": boxes, "box": self._chosen}
-
-    def state(self) -> dict[str, Any]:
-        """Return nothing: the seed says it all."""
-        return {}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Do nothing."""
