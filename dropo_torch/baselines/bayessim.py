@@ -114,22 +114,19 @@ class BayesSimOptimizer(Optimizer):
     @property
     def caveat(self) -> str:
         """That the network had to guess, where it had to."""
-        doubt = "" if self._mixture is None else self._doubt()
-        return f"{doubt}, so the posterior is a guess" if doubt else ""
-
-    def _doubt(self) -> str:
-        """Why the network had to guess outside what it was trained on; empty where it had not."""
-        assert self._mixture is not None
+        if self._mixture is None:
+            return ""
         if self._distance > _UNLIKE:
             return (
                 f"the log is unlike every simulation: its summary is {self._distance:.3g} times as far from the "
-                "nearest ones as those are from each other"
+                "nearest ones as those are from each other, so the posterior is a guess"
             )
         shares = zip(self._space.names, self._mixture.shares_inside, strict=True)
-        outside = [name for name, share in shares if share < _LEAST_INSIDE]
-        if outside:
-            return f"that of {', '.join(outside)} lies outside the search box: the log is unlike every simulation"
-        return ""
+        outside = ", ".join(name for name, share in shares if share < _LEAST_INSIDE)
+        return outside and (
+            f"that of {outside} lies outside the search box: the log is unlike every simulation, so the posterior is "
+            "a guess"
+        )
 
     @property
     def progress(self) -> Progress:
@@ -161,7 +158,7 @@ class BayesSimOptimizer(Optimizer):
             "mixture": {"parameters": list(self._space.names), **self._mixture.document()},
             "share_inside": self._mixture.share_inside,
             "summary_distance": self._distance,
-            "extrapolates": bool(self._doubt()),
+            "extrapolates": bool(self.caveat),
             "windows": len(self._replay.states),
             "features": self._settings.features,
             "horizon": self._replay.horizon,
