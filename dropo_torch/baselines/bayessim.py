@@ -7,16 +7,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import fit_mixture, require_sbi, unlikeness
+from dropo_torch.baselines.density import fit_mixture, unlikeness
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import DRAWN_STD, Distribution, to_values
+from dropo_torch.distribution import DRAWN_STD, Distribution
 from dropo_torch.errors import InputError
 from dropo_torch.evaluator import ReplayReduce
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.extras import require
 from dropo_torch.support.random import derived_seed, draw_uniforms
 
 #: Unlikeness above which the network has guessed outside what it was trained on.
@@ -74,7 +75,7 @@ class BayesSimOptimizer(Optimizer):
     STATE = ("_sums", "_logged", "_mixture", "_distance")
 
     def __init__(self, objective: Objective, replay: Replay, *, settings: BayesSimSettings, seed: int) -> None:
-        require_sbi()
+        require("baselines", "method: bayessim")
         if replay.horizon < 2:
             raise InputError("method: bayessim needs an episode of two transitions or more; this log has none")
         self._space, self._box, self._noise = objective.simulator.parameters, objective.box, objective.feature_noise
@@ -88,12 +89,8 @@ class BayesSimOptimizer(Optimizer):
     def ask(self) -> Request:
         """Return the next batch of the prior, ``(n, d)``."""
         points = self._box.low + self._shares(len(self._sums)) * self._box.width
-        return Request(
-            values=to_values(points, self._space.is_log),
-            reduce=self._measured(len(self._sums)),
-            evaluations=len(points),
-            replay=self._replay,
-        )
+        values, reduce = self._box.values(points), self._measured(len(self._sums))
+        return Request(values=values, reduce=reduce, evaluations=len(points), replay=self._replay)
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Keep the summaries; train the network on the last batch's."""

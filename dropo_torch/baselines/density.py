@@ -17,7 +17,6 @@ from torch import nn
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.errors import InputError
-from dropo_torch.support.extras import require
 from dropo_torch.support.threads import single_thread
 
 if TYPE_CHECKING:
@@ -42,15 +41,6 @@ _QUARTILES = 1.349
 _PRECISION_FLOOR = 1e-4
 #: Standard deviation of a share that is uniform in [0, 1].
 _UNIFORM = 12**-0.5
-
-
-def require_sbi() -> None:
-    """Check that ``sbi`` is installed.
-
-    Raises:
-        InputError: it is not.
-    """
-    require("baselines", "method: bayessim")
 
 
 class FourierFeatures(nn.Module):
@@ -92,9 +82,8 @@ def fit_mixture(
         low, width: the search box, in coordinates, ``(d,)`` each.
 
     Raises:
-        InputError: ``sbi`` is not installed, or fewer than ten simulations did not diverge.
+        InputError: fewer than ten simulations did not diverge.
     """
-    require_sbi()
     alive = np.isfinite(inputs).all(1)
     if alive.sum() < 10:
         raise InputError(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from dropo_torch.baselines.settings import DroidSettings
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.distribution import Distribution, SearchBox
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.optimizers.cma import evolution, why_stopped
@@ -57,9 +57,7 @@ class DroidOptimizer(Optimizer):
         if self._asked is None:
             self._asked = self._search.ask()
         points = self._coordinates(np.array(self._asked))
-        return Request(
-            values=to_values(points, self._space.is_log), reduce=squared_errors, evaluations=len(self._asked)
-        )
+        return Request(values=self._box.values(points), reduce=squared_errors, evaluations=len(points))
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its errors."""

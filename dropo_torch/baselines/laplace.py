@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from dropo_torch.diagnostics import estimates
-from dropo_torch.distribution import Distribution, to_values
+from dropo_torch.distribution import Distribution
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.optimizers.fisher import AT_REST, NOISY_ROUNDS
@@ -33,7 +33,6 @@ class LaplaceOptimizer(Optimizer):
     STATE = ("_means", "_linearised", "_round")
 
     def __init__(self, objective: Objective) -> None:
-        self._space: ParameterSpace = objective.simulator.parameters
         self._box = objective.box
         self._shape = (len(objective), objective.features.size)
         self._means = MeansStage(self._box.low, self._box.high, self._box.middle, self._shape)
@@ -43,7 +42,7 @@ class LaplaceOptimizer(Optimizer):
     def ask(self) -> Request:
         """Return the stencil of the means."""
         return Request(
-            values=to_values(self._means.points(), self._space.is_log),
+            values=self._box.values(self._means.points()),
             reduce=self._means.reduction(),
             evaluations=1,
             linearise_at=self._linearised,
@@ -89,7 +88,7 @@ class LaplaceOptimizer(Optimizer):
 
     def _posterior(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard errors ``(d,)`` and correlations ``(d, d)``."""
-        d = len(self._space)
+        d = len(self._box.low)
         if not self._means.hessian.any():  # nothing has been simulated yet, or nothing survived
             return self._box.width.copy(), np.eye(d)
         width = np.outer(self._box.width, self._box.width)

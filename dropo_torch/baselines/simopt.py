@@ -11,7 +11,7 @@ import torch
 
 from dropo_torch.baselines.settings import SimOptSettings
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import DRAWN_STD, Distribution, to_values
+from dropo_torch.distribution import DRAWN_STD, Distribution
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
@@ -83,19 +83,18 @@ class SimOptOptimizer(Optimizer):
     STATE = ("_mean", "_covariance", "_iteration", "_cost")
 
     def __init__(self, objective: Objective, replay: Replay, *, settings: SimOptSettings, seed: int) -> None:
-        self._space, self._box = objective.simulator.parameters, objective.box
-        self._replay, self._settings, self._seed = replay, settings, seed
+        self._box, self._replay, self._settings, self._seed = objective.box, replay, settings, seed
         std = objective.measured.std(0, unbiased=False)
         self._reduce = functools.partial(discrepancy, scale=torch.where(std > 1e-12, std, torch.ones_like(std)))
-        self._mean = np.full(len(self._space), 0.5)  # as shares of the search box
-        self._covariance = np.diag(np.full(len(self._space), 0.25**2))
+        self._mean = np.full(len(self._box.low), 0.5)  # as shares of the search box
+        self._covariance = np.diag(np.full(len(self._box.low), 0.25**2))
         self._iteration = 0
         self._cost = float("nan")
 
     def ask(self) -> Request:
         """Return the samples of the current distribution, ``(N, d)``."""
         points = self._box.low + self._draws() * self._box.width
-        values = to_values(points, self._space.is_log)
+        values = self._box.values(points)
         return Request(values=values, reduce=self._reduce, evaluations=len(points), replay=self._replay)
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:

@@ -302,12 +302,9 @@ class _Episode:
             actions = {name: motion[name][1:] for name in controlled}
         else:
             actions = {name: self._commands(name, grid[:-1]) for name in self.part.action_names}
-        return Trajectories.of_samples(
-            np.concatenate([_columns(position, len(grid)), _columns(velocity, len(grid))], axis=1),
-            _columns(actions, len(grid) - 1),
-            dt=self.options.dt,
-            source=self.part.source,
-        )
+        observations = np.stack([*position.values(), *velocity.values()], axis=1)
+        commands = np.stack(list(actions.values()), axis=1) if actions else np.empty((len(grid) - 1, 0))
+        return Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
         return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")
@@ -408,10 +405,6 @@ def _velocities(
             angular = 2 * (w * dv - dw * v - np.cross(v, dv)) / (quaternion**2).sum(axis=1, keepdims=True)
             velocity |= {f"{group[0]}.angular[{axis}]": angular[:, axis] for axis in range(3)}
     return velocity
-
-
-def _columns(columns: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
-    return np.stack(list(columns.values()), axis=1) if columns else np.empty((rows, 0))
 
 
 def _names(value: object, what: str) -> tuple[str, ...] | None:

@@ -171,9 +171,8 @@ def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
             return [_read_minari(folder, options)]
     if not path.exists() and not path.suffix and "-v" in path.name:
         raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
-    return [
-        _read_table(table, options) for table in open_tables(path, group=options.group, separator=options.separator)
-    ]
+    tables = open_tables(path, group=options.group, separator=options.separator)
+    return [_read_table(table, options) for table in tables]
 
 
 def _read_table(table: Table, options: ReadOptions) -> Trajectories:
