@@ -21,7 +21,7 @@ from dropo_torch.baselines.bayessim import BayesSimOptimizer
 from dropo_torch.baselines.droid import DroidOptimizer
 from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.settings import BayesSimSettings, DroidSettings, SimOptSettings, UdrSettings
-from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
+from dropo_torch.baselines.simopt import SimOptOptimizer
 from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.data.trajectory import Replay
@@ -169,22 +169,18 @@ def of_settings(**options: Any) -> MakeOptimizer:
 def simopt(objective: Objective, seed: int) -> SimOptOptimizer:
     log, settings = objective.transitions, SimOptSettings(samples=60, iterations=12)
     replay = Replay(log.states, log.controls, log.measured[:, None])
-    return SimOptOptimizer(
-        objective.simulator.parameters, replay, column_scales(objective), settings=settings, seed=seed
-    )
+    return SimOptOptimizer(objective, replay, settings=settings, seed=seed)
 
 
 def droid(objective: Objective, seed: int) -> DroidOptimizer:
-    return DroidOptimizer(objective.simulator.parameters, settings=DroidSettings(budget=150), seed=seed)
+    return DroidOptimizer(objective, settings=DroidSettings(budget=150), seed=seed)
 
 
 def bayessim(objective: Objective, seed: int) -> BayesSimOptimizer:
     log = objective.transitions
     pairs = [x.reshape(-1, 2, x.shape[-1]) for x in (log.controls[:, 0], log.measured)]
-    return BayesSimOptimizer(
-        objective.simulator.parameters, Replay(log.states[::2], *pairs), 2,
-        settings=BayesSimSettings(simulations=60, hidden=8, epochs=3), seed=seed,
-    )  # fmt: skip
+    settings = BayesSimSettings(simulations=60, hidden=8, epochs=3)
+    return BayesSimOptimizer(objective, Replay(log.states[::2], *pairs), settings=settings, seed=seed)
 
 
 #: Every optimizer and baseline: how it is made, and how near the truth it comes; see ``check_optimizer``.
@@ -206,7 +202,7 @@ SEARCHES: dict[str, tuple[MakeOptimizer, dict[str, float | None]]] = {
     "simopt": (simopt, {"mean": 0.05, "std": None}),
     "bayessim": (bayessim, {"mean": None, "std": None}),
     "udr": (
-        lambda o, seed: UdrOptimizer(o.simulator.parameters, settings=UdrSettings(), seed=seed),
+        lambda o, seed: UdrOptimizer(o, settings=UdrSettings(), seed=seed),
         {"mean": None, "std": None},
     ),
 }

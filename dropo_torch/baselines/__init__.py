@@ -21,7 +21,7 @@ from dropo_torch.baselines.settings import (
     method_options,
     method_settings,
 )
-from dropo_torch.baselines.simopt import SimOptOptimizer, column_scales
+from dropo_torch.baselines.simopt import SimOptOptimizer
 from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.config import Config
 from dropo_torch.data.trajectory import make_replay
@@ -43,32 +43,22 @@ def make_search(problem: Problem) -> Optimizer | None:
     if config.method != "dropo":
         _refuse_options_of_dropo(config)
     settings = method_settings(config.method, config.method_options)
-    space, seed = problem.space, config.seed
     if isinstance(settings, UdrSettings):
-        return UdrOptimizer(space, settings=settings, seed=seed)
+        return UdrOptimizer(objective, settings=settings, seed=config.seed)
     if isinstance(settings, DroidSettings):
-        return DroidOptimizer(space, settings=settings, seed=seed)
-    if config.method == "laplace":
-        return LaplaceOptimizer(objective)
+        return DroidOptimizer(objective, settings=settings, seed=config.seed)
     if isinstance(settings, SimOptSettings | BayesSimSettings):
-        history = objective.transitions.history
-        relative = isinstance(settings, BayesSimSettings)
         replay = make_replay(
-            problem.trajectories, problem.observation, settings.horizon, history=history, about_start=relative
+            problem.trajectories,
+            problem.observation,
+            settings.horizon,
+            history=objective.transitions.history,
+            about_start=isinstance(settings, BayesSimSettings),
         )
         if isinstance(settings, SimOptSettings):
-            return SimOptOptimizer(space, replay, column_scales(objective), settings=settings, seed=seed)
-        if replay.horizon < 2:
-            raise InputError("method: bayessim needs an episode of two transitions or more; this log has none")
-        return BayesSimOptimizer(
-            space,
-            replay,
-            objective.features.size,
-            settings=settings,
-            seed=seed,
-            noise=objective.feature_noise,
-        )
-    return None
+            return SimOptOptimizer(objective, replay, settings=settings, seed=config.seed)
+        return BayesSimOptimizer(objective, replay, settings=settings, seed=config.seed)
+    return LaplaceOptimizer(objective) if config.method == "laplace" else None
 
 
 def _refuse_options_of_dropo(config: Config) -> None:

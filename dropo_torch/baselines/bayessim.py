@@ -7,14 +7,17 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import fit_mixture, require_sbi, unlikeness
+from dropo_torch.baselines.density import fit_mixture, unlikeness
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
+from dropo_torch.distribution import DRAWN_STD, Distribution
+from dropo_torch.errors import InputError
 from dropo_torch.evaluator import ReplayReduce
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.extras import require
 from dropo_torch.support.random import derived_seed, draw_uniforms
 
 #: Unlikeness above which the network has guessed outside what it was trained on.
@@ -55,35 +58,29 @@ class BayesSimOptimizer(Optimizer):
     changes per step and their correlation with the controls, over all windows together. A network learns the
     parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
     posterior. The result is the normal whose draws have the posterior's mean and covariance inside the box, its
-    correlation included; the mixture is kept beside it. With ``noise``, replays are measured as the log was.
+    correlation included; the mixture is kept beside it. Where the log has noise, replays are measured as the log was.
 
     Args:
-        space: what varies.
-        replay: the windows.
-        num_columns: compared columns m.
-        noise: standard deviation of the measurement in each of them, ``(m,)``, or ``None``.
+        objective: gives what varies, the compared columns and their noise.
+        replay: the windows, of two steps or more.
         settings: features, simulations and size of the network.
         seed: seeds simulations and network.
+
+    Raises:
+        InputError: windows of one step; ``sbi`` is not installed.
     """
 
     name = "mixture-density network"
     method = "bayessim"
+    STATE = ("_sums", "_logged", "_mixture", "_distance")
 
-    def __init__(
-        self,
-        space: ParameterSpace,
-        replay: Replay,
-        num_columns: int,
-        *,
-        settings: BayesSimSettings,
-        seed: int,
-        noise: torch.Tensor | None = None,
-    ) -> None:
-        require_sbi()
-        self._noise = noise
-        self._space, self._replay, self._settings, self._seed = space, replay, settings, seed
-        self._num_columns = num_columns
-        self._box = SearchBox.of(space)
+    def __init__(self, objective: Objective, replay: Replay, *, settings: BayesSimSettings, seed: int) -> None:
+        require("baselines", "method: bayessim")
+        if replay.horizon < 2:
+            raise InputError("method: bayessim needs an episode of two transitions or more; this log has none")
+        self._space, self._box, self._noise = objective.simulator.parameters, objective.box, objective.feature_noise
+        self._replay, self._settings, self._seed = replay, settings, seed
+        self._num_columns = objective.features.size
         self._sums: list[np.ndarray] = []  # of each batch, (n, q)
         self._logged = np.zeros(0)
         self._mixture: Mixture | None = None
@@ -92,12 +89,8 @@ class BayesSimOptimizer(Optimizer):
     def ask(self) -> Request:
         """Return the next batch of the prior, ``(n, d)``."""
         points = self._box.low + self._shares(len(self._sums)) * self._box.width
-        return Request(
-            values=to_values(points, self._space.is_log),
-            reduce=self._measured(len(self._sums)),
-            evaluations=len(points),
-            replay=self._replay,
-        )
+        values, reduce = self._box.values(points), self._measured(len(self._sums))
+        return Request(values=values, reduce=reduce, evaluations=len(points), replay=self._replay)
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Keep the summaries; train the network on the last batch's."""
@@ -118,22 +111,19 @@ class BayesSimOptimizer(Optimizer):
     @property
     def caveat(self) -> str:
         """That the network had to guess, where it had to."""
-        doubt = "" if self._mixture is None else self._doubt()
-        return f"{doubt}, so the posterior is a guess" if doubt else ""
-
-    def _doubt(self) -> str:
-        """Why the network had to guess outside what it was trained on; empty where it had not."""
-        assert self._mixture is not None
+        if self._mixture is None:
+            return ""
         if self._distance > _UNLIKE:
             return (
                 f"the log is unlike every simulation: its summary is {self._distance:.3g} times as far from the "
-                "nearest ones as those are from each other"
+                "nearest ones as those are from each other, so the posterior is a guess"
             )
         shares = zip(self._space.names, self._mixture.shares_inside, strict=True)
-        outside = [name for name, share in shares if share < _LEAST_INSIDE]
-        if outside:
-            return f"that of {', '.join(outside)} lies outside the search box: the log is unlike every simulation"
-        return ""
+        outside = ", ".join(name for name, share in shares if share < _LEAST_INSIDE)
+        return outside and (
+            f"that of {outside} lies outside the search box: the log is unlike every simulation, so the posterior is "
+            "a guess"
+        )
 
     @property
     def progress(self) -> Progress:
@@ -165,22 +155,12 @@ class BayesSimOptimizer(Optimizer):
             "mixture": {"parameters": list(self._space.names), **self._mixture.document()},
             "share_inside": self._mixture.share_inside,
             "summary_distance": self._distance,
-            "extrapolates": bool(self._doubt()),
+            "extrapolates": bool(self.caveat),
             "windows": len(self._replay.states),
             "features": self._settings.features,
             "horizon": self._replay.horizon,
             "simulations": self._settings.simulations,
         }
-
-    def state(self) -> dict[str, Any]:
-        """Return the summaries so far, and the mixture."""
-        mixture = None if self._mixture is None else self._mixture.document()
-        return {"sums": self._sums, "logged": self._logged, "mixture": mixture, "distance": self._distance}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self._sums, self._logged, self._distance = list(state["sums"]), state["logged"], state["distance"]
-        self._mixture = None if state["mixture"] is None else Mixture.of(state["mixture"])
 
     def _measured(self, batch: int) -> ReplayReduce:
         """The sums of a batch's summaries, noise added to what is simulated."""

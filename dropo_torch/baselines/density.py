@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 import math
 import warnings
@@ -16,7 +17,6 @@ from torch import nn
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.errors import InputError
-from dropo_torch.support.extras import require
 from dropo_torch.support.threads import single_thread
 
 if TYPE_CHECKING:
@@ -41,15 +41,6 @@ _QUARTILES = 1.349
 _PRECISION_FLOOR = 1e-4
 #: Standard deviation of a share that is uniform in [0, 1].
 _UNIFORM = 12**-0.5
-
-
-def require_sbi() -> None:
-    """Check that ``sbi`` is installed.
-
-    Raises:
-        InputError: it is not.
-    """
-    require("baselines", "method: bayessim")
 
 
 class FourierFeatures(nn.Module):
@@ -91,9 +82,8 @@ def fit_mixture(
         low, width: the search box, in coordinates, ``(d,)`` each.
 
     Raises:
-        InputError: ``sbi`` is not installed, or fewer than ten simulations did not diverge.
+        InputError: fewer than ten simulations did not diverge.
     """
-    require_sbi()
     alive = np.isfinite(inputs).all(1)
     if alive.sum() < 10:
         raise InputError(
@@ -160,10 +150,7 @@ def _standard(inputs: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _train(x: torch.Tensor, theta: torch.Tensor, settings: BayesSimSettings, seed: int) -> MixtureDensityEstimator:
     """The network, trained on all pairs but those held out; the weights that are best on those are kept."""
-
-    def build(theta: torch.Tensor, x: torch.Tensor) -> MixtureDensityEstimator:
-        return _estimator(theta, x, settings, seed)
-
+    build = functools.partial(_estimator, settings=settings, seed=seed)
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")  # that ``epochs`` came first, and imports of old names
         from sbi.inference import NPE

@@ -5,14 +5,14 @@ from __future__ import annotations
 import pickle
 from typing import Any
 
-import cma
 import numpy as np
 import torch
 
 from dropo_torch.baselines.settings import DroidSettings
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.distribution import Distribution, SearchBox
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
-from dropo_torch.optimizers.cma import Normals
+from dropo_torch.optimizers.cma import evolution, why_stopped
 from dropo_torch.parameters import ParameterSpace
 
 #: Squared error that a diverged transition counts as, per column.
@@ -33,31 +33,22 @@ class DroidOptimizer(Optimizer):
     how far the search had contracted when it stopped, and nothing about the log.
 
     Args:
-        space: what varies.
+        objective: gives what varies.
         settings: budget and population.
         seed: seeds the search.
     """
 
     name = "cma"
     method = "droid"
+    STATE = ("_asked", "_best")
 
-    def __init__(self, space: ParameterSpace, *, settings: DroidSettings, seed: int) -> None:
-        self._space, self._box, self._settings = space, SearchBox.of(space), settings
-        options: dict[str, Any] = {
-            "bounds": [0, SearchBox.WIDTH],
-            "randn": Normals(seed),
-            "seed": np.nan,  # the generator above is the only source of randomness
-            "verbose": -9,
-            "verb_log": 0,
-            "verb_disp": 0,
-            "maxfevals": settings.budget,
-            "tolfun": 1e-12,
-            "tolfunhist": 1e-13,
-        }
-        if settings.population:
-            options["popsize"] = settings.population
-        start = np.full(max(2, len(space)), SearchBox.WIDTH / 2)  # pycma needs two dimensions; the second is idle
-        self._search = cma.CMAEvolutionStrategy(start, 1.0, options)
+    def __init__(self, objective: Objective, *, settings: DroidSettings, seed: int) -> None:
+        self._space, self._box, self._settings = objective.simulator.parameters, objective.box, settings
+        self._search = evolution(
+            max(2, len(self._space)),  # pycma needs two dimensions; the second is idle
+            seed=seed, budget=settings.budget, population=settings.population,
+            tolerances={"tolfun": 1e-12, "tolfunhist": 1e-13},
+        )  # fmt: skip
         self._asked: list[np.ndarray] | None = None
         self._best = np.inf
 
@@ -66,9 +57,7 @@ class DroidOptimizer(Optimizer):
         if self._asked is None:
             self._asked = self._search.ask()
         points = self._coordinates(np.array(self._asked))
-        return Request(
-            values=to_values(points, self._space.is_log), reduce=squared_errors, evaluations=len(self._asked)
-        )
+        return Request(values=self._box.values(points), reduce=squared_errors, evaluations=len(points))
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its errors."""
@@ -80,15 +69,7 @@ class DroidOptimizer(Optimizer):
     @property
     def stop_reason(self) -> str | None:
         """Pycma's termination conditions, in words."""
-        met = self._search.stop()
-        words = {
-            "maxfevals": f"the budget of {self._settings.budget} simulations of the log is spent",
-            "tolfun": "the error no longer differs within a generation",
-            "tolfunhist": "the best error no longer changes",
-            "tolx": "the search distribution has shrunk to a point",
-            "tolflatfitness": "the error is flat",
-        }
-        return "; ".join(words.get(k, f"pycma stopped: {k}") for k in met) if met else None
+        return why_stopped(self._search, f"{self._settings.budget} simulations of the log", "error")
 
     @property
     def progress(self) -> Progress:
@@ -115,12 +96,11 @@ class DroidOptimizer(Optimizer):
 
     def state(self) -> dict[str, Any]:
         """Return pycma's own pickle and what stands beside it."""
-        return {"search": self._search.pickle_dumps(), "asked": self._asked, "best": self._best}
+        return super().state() | {"_search": self._search.pickle_dumps()}
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
-        self._search = pickle.loads(state["search"])
-        self._asked, self._best = state["asked"], state["best"]
+        super().restore(state | {"_search": pickle.loads(state["_search"])})
 
     def _coordinates(self, points: np.ndarray) -> np.ndarray:
         """Parameter vectors in coordinates of points in [0, 4], ``(P, d)``."""

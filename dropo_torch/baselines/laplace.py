@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from dropo_torch.diagnostics import estimates
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.distribution import Distribution
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.optimizers.fisher import AT_REST, NOISY_ROUNDS
@@ -30,10 +30,10 @@ class LaplaceOptimizer(Optimizer):
 
     name = "gauss-newton"
     method = "laplace"
+    STATE = ("_means", "_linearised", "_round")
 
     def __init__(self, objective: Objective) -> None:
-        self._space: ParameterSpace = objective.simulator.parameters
-        self._box = SearchBox.of(self._space)
+        self._box = objective.box
         self._shape = (len(objective), objective.features.size)
         self._means = MeansStage(self._box.low, self._box.high, self._box.middle, self._shape)
         self._linearised: np.ndarray | None = None if objective.noise is None else self._means.point
@@ -42,7 +42,7 @@ class LaplaceOptimizer(Optimizer):
     def ask(self) -> Request:
         """Return the stencil of the means."""
         return Request(
-            values=to_values(self._means.points(), self._space.is_log),
+            values=self._box.values(self._means.points()),
             reduce=self._means.reduction(),
             evaluations=1,
             linearise_at=self._linearised,
@@ -86,18 +86,9 @@ class LaplaceOptimizer(Optimizer):
         """Return the reduced χ², 1 where ε (and the noise) are as large as the residuals."""
         return {"reduced_chi2": self._means.reduced_chi2}
 
-    def state(self) -> dict[str, Any]:
-        """Return the stage as plain data."""
-        return {"means": dict(vars(self._means)), "round": self._round, "linearised": self._linearised}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self._means = MeansStage(**state["means"])
-        self._round, self._linearised = state["round"], state["linearised"]
-
     def _posterior(self) -> tuple[np.ndarray, np.ndarray]:
         """Standard errors ``(d,)`` and correlations ``(d, d)``."""
-        d = len(self._space)
+        d = len(self._box.low)
         if not self._means.hessian.any():  # nothing has been simulated yet, or nothing survived
             return self._box.width.copy(), np.eye(d)
         width = np.outer(self._box.width, self._box.width)

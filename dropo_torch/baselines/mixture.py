@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -94,7 +94,7 @@ class Mixture:
 
     def document(self) -> dict[str, Any]:
         """Return the mixture as plain data."""
-        return {name: getattr(self, name).tolist() for name in ("weights", "means", "covariances", "low", "high")}
+        return {field.name: getattr(self, field.name).tolist() for field in fields(self)}
 
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Mixture:
@@ -103,7 +103,7 @@ class Mixture:
         Raises:
             InputError: no such entry.
         """
-        names: Sequence[str] = ("weights", "means", "covariances", "low", "high")
+        names = [field.name for field in fields(cls)]
         try:
             return cls(*(np.asarray(document[name], dtype=np.float64) for name in names))
         except (KeyError, TypeError, ValueError):

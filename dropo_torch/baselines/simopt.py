@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import numpy as np
@@ -10,19 +11,22 @@ import torch
 
 from dropo_torch.baselines.settings import SimOptSettings
 from dropo_torch.data.trajectory import Replay
-from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox, to_values
+from dropo_torch.distribution import DRAWN_STD, Distribution
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 
 
-def discrepancy(features: torch.Tensor, measured: torch.Tensor, scale: torch.Tensor) -> torch.Tensor:
+def discrepancy(
+    features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor, *, scale: torch.Tensor
+) -> torch.Tensor:
     """Return Σ (|e|₁ + |e|₂²) of each parameter vector, ``(P,)``, with e = (s − s')/scale; NaN where one diverged.
 
     Args:
         features: replayed, ``(w, P, H, m)``.
         measured: ``(w, H, m)``.
+        controls: ``(w, H, n)``, of no account.
         scale: of each column, ``(m,)``.
     """
     error = (features - measured[:, None]) / scale
@@ -62,43 +66,36 @@ class SimOptOptimizer(Optimizer):
 
     The log is cut into windows of ``horizon`` steps. Each is replayed *open loop* from its logged state with its
     logged actions, so errors add up along it. The discrepancy is the sum of the L1 and squared L2 errors over all
-    steps, in columns scaled by their standard deviation over the log. (SimOpt also filters the error in time, for
-    robots whose clock drifts against the simulation's; a log and its replay share theirs.) The first distribution is
-    the search box's middle with a quarter of its width. Each iteration fits the normal to its samples, weighted by
-    :func:`reps_weights`.
+    steps, in columns scaled by their standard deviation over the log, where they move. (SimOpt also filters the error
+    in time, for robots whose clock drifts against the simulation's; a log and its replay share theirs.) The first
+    distribution is the search box's middle with a quarter of its width. Each iteration fits the normal to its
+    samples, weighted by :func:`reps_weights`.
 
     Args:
-        space: what varies.
+        objective: gives what varies and the compared columns.
         replay: the windows.
-        scale: of each compared column, ``(m,)``.
         settings: samples, iterations and bounds.
         seed: seeds the samples.
     """
 
     name = "reps"
     method = "simopt"
+    STATE = ("_mean", "_covariance", "_iteration", "_cost")
 
-    def __init__(
-        self, space: ParameterSpace, replay: Replay, scale: torch.Tensor, *, settings: SimOptSettings, seed: int
-    ) -> None:
-        self._space, self._replay, self._scale, self._settings, self._seed = space, replay, scale, settings, seed
-        self._box = SearchBox.of(space)
-        self._mean = np.full(len(space), 0.5)  # as shares of the search box
-        self._covariance = np.diag(np.full(len(space), 0.25**2))
+    def __init__(self, objective: Objective, replay: Replay, *, settings: SimOptSettings, seed: int) -> None:
+        self._box, self._replay, self._settings, self._seed = objective.box, replay, settings, seed
+        std = objective.measured.std(0, unbiased=False)
+        self._reduce = functools.partial(discrepancy, scale=torch.where(std > 1e-12, std, torch.ones_like(std)))
+        self._mean = np.full(len(self._box.low), 0.5)  # as shares of the search box
+        self._covariance = np.diag(np.full(len(self._box.low), 0.25**2))
         self._iteration = 0
         self._cost = float("nan")
 
     def ask(self) -> Request:
         """Return the samples of the current distribution, ``(N, d)``."""
         points = self._box.low + self._draws() * self._box.width
-        scale = self._scale
-
-        def reduce(features: torch.Tensor, measured: torch.Tensor, controls: torch.Tensor) -> torch.Tensor:
-            return discrepancy(features, measured, scale)
-
-        return Request(
-            values=to_values(points, self._space.is_log), reduce=reduce, evaluations=len(points), replay=self._replay
-        )
+        values = self._box.values(points)
+        return Request(values=values, reduce=self._reduce, evaluations=len(points), replay=self._replay)
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Fit the distribution to the weighted samples."""
@@ -151,29 +148,9 @@ class SimOptOptimizer(Optimizer):
         """Return the weighted discrepancy of the last iteration, and the windows' length and number."""
         return {"discrepancy": self._cost, "horizon": self._replay.horizon, "windows": len(self._replay.states)}
 
-    def state(self) -> dict[str, Any]:
-        """Return the distribution and the iteration."""
-        return {
-            "mean": self._mean,
-            "covariance": self._covariance,
-            "iteration": self._iteration,
-            "cost": self._cost,
-        }
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self._mean, self._covariance = state["mean"], state["covariance"]
-        self._iteration, self._cost = state["iteration"], state["cost"]
-
     def _draws(self) -> np.ndarray:
         """The iteration's samples, as shares of the search box, ``(N, d)``; a function of seed and iteration."""
         generator = np.random.default_rng([self._seed, 11, self._iteration])
         normal = generator.standard_normal((self._settings.samples, len(self._mean)))
         values, vectors = np.linalg.eigh(self._covariance)
         return np.clip(self._mean + normal * np.sqrt(np.maximum(values, 0)) @ vectors.T, 0.0, 1.0)
-
-
-def column_scales(objective: Objective) -> torch.Tensor:
-    """Return the standard deviation of each compared column over the log, 1 where it never moves, ``(m,)``."""
-    std = objective.measured.std(0, unbiased=False)
-    return torch.where(std > 1e-12, std, torch.ones_like(std))

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 
 from dropo_torch.baselines.settings import UdrSettings
-from dropo_torch.distribution import Distribution, SearchBox, to_values
+from dropo_torch.distribution import Distribution
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 
@@ -20,7 +21,7 @@ class UdrOptimizer(Optimizer):
     ``method_options.box`` from 0 to ``boxes`` − 1 gives them all.
 
     Args:
-        space: what varies.
+        objective: gives what varies.
         settings: how many boxes, and which.
         seed: seeds the boxes.
     """
@@ -28,11 +29,10 @@ class UdrOptimizer(Optimizer):
     name = "udr"
     method = "udr"
 
-    def __init__(self, space: ParameterSpace, *, settings: UdrSettings, seed: int) -> None:
-        box = SearchBox.of(space)
-        ends = np.random.default_rng(seed).uniform(size=(settings.boxes, 2, len(space)))
-        self._ends = box.low + np.sort(ends, axis=1) * box.width  # (boxes, 2, d), coordinates
-        self._space, self._chosen = space, settings.box
+    def __init__(self, objective: Objective, *, settings: UdrSettings, seed: int) -> None:
+        self._space, self._box, self._chosen = objective.simulator.parameters, objective.box, settings.box
+        ends = np.random.default_rng(seed).uniform(size=(settings.boxes, 2, len(self._space)))
+        self._ends = self._box.low + np.sort(ends, axis=1) * self._box.width  # (boxes, 2, d), coordinates
 
     def ask(self) -> Request:
         """Nothing is asked."""
@@ -64,16 +64,5 @@ class UdrOptimizer(Optimizer):
 
     def extras(self) -> dict[str, Any]:
         """Return all boxes, in the parameters' units."""
-        values = to_values(self._ends, self._space.is_log)
-        boxes = [
-            {name: [float(a), float(b)] for name, a, b in zip(self._space.names, low, high, strict=True)}
-            for low, high in values
-        ]
-        return {"boxes": boxes, "box": self._chosen}
-
-    def state(self) -> dict[str, Any]:
-        """Return nothing: the seed says it all."""
-        return {}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Do nothing."""
+        ends = self._box.values(self._ends).swapaxes(1, 2).tolist()  # (boxes, d, 2)
+        return {"boxes": [dict(zip(self._space.names, box, strict=True)) for box in ends], "box": self._chosen}

@@ -64,6 +64,7 @@ def _silence() -> None:
 
 
 def _dispatch(given: list[str]) -> None:
+    """Run the command that was given; what it does not know are overrides of its config."""
     command = given[0] if given else ""
     if command not in (*COMMANDS, "", "-h", "--help", "--version"):
         if command.startswith("-"):
@@ -76,22 +77,15 @@ def _dispatch(given: list[str]) -> None:
     elif parsed.command is None:
         parser.print_help()
     else:
-        _run(parsed, rest)
+        from rich.console import Console
 
+        from dropo_torch.commands.folder import claimed
+        from dropo_torch.config import parse_overrides
 
-def _run(parsed: argparse.Namespace, rest: list[str]) -> None:
-    """Run the command that was given; ``rest`` are overrides of its config."""
-    from rich.console import Console
-
-    from dropo_torch.commands.folder import claimed
-    from dropo_torch.config import parse_overrides
-
-    class Output(Console):
-        def on_broken_pipe(self) -> None:
-            _silence()
-
-    with claimed(parsed.out):
-        parsed.run(parsed, parse_overrides(rest), Output(highlight=False))
+        console = Console(highlight=False)
+        console.on_broken_pipe = _silence  # type: ignore[method-assign]
+        with claimed(parsed.out):
+            parsed.run(parsed, parse_overrides(rest), console)
 
 
 def _parser(called: str) -> argparse.ArgumentParser:

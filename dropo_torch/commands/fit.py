@@ -97,9 +97,9 @@ def _write_model(problem: Problem, result: Fit, path: Path) -> list[str]:
     from dropo_torch.effects.export import write_model
     from dropo_torch.models.export import export_model
 
-    values, rest = result.distribution.center, []
     if problem.model_path is None:
         return []
+    values, rest = result.distribution.center, []
     try:
         if problem.effects is None:
             export_model(problem.model_path, problem.space, values, path)

@@ -71,7 +71,7 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
     for words, key, form in rows:
         table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
     console.print(table)
-    for line in (*([gap.next_experiment] if gap.next_experiment else []), *gap.notes):
+    for line in filter(None, (gap.next_experiment, *gap.notes)):
         console.print(line, markup=False)
     console.print(
         f"{gap.simulated_transitions} simulated transitions, {gap.seconds:.1f} s; report: {out / 'report.html'}",

@@ -10,6 +10,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
@@ -95,20 +96,20 @@ def open_hdf5(path: Path, group: str | None) -> list[Table]:
         if isinstance(name, str):  # a name that is no UTF-8 comes as bytes
             (datasets if isinstance(item, h5py.Dataset) else groups).append(name)
 
-    def read(name: str) -> np.ndarray:
-        with reading(f"{path}: {name}", "an HDF5 data set"), h5py.File(path, "r") as file:
-            return np.asarray(file[name][()])
+    def read(name: str, below: str = "") -> np.ndarray:
+        with reading(f"{path}: {below}{name}", "an HDF5 data set"), h5py.File(path, "r") as file:
+            return np.asarray(file[below + name][()])
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
         file.visititems(visit)
-    whole = Table(str(path), tuple(datasets), read)
     if group is None:
-        return [whole]
+        return [Table(str(path), tuple(datasets), read)]
     pattern = f"/{group.strip('/')}"
     matched = sorted((g for g in groups if PurePosixPath(f"/{g}").match(pattern)), key=_natural)
     if not matched:
         raise InputError(f"{path}: group: no group matches {group!r}{choices(group, groups)}")
-    return [_within(whole, g) for g in matched]
+    below = {g: tuple(n.removeprefix(f"{g}/") for n in datasets if n.startswith(f"{g}/")) for g in matched}
+    return [Table(f"{path}: {g}", names, partial(read, below=f"{g}/")) for g, names in below.items()]
 
 
 def open_mat(path: Path, _: str | None) -> list[Table]:
@@ -202,13 +203,6 @@ def _npz(path: Path) -> Iterator[Any]:
     # the file is opened here because numpy leaves it open where it is corrupt
     with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
         yield archive
-
-
-def _within(table: Table, group: str) -> Table:
-    """The arrays below a group, named from there."""
-    prefix = f"{group}/"
-    names = tuple(n.removeprefix(prefix) for n in table.names if n.startswith(prefix))
-    return Table(f"{table.source}: {group}", names, lambda name: table.read(prefix + name))
 
 
 def _mat73(table: Table) -> Table:

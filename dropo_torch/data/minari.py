@@ -49,9 +49,7 @@ def read_minari(
         where = f"{source}: episode {i}"
         seen, done = (_part(episode, *what, where) for what in (("observations", observations), ("actions", actions)))
         if len(seen) != len(done) + 1:
-            raise InputError(
-                f"{where}: {len(seen)} observations and {len(done)} actions; expected one observation more"
-            )
+            raise InputError(f"{where}: {len(seen)} observations, {len(done)} actions; expected one observation more")
         logs.append(Trajectories.of_samples(seen, done, dt=dt, source=where))
     if not logs:
         raise InputError(f"{source}: the dataset has no episode")

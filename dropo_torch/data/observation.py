@@ -118,17 +118,10 @@ def parse_observation(
         InputError: an entry that names nothing, a column named twice, a width that does not fit.
     """
     joints = _joints(model)
-    columns: list[int] = []
-    log_columns: list[int] = []
-    width = 0
+    listed: list[int | None] = []  # a state column, or None, for each column of the log
     for entry in ("qpos", "qvel") if entries is None else entries:
-        found = _entry_columns(model, joints, str(entry).strip())
-        if isinstance(found, int):
-            width += found
-            continue
-        columns += found
-        log_columns += range(width, width + len(found))
-        width += len(found)
+        listed += _entry_columns(model, joints, str(entry).strip())
+    columns, width = [c for c in listed if c is not None], len(listed)
     about = {c: entry for joint in joints for c, entry in (joint.positions | joint.velocities).items()}
     twice = {c for c in columns if columns.count(c) > 1}
     if twice:
@@ -146,7 +139,7 @@ def parse_observation(
     return Observation(
         columns=tuple(columns),
         labels=tuple(about[c][0] for c in columns),
-        log_columns=tuple(log_columns),
+        log_columns=tuple(i for i, c in enumerate(listed) if c is not None),
         log_width=width,
         default_state=tuple(default.tolist()),
         units=tuple(about[c][1] for c in columns),
@@ -177,78 +170,63 @@ def joint_name(model: mujoco.MjModel, joint: int) -> str:
 
 
 def _joints(model: mujoco.MjModel) -> list[_Joint]:
+    def columns(stem: str, labels: _Labels, first: int) -> dict[int, tuple[str, str]]:
+        return {first + i: (f"{stem}{suffix}", unit) for i, (suffix, unit) in enumerate(labels)}
+
     found = []
     for j in range(model.njnt):
         name, (positions, velocities) = joint_name(model, j), _KINDS[int(model.jnt_type[j])]
-        first, begin = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
-        found.append(
-            _Joint(
-                name,
-                {first + i: (f"{name}.position{suffix}", unit) for i, (suffix, unit) in enumerate(positions)},
-                {begin + i: (f"{name}.velocity{suffix}", unit) for i, (suffix, unit) in enumerate(velocities)},
-            )
-        )
+        place = columns(f"{name}.position", positions, int(model.jnt_qposadr[j]))
+        found.append(_Joint(name, place, columns(f"{name}.velocity", velocities, model.nq + int(model.jnt_dofadr[j]))))
     return found
 
 
-def _entry_columns(model: mujoco.MjModel, joints: Sequence[_Joint], entry: str) -> list[int] | int:
-    """State columns of one entry, or the number of log columns to skip."""
+def _entry_columns(model: mujoco.MjModel, joints: Sequence[_Joint], entry: str) -> list[int] | list[None]:
+    """State columns of one entry; ``None`` for each log column to skip."""
     skip = re.fullmatch(r"skip(?:\[(\d+)\])?", entry)
     if skip:
-        return int(skip[1] or 1)
-    dotted = re.fullmatch(r"(.+)\.(position|velocity)", entry)
-    if dotted:
-        joint = _joint(joints, dotted[1], entry)
-        return list(joint.positions if dotted[2] == "position" else joint.velocities)
-    match = re.fullmatch(r"(qpos|qvel)(?:\[(.*)\])?", entry)
+        return [None] * int(skip[1] or 1)
+    match = re.fullmatch(r"(.+)\.(position|velocity)|(qpos|qvel)(?:\[(.*)\])?", entry)
     if match is None:
         raise InputError(
             f"observation: {entry!r} is not understood; expected qpos, qvel, a slice qpos[1:], a joint "
             "qpos[elbow] or elbow.position, or skip" + choices(entry, ["qpos", "qvel", "skip"])
         )
-    every = range(model.nq) if match[1] == "qpos" else range(model.nq, model.nq + model.nv)
-    size, inside = len(every), match[2]
-    if inside is None:
+    name, side, whole, inside = match.groups()
+    of_position = side == "position" or whole == "qpos"
+    every = range(model.nq) if of_position else range(model.nq, model.nq + model.nv)
+    if whole and inside is None:
         return list(every)
-    if re.fullmatch(r"-?\d+", inside):
-        index = int(inside)
-        if not -size <= index < size:
-            raise InputError(f"observation: {entry} is outside {match[1]}, which has {size} entries")
-        return [every[index]]
-    part = re.fullmatch(r"(-?\d*):(-?\d*)(?::(-?\d+))?", inside)
-    if part:
-        bounds = [int(p) if p else None for p in part.groups()]
-        if bounds[2] == 0:
-            raise InputError(f"observation: {entry} has step 0; expected a step such as 1 or -1")
-        found = list(every[slice(*bounds)])
-        if not found:
-            raise InputError(f"observation: {entry} is empty; {match[1]} has {size} entries")
-        return found
-    joint = _joint(joints, inside, entry)
-    return list(joint.positions if match[1] == "qpos" else joint.velocities)
-
-
-def _joint(joints: Sequence[_Joint], name: str, entry: str) -> _Joint:
-    for joint in joints:
-        if joint.name == name:
-            return joint
-    raise InputError(
-        f"observation: {entry}: the model has no joint {name!r}" + choices(name, [joint.name for joint in joints])
-    )
+    part = whole and re.fullmatch(r"(-?\d+)|(-?\d*):(-?\d*)(?::(-?\d+))?", inside)
+    if not part:
+        named = {joint.name: joint for joint in joints}
+        wanted = name or inside
+        if wanted not in named:
+            raise InputError(f"observation: {entry}: the model has no joint {wanted!r}" + choices(wanted, named))
+        return list(named[wanted].positions if of_position else named[wanted].velocities)
+    index, *bounds = (int(p) if p else None for p in part.groups())
+    if index is not None:
+        bounds = [index, index + 1 or None, None]
+    if bounds[2] == 0:
+        raise InputError(f"observation: {entry} has step 0; expected a step such as 1 or -1")
+    found = list(every[slice(*bounds)])
+    if not found:
+        why = f"is empty; {whole}" if index is None else f"is outside {whole}, which"
+        raise InputError(f"observation: {entry} {why} has {len(every)} entries")
+    return found
 
 
 def _complete_quaternions(joints: Sequence[_Joint], columns: list[int]) -> tuple[tuple[int, int, int, int], ...]:
     found = []
     for joint in joints:
-        wanted = list(joint.positions)[-4:]
-        present = [columns.index(c) for c in wanted if c in columns]
-        if len(wanted) < 4:
+        present = [columns.index(c) for c in list(joint.positions)[-4:] if c in columns]
+        if len(joint.positions) < 4 or not present:
             continue
-        if len(present) == 4:
-            found.append((present[0], present[1], present[2], present[3]))
-        elif present:
+        if len(present) != 4:
             raise InputError(
                 f"observation: only {len(present)} of the 4 quaternion columns of joint {joint.name!r} are named; "
                 "name all four or none"
             )
+        w, x, y, z = present
+        found.append((w, x, y, z))
     return tuple(found)

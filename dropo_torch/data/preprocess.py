@@ -189,11 +189,11 @@ def signal_delays(recording: Recording, options: Preprocess) -> dict[str, float]
     names = recording.names
     delays: dict[str, float] = {}
     for name, delay in options.delays.items():
-        delays |= dict.fromkeys(resolve_names([name], names, recording.source, "preprocess: delays"), delay)
+        delays |= dict.fromkeys(resolve_names([name], names, f"{recording.source}: preprocess: delays"), delay)
     if options.reference is None:
         return delays
     known = delays.get(options.reference, 0.0)
-    for name in resolve_names(options.align, names, recording.source, "preprocess: align"):
+    for name in resolve_names(options.align, names, f"{recording.source}: preprocess: align"):
         if name in delays:
             raise InputError(f"{recording.source}: preprocess: {name} stands in both align and delays; leave one out")
         found = [
@@ -278,10 +278,10 @@ class _Episode:
         positions = self._resolve(
             "positions", [n for n in names if n not in velocities] if given is None else given, names
         )
-        quaternions = [self._quaternion(group, positions) for group in self.options.quaternions]
+        quaternions = [self._resolve("quaternions", group, positions) for group in self.options.quaternions]
         signals = {name: self._samples(name) for name in positions + velocities}
         for group in quaternions:
-            signals |= self._continuous({name: signals[name] for name in group})
+            signals |= self._continuous(group, signals)
         for name, samples in signals.items():
             self._check_gaps(name, samples)
         if self.options.cutoff is not None:
@@ -296,37 +296,28 @@ class _Episode:
         for group in quaternions:
             norm = np.linalg.norm([position[name] for name in group], axis=0)
             position |= {name: position[name] / norm for name in group}
-        if self.options.actions == "position":
-            actions = self._controlled(position)
-        elif self.options.actions == "velocity":
-            actions = self._controlled(velocity)
+        if self.options.infers_actions:  # what was measured at each step's end
+            motion = position if self.options.actions == "position" else velocity
+            controlled = self._resolve("controlled", self.options.controlled or list(motion), list(motion))
+            actions = {name: motion[name][1:] for name in controlled}
         else:
             actions = {name: self._commands(name, grid[:-1]) for name in self.part.action_names}
-        return Trajectories.of_samples(
-            np.concatenate([_columns(position, len(grid)), _columns(velocity, len(grid))], axis=1),
-            _columns(actions, len(grid) - 1),
-            dt=self.options.dt,
-            source=self.part.source,
-        )
+        observations = np.stack([*position.values(), *velocity.values()], axis=1)
+        commands = np.stack(list(actions.values()), axis=1) if actions else np.empty((len(grid) - 1, 0))
+        return Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
-        return resolve_names(wanted, names, self.part.source, f"preprocess: {key}")
+        return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")
 
     def _samples(self, name: str) -> _Samples:
         return _samples(self.part, name, self.delays.get(name, 0.0))
 
-    def _quaternion(self, given: Sequence[str], positions: Sequence[str]) -> list[str]:
-        group = self._resolve("quaternions", given, positions)
-        if len(set(group)) != 4:
-            raise InputError(
-                f"{self.part.source}: preprocess: quaternions: {', '.join(group)}: expected four different signals"
-            )
-        return group
-
-    def _continuous(self, quaternion: Mapping[str, _Samples]) -> dict[str, _Samples]:
+    def _continuous(self, group: Sequence[str], signals: Mapping[str, _Samples]) -> dict[str, _Samples]:
         """The four components with signs by which no sample lies opposite to the one before it."""
-        where = f"{self.part.source}: preprocess: quaternions: {', '.join(quaternion)}"
-        parts = list(quaternion.values())
+        where = f"{self.part.source}: preprocess: quaternions: {', '.join(group)}"
+        if len(set(group)) != 4:
+            raise InputError(f"{where}: expected four different signals")
+        parts = [signals[name] for name in group]
         if any(not np.array_equal(part.time, parts[0].time) for part in parts):
             raise InputError(f"{where} need samples at the same times and one delay")
         values = np.stack([part.values for part in parts], axis=1)
@@ -338,7 +329,7 @@ class _Episode:
             )
         flips = np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)
         values = values * np.cumprod(np.append(1.0, flips))[:, None]
-        return {name: replace(part, values=values[:, i]) for i, (name, part) in enumerate(quaternion.items())}
+        return {name: _Samples(parts[0].time, values[:, i]) for i, name in enumerate(group)}
 
     def _check_gaps(self, name: str, samples: _Samples) -> None:
         steps, most = np.diff(samples.time), self.options.max_gap
@@ -385,11 +376,6 @@ class _Episode:
             )
         return low + options.dt * np.arange(steps + 1)
 
-    def _controlled(self, motion: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-        """What the robot was told, if it tracks it closely: what was measured at each step's end."""
-        names = list(motion)
-        return {name: motion[name][1:] for name in self._resolve("controlled", self.options.controlled or names, names)}
-
     def _commands(self, name: str, begin: np.ndarray) -> np.ndarray:
         """A command in the steps that begin at the given times, ``(T,)``: in force then, or the mean of each step."""
         samples, dt = self._samples(name), self.options.dt
@@ -408,28 +394,17 @@ def _velocities(
     position: Mapping[str, np.ndarray], slope: Mapping[str, np.ndarray], quaternions: Sequence[Sequence[str]]
 ) -> dict[str, np.ndarray]:
     """The derivatives of positions; in place of a quaternion's, its angular velocity."""
-    places = {next(name for name in slope if name in group): group for group in quaternions}
-    members = {name for group in quaternions for name in group}
     velocity: dict[str, np.ndarray] = {}
     for name, values in slope.items():
-        if name in places:
-            group = places[name]
-            angular = _angular_velocity(*(np.stack([of[n] for n in group], axis=1) for of in (position, slope)))
-            velocity |= {f"{group[0]}.angular[{axis}]": angular[:, axis] for axis in range(3)}
-        elif name not in members:
+        group = next((group for group in quaternions if name in group), None)
+        if group is None:
             velocity[name] = values
+        elif f"{group[0]}.angular[0]" not in velocity:  # in the body's frame: twice the vector part of q⁻¹ q̇
+            quaternion, derivative = (np.stack([of[n] for n in group], axis=1) for of in (position, slope))
+            w, v, dw, dv = quaternion[:, :1], quaternion[:, 1:], derivative[:, :1], derivative[:, 1:]
+            angular = 2 * (w * dv - dw * v - np.cross(v, dv)) / (quaternion**2).sum(axis=1, keepdims=True)
+            velocity |= {f"{group[0]}.angular[{axis}]": angular[:, axis] for axis in range(3)}
     return velocity
-
-
-def _angular_velocity(quaternion: np.ndarray, derivative: np.ndarray) -> np.ndarray:
-    """Angular velocity in the body's frame ``(N, 3)``: twice the vector part of ``q⁻¹ q̇``."""
-    w, v = quaternion[:, :1], quaternion[:, 1:]
-    dw, dv = derivative[:, :1], derivative[:, 1:]
-    return np.asarray(2 * (w * dv - dw * v - np.cross(v, dv)) / (quaternion**2).sum(axis=1, keepdims=True))
-
-
-def _columns(columns: Mapping[str, np.ndarray], rows: int) -> np.ndarray:
-    return np.stack(list(columns.values()), axis=1) if columns else np.empty((rows, 0))
 
 
 def _names(value: object, what: str) -> tuple[str, ...] | None:

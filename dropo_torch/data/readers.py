@@ -36,9 +36,9 @@ from dropo_torch.support.given import check_keys, number, reading
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 class ReadOptions:
-    """How a log is read; :func:`read_trajectories` explains each."""
+    """How a log is read; :func:`read_trajectories` explains each, and takes them in this order."""
 
     observations: ColumnMap | None = None
     next_observations: ColumnMap | None = None
@@ -113,8 +113,9 @@ def read_trajectories(
     Raises:
         InputError: a file, name or value that cannot be used; its one line says which.
     """
-    given = locals()
-    options = ReadOptions(**{field.name: given[field.name] for field in fields(ReadOptions)})
+    options = ReadOptions(
+        observations, next_observations, actions, time, episode, terminals, dt, tolerance, group, separator, preprocess
+    )
     return concatenate(_read(source, options, Path(base or ".")))
 
 
@@ -134,9 +135,7 @@ def read_recording(
     Raises:
         InputError: a file, name or value that cannot be used; its one line says which.
     """
-    options = ReadOptions(
-        observations=observations, actions=actions, time=time, episode=episode, terminals=terminals, dt=dt
-    )
+    options = ReadOptions(observations, None, actions, time, episode, terminals, dt)
     return _recording(open_tables(Path(path), separator=separator)[0], options)
 
 
@@ -172,9 +171,8 @@ def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
             return [_read_minari(folder, options)]
     if not path.exists() and not path.suffix and "-v" in path.name:
         raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
-    return [
-        _read_table(table, options) for table in open_tables(path, group=options.group, separator=options.separator)
-    ]
+    tables = open_tables(path, group=options.group, separator=options.separator)
+    return [_read_table(table, options) for table in tables]
 
 
 def _read_table(table: Table, options: ReadOptions) -> Trajectories:
@@ -187,17 +185,10 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
     following = options.next_observations
     if following is None and options.observations is None and "next_observations" in table.names:
         following = "next_observations"
-    recording = _recording(table, options)
+    rows = _recording(table, options)
     if following is None:
-        return recording.trajectories(tolerance=options.tolerance)
-    return _transitions(recording, *table.matrix(following, "next_observations"), options)
-
-
-def _transitions(
-    rows: Recording, next_observations: np.ndarray, next_names: Sequence[str], options: ReadOptions
-) -> Trajectories:
-    """A log that has its next observations: each row is a transition."""
-    _check_rows(rows.source, "next_observations", len(next_observations), len(rows))
+        return rows.trajectories(tolerance=options.tolerance)
+    next_observations, next_names = table.matrix(following, "next_observations", len(rows))
     for what, values, names in (
         ("observations", rows.observations, rows.observation_names),
         ("next_observations", next_observations, next_names),
@@ -220,27 +211,13 @@ def _recording(table: Table, options: ReadOptions) -> Recording:
         raise InputError(f"{table.source}: observations: the list is empty; name at least one column")
     if len(observations) == 0:
         raise InputError(f"{table.source}: the log has no row; at least two samples are needed")
-    rows = len(observations)
-    actions, action_names = _actions(table, options, rows)
-    _check_rows(table.source, "actions", len(actions), rows)
-    episodes = _episodes(table, options, rows)
+    infers = isinstance(options.preprocess, Preprocess) and options.preprocess.infers_actions
+    wanted = [] if infers and options.actions is None else _wanted(table, options.actions, "actions")
+    actions, action_names = table.matrix(wanted, "actions", len(observations))
+    episodes = _episodes(table, options, len(observations))
     return Recording(
-        observations=observations,
-        actions=actions,
-        time=_time(table, options, episodes),
-        episodes=episodes,
-        observation_names=names,
-        action_names=action_names,
-        source=table.source,
+        observations, actions, _time(table, options, episodes), episodes, names, action_names, source=table.source
     )
-
-
-def _actions(table: Table, options: ReadOptions, rows: int) -> tuple[np.ndarray, tuple[str, ...]]:
-    inferred = isinstance(options.preprocess, Preprocess) and options.preprocess.infers_actions
-    if options.actions is None and inferred:
-        return np.empty((rows, 0)), ()
-    actions, names = table.matrix(_wanted(table, options.actions, "actions"), "actions")
-    return (actions, names) if names else (np.empty((rows, 0)), ())
 
 
 def _wanted(table: Table, columns: ColumnMap | None, default: str) -> ColumnMap:
@@ -266,20 +243,18 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
                 f"{table.source}: there is no 'terminals'; say where episodes end with terminals: NAME "
                 f"(or terminals: [] if all of it is one episode){choices('terminals', table.names)}"
             )
-    values, names = table.matrix(flags, "terminals")
-    if names:
-        _check_rows(table.source, names[0], len(values), rows)
-        bad = np.argwhere(~np.isin(values, (0, 1)))
-        if bad.size:
-            row, column = bad[0]
-            raise InputError(
-                f"{table.source}: terminals: {names[column]} is {values[row, column]:g} at row {row} (counted from 0); "
-                "expected true/false or 0/1"
-            )
-        start[1:] |= values[:-1].any(axis=1)
+    values, names = table.matrix(flags, "terminals", rows)
+    bad = np.argwhere(~np.isin(values, (0, 1)))
+    if bad.size:
+        row, column = bad[0]
+        raise InputError(
+            f"{table.source}: terminals: {names[column]} is {values[row, column]:g} at row {row} (counted from 0); "
+            "expected true/false or 0/1"
+        )
+    start[1:] |= values[:-1].any(axis=1)
     if options.episode is not None:
         label = table.array(options.episode, "episode").reshape(-1)
-        _check_rows(table.source, options.episode, len(label), rows)
+        table.check_rows(options.episode, len(label), rows)
         empty = np.flatnonzero(missing(label))
         if empty.size:
             raise InputError(f"{table.source}: {options.episode} has no value at row {empty[0]} (counted from 0)")
@@ -300,11 +275,14 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
     if len(signals) == 1 and signals[0].signal in table.names:
         stamps = table.array(signals[0].signal, "time")
         if _are_dates(stamps):
-            return _since_first(stamps, f"{table.source}: {signals[0].signal}")
-    values, names = table.matrix(options.time, "time")
+            import pandas as pd
+
+            with reading(f"{table.source}: {signals[0].signal}", "dates such as 2024-05-01T12:00:00.125"):
+                dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
+            return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
+    values, names = table.matrix(options.time, "time", len(episodes))
     if len(names) != 1:
         raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
-    _check_rows(table.source, "time", len(values), len(episodes))
     return values[:, 0]
 
 
@@ -319,24 +297,8 @@ def _are_dates(stamps: np.ndarray) -> bool:
     return stamps.dtype.kind == "M" or bool(np.isnan(pd.to_numeric(stamps[:1], errors="coerce"))[0])
 
 
-def _since_first(stamps: np.ndarray, where: str) -> np.ndarray:
-    import pandas as pd
-
-    with reading(where, "dates such as 2024-05-01T12:00:00.125"):
-        dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
-    return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
-
-
-def _check_rows(source: str, what: str, rows: int, expected: int) -> None:
-    if rows != expected:
-        raise InputError(
-            f"{source}: {what} has {rows} rows and observations has {expected}; both need one row a sample"
-        )
-
-
 def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
-    unused = ("next_observations", "time", "episode", "terminals", "group", "separator", "preprocess")
-    for name in unused:
+    for name in ("next_observations", "time", "episode", "terminals", "group", "separator", "preprocess"):
         if getattr(options, name) is not None:
             source = f"{PREFIX}{dataset}" if isinstance(dataset, str) else dataset
             raise InputError(

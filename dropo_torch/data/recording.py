@@ -87,10 +87,9 @@ class Recording:
         Raises:
             InputError: a name that is not there.
         """
-        if name in self.observation_names:
-            return self.observations[:, self.observation_names.index(name)]
-        if name in self.action_names:
-            return self.actions[:, self.action_names.index(name)]
+        for names, values in ((self.observation_names, self.observations), (self.action_names, self.actions)):
+            if name in names:
+                return values[:, names.index(name)]
         raise InputError(f"{self.source}: there is no signal {name!r}{choices(name, self.names)}")
 
     def interval(self, tolerance: float) -> float | None:
@@ -166,7 +165,7 @@ class Recording:
         return stamps
 
 
-def resolve_names(wanted: Sequence[str], names: Sequence[str], source: str, what: str) -> list[str]:
+def resolve_names(wanted: Sequence[str], names: Sequence[str], where: str) -> list[str]:
     """Return the column names meant by ``wanted``, where ``q`` stands for ``q[0]``, ``q[1]``, ... as well.
 
     Raises:
@@ -176,6 +175,6 @@ def resolve_names(wanted: Sequence[str], names: Sequence[str], source: str, what
     for name in wanted:
         matches = [n for n in names if n == name or n.startswith(f"{name}[")]
         if not matches:
-            raise InputError(f"{source}: {what}: there is no signal {name!r}{choices(name, names)}")
+            raise InputError(f"{where}: there is no signal {name!r}{choices(name, names)}")
         found += matches
     return found

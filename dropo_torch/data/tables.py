@@ -63,24 +63,37 @@ class Table:
     names: tuple[str, ...]
     read: Callable[[str], np.ndarray]
 
-    def matrix(self, columns: ColumnMap, what: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    def matrix(self, columns: ColumnMap, what: str, rows: int | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the float64 matrix ``(N, k)`` that a column map picks, and the ``k`` names.
+
+        Args:
+            columns: the column map.
+            what: what is picked, for messages.
+            rows: the number of samples N, where the observations have said it.
 
         Raises:
             InputError: a name that is not there, something not numeric, lengths that differ.
         """
-        parts: list[np.ndarray] = []
-        names: list[str] = []
-        for signal in parse_columns(columns, f"{self.source}: {what}"):
-            values, labels = self._signal(signal, what)
-            if parts and len(values) != len(parts[0]):
+        parts = [self._signal(signal, what) for signal in parse_columns(columns, f"{self.source}: {what}")]
+        if not parts:
+            return np.empty((rows or 0, 0)), ()
+        first, names = parts[0]
+        for values, labels in parts:
+            if len(values) != len(first):
                 raise InputError(
-                    f"{self.source}: {what}: {labels[0]} has {len(values)} rows and {names[0]} has {len(parts[0])}; "
+                    f"{self.source}: {what}: {labels[0]} has {len(values)} rows and {names[0]} has {len(first)}; "
                     "both need one row a sample (transpose: true where a sample is a column)"
                 )
-            parts.append(values)
-            names += labels
-        return (np.concatenate(parts, axis=1) if parts else np.empty((0, 0))), tuple(names)
+        if rows is not None:
+            self.check_rows(what, len(first), rows)
+        return np.concatenate([values for values, _ in parts], axis=1), tuple(n for _, labels in parts for n in labels)
+
+    def check_rows(self, what: str, found: int, rows: int) -> None:
+        """Raise an :class:`InputError` for something with other than one row a sample."""
+        if found != rows:
+            raise InputError(
+                f"{self.source}: {what} has {found} rows and observations has {rows}; both need one row a sample"
+            )
 
     def array(self, name: str, what: str) -> np.ndarray:
         """Return one array as the file holds it.
@@ -201,18 +214,12 @@ def _parse_signal(entry: Mapping[str, Any], where: str) -> Signal:
     if not isinstance(signal.transpose, bool):
         raise InputError(f"{where}: transpose is {signal.transpose!r}; expected true or false")
     scale = signal.scale
-    if not (isinstance(scale, str) and _is_name(scale)):
-        scale = number(scale, f"{where}: scale")
-    return replace(signal, scale=scale, offset=number(signal.offset, f"{where}: offset"))
-
-
-def _is_name(text: str) -> bool:
-    """Whether text names a variable; YAML reads some numbers, such as ``1e-3``, as text."""
     try:
-        float(text)
-    except ValueError:
-        return bool(text)
-    return False
+        scale = number(scale, f"{where}: scale")
+    except InputError:
+        if not isinstance(scale, str) or not scale:  # text that is no number names a variable
+            raise
+    return replace(signal, scale=scale, offset=number(signal.offset, f"{where}: offset"))
 
 
 def _inside(index: slice, width: int) -> bool:

@@ -47,8 +47,7 @@ class Trajectories:
             raise InputError(f"{self.source}: terminals must be true/false or 0/1 flags")
         set_frozen(self, "terminals", np.append(terminals.reshape(-1).astype(bool)[:-1], True))
         for name in ("next_observations", "actions", "terminals"):
-            found = len(getattr(self, name))
-            if found != rows:
+            if (found := len(getattr(self, name))) != rows:
                 raise InputError(
                     f"{self.source}: {name} has {found} rows and observations has {rows}; "
                     "both need one row a transition"
@@ -240,23 +239,19 @@ def make_replay(
     """
     if horizon < 1:
         raise InputError(f"horizon: {horizon} given; expected a whole number of logged steps, 1 or more")
-    steps = _window_length(np.bincount(trajectories.episodes), horizon)
+    lengths = np.bincount(trajectories.episodes)
+    longest = min(horizon, int(lengths.max()))
+    steps = max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
     windows = make_transitions(trajectories, observation, lag=steps, history=history)
     rows = (windows.rows[:, None] + np.arange(steps)).reshape(-1)
     measured = observation.observed(trajectories.next_observations[rows])
     return Replay(
-        states=np.ascontiguousarray(windows.states, dtype=np.float64),
-        controls=np.ascontiguousarray(windows.controls, dtype=np.float64),
+        states=windows.states,
+        controls=windows.controls,
         measured=np.ascontiguousarray(measured.reshape(len(windows), steps, -1)),
         history=history,
         about_start=about_start,
     )
-
-
-def _window_length(lengths: np.ndarray, horizon: int) -> int:
-    """The length of windows for episodes of these lengths."""
-    longest = min(horizon, int(lengths.max()))
-    return max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
 
 
 def column_names(name: str, width: int) -> list[str]:

@@ -27,16 +27,25 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
         write_inertials(spec)
     model = spec.compile()
-    for column, parameter in enumerate(space.parameters):
-        for target in parameter.targets:
-            write_field(model, target.field, target.index, target.factor * values[column])
+    wanted = [(p.name, t, t.factor * v) for p, v in zip(space.parameters, values, strict=True) for t in p.targets]
+    for _, target, value in wanted:
+        write_field(model, target.field, target.index, value)
     try:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         spec.copy_back(model)
         path.write_text(spec.to_xml(), encoding="utf-8")
     except (ValueError, mujoco.FatalError) as error:
-        raise InputError(f"export: MJCF cannot express these parameters: {' '.join(str(error).split())}") from None
-    _compare(path, space, values)
+        raise InputError(f"export: MJCF cannot express these parameters: {error}") from None
+    try:
+        written = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        path.unlink()
+        raise InputError(f"export: MuJoCo refuses the model with these parameters: {error}") from None
+    for name, target, value in wanted:
+        found = float(read_field(written, target.field).reshape(-1)[target.index])
+        if abs(found - value) > PRECISION * max(abs(value), 1e-6):
+            path.unlink()
+            raise InputError(f"export: MJCF gives {found:g} for {name} instead of {value:g}")
 
 
 def read_spec(source: str | Path) -> mujoco.MjSpec:
@@ -66,19 +75,3 @@ def write_inertials(spec: mujoco.MjSpec) -> None:
         body.mass, body.inertia = compiled.body_mass[body.id], compiled.body_inertia[body.id]
         body.ipos, body.iquat = compiled.body_ipos[body.id], compiled.body_iquat[body.id]
     spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
-
-
-def _compare(path: Path, space: ParameterSpace, values: np.ndarray) -> None:
-    """Raise an :class:`InputError` unless the written model holds the parameters."""
-    try:
-        written = mujoco.MjModel.from_xml_path(str(path))
-    except ValueError as error:
-        path.unlink()
-        raise InputError(f"export: MuJoCo refuses the model with these parameters: {error}") from None
-    for column, parameter in enumerate(space.parameters):
-        for target in parameter.targets:
-            wanted = target.factor * values[column]
-            found = float(read_field(written, target.field).reshape(-1)[target.index])
-            if abs(found - wanted) > PRECISION * max(abs(wanted), 1e-6):
-                path.unlink()
-                raise InputError(f"export: MJCF gives {found:g} for {parameter.name} instead of {wanted:g}")

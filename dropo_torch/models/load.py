@@ -54,8 +54,7 @@ def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> 
             unsimplify(spec)
             return spec.compile()
     except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise InputError(f"model: MuJoCo does not compile {path}: {reason}") from None
+        raise InputError(f"model: MuJoCo does not compile {path}: {error}") from None
 
 
 def unsimplify(spec: mujoco.MjSpec) -> None:

@@ -27,6 +27,37 @@ class Normals:
         return self.generator.standard_normal(shape)
 
 
+def evolution(
+    dimensions: int, *, seed: int, budget: int, population: int | None, tolerances: dict[str, float]
+) -> cma.CMAEvolutionStrategy:
+    """Return pycma's search over [0, 4] in each dimension, from the middle with step 1; ``tolerances`` end it."""
+    options = {
+        "bounds": [0, SearchBox.WIDTH],
+        "randn": Normals(seed),
+        "seed": np.nan,  # the generator above is the only source of randomness
+        "verbose": -9,
+        "verb_log": 0,
+        "verb_disp": 0,
+        "maxfevals": budget,
+    }
+    if population:
+        options["popsize"] = population
+    return cma.CMAEvolutionStrategy(np.full(dimensions, SearchBox.WIDTH / 2), 1.0, options | tolerances)
+
+
+def why_stopped(search: cma.CMAEvolutionStrategy, budget: str, value: str) -> str | None:
+    """Return pycma's termination conditions, in words for what is spent and what is searched for; ``None`` without."""
+    words = {
+        "maxfevals": f"the budget of {budget} is spent",
+        "tolfun": f"the {value} no longer differs within a generation",
+        "tolfunhist": f"the best {value} no longer changes",
+        "tolx": "the search distribution has shrunk to a point",
+        "tolstagnation": f"the {value} has not improved for long",
+        "tolflatfitness": f"the {value} is flat",
+    }
+    return "; ".join(words.get(k, f"pycma stopped: {k}") for k in search.stop()) or None
+
+
 class CMAOptimizer(LikelihoodOptimizer):
     """CMA-ES on the sampled objective: μ linear, σ logarithmic, all in [0, 4], step 1.
 
@@ -40,22 +71,10 @@ class CMAOptimizer(LikelihoodOptimizer):
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
-        options = {
-            "bounds": [0, SearchBox.WIDTH],
-            "randn": Normals(settings.seed),
-            "seed": np.nan,  # the generator above is the only source of randomness
-            "verbose": -9,
-            "verb_log": 0,
-            "verb_disp": 0,
-            "maxfevals": settings.budget,
-            "tolfun": 1e-3,
-            "tolfunhist": 1e-4,
-            "tolstagnation": 200,
-        }
-        if settings.population is not None:
-            options["popsize"] = settings.population
-        dim = 2 * len(self._space)
-        self._search = cma.CMAEvolutionStrategy(np.full(dim, SearchBox.WIDTH / 2), 1.0, options)
+        self._search = evolution(
+            2 * len(self._space), seed=settings.seed, budget=settings.budget, population=settings.population,
+            tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
+        )  # fmt: skip
         self._asked: list[np.ndarray] | None = None
         self._best = -np.inf
         self._best_phi: np.ndarray | None = None
@@ -89,18 +108,7 @@ class CMAOptimizer(LikelihoodOptimizer):
     @property
     def stop_reason(self) -> str | None:
         """Pycma's termination conditions, in words."""
-        met = self._search.stop()
-        if not met:
-            return None
-        words = {
-            "maxfevals": f"the budget of {self._settings.budget} evaluations is spent",
-            "tolfun": "the likelihood no longer differs within a generation",
-            "tolfunhist": "the best likelihood no longer changes",
-            "tolx": "the search distribution has shrunk to a point",
-            "tolstagnation": "the likelihood has not improved for long",
-            "tolflatfitness": "the likelihood is flat",
-        }
-        return "; ".join(words.get(k, f"pycma stopped: {k}") for k in met)
+        return why_stopped(self._search, f"{self._settings.budget} evaluations", "likelihood")
 
     @property
     def progress(self) -> Progress:

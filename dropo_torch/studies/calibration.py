@@ -133,11 +133,6 @@ def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: in
     )
 
 
-def with_seed(problem: Problem, seed: int) -> Problem:
-    """Return the problem whose fit draws other random numbers, so that fits of several logs are independent."""
-    return replace(problem, config=problem.config.model_copy(update={"seed": seed}))
-
-
 def draw_truths(problem: Problem, kind: Kind, seed: int) -> np.ndarray:
     """Return parameters of each transition of a log, in coordinates, ``(T, d)``."""
     box, generator = SearchBox.of(problem.space), np.random.default_rng([seed, 23])
@@ -156,18 +151,16 @@ def interval(found: Fit, level: float) -> tuple[np.ndarray, np.ndarray]:
     Of a mixture it is the mixture's own, of a Laplace posterior the normal's, of all others that of the
     distribution which draws follow.
     """
-    distribution = found.distribution
+    distribution, tails = found.distribution, (0.5 - level / 2, 0.5 + level / 2)
     if "mixture" in found.extras:
         draws = Mixture.of(found.extras["mixture"]).sample(_DRAWS, seed=0)
-        low, high = np.quantile(draws, [0.5 - level / 2, 0.5 + level / 2], axis=0)
-        return to_values(low, distribution.is_log), to_values(high, distribution.is_log)
-    if found.method == "laplace":
-        reach = float(scipy.special.ndtri(0.5 + level / 2)) * distribution.std
-        ends = (distribution.mean - reach, distribution.mean + reach)
-        return to_values(ends[0], distribution.is_log), to_values(ends[1], distribution.is_log)
-    tails = torch.tensor([0.5 - level / 2, 0.5 + level / 2], dtype=torch.float64)
-    alone = replace(distribution, correlation=None)
-    low, high = alone.rsample(tails[:, None].expand(2, len(distribution))).numpy()
+        low, high = to_values(np.quantile(draws, tails, axis=0), distribution.is_log)
+    elif found.method == "laplace":
+        reach = float(scipy.special.ndtri(tails[1])) * distribution.std
+        low, high = to_values(distribution.mean + np.array([-reach, reach]), distribution.is_log)
+    else:
+        uniforms = torch.tensor(tails, dtype=torch.float64)[:, None].expand(2, len(distribution))
+        low, high = replace(distribution, correlation=None).rsample(uniforms).numpy()
     return low, high
 
 
@@ -182,7 +175,8 @@ def calibrate(cell: CalibrationCell, problem: Problem, *, noise: np.ndarray) -> 
     space, box = problem.space, SearchBox.of(problem.space)
     truths = draw_truths(problem, cell.kind, cell.log)
     values = to_values(truths, space.is_log)
-    fitted = fit_problem(with_seed(synthesise(problem, values, noise, seed=cell.log), cell.log))
+    config = problem.config.model_copy(update={"seed": cell.log})  # fits of several logs are independent
+    fitted = fit_problem(replace(synthesise(problem, values, noise, seed=cell.log), config=config))
     inside, width = {}, {}
     for level in LEVELS:
         low, high = interval(fitted, level)

@@ -77,9 +77,7 @@ class Comparison:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``compare.json``."""
-        return {"schema": SCHEMA, "reference": self.reference, "reference_is": self.reference_is} | {
-            "runs": [asdict(run) for run in self.runs]
-        }
+        return {"schema": SCHEMA} | asdict(self)
 
 
 def compare(
@@ -131,24 +129,19 @@ def _record(method: str, seed: int, fit: Fit, objective: Objective) -> dict[str,
     picked = np.unique(np.geomspace(1, len(history), min(CURVE_POINTS, len(history))).astype(int)) - 1
     uniforms = draw_uniforms(fit.samples, len(fit.distribution), fit.seed, 0)
     likelihood = {}
-    for i in picked:
-        initial = objective.initial_noise(history[i].mean)
-        std = np.maximum(history[i].std, objective.box.min_std)
-        found = objective.evaluate(history[i].mean[None], std[None], uniforms, initial)[0]
-        likelihood[int(i)] = found.log_likelihood
+    for i in picked.tolist():
+        mean, std = history[i].mean, np.maximum(history[i].std, objective.box.min_std)
+        found = objective.evaluate(mean[None], std[None], uniforms, objective.initial_noise(mean))[0]
+        likelihood[str(i)] = found.log_likelihood
     summary = fit.distribution.summary()
     centers = [type(fit.distribution).over(objective.simulator.parameters, h.mean, h.std).center for h in history]
     return {
         "method": method,
         "seed": seed,
-        "log_likelihood": fit.log_likelihood,
-        "simulated_transitions": fit.simulated_transitions,
-        "seconds": fit.seconds,
-        "stop_reason": fit.stop_reason,
-        "mean": {n: e["mean"] for n, e in summary.items()},
-        "std": {n: e["std"] for n, e in summary.items()},
+        **{key: getattr(fit, key) for key in ("log_likelihood", "simulated_transitions", "seconds", "stop_reason")},
+        **{key: {n: e[key] for n, e in summary.items()} for key in ("mean", "std")},
         "history": [[h.simulated_transitions, h.seconds, *c.tolist()] for h, c in zip(history, centers, strict=True)],
-        "likelihood": {str(i): v for i, v in likelihood.items()},
+        "likelihood": likelihood,
     }
 
 
@@ -157,18 +150,13 @@ def _judge(raw: dict[str, Any], reference: dict[str, float]) -> Run:
     values = np.array([reference[name] for name in raw["mean"]])
     history = np.array(raw["history"])
     error = np.max(np.abs(history[:, 2:] - values) / np.maximum(np.abs(values), 1e-12), axis=1)
-    curve = tuple(
-        CurvePoint(int(history[int(i), 0]), float(history[int(i), 1]), value, float(error[int(i)]))
-        for i, value in raw["likelihood"].items()
-    )
+
+    def reached(limit: float) -> int | None:
+        """Simulated transitions from which the error stays within a limit."""
+        first = np.flatnonzero(np.append(True, error > limit))[-1]
+        return int(history[first, 0]) if first < len(history) else None
+
+    points = ((int(i), value) for i, value in raw["likelihood"].items())
+    curve = tuple(CurvePoint(int(history[i, 0]), float(history[i, 1]), value, float(error[i])) for i, value in points)
     plain = {k: v for k, v in raw.items() if k not in ("history", "likelihood")}
-    return Run(
-        **plain, to_percent=_reached(history, error, 1e-2), to_permille=_reached(history, error, 1e-3), curve=curve
-    )
-
-
-def _reached(history: np.ndarray, error: np.ndarray, limit: float) -> int | None:
-    """Simulated transitions from which the error stays within a limit."""
-    outside = np.flatnonzero(error > limit)
-    first = outside[-1] + 1 if outside.size else 0
-    return int(history[first, 0]) if first < len(history) else None
+    return Run(**plain, to_percent=reached(1e-2), to_permille=reached(1e-3), curve=curve)

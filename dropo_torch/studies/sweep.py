@@ -52,14 +52,8 @@ class SweepPoint:
     def of(cls, epsilon: float, fit: Fit, robust_log_likelihood: float | None = None) -> SweepPoint:
         """Return what a sweep keeps of a fit."""
         summary = fit.distribution.summary()
-        return cls(
-            epsilon=epsilon,
-            mse=fit.mse,
-            log_likelihood=fit.log_likelihood,
-            mean={name: entry["mean"] for name, entry in summary.items()},
-            std={name: entry["std"] for name, entry in summary.items()},
-            robust_log_likelihood=robust_log_likelihood,
-        )
+        mean, std = ({name: entry[key] for name, entry in summary.items()} for key in ("mean", "std"))
+        return cls(epsilon, fit.mse, fit.log_likelihood, mean, std, robust_log_likelihood)
 
 
 @dataclass(frozen=True)
@@ -80,13 +74,7 @@ class Sweep:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``sweep.json``."""
-        return {
-            "schema": SCHEMA,
-            "noisy_starts": self.noisy_starts,
-            "chosen": self.chosen,
-            "reason": self.reason,
-            "points": [asdict(p) for p in self.points],
-        }
+        return {"schema": SCHEMA} | asdict(self)
 
 
 def elbow(epsilons: Sequence[float], errors: Sequence[float]) -> tuple[float, str]:

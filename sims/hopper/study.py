@@ -17,11 +17,11 @@ import numpy as np
 import torch
 
 from dropo_torch.baselines import fit_problem
-from dropo_torch.baselines.density import require_sbi
 from dropo_torch.config import make_config
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.studies.study import run_cells
 from dropo_torch.studies.sweep import NEGLIGIBLE, robust_log_likelihood
+from dropo_torch.support.extras import require
 
 from . import LINKS, SIM
 from .record import NOISE_VARIANCE, HopperLog, record
@@ -149,7 +149,7 @@ def run_study(
     Raises:
         InputError: a folder with another study, or with one that is not to be resumed; ``sbi`` is not installed.
     """
-    require_sbi()
+    require("baselines", "method: bayessim")
     plan = plan or (REDUCED if reduced else Plan())
     run = functools.partial(run_cell, plan=plan, logs=out / "logs")
     results = run_cells(out, plan, all_cells(plan), run, resume=resume, workers=workers, report=report)
