@@ -21,10 +21,8 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.commands import Commands
-from dropo_torch.rl.mujoco_stepper import MujocoStepper
-from dropo_torch.rl.sensors import Sensors
 from dropo_torch.simulators.mujoco import MujocoSimulator
+from dropo_torch.support.extras import MissingExtra
 from dropo_torch.testing.laws import Broken, NotApplicable, Report, require, require_same, try_laws
 
 #: Two links in a chain, a free ball on a floor and a cart on a rail: places for every kind of effect.
@@ -210,6 +208,12 @@ class EffectCase:
 
     def trained(self, target: str | None, values: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """What the environments of a training show at first ``(W, nq + nv)``, and then ``(W, T, nq + nv)``."""
+        try:
+            from dropo_torch.rl.commands import Commands
+            from dropo_torch.rl.mujoco_stepper import MujocoStepper
+            from dropo_torch.rl.sensors import Sensors
+        except MissingExtra as error:
+            raise NotApplicable(str(error)) from None
         effects, space, rows = self.placed(target, values), ParameterSpace.empty(self.setting.model), torch.arange(3)
         none = np.zeros((_WINDOWS, 0))
         stepper = MujocoStepper(space, _WINDOWS, frame_skip=self.setting.frame_skip, effects=effects, num_threads=1)
