@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy.optimize
 
 from dropo_torch.optimizers.least_squares import bounded_step, damped_step
 
@@ -64,3 +65,13 @@ def test_an_entry_at_its_bound_does_not_lead_the_others_astray() -> None:
     assert damped_step(normal, force, np.ones(2, bool), 0.0)[0] < 0
     step = bounded_step(normal, force, np.array([0.0, -9.0]), np.array([9.0, 9.0]), 0.0)
     np.testing.assert_allclose(step, [0.0, 1.0])
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_step_from_bounds_is_the_best_that_leaves_none(seed: int) -> None:
+    """With every entry at its lower bound, that is non-negative least squares."""
+    normal, force = problem(seed, size=5)
+    step = bounded_step(normal, force, np.zeros(5), np.full(5, np.inf), 0.1)
+    factor = np.linalg.cholesky(normal + 0.1 * np.diag(np.diag(normal)))
+    expected, _ = scipy.optimize.nnls(factor.T, np.linalg.solve(factor, force))
+    np.testing.assert_allclose(step, expected, atol=1e-10)

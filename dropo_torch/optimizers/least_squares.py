@@ -6,6 +6,8 @@ import numpy as np
 
 #: What a diagonal entry of 0 counts as, relative to the largest: a column without influence stays solvable.
 FLOOR = 1e-12
+#: Most changes of the active set, for each entry: rounding could change one for ever.
+PIVOTS = 10
 
 
 def damped_step(
@@ -43,23 +45,27 @@ def bounded_step(
     normal: np.ndarray, force: np.ndarray, low: np.ndarray, high: np.ndarray, damping: float, ridge: float = 0.0,
     units: np.ndarray | None = None,
 ) -> np.ndarray:  # fmt: skip
-    """Return :func:`damped_step` with an active set: what would leave its bounds from a bound stays there.
+    """Return the damped step that carries nothing out of its bounds which sits at one.
 
-    At a bound, entries whose force points out are held, and so are those that the step of all free entries together
-    would carry out; the others are then solved anew. The step is zero only where the bounded minimum is. An entry
-    inside its bounds may step beyond them: the caller clips, and it is at the bound in the next iteration.
+    Of all such steps the best: what is held at a bound is pressed against it by what the others leave of its force
+    (principal pivoting, from all entries free). So the step is zero only where the bounded minimum is. An entry inside
+    its bounds may step beyond them: the caller clips, and it is at the bound in the next iteration.
 
     Args:
         normal, force, damping, ridge, units: of :func:`damped_step`.
         low, high: the smallest and the largest move within bounds, ``(q,)`` each; ``low <= 0 <= high``.
     """
-    free = ~_leaves(force, low, high)
-    while True:
+    free = np.ones(len(force), dtype=bool)
+    step = damped_step(normal, force, free, damping, ridge, units)
+    for _ in range(PIVOTS * len(force)):
+        left = force - normal @ step
+        inwards = ~_leaves(left, low, high) & (left != 0)
+        wrong = np.flatnonzero(np.where(free, _leaves(step, low, high), inwards))
+        if not wrong.size:
+            break
+        free[wrong[-1]] ^= True
         step = damped_step(normal, force, free, damping, ridge, units)
-        stuck = free & _leaves(step, low, high)
-        if not stuck.any():
-            return step
-        free &= ~stuck
+    return step
 
 
 def _leaves(direction: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
