@@ -196,14 +196,7 @@ def signal_delays(recording: Recording, options: Preprocess) -> dict[str, float]
     for name in resolve_names(options.align, names, f"{recording.source}: preprocess: align"):
         if name in delays:
             raise InputError(f"{recording.source}: preprocess: {name} stands in both align and delays; leave one out")
-        found = [
-            estimate_delay(
-                *_common_grid(part, options.reference, name),
-                max_delay=options.max_delay,
-                source=f"{recording.source}: {name} and {options.reference}",
-            )
-            for part in recording.split()
-        ]
+        found = [_lag(part, options.reference, name, options.max_delay) for part in recording.split()]
         delays[name] = known + float(np.median(found))
     return delays
 
@@ -244,14 +237,15 @@ def estimate_delay(
     return float((peak - most + 0.5 * (left - right) / (left - 2 * top + right)) * dt)
 
 
-def _common_grid(part: Recording, reference: str, name: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Two signals on one even grid at the faster one's sampling interval, and that interval."""
+def _lag(part: Recording, reference: str, name: str, max_delay: float) -> float:
+    """Seconds by which a signal lags behind another, both on one even grid at the faster one's sampling interval."""
     first, second = (_samples(part, label) for label in (reference, name))
     dt = float(min(np.median(np.diff(s.time)) for s in (first, second)))
     low, high = max(first.time[0], second.time[0]), min(first.time[-1], second.time[-1])
     grid = low + dt * np.arange(int((high - low) / dt + _EDGE) + 1)
     grid = grid[grid <= high]
-    return first.spline(grid), second.spline(grid), dt
+    source = f"{part.source}: {name} and {reference}"
+    return estimate_delay(first.spline(grid), second.spline(grid), dt, max_delay=max_delay, source=source)
 
 
 def _samples(part: Recording, name: str, delay: float = 0.0) -> _Samples:

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.data.formats import missing_file, open_tables
-from dropo_torch.data.minari import PREFIX, is_minari, read_minari
+from dropo_torch.data.minari import PREFIX, read_minari
 from dropo_torch.data.preprocess import Preprocess, preprocess
 from dropo_torch.data.recording import TOLERANCE, Recording
 from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
@@ -167,7 +167,7 @@ def _paths(source: str | Path, base: Path) -> list[Path]:
 
 def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
     for folder in (path, path / "data"):
-        if is_minari(folder):
+        if (folder / "metadata.json").exists():
             return [_read_minari(folder, options)]
     if not path.exists() and not path.suffix and "-v" in path.name:
         raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
