@@ -273,7 +273,7 @@ class _Episode:
             "positions", [n for n in names if n not in velocities] if given is None else given, names
         )
         quaternions = [self._resolve("quaternions", group, positions) for group in self.options.quaternions]
-        signals = {name: self._samples(name) for name in positions + velocities}
+        signals = {name: _samples(self.part, name, self.delays.get(name, 0.0)) for name in positions + velocities}
         for group in quaternions:
             signals |= self._continuous(group, signals)
         for name, samples in signals.items():
@@ -302,9 +302,6 @@ class _Episode:
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
         return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")
-
-    def _samples(self, name: str) -> _Samples:
-        return _samples(self.part, name, self.delays.get(name, 0.0))
 
     def _continuous(self, group: Sequence[str], signals: Mapping[str, _Samples]) -> dict[str, _Samples]:
         """The four components with signs by which no sample lies opposite to the one before it."""
@@ -359,9 +356,8 @@ class _Episode:
         trim = 1 / options.cutoff if options.cutoff is not None and options.trim is None else options.trim or 0.0
         early = [self.delays.get(name, 0.0) for name in self.part.action_names]
         low = max([s.time[0] + trim for s in signals] + [-delay for delay in early] + [options.start or 0.0])
-        high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early])
-        if options.stop is not None:
-            high = min(high, options.stop)
+        stop = np.inf if options.stop is None else options.stop
+        high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early] + [stop])
         steps = int(np.floor((high - low) / options.dt + _EDGE)) if high > low else 0
         if steps < 1:
             raise InputError(
@@ -372,7 +368,7 @@ class _Episode:
 
     def _commands(self, name: str, begin: np.ndarray) -> np.ndarray:
         """A command in the steps that begin at the given times, ``(T,)``: in force then, or the mean of each step."""
-        samples, dt = self._samples(name), self.options.dt
+        samples, dt = _samples(self.part, name, self.delays.get(name, 0.0)), self.options.dt
         if samples.time[0] > begin[0] + _EDGE * dt:
             raise InputError(
                 f"{self.part.source}: {name} has no sample before {samples.time[0]:.6g} s; use start from there on"
