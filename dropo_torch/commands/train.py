@@ -48,9 +48,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     continued = given.resume and checkpoint.exists()
     path = problem.distribution_path
     if path is not None and not continued and path.resolve().parent == out.resolve():
-        raise InputError(
-            f"--out: {drawn} is the distribution of this run and would be moved aside; name another folder"
-        )
+        raise InputError(f"--out: {path} is the distribution of this run and would be moved aside; name another folder")
     check_training(problem)  # before an earlier run is moved aside
     prepare_folder(out, problem.model_path, resume=continued)
     curves = None if given.log is None else _Curves(out / "tensorboard", problem.settings.steps)
