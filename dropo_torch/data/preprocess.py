@@ -167,11 +167,9 @@ def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
             f"log's actions are {', '.join(recording.action_names)}; leave one of both out"
         )
     if options.max_gap is None:
-        for values, names in (
-            (recording.observations, recording.observation_names),
-            (recording.actions, recording.action_names),
-        ):
-            check_values(values, names, f"{recording.source}: preprocess without max_gap")
+        where = f"{recording.source}: preprocess without max_gap"
+        check_values(recording.observations, recording.observation_names, where)
+        check_values(recording.actions, recording.action_names, where)
     delays = signal_delays(recording, options)
     logs = [
         _Episode(replace(part, source=f"{recording.source}: episode {i}"), options, delays).transitions()

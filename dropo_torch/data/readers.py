@@ -189,12 +189,9 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
     if following is None:
         return rows.trajectories(tolerance=options.tolerance)
     next_observations, next_names = table.matrix(following, "next_observations", len(rows))
-    for what, values, names in (
-        ("observations", rows.observations, rows.observation_names),
-        ("next_observations", next_observations, next_names),
-        ("actions", rows.actions, rows.action_names),
-    ):
-        check_values(values, names, f"{rows.source}: {what}")
+    check_values(rows.observations, rows.observation_names, f"{rows.source}: observations")
+    check_values(next_observations, next_names, f"{rows.source}: next_observations")
+    check_values(rows.actions, rows.action_names, f"{rows.source}: actions")
     return Trajectories(
         observations=rows.observations,
         next_observations=next_observations,
