@@ -66,11 +66,6 @@ class ReadOptions:
         elif self.preprocess is not None and not isinstance(self.preprocess, Preprocess):
             raise InputError(f"data: preprocess is {self.preprocess!r}; expected options such as dt and cutoff")
 
-    def updated(self, mapping: Mapping[str, Any]) -> ReadOptions:
-        """Return these options with those of a config's mapping in their place."""
-        check_keys(mapping, [field.name for field in fields(self)], "data")
-        return replace(self, **mapping)
-
 
 def read_trajectories(
     source: Source,
@@ -144,7 +139,8 @@ def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories
         if "path" not in source:
             raise InputError(f"data: there is no key 'path'{choices('path', source)}")
         rest = {key: value for key, value in source.items() if key != "path"}
-        return _read(source["path"], options.updated(rest), base)
+        check_keys(rest, [field.name for field in fields(ReadOptions)], "data")
+        return _read(source["path"], replace(options, **rest), base)
     if isinstance(source, str) and source.startswith(PREFIX):
         return [_read_minari(source.removeprefix(PREFIX), options)]
     if isinstance(source, str | Path):
