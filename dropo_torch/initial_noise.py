@@ -11,7 +11,7 @@ import torch
 from dropo_torch.distribution import SearchBox
 from dropo_torch.evaluator import Evaluator
 from dropo_torch.likelihood import propagate
-from dropo_torch.support.random import draw_normals
+from dropo_torch.support.random import draw_uniforms
 from dropo_torch.support.threads import single_thread
 
 #: Antithetic pairs of draws per noisy column, and their seed.
@@ -80,7 +80,7 @@ def propagate_noise(
     std = None if std is None else np.array(std, dtype=np.float64)
     values = torch.from_numpy(box.values(mean))[None]
     columns = torch.nonzero(noise)[:, 0].tolist()
-    half = draw_normals(NOISE_DRAWS * len(columns), len(columns), NOISE_SEED)
+    half = torch.special.ndtri(draw_uniforms(NOISE_DRAWS * len(columns), len(columns), NOISE_SEED))
     draws = torch.cat([torch.zeros(1, len(columns), dtype=torch.float64), half, -half])
     parts = []
     with single_thread():

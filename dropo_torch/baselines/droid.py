@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from typing import Any
 
 import numpy as np
@@ -11,8 +10,8 @@ import torch
 from dropo_torch.baselines.settings import DroidSettings
 from dropo_torch.distribution import Distribution, SearchBox
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers.base import Optimizer, Progress, Request
-from dropo_torch.optimizers.cma import evolution, why_stopped
+from dropo_torch.optimizers.base import Progress, Request
+from dropo_torch.optimizers.cma import Evolution, evolution, why_stopped
 from dropo_torch.parameters import ParameterSpace
 
 #: Squared error that a diverged transition counts as, per column.
@@ -25,7 +24,7 @@ def squared_errors(features: torch.Tensor, measured: torch.Tensor, covariance: t
     return torch.nan_to_num(error, nan=_LOST).sum((0, 2))
 
 
-class DroidOptimizer(Optimizer):
+class DroidOptimizer(Evolution):
     """CMA-ES over parameter vectors, scaled to [0, 4], first step 1, start in the middle.
 
     Each logged transition (window of λ steps) is replayed from its logged state; the error is the squared L2 distance
@@ -40,7 +39,6 @@ class DroidOptimizer(Optimizer):
 
     name = "cma"
     method = "droid"
-    STATE = ("_asked", "_best")
 
     def __init__(self, objective: Objective, *, settings: DroidSettings, seed: int) -> None:
         self._space, self._box, self._settings = objective.simulator.parameters, objective.box, settings
@@ -49,14 +47,11 @@ class DroidOptimizer(Optimizer):
             seed=seed, budget=settings.budget, population=settings.population,
             tolerances={"tolfun": 1e-12, "tolfunhist": 1e-13},
         )  # fmt: skip
-        self._asked: list[np.ndarray] | None = None
         self._best = np.inf
 
     def ask(self) -> Request:
         """Return a generation, ``(population, d)``."""
-        if self._asked is None:
-            self._asked = self._search.ask()
-        points = self._coordinates(np.array(self._asked))
+        points = self._coordinates(self._generation())
         return Request(values=self._box.values(points), reduce=squared_errors, evaluations=len(points))
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
@@ -93,14 +88,6 @@ class DroidOptimizer(Optimizer):
     def extras(self) -> dict[str, Any]:
         """Return the best squared error, summed over the log."""
         return {"squared_error": self._best}
-
-    def state(self) -> dict[str, Any]:
-        """Return pycma's own pickle and what stands beside it."""
-        return super().state() | {"_search": self._search.pickle_dumps()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        super().restore(state | {"_search": pickle.loads(state["_search"])})
 
     def _coordinates(self, points: np.ndarray) -> np.ndarray:
         """Parameter vectors in coordinates of points in [0, 4], ``(P, d)``."""

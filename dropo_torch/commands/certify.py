@@ -37,6 +37,6 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         table.add_row(p.name, f"{p.magnitude:.3g}", *errors, p.verdict)
     console.print(table)
     console.print(
-        f"{found.transitions} transitions; next states differ from MuJoCo's by at most {found.state_error:.1e}",
+        f"{found.transitions} transitions; next states differ from MuJoCo's by at most {found.state_error:.1e}"
     )
     found.check()

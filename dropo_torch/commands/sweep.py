@@ -43,13 +43,14 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     from dropo_torch.studies import sweep as study
 
     config, out, noisy_starts = load_config(given.config, overrides), given.out, given.noisy_starts
-    _check(config, noisy_starts)
+    only_dropo(config, "sweep-epsilon chooses the ε of DROPO")
+    if noisy_starts and config.noise is not None:
+        raise InputError(f"noise: {config.noise} given, which --noisy-starts is to find; leave one of them out")
+    if noisy_starts and isinstance(config.epsilon, list):
+        raise InputError(f"epsilon: {config.epsilon} given, but --noisy-starts tries one for all columns; leave it out")
     problem = make_problem(config)
     store = out / "sweep-progress.json"
-    if given.epsilons is None:
-        values = study.default_epsilons(problem.objective.measured.numpy())
-    else:
-        values = study.rising(given.epsilons)
+    values = study.rising(given.epsilons or study.default_epsilons(problem.objective.measured.numpy()))
     continued = given.resume and store.exists()
     if not continued:
         refuse_dead_parameters(problem.objective)  # before an earlier run is moved aside
@@ -80,14 +81,6 @@ def only_dropo(config: Config, what: str) -> None:
     """Raise an :class:`InputError` for a config with another method."""
     if config.method != "dropo":
         raise InputError(f"method: {config.method} given, but {what}; leave method and method_options out")
-
-
-def _check(config: Config, noisy_starts: bool) -> None:
-    only_dropo(config, "sweep-epsilon chooses the ε of DROPO")
-    if noisy_starts and config.noise is not None:
-        raise InputError(f"noise: {config.noise} given, which --noisy-starts is to find; leave one of them out")
-    if noisy_starts and isinstance(config.epsilon, list):
-        raise InputError(f"epsilon: {config.epsilon} given, but --noisy-starts tries one for all columns; leave it out")
 
 
 def _show(sweep: Sweep, chosen: Mapping[str, Any], names: Sequence[str], console: Console) -> None:

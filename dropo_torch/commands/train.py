@@ -46,7 +46,9 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     problem = make_training(load_config(given.config, overrides))
     checkpoint = out / "train-progress.pt"
     continued = given.resume and checkpoint.exists()
-    _keep_distribution(problem, out, continued)
+    path = problem.distribution_path
+    if path is not None and not continued and path.resolve().parent == out.resolve():
+        raise InputError(f"--out: {path} is the distribution of this run and would be moved aside; name another folder")
     check_training(problem)  # before an earlier run is moved aside
     prepare_folder(out, problem.model_path, resume=continued)
     curves = None if given.log is None else _Curves(out / "tensorboard", problem.settings.steps)
@@ -63,13 +65,6 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         )  # fmt: skip
     _write(problem, result, out)
     _show(result, out, console)
-
-
-def _keep_distribution(problem: TrainingProblem, out: Path, continued: bool) -> None:
-    """Refuse a folder whose earlier results, which would be moved aside, hold the distribution of this run."""
-    path = problem.distribution_path
-    if path is not None and not continued and path.resolve().parent == out.resolve():
-        raise InputError(f"--out: {path} is the distribution of this run and would be moved aside; name another folder")
 
 
 def _write(problem: TrainingProblem, result: Training, out: Path) -> None:

@@ -16,11 +16,6 @@ from dropo_torch.support.given import reading
 PREFIX = "minari:"
 
 
-def is_minari(folder: Path) -> bool:
-    """Whether a folder holds a dataset's data."""
-    return (folder / "metadata.json").exists()
-
-
 def read_minari(
     dataset: str | Path, *, observations: ColumnMap | None, actions: ColumnMap | None, dt: float | None
 ) -> Trajectories:

@@ -167,11 +167,9 @@ def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
             f"log's actions are {', '.join(recording.action_names)}; leave one of both out"
         )
     if options.max_gap is None:
-        for values, names in (
-            (recording.observations, recording.observation_names),
-            (recording.actions, recording.action_names),
-        ):
-            check_values(values, names, f"{recording.source}: preprocess without max_gap")
+        where = f"{recording.source}: preprocess without max_gap"
+        check_values(recording.observations, recording.observation_names, where)
+        check_values(recording.actions, recording.action_names, where)
     delays = signal_delays(recording, options)
     logs = [
         _Episode(replace(part, source=f"{recording.source}: episode {i}"), options, delays).transitions()
@@ -196,14 +194,7 @@ def signal_delays(recording: Recording, options: Preprocess) -> dict[str, float]
     for name in resolve_names(options.align, names, f"{recording.source}: preprocess: align"):
         if name in delays:
             raise InputError(f"{recording.source}: preprocess: {name} stands in both align and delays; leave one out")
-        found = [
-            estimate_delay(
-                *_common_grid(part, options.reference, name),
-                max_delay=options.max_delay,
-                source=f"{recording.source}: {name} and {options.reference}",
-            )
-            for part in recording.split()
-        ]
+        found = [_lag(part, options.reference, name, options.max_delay) for part in recording.split()]
         delays[name] = known + float(np.median(found))
     return delays
 
@@ -244,14 +235,15 @@ def estimate_delay(
     return float((peak - most + 0.5 * (left - right) / (left - 2 * top + right)) * dt)
 
 
-def _common_grid(part: Recording, reference: str, name: str) -> tuple[np.ndarray, np.ndarray, float]:
-    """Two signals on one even grid at the faster one's sampling interval, and that interval."""
+def _lag(part: Recording, reference: str, name: str, max_delay: float) -> float:
+    """Seconds by which a signal lags behind another, both on one even grid at the faster one's sampling interval."""
     first, second = (_samples(part, label) for label in (reference, name))
     dt = float(min(np.median(np.diff(s.time)) for s in (first, second)))
     low, high = max(first.time[0], second.time[0]), min(first.time[-1], second.time[-1])
     grid = low + dt * np.arange(int((high - low) / dt + _EDGE) + 1)
     grid = grid[grid <= high]
-    return first.spline(grid), second.spline(grid), dt
+    source = f"{part.source}: {name} and {reference}"
+    return estimate_delay(first.spline(grid), second.spline(grid), dt, max_delay=max_delay, source=source)
 
 
 def _samples(part: Recording, name: str, delay: float = 0.0) -> _Samples:
@@ -279,7 +271,7 @@ class _Episode:
             "positions", [n for n in names if n not in velocities] if given is None else given, names
         )
         quaternions = [self._resolve("quaternions", group, positions) for group in self.options.quaternions]
-        signals = {name: self._samples(name) for name in positions + velocities}
+        signals = {name: _samples(self.part, name, self.delays.get(name, 0.0)) for name in positions + velocities}
         for group in quaternions:
             signals |= self._continuous(group, signals)
         for name, samples in signals.items():
@@ -308,9 +300,6 @@ class _Episode:
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
         return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")
-
-    def _samples(self, name: str) -> _Samples:
-        return _samples(self.part, name, self.delays.get(name, 0.0))
 
     def _continuous(self, group: Sequence[str], signals: Mapping[str, _Samples]) -> dict[str, _Samples]:
         """The four components with signs by which no sample lies opposite to the one before it."""
@@ -365,9 +354,8 @@ class _Episode:
         trim = 1 / options.cutoff if options.cutoff is not None and options.trim is None else options.trim or 0.0
         early = [self.delays.get(name, 0.0) for name in self.part.action_names]
         low = max([s.time[0] + trim for s in signals] + [-delay for delay in early] + [options.start or 0.0])
-        high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early])
-        if options.stop is not None:
-            high = min(high, options.stop)
+        stop = np.inf if options.stop is None else options.stop
+        high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early] + [stop])
         steps = int(np.floor((high - low) / options.dt + _EDGE)) if high > low else 0
         if steps < 1:
             raise InputError(
@@ -378,7 +366,7 @@ class _Episode:
 
     def _commands(self, name: str, begin: np.ndarray) -> np.ndarray:
         """A command in the steps that begin at the given times, ``(T,)``: in force then, or the mean of each step."""
-        samples, dt = self._samples(name), self.options.dt
+        samples, dt = _samples(self.part, name, self.delays.get(name, 0.0)), self.options.dt
         if samples.time[0] > begin[0] + _EDGE * dt:
             raise InputError(
                 f"{self.part.source}: {name} has no sample before {samples.time[0]:.6g} s; use start from there on"

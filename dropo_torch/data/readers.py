@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.data.formats import missing_file, open_tables
-from dropo_torch.data.minari import PREFIX, is_minari, read_minari
+from dropo_torch.data.minari import PREFIX, read_minari
 from dropo_torch.data.preprocess import Preprocess, preprocess
 from dropo_torch.data.recording import TOLERANCE, Recording
 from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
@@ -65,11 +65,6 @@ class ReadOptions:
             object.__setattr__(self, "preprocess", Preprocess.from_mapping(self.preprocess))
         elif self.preprocess is not None and not isinstance(self.preprocess, Preprocess):
             raise InputError(f"data: preprocess is {self.preprocess!r}; expected options such as dt and cutoff")
-
-    def updated(self, mapping: Mapping[str, Any]) -> ReadOptions:
-        """Return these options with those of a config's mapping in their place."""
-        check_keys(mapping, [field.name for field in fields(self)], "data")
-        return replace(self, **mapping)
 
 
 def read_trajectories(
@@ -144,7 +139,8 @@ def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories
         if "path" not in source:
             raise InputError(f"data: there is no key 'path'{choices('path', source)}")
         rest = {key: value for key, value in source.items() if key != "path"}
-        return _read(source["path"], options.updated(rest), base)
+        check_keys(rest, [field.name for field in fields(ReadOptions)], "data")
+        return _read(source["path"], replace(options, **rest), base)
     if isinstance(source, str) and source.startswith(PREFIX):
         return [_read_minari(source.removeprefix(PREFIX), options)]
     if isinstance(source, str | Path):
@@ -167,7 +163,7 @@ def _paths(source: str | Path, base: Path) -> list[Path]:
 
 def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
     for folder in (path, path / "data"):
-        if is_minari(folder):
+        if (folder / "metadata.json").exists():
             return [_read_minari(folder, options)]
     if not path.exists() and not path.suffix and "-v" in path.name:
         raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
@@ -189,12 +185,9 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
     if following is None:
         return rows.trajectories(tolerance=options.tolerance)
     next_observations, next_names = table.matrix(following, "next_observations", len(rows))
-    for what, values, names in (
-        ("observations", rows.observations, rows.observation_names),
-        ("next_observations", next_observations, next_names),
-        ("actions", rows.actions, rows.action_names),
-    ):
-        check_values(values, names, f"{rows.source}: {what}")
+    check_values(rows.observations, rows.observation_names, f"{rows.source}: observations")
+    check_values(next_observations, next_names, f"{rows.source}: next_observations")
+    check_values(rows.actions, rows.action_names, f"{rows.source}: actions")
     return Trajectories(
         observations=rows.observations,
         next_observations=next_observations,

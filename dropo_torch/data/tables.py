@@ -117,7 +117,9 @@ class Table:
         width = values.shape[1]
         labels = column_names(signal.name or name, width)
         if index is not None:
-            picked = np.arange(width)[index] if _inside(index, width) else np.empty(0, dtype=np.int64)
+            low, high = index.start or 0, width if index.stop is None else index.stop
+            inside = -width <= low < width and -width <= high <= width
+            picked = np.arange(width)[index if inside else slice(0)]
             if picked.size == 0:
                 raise InputError(f"{self.source}: {what}: {signal.signal} is outside {name}, which has {width} columns")
             values, labels = values[:, picked], [labels[i] for i in picked]
@@ -220,10 +222,3 @@ def _parse_signal(entry: Mapping[str, Any], where: str) -> Signal:
         if not isinstance(scale, str) or not scale:  # text that is no number names a variable
             raise
     return replace(signal, scale=scale, offset=number(signal.offset, f"{where}: offset"))
-
-
-def _inside(index: slice, width: int) -> bool:
-    """Whether the ends of a slice lie within ``width`` columns."""
-    low = 0 if index.start is None else index.start
-    high = width if index.stop is None else index.stop
-    return -width <= low < width and -width <= high <= width

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pickle
-from typing import Any
+from typing import Any, ClassVar
 
 import cma
 import numpy as np
@@ -11,7 +11,7 @@ import torch
 
 from dropo_torch.distribution import SearchBox
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers.base import LikelihoodOptimizer, Progress, Request
+from dropo_torch.optimizers.base import LikelihoodOptimizer, Optimizer, Progress, Request
 from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.support.random import draw_uniforms
 
@@ -58,7 +58,29 @@ def why_stopped(search: cma.CMAEvolutionStrategy, budget: str, value: str) -> st
     return "; ".join(words.get(k, f"pycma stopped: {k}") for k in search.stop()) or None
 
 
-class CMAOptimizer(LikelihoodOptimizer):
+class Evolution(Optimizer):
+    """A search by pycma: a generation stands until it was told, and the state holds pycma's own pickle."""
+
+    STATE: ClassVar[tuple[str, ...]] = ("_asked", "_best")
+    _search: cma.CMAEvolutionStrategy
+    _asked: list[np.ndarray] | None = None
+
+    def state(self) -> dict[str, Any]:
+        """Return pycma's own pickle and what stands beside it."""
+        return super().state() | {"_search": self._search.pickle_dumps()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        super().restore(state | {"_search": pickle.loads(state["_search"])})
+
+    def _generation(self) -> np.ndarray:
+        """The points in [0, 4] to be told next, ``(population, dimensions)``."""
+        if self._asked is None:
+            self._asked = self._search.ask()
+        return np.array(self._asked)
+
+
+class CMAOptimizer(Evolution, LikelihoodOptimizer):
     """CMA-ES on the sampled objective: μ linear, σ logarithmic, all in [0, 4], step 1.
 
     Args:
@@ -67,7 +89,7 @@ class CMAOptimizer(LikelihoodOptimizer):
     """
 
     name = "cma"
-    STATE = ("_asked", "_best", "_best_phi")
+    STATE = (*Evolution.STATE, "_best_phi")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
@@ -75,15 +97,12 @@ class CMAOptimizer(LikelihoodOptimizer):
             2 * len(self._space), seed=settings.seed, budget=settings.budget, population=settings.population,
             tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
         )  # fmt: skip
-        self._asked: list[np.ndarray] | None = None
         self._best = -np.inf
         self._best_phi: np.ndarray | None = None
 
     def ask(self) -> Request:
         """Return the samples of a generation, ``(population · K, d)``."""
-        if self._asked is None:
-            self._asked = self._search.ask()
-        mean, std = self._box.denormalise(np.array(self._asked))
+        mean, std = self._box.denormalise(self._generation())
         settings = self._settings
         generation = 0 if settings.common_random_numbers else self._search.countiter
         uniforms = draw_uniforms(settings.samples, len(self._space), settings.seed, 1, generation)
@@ -122,14 +141,6 @@ class CMAOptimizer(LikelihoodOptimizer):
         if self._best_phi is not None:
             found.append(self._best_phi)
         return [self._box.denormalise(phi) for phi in found]
-
-    def state(self) -> dict[str, Any]:
-        """Return pycma's own pickle and what stands beside it."""
-        return super().state() | {"_search": self._search.pickle_dumps()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        super().restore(state | {"_search": pickle.loads(state["_search"])})
 
     def _center(self) -> np.ndarray:
         """Return μ of the search distribution, in coordinates."""

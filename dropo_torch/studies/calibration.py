@@ -61,7 +61,7 @@ class CalibrationCell:
 
 
 @dataclass(frozen=True)
-class CalibrationRun:
+class CalibrationRun(CalibrationCell):
     """One fit of one simulated log.
 
     Attributes:
@@ -71,9 +71,6 @@ class CalibrationRun:
         error: of the mean, as a share of the search box, name → share.
     """
 
-    kind: str
-    method: str
-    log: int
     inside: dict[str, dict[str, float]]
     width: dict[str, dict[str, float]]
     error: dict[str, float]
@@ -183,7 +180,7 @@ def calibrate(cell: CalibrationCell, problem: Problem, *, noise: np.ndarray) -> 
         inside[f"{level:g}"] = space.named(((values >= low) & (values <= high)).mean(0))
         width[f"{level:g}"] = space.named((high - low) / (space.high - space.low))
     error = np.abs(fitted.distribution.mean - truths.mean(0)) / box.width
-    return CalibrationRun(cell.kind, cell.method, cell.log, inside, width, space.named(error))
+    return CalibrationRun(**vars(cell), inside=inside, width=width, error=space.named(error))
 
 
 def coverages(runs: Sequence[CalibrationRun]) -> list[Coverage]:

@@ -16,11 +16,6 @@ def draw_uniforms(num_samples: int, num_parameters: int, *seeds: int) -> torch.T
     return base_uniforms(num_samples, num_parameters, torch.Generator().manual_seed(derived_seed(*seeds)))
 
 
-def draw_normals(num_draws: int, width: int, seed: int) -> torch.Tensor:
-    """Draw standard normals ``(num_draws, width)``, float64."""
-    return torch.special.ndtri(draw_uniforms(num_draws, width, seed))
-
-
 def derived_seed(*seeds: int) -> int:
     """Return a seed that torch accepts, of seeds of any size."""
     return int(np.random.SeedSequence(seeds).generate_state(1, np.uint64)[0]) >> 1
