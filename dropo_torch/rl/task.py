@@ -138,6 +138,14 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
     return made
 
 
+def check_model(task: Task, model: mujoco.MjModel, called: str) -> None:
+    """Raise an :class:`InputError` for a model of other sizes than the task's; ``called`` names it."""
+    for size in ("nq", "nv", "nu"):
+        ours, theirs = getattr(task.model, size), getattr(model, size)
+        if ours != theirs:
+            raise InputError(f"task: {task.name} is for a model with {size} {ours}; {called} has {theirs}")
+
+
 def check_task(task: Task) -> None:
     """Raise an :class:`InputError` for a task whose methods fail, or return other shapes than they should."""
     width, where = task.model.nq + task.model.nv, f"task: {task.name}"

@@ -13,8 +13,8 @@ import warp as wp
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.effects.simulator import check_backend
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.batch_stepper import BatchStepper
-from dropo_torch.rl.inside import inside_model
+from dropo_torch.rl.inside import inside_model, no_effects
+from dropo_torch.rl.stepper import BatchStepper
 from dropo_torch.simulators.warp.engine import Batch
 from dropo_torch.simulators.warp.simulator import make_engine
 
@@ -44,8 +44,8 @@ class WarpStepper(BatchStepper):
         self, space: ParameterSpace, num_envs: int, *, frame_skip: int, effects: EffectSet | None = None,
         num_threads: int = 0, device: str = "cpu",
     ) -> None:  # fmt: skip
-        if effects is not None:
-            check_backend("warp", effects, space)
+        effects = effects or no_effects(space, frame_skip)
+        check_backend("warp", effects, space)
         inside = inside_model(space, effects)
         model = copy.copy(inside.model)
         mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -21,9 +21,8 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.commands import Commands
 from dropo_torch.rl.mujoco_stepper import MujocoStepper
-from dropo_torch.rl.sensors import Sensors
+from dropo_torch.rl.signals import Commands, Sensors
 from dropo_torch.simulators.mujoco import MujocoSimulator
 from dropo_torch.testing.laws import Broken, NotApplicable, Report, require, require_same, try_laws
 
