@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 
 import mujoco
 import mujoco.batch
@@ -18,29 +17,18 @@ from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
 
 
-@dataclass(frozen=True)
-class Inside:
-    """The model that is simulated, and how.
-
-    Attributes:
-        model: a copy of the model, with the effects in it that are the same in every episode.
-        finer: its steps in one of the given model's.
-        varies: whether effects change the model from episode to episode.
-    """
-
-    model: mujoco.MjModel
-    finer: int
-    varies: bool
-
-
 def no_effects(space: ParameterSpace, frame_skip: int) -> EffectSet:
     """Return an empty set of effects on a space's model."""
     assert space.model is not None
     return EffectSet((), plain_setting(space.model, parse_observation(space.model, None), frame_skip))
 
 
-def inside_model(space: ParameterSpace, effects: EffectSet) -> Inside:
+def inside_model(space: ParameterSpace, effects: EffectSet) -> tuple[mujoco.MjModel, int, bool]:
     """Return the model with effects that change it.
+
+    Returns:
+        A copy of the model, with the effects in it that are the same in every episode; its steps in one of the given
+        model's; whether effects change the model from episode to episode.
 
     Raises:
         InputError: effects whose finer steps do not fill the model's.
@@ -48,9 +36,9 @@ def inside_model(space: ParameterSpace, effects: EffectSet) -> Inside:
     assert space.model is not None
     applied = effects.having("apply")
     if any(e.varies for e in applied.entries) or overlap(applied, space) is not None:
-        return Inside(copy.copy(space.model), 1, True)
+        return copy.copy(space.model), 1, True
     model = apply_native(space.model, applied) if len(applied) else copy.copy(space.model)
-    return Inside(model, finer_steps(space.model, model, applied), False)
+    return model, finer_steps(space.model, model, applied), False
 
 
 class RowFields:
@@ -67,7 +55,12 @@ class RowFields:
 
     def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, finer: int) -> None:
         self._batch, self._space = batch, space
-        self._fields = {f: batch.expand(f) for f in derived_fields(batch.model, space)} if space.fields else {}
+        for field in space.fields:
+            batch.expand(field)
+        if space.fields:
+            batch.set_const()  # what it derives becomes each simulation's own, too
+        own = [f for f in sorted(mujoco.batch.MODEL_FIELDS) if batch.expanded(f) is not None]
+        self._fields = {f: batch.expand(f) for f in own if read_field(batch.model, f).dtype.kind == "f"}
         self._shared = {f: read_field(batch.model, f).copy() for f in self._fields}
         self.finer = np.full(batch.nsim, finer)
 
@@ -116,19 +109,6 @@ class RowModels:
         self._batch.set_models(self._models)
 
 
-def derived_fields(model: mujoco.MjModel, space: ParameterSpace) -> list[str]:
-    """Return the real-valued model fields that the parameters write, and those that ``mj_setConst`` then does."""
-    probe = mujoco.batch.Batch(model, 1, 1)
-    for field in space.fields:
-        probe.expand(field)
-    probe.set_const()
-    return [
-        f
-        for f in sorted(mujoco.batch.MODEL_FIELDS)
-        if probe.expanded(f) is not None and read_field(model, f).dtype.kind == "f"
-    ]
-
-
 def _refused(space: ParameterSpace, values: np.ndarray, reason: str) -> InputError:
     named = ", ".join(f"{n} {v:g}" for n, v in space.named(values).items())
     return InputError(f"distribution: MuJoCo refuses {named}: {reason}; narrow the distribution or give limits")
@@ -152,7 +132,6 @@ class RowForces:
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
         self._force, self._wrench = batch.bind("qfrc_applied"), batch.bind("xfrc_applied")
         self._values = [np.full((batch.nsim, len(e.fixed)), e.fixed) for e in self._entries]
-        self._constant = np.zeros_like(self._wrench)
         self.any = bool(self._entries)
         self.before = np.zeros_like(self._qvel)
 
@@ -160,16 +139,14 @@ class RowForces:
         """Give simulations ``ids`` the numbers in values ``(k, d)``."""
         for entry, own in zip(self._entries, self._values, strict=True):
             own[ids] = entry.values(values)
+
+    def restart(self, ids: np.ndarray, values: np.ndarray) -> None:
+        """Begin episodes in simulations whose states have just been set, with values ``(k, d)``."""
+        self.before[ids] = self._qvel[ids]
         for row, vector in zip(ids, values, strict=True) if self._wrenches else ():
-            self._constant[row] = sum(
+            self._wrench[row] = sum(
                 e.effect.wrench(self._setting, e.target, e.values(vector[None])[0]) for e in self._wrenches
             )
-
-    def restart(self, ids: np.ndarray) -> None:
-        """Begin episodes in simulations whose states have just been set."""
-        self.before[ids] = self._qvel[ids]
-        if self._wrenches:
-            self._wrench[ids] = self._constant[ids]
 
     def apply(self, ids: np.ndarray, finer: int) -> None:
         """Set the forces that act in the next physics step of simulations ``ids``."""

@@ -36,8 +36,8 @@ class MujocoStepper(BatchStepper):
         num_threads: int = 0,
     ) -> None:  # fmt: skip
         effects = effects or no_effects(space, frame_skip)
-        inside = inside_model(space, effects)
-        model = show_divergence(inside.model)
+        model, finer, varies = inside_model(space, effects)
+        show_divergence(model)
         unmark_frames(model, space)
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
         self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
@@ -45,20 +45,19 @@ class MujocoStepper(BatchStepper):
         self._qpos, self._qvel, self._ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._failed = np.zeros(num_envs, dtype=bool)
         self._models: RowModels | RowFields = (
-            RowModels(self._batch, space, effects)
-            if inside.varies
-            else RowFields(self._batch, space.on(model), inside.finer)
+            RowModels(self._batch, space, effects) if varies else RowFields(self._batch, space.on(model), finer)
         )
         self._forces = RowForces(self._batch, effects)
 
     def reset(self, rows: torch.Tensor, states: torch.Tensor, values: torch.Tensor) -> None:
         """Start new episodes; see :meth:`BatchStepper.reset`."""
         ids = rows.cpu().numpy()
-        self._set_parameters(ids, values.cpu().numpy())
+        numbers = values.cpu().numpy()
+        self._set_parameters(ids, numbers)
         self._batch.state[ids] = self._row
         self._qpos[ids], self._qvel[ids] = np.split(states.cpu().numpy(), [self._qpos.shape[1]], axis=1)
         self._failed[ids] = False
-        self._forces.restart(ids)
+        self._forces.restart(ids, numbers)
 
     def step(self, controls: torch.Tensor) -> torch.Tensor:
         """Make an environment step; see :meth:`BatchStepper.step`."""

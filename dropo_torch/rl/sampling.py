@@ -162,8 +162,6 @@ def load_source(
     """
     if isinstance(given, ParameterSource):
         return given.over(space)
-    if isinstance(given, Distribution):
-        return _checked(DistributionSource(given), space)
     if isinstance(given, Mapping):
         vector = space.vector(given)
         _check_limits(vector, vector, space)
@@ -172,12 +170,8 @@ def load_source(
         return UniformSource(space)
     if given == "nominal":
         return PointSource.nominal(space)
-    return _checked(DistributionSource(Distribution.load(given)), space)
-
-
-def _checked(source: DistributionSource, space: ParameterSpace) -> ParameterSource:
-    """A distribution in a space's order, all of whose values the model can have, in the model's units."""
-    found, ordered = source.distribution, source.over(space)
+    found = given if isinstance(given, Distribution) else Distribution.load(given)
+    ordered = DistributionSource(found).over(space)
     for name, unit in zip(found.names, found.units, strict=True):
         own = space.parameters[space.names.index(name)].unit
         if unit and own and unit != own:

@@ -25,7 +25,7 @@ from dropo_torch.rl.settings import SACSettings
 from dropo_torch.support.threads import single_thread
 
 SCHEMA = "dropo-torch/train/1"
-#: History entries that are kept: a run of many short iterations keeps some of them.
+#: History entries that are kept: a run of many short iterations keeps every second, fourth, ... of them.
 MAX_ENTRIES = 1000
 #: A checkpoint may take this share of the time since the last.
 SHARE = 0.05
@@ -188,7 +188,7 @@ def check_training(problem: TrainingProblem) -> None:
 class _Run(Stateful):
     """A training that is under way."""
 
-    kept = ("steps", "iterations", "stride", "simulating", "learning", "score", "best")
+    kept = ("steps", "simulating", "learning", "best")
 
     def __init__(self, problem: TrainingProblem, checkpoint: Path | None) -> None:
         self.problem, settings, self.checkpoint = problem, problem.settings, checkpoint
@@ -199,11 +199,11 @@ class _Run(Stateful):
         self.collector = Collector(self.env, self.policy.to_action)
         self.parts = {"learner": self.learner, "collector": self.collector}
         self.per_iteration = settings.num_envs * settings.horizon
-        self.steps, self.iterations, self.stride = 0, 0, 1
-        self.simulating, self.learning = 0.0, 0.0
+        fullness = settings.steps // self.per_iteration / MAX_ENTRIES
+        self.stride = 2 ** max(0, math.ceil(math.log2(fullness)))  # iterations from entry to entry
+        self.steps, self.simulating, self.learning = 0, 0.0, 0.0
         self.history: list[TrainEntry] = []
         self.evaluations: list[EvaluationPoint] = []
-        self.score = -math.inf
         self.best: dict[str, torch.Tensor] = {}
         self.begun = time.monotonic()  # of a resumed run as if it had never been interrupted
         self.next_checkpoint = 0.0
@@ -223,11 +223,11 @@ class _Run(Stateful):
         self.simulating += collected - begun
         self.learning += time.monotonic() - collected
         self.steps += self.per_iteration
-        self.iterations += 1
         every = settings.steps / settings.evaluations
         evaluation = self._evaluate() if self.done or self.steps // every > before // every else None
         entry = self._entry(scalars)
-        self._remember(entry)
+        if self.steps // self.per_iteration % self.stride == 0 or self.done:
+            self.history.append(entry)
         if time.monotonic() >= self.next_checkpoint or self.done:
             self._save()
         return entry, evaluation
@@ -283,10 +283,10 @@ class _Run(Stateful):
     def _evaluate(self) -> EvaluationPoint:
         """Evaluate under the training's distribution, and keep the policy if it is the best."""
         found = self._episodes(self.problem.training, 0)
-        score = found.mean if math.isfinite(found.mean) else -math.inf
-        better = not self.evaluations or score > self.score
+        best = max((e.mean for e in self.evaluations if math.isfinite(e.mean)), default=-math.inf)
+        better = not self.evaluations or found.mean > best
         if better:
-            self.score, self.best = score, {k: v.cpu().clone() for k, v in self.policy.state_dict().items()}
+            self.best = {k: v.cpu().clone() for k, v in self.policy.state_dict().items()}
         self.evaluations.append(EvaluationPoint(self.steps, found.mean, found.std, better))
         return self.evaluations[-1]
 
@@ -308,14 +308,6 @@ class _Run(Stateful):
             scalars=scalars,
         )
 
-    def _remember(self, entry: TrainEntry) -> None:
-        """Add an entry to the history; of very many, every second, fourth, ... is kept."""
-        if self.iterations % self.stride == 0 or self.done:
-            self.history.append(entry)
-        if len(self.history) > MAX_ENTRIES:
-            self.history = self.history[1::2]
-            self.stride *= 2
-
     def _seconds(self) -> float:
         return time.monotonic() - self.begun
 
@@ -325,10 +317,7 @@ def _fresh_policy(problem: TrainingProblem) -> Policy:
     architecture = {
         "num_observations": task.num_observations,
         "num_actions": len(task.action_low),
-        "hidden": list(settings.hidden),
-        "activation": settings.activation,
-        "head": settings.head,
-        "initial_std": settings.initial_std,
+        **{name: getattr(settings, name) for name in ("hidden", "activation", "head", "initial_std")},
     }
     policy = Policy(architecture, config=problem.config.document(), distribution=problem.distribution)
     policy.low.copy_(torch.as_tensor(task.action_low, dtype=torch.float32))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from typing import Any
 
@@ -46,13 +45,11 @@ class WarpStepper(BatchStepper):
     ) -> None:  # fmt: skip
         effects = effects or no_effects(space, frame_skip)
         check_backend("warp", effects, space)
-        inside = inside_model(space, effects)
-        model = copy.copy(inside.model)
+        model, self._finer, _ = inside_model(space, effects)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
-        self._finer = inside.finer
         self._engine, self._fields = make_engine(
-            model, space.on(model), skip=frame_skip * inside.finer,
+            model, space.on(model), skip=frame_skip * self._finer,
             chunk_size=self.CHUNK if device == "cpu" else num_envs, num_threads=num_threads or os.cpu_count() or 1,
             device=device,
         )  # fmt: skip
