@@ -57,9 +57,8 @@ class Collector(Stateful):
             after, now = self._env.step_and_maybe_reset(now)
             found = after.get("next")
             self._count(found.get("reward")[:, 0], found.get("done")[:, 0])
-            ends = {key: found.get(key) for key in ("observation", "reward", "done", "terminated")}
-            step = {"observation": observation, "parameters": parameters, "action": unit, **extra}
-            step["next"] = TensorDict._new_unsafe(ends, batch_size=unit.shape[:1])
+            ends = found.select("observation", "reward", "done", "terminated")
+            step = {"observation": observation, "parameters": parameters, "action": unit, **extra, "next": ends}
             rows.append(TensorDict._new_unsafe(step, batch_size=unit.shape[:1]))
         return torch.stack(rows, 1)
 

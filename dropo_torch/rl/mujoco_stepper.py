@@ -53,7 +53,8 @@ class MujocoStepper(BatchStepper):
         """Start new episodes; see :meth:`BatchStepper.reset`."""
         ids = rows.cpu().numpy()
         numbers = values.cpu().numpy()
-        self._set_parameters(ids, numbers)
+        self._models.write(ids, numbers)
+        self._forces.write(ids, numbers)
         self._batch.state[ids] = self._row
         self._qpos[ids], self._qvel[ids] = np.split(states.cpu().numpy(), [self._qpos.shape[1]], axis=1)
         self._failed[ids] = False
@@ -85,17 +86,14 @@ class MujocoStepper(BatchStepper):
                 except mujoco.batch.SimulationError as error:
                     self._failed[error.ids] = True
 
-    def _set_parameters(self, ids: np.ndarray, values: np.ndarray) -> None:
-        self._models.write(ids, values)
-        self._forces.write(ids, values)
-
     def state_dict(self) -> dict[str, Any]:
         """Return MuJoCo's integration states; see :meth:`BatchStepper.state_dict`."""
         return {name: torch.from_numpy(own.copy()) for name, own in self._kept().items()}
 
     def load_state_dict(self, state: dict[str, Any], values: torch.Tensor) -> None:
         """Go on from a state; see :meth:`BatchStepper.load_state_dict`."""
-        self._set_parameters(np.arange(self.num_envs), values.cpu().numpy())
+        for part in (self._models, self._forces):
+            part.write(np.arange(self.num_envs), values.cpu().numpy())
         for name, own in self._kept().items():
             own[:] = state[name].numpy()
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import nn
@@ -15,7 +14,6 @@ CLIP = 10.0
 #: Least and largest logarithm of a state-dependent standard deviation.
 LOG_STD = (-5.0, 2.0)
 
-Head = Literal["normal", "tanh"]
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
 
@@ -73,7 +71,7 @@ class Actor(nn.Module):
         num_observations: int,
         num_actions: int,
         hidden: Sequence[int],
-        head: Head,
+        head: str,
         activation: str,
         initial_std: float = 0.6,
     ) -> None:

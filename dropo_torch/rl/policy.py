@@ -16,6 +16,7 @@ from dropo_torch.rl.networks import Actor, Normalizer
 from dropo_torch.support.given import reading
 
 SCHEMA = "dropo-torch/policy/1"
+Plain = Mapping[str, Any]
 
 
 class Policy(nn.Module):
@@ -35,13 +36,7 @@ class Policy(nn.Module):
     low: torch.Tensor
     high: torch.Tensor
 
-    def __init__(
-        self,
-        architecture: Mapping[str, Any],
-        *,
-        config: Mapping[str, Any] | None = None,
-        distribution: Mapping[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, architecture: Plain, *, config: Plain | None = None, distribution: Plain | None = None) -> None:
         super().__init__()
         self.actor = Actor(**architecture)
         self.normalizer = Normalizer(architecture["num_observations"])

@@ -65,8 +65,7 @@ class TrainingProblem:
         training: the world in which the policy learns.
         nominal: the model as it is; ``None`` where a number of an effect has no value of its own.
         target: the world of the config's ``target``, or ``None``.
-        distribution: where parameters come from, as plain data.
-        distribution_path: its file, or ``None``.
+        distribution_path: file of the distribution, or ``None``.
         fingerprint: identifies all of it; an interrupted run goes on only with the same.
     """
 
@@ -77,7 +76,6 @@ class TrainingProblem:
     training: World
     nominal: World | None
     target: World | None
-    distribution: dict[str, Any]
     distribution_path: Path | None
     fingerprint: str
 
@@ -94,6 +92,11 @@ class TrainingProblem:
             num_threads=self.config.threads,
             device=self.device,
         )
+
+    @property
+    def distribution(self) -> dict[str, Any]:
+        """Where the parameters of a training's episodes come from, as plain data."""
+        return self.training.source.document()
 
     @property
     def device(self) -> str:
@@ -119,7 +122,6 @@ def make_training(config: Config) -> TrainingProblem:
     space, effects = _space_and_effects(full, task)
     training = World(task, space, load_source(given, space), effects)
     has_nominal = np.isfinite(space.nominal).all()
-    described = training.source.document()
     return TrainingProblem(
         config=config,
         algorithm=algorithm,
@@ -128,9 +130,8 @@ def make_training(config: Config) -> TrainingProblem:
         training=training,
         nominal=replace(training, source=PointSource.nominal(space)) if has_nominal else None,
         target=_target_world(full, {} if sim is None else sim.parameters, task) if config.target else None,
-        distribution=described,
         distribution_path=given if isinstance(given, Path) else None,
-        fingerprint=_fingerprint(config, algorithm, settings, task, described),
+        fingerprint=_fingerprint(config, algorithm, settings, training),
     )
 
 
@@ -218,12 +219,11 @@ def _around(value: float) -> list[float]:
     return sorted([0.5 * value, 2 * value]) if value else [0.0, 1.0]
 
 
-def _fingerprint(
-    config: Config, algorithm: str, settings: Settings, task: Task, distribution: Mapping[str, Any]
-) -> str:
+def _fingerprint(config: Config, algorithm: str, settings: Settings, training: World) -> str:
     """A digest of what decides a training's course."""
+    task, distribution = training.task, training.source.document()
     learning = settings.model_dump(mode="json", exclude={"checkpoint_seconds"})
-    text = json.dumps([config.fingerprint(*_FITTING), algorithm, learning, dict(distribution)], sort_keys=True)
+    text = json.dumps([config.fingerprint(*_FITTING), algorithm, learning, distribution], sort_keys=True)
     text += f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}"
     places = (name.rpartition(":")[0] for name in (config.task or "", *config.own_effects))
     code = [config.path(place).read_bytes() for place in places if place.endswith(".py")]

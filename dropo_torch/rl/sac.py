@@ -34,9 +34,11 @@ class SAC(Learner):
         self.settings = settings
         self._num_actions = len(policy.low)
         entropy = -float(self._num_actions) if settings.target_entropy is None else settings.target_entropy
+        shape = self.num_features + self._num_actions, 1, settings.hidden, settings.activation, 1.0
+        in_keys, out_keys = ["critic_features", "action"], ["state_action_value"]
         self._loss = SACLoss(
             self._actor(TanhNormal),
-            [self._critic(), self._critic()],
+            [TensorDictModule(ActionValue(*mlp(*shape)), in_keys, out_keys) for _ in range(2)],
             loss_function="l2",
             target_entropy=entropy,
             alpha_init=0.2,
@@ -72,11 +74,6 @@ class SAC(Learner):
             losses = self._gradient().detach()
         entries = {"loss_policy": "loss_actor", "loss_critic": "loss_qvalue", "alpha": "alpha", "entropy": "entropy"}
         return {name: float(losses[key]) for name, key in entries.items()} if updates else {}
-
-    def _critic(self) -> TensorDictModule:
-        layers = mlp(self.num_features + self._num_actions, 1, self.settings.hidden, self.settings.activation, 1.0)
-        network = ActionValue(*layers)
-        return TensorDictModule(network, in_keys=["critic_features", "action"], out_keys=["state_action_value"])
 
     def _gradient(self) -> TensorDict:
         """One gradient of policy, critics and temperature, and a step of the targets."""
