@@ -50,8 +50,7 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 
 def load_tensors(path: Path) -> dict[str, Any]:
     """Return what :func:`save_tensors` has written, on the CPU; no code in the file is run."""
-    found: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    return found
+    return dict(torch.load(path, map_location="cpu", weights_only=True))
 
 
 def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> None:

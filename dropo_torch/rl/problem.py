@@ -32,8 +32,6 @@ _FITTING = (
     "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm", "method", "method_options",
     "entropy", "covariance", "environment",
 )  # fmt: skip
-#: Distributions that need no file.
-KEYWORDS = ("uniform", "nominal")
 
 
 @dataclass(frozen=True)
@@ -121,14 +119,13 @@ def make_training(config: Config) -> TrainingProblem:
     given = _given_distribution(full)
     space, effects = _space_and_effects(full, task)
     training = World(task, space, load_source(given, space), effects)
-    has_nominal = np.isfinite(space.nominal).all()
     return TrainingProblem(
         config=config,
         algorithm=algorithm,
         settings=settings,
         model_path=model_path,
         training=training,
-        nominal=replace(training, source=PointSource.nominal(space)) if has_nominal else None,
+        nominal=replace(training, source=PointSource.nominal(space)) if np.isfinite(space.nominal).all() else None,
         target=_target_world(full, {} if sim is None else sim.parameters, task) if config.target else None,
         distribution_path=given if isinstance(given, Path) else None,
         fingerprint=_fingerprint(config, algorithm, settings, training),
@@ -169,7 +166,7 @@ def _given_distribution(config: Config) -> str | dict[str, float] | Path:
         return {name: number(value, f"distribution.{name}") for name, value in given.items()}
     if given is None and not (config.parameters and (config.base / "fit.json").is_file()):
         return "uniform" if config.parameters else "nominal"
-    if given in KEYWORDS:
+    if given in ("uniform", "nominal"):
         return given
     path = config.path(given or "fit.json").resolve()
     if not path.is_file():
@@ -197,7 +194,8 @@ def _target_world(config: Config, bundled: Mapping[str, Mapping[str, Any]], task
         if isinstance(entry, dict):
             spec = {k: v for k, v in entry.items() if k != "value"}
             values[name] = number(entry.get("value"), f"target.{name}.value")
-            wanted[name] = {"bounds": _around(values[name]), **spec}
+            bounds = sorted([0.5 * values[name], 2 * values[name]]) if values[name] else [0.0, 1.0]  # that hold it
+            wanted[name] = {"bounds": bounds, **spec}
         elif name in known:
             values[name] = number(entry, f"target.{name}")
             wanted[name] = known[name]
@@ -212,11 +210,6 @@ def _target_world(config: Config, bundled: Mapping[str, Mapping[str, Any]], task
         if name in values and not low <= values[name] <= high:
             raise InputError(f"target.{name} is {values[name]:g}; the model allows {low:g} to {high:g}")
     return World(task, space, PointSource(vector), effects)
-
-
-def _around(value: float) -> list[float]:
-    """Bounds that hold a value, for a parameter that is only set."""
-    return sorted([0.5 * value, 2 * value]) if value else [0.0, 1.0]
 
 
 def _fingerprint(config: Config, algorithm: str, settings: Settings, training: World) -> str:

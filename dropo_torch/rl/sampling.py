@@ -107,14 +107,13 @@ class UniformSource(ParameterSource):
 
     def __init__(self, space: ParameterSpace) -> None:
         self.names, self._space = space.names, space
-        self._is_log = space.is_log
         self._low, high = (to_coordinates(x, space.is_log) for x in (space.low, space.high))
         self._width = high - self._low
 
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Return values ``(count, d)`` inside the bounds."""
         uniforms = torch.rand(count, len(self.names), generator=generator, dtype=torch.float64).numpy()
-        return torch.from_numpy(to_values(self._low + uniforms * self._width, self._is_log))
+        return torch.from_numpy(to_values(self._low + uniforms * self._width, self._space.is_log))
 
     def document(self) -> dict[str, Any]:
         """Return each parameter's bounds, unit and scale."""
