@@ -21,7 +21,7 @@ class Stateful:
     """Something whose state can be kept, and gone on from.
 
     Attributes:
-        kept: names of the attributes that belong to the state: tensors on the CPU, numbers, and lists of them.
+        kept: names of the attributes that belong to the state: tensors on the CPU, numbers, and what holds them.
         parts: name → what has ``state_dict`` and ``load_state_dict`` of its own.
     """
 
@@ -66,10 +66,9 @@ def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any]:
     """
     with reading(f"resume: {path}", "the checkpoint of a training", "start again without --resume"):
         content = load_tensors(path)
-        schema, owner, state = content["schema"], content["fingerprint"], content["state"]
-    if schema != SCHEMA or owner != fingerprint:
-        raise InputError(
-            f"resume: {path} belongs to another task, config, distribution or algorithm; restore those, or start again "
-            "without --resume"
-        )
-    return dict(state)
+        if (content["schema"], content["fingerprint"]) != (SCHEMA, fingerprint):
+            raise InputError(
+                f"resume: {path} belongs to another task, config, distribution or algorithm; restore those, or start "
+                "again without --resume"
+            )
+        return dict(content["state"])

@@ -74,14 +74,12 @@ class Learner(Stateful, ABC):
 
     def _is_sound(self, loss: torch.Tensor) -> bool:
         """Whether a loss may be followed; counts those that may not."""
-        if bool(torch.isfinite(loss)):
-            self.in_a_row = 0
-            return True
-        self.skipped += 1
-        self.in_a_row += 1
+        sound = bool(torch.isfinite(loss))
+        self.skipped += not sound
+        self.in_a_row = 0 if sound else self.in_a_row + 1
         if self.in_a_row >= PATIENCE:
             raise InputError(
                 f"train: the loss was not finite for {PATIENCE} updates in a row; lower train.learning_rate, "
                 "or scale the task's reward"
             )
-        return False
+        return sound

@@ -96,9 +96,8 @@ def load_policy(path: str | Path) -> Policy:
         raise InputError(f"policy: no file {path}; expected a policy.pt that dropo train has written")
     with reading(f"policy: {path}", "a policy that dropo train has written"):
         content = load_tensors(path)
-        schema = content["schema"]
+        if content["schema"] != SCHEMA:
+            raise InputError(f"policy: {path} is of schema {content['schema']!r}; expected {SCHEMA!r}")
         policy = Policy(content["architecture"], config=content["config"], distribution=content["distribution"])
         policy.load_state_dict(content["weights"])
-    if schema != SCHEMA:
-        raise InputError(f"policy: {path} is of schema {schema!r}; expected {SCHEMA!r}")
     return policy.eval()

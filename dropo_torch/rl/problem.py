@@ -36,7 +36,7 @@ _FITTING = (
 
 @dataclass(frozen=True)
 class World:
-    """A model of the robot with parameters that come from somewhere.
+    """A model of the robot with parameters that come from somewhere, as :class:`RandomizedEnv` takes them.
 
     Attributes:
         task: what is to be done, on its model.
@@ -80,11 +80,8 @@ class TrainingProblem:
     def env(self, world: World, num_envs: int, seed: int) -> RandomizedEnv:
         """Return environments of one of the worlds, on the config's backend."""
         return RandomizedEnv(
-            world.task,
-            num_envs,
-            space=world.space,
-            source=world.source,
-            effects=world.effects,
+            **vars(world),
+            num_envs=num_envs,
             backend=self.config.backend,
             seed=seed,
             num_threads=self.config.threads,

@@ -102,12 +102,9 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
     """
     if isinstance(task, Task):
         return task
-    name = task
-    if ":" not in task:
-        sim = bundled_sim(task, key="task")
-        if sim.task is None:
-            raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
-        name = sim.task
+    name = task if ":" in task else bundled_sim(task, key="task").task
+    if name is None:
+        raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
     maker = load_callable(
         "task",
         name,

@@ -154,7 +154,8 @@ def train(
     with _own_random_numbers(problem.config.seed, problem.device), single_thread():
         run = _Run(problem, checkpoint)
         if resume and checkpoint is not None and checkpoint.is_file():
-            run.load_state_dict(load_checkpoint(checkpoint, problem.fingerprint))
+            with torch.serialization.safe_globals([TrainEntry, EvaluationPoint]):
+                run.load_state_dict(load_checkpoint(checkpoint, problem.fingerprint))
         if on_start is not None:
             on_start(run.history, run.evaluations)
         while not run.done:
@@ -188,7 +189,7 @@ def check_training(problem: TrainingProblem) -> None:
 class _Run(Stateful):
     """A training that is under way."""
 
-    kept = ("steps", "simulating", "learning", "best")
+    kept = ("steps", "simulating", "learning", "history", "evaluations", "best")
 
     def __init__(self, problem: TrainingProblem, checkpoint: Path | None) -> None:
         self.problem, settings, self.checkpoint = problem, problem.settings, checkpoint
@@ -259,15 +260,12 @@ class _Run(Stateful):
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the rest of the run depends on."""
         states = [torch.get_rng_state(), *map(torch.cuda.get_rng_state, _devices(self.problem.device))]
-        told = {name: [asdict(e) for e in getattr(self, name)] for name in ("history", "evaluations")}
-        return {**super().state_dict(), **told, "random": states, "seconds": self._seconds()}
+        return {**super().state_dict(), "random": states, "seconds": self._seconds()}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a state that :meth:`state_dict` returned."""
         super().load_state_dict(state)
         self.begun -= state["seconds"]
-        self.history = [TrainEntry(**e) for e in state["history"]]
-        self.evaluations = [EvaluationPoint(**e) for e in state["evaluations"]]
         torch.set_rng_state(state["random"][0])
         for device, own in zip(_devices(self.problem.device), state["random"][1:], strict=True):
             torch.cuda.set_rng_state(own, device)
