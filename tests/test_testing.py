@@ -559,7 +559,7 @@ def test_a_broken_effect_is_told_which_law(law: str, effect: Effect) -> None:
 
 
 def test_a_training_that_disagrees_with_a_fit_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(RowForces, "restart", lambda self, ids: None)
+    monkeypatch.setattr(RowForces, "restart", lambda self, ids, values: None)
     with pytest.raises(ConformanceError, match="broken law 'fit and training agree': found states of a training at"):
         check_effect(Drag())
 

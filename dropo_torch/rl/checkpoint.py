@@ -1,9 +1,9 @@
-"""Files of tensors: whole or absent, and read without running code in them. A training's state between iterations."""
+"""Files of tensors, whole or absent and read without running code in them, and states that are kept in them."""
 
 from __future__ import annotations
 
+import copy
 import io
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +15,30 @@ from dropo_torch.support.files import write_atomically
 from dropo_torch.support.given import reading
 
 SCHEMA = "dropo-torch/training/1"
-#: A checkpoint may take this share of the time since the last.
-SHARE = 0.05
+
+
+class Stateful:
+    """Something whose state can be kept, and gone on from.
+
+    Attributes:
+        kept: names of the attributes that belong to the state: tensors on the CPU, numbers, and what holds them.
+        parts: name → what has ``state_dict`` and ``load_state_dict`` of its own.
+    """
+
+    kept: tuple[str, ...]
+    parts: dict[str, Any]
+
+    def state_dict(self) -> dict[str, Any]:
+        """Return everything that what follows depends on."""
+        own = {name: copy.deepcopy(getattr(self, name)) for name in self.kept}
+        return {"kept": own, **{name: part.state_dict() for name, part in self.parts.items()}}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that :meth:`state_dict` returned."""
+        for name, part in self.parts.items():
+            part.load_state_dict(state[name])
+        for name, value in state["kept"].items():
+            setattr(self, name, copy.deepcopy(value))
 
 
 def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
@@ -28,50 +50,25 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 
 def load_tensors(path: Path) -> dict[str, Any]:
     """Return what :func:`save_tensors` has written, on the CPU; no code in the file is run."""
-    found: dict[str, Any] = torch.load(path, map_location="cpu", weights_only=True)
-    return found
+    return dict(torch.load(path, map_location="cpu", weights_only=True))
 
 
-class Checkpoints:
-    """Writes a training's state now and then, whole or not at all.
+def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> None:
+    """Write the state of the training that a fingerprint identifies, whole or not at all."""
+    save_tensors(path, {"schema": SCHEMA, "fingerprint": fingerprint, "state": state})
 
-    Args:
-        path: the file, or ``None`` to keep nothing.
-        fingerprint: identifies the training.
-        seconds: least time between two; more where writing takes long.
+
+def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any]:
+    """Return the state that :func:`save_checkpoint` has written.
+
+    Raises:
+        InputError: a file that is no checkpoint, or that of another training.
     """
-
-    def __init__(self, path: Path | None, fingerprint: str, seconds: float) -> None:
-        self._path, self._fingerprint, self._seconds = path, fingerprint, seconds
-        self._next = 0.0
-
-    def due(self) -> bool:
-        """Whether it is time for the next."""
-        return self._path is not None and time.monotonic() >= self._next
-
-    def save(self, state: Mapping[str, Any]) -> None:
-        """Write a state: tensors, numbers and text in mappings and lists."""
-        if self._path is None:
-            return
-        begun = time.monotonic()
-        save_tensors(self._path, {"schema": SCHEMA, "fingerprint": self._fingerprint, "state": dict(state)})
-        ended = time.monotonic()
-        self._next = ended + max(self._seconds, (ended - begun) / SHARE)
-
-    def load(self) -> dict[str, Any] | None:
-        """Return the state that was kept last; ``None`` where there is none.
-
-        Raises:
-            InputError: a file that is no checkpoint, or that of another training.
-        """
-        if self._path is None or not self._path.is_file():
-            return None
-        with reading(f"resume: {self._path}", "the checkpoint of a training", "start again without --resume"):
-            content = load_tensors(self._path)
-            schema, owner, state = content["schema"], content["fingerprint"], content["state"]
-        if schema != SCHEMA or owner != self._fingerprint:
+    with reading(f"resume: {path}", "the checkpoint of a training", "start again without --resume"):
+        content = load_tensors(path)
+        if (content["schema"], content["fingerprint"]) != (SCHEMA, fingerprint):
             raise InputError(
-                f"resume: {self._path} belongs to another task, config, distribution or algorithm; restore those, "
-                "or start again without --resume"
+                f"resume: {path} belongs to another task, config, distribution or algorithm; restore those, or start "
+                "again without --resume"
             )
-        return state
+        return dict(content["state"])

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
@@ -13,11 +12,11 @@ from torchrl.envs import EnvBase
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.commands import Commands
+from dropo_torch.rl.inside import no_effects
 from dropo_torch.rl.sampling import ParameterSource, UniformSource
-from dropo_torch.rl.sensors import Sensors
+from dropo_torch.rl.signals import Commands, Sensors
 from dropo_torch.rl.stepper import make_stepper
-from dropo_torch.rl.task import Task, check_task, load_task
+from dropo_torch.rl.task import Task, check_model, check_task, load_task
 from dropo_torch.simulators.base import DIVERGED
 
 
@@ -41,7 +40,7 @@ class RandomizedEnv(EnvBase):
         effects: physical effects, understood over ``space``. Those of sensors change what is observed; reward and
             termination see the true states.
         backend: ``"mujoco"`` or ``"warp"``.
-        seed: of start states and parameters.
+        seed: of initial states and parameters.
         num_threads: threads of a CPU, 0 for all processors; results do not depend on it.
         device: of the tensors; with ``backend="warp"`` also of the simulation.
         expose_parameters: whether ``parameters`` is among the keys.
@@ -53,6 +52,9 @@ class RandomizedEnv(EnvBase):
     Raises:
         InputError: a task, parameters, effects and a backend that do not fit each other.
     """
+
+    #: What is kept of every environment, beside the simulations and effects; replaced in each step, never written to.
+    _KEPT = ("values", "states", "observation", "count")
 
     def __init__(
         self,
@@ -78,19 +80,16 @@ class RandomizedEnv(EnvBase):
         if self.space.model is not self.task.model and self.space.model is not None:
             self.task = self.task.on(self.space.model)
         self.source = (UniformSource(self.space) if source is None else source).over(self.space)
+        effects = effects or no_effects(self.space, self.task.frame_skip)
         self._stepper = make_stepper(
             backend, self.space, num_envs, frame_skip=self.task.frame_skip, effects=effects, num_threads=num_threads,
             device=str(device),
         )  # fmt: skip
-        self._commands, self._sensors = None, None
-        if effects is not None:
-            commands = Commands(effects, num_envs, device=self.device)
-            sensors = Sensors(effects, num_envs, space=self.space, device=self.device)
-            self._commands, self._sensors = commands or None, sensors or None
+        self._commands = Commands(effects, num_envs, device=self.device)
+        self._sensors = Sensors(effects, num_envs, space=self.space, device=self.device)
         self._exposed = expose_parameters and len(self.space) > 0
         self._generator = torch.Generator()
-        self._values = torch.zeros(num_envs, len(self.space), dtype=torch.float64)
-        self._shared = torch.zeros(num_envs, len(self.space), device=self.device)
+        self._values = torch.zeros(num_envs, len(self.space), dtype=torch.float64, device=self.device)
         self._states = torch.zeros(num_envs, self._stepper.num_states, dtype=torch.float64, device=self.device)
         self._observation = torch.zeros(num_envs, self.task.num_observations, device=self.device)
         self._count = torch.zeros(num_envs, 1, dtype=torch.int64, device=self.device)
@@ -98,36 +97,37 @@ class RandomizedEnv(EnvBase):
         self.set_seed(seed)
 
     def _make_specs(self) -> None:
-        num, device = self.num_envs, self.device
+        batch, column = (self.num_envs,), (self.num_envs, 1)
+        flag = Binary(1, shape=column, dtype=torch.bool)
         entries = {
-            "observation": Unbounded((num, self.task.num_observations), device=device),
-            "step_count": Unbounded((num, 1), dtype=torch.int64, device=device),
-            "diverged": Binary(1, shape=(num, 1), dtype=torch.bool, device=device),
+            "observation": Unbounded((*batch, self.task.num_observations)),
+            "step_count": Unbounded(column, dtype=torch.int64),
+            "diverged": flag,
         }
         if self._exposed:
-            entries["parameters"] = Unbounded((num, len(self.space)), device=device)
-        self.observation_spec = Composite(entries, shape=(num,), device=device)
-        low, high = (
-            torch.as_tensor(np.asarray(x, dtype=np.float32), device=device).expand(num, -1).clone()
-            for x in (self.task.action_low, self.task.action_high)
-        )
-        self.action_spec = Bounded(low, high, shape=low.shape, dtype=torch.float32, device=device)
-        self.reward_spec = Unbounded((num, 1), device=device)
-        ends = ("done", "terminated", "truncated")
-        self.full_done_spec = Composite(
-            {key: Binary(1, shape=(num, 1), dtype=torch.bool, device=device) for key in ends}, shape=(num,),
-            device=device,
-        )  # fmt: skip
+            entries["parameters"] = Unbounded((*batch, len(self.space)))
+        self.observation_spec = Composite(entries, shape=batch).to(self.device)
+        bounds = (torch.as_tensor(x, dtype=torch.float32) for x in (self.task.action_low, self.task.action_high))
+        low, high = (x.expand(*batch, -1).clone() for x in bounds)
+        self.action_spec = Bounded(low, high, shape=low.shape, dtype=torch.float32).to(self.device)
+        self.reward_spec = Unbounded(column).to(self.device)
+        ends = {key: flag.clone() for key in ("done", "terminated", "truncated")}
+        self.full_done_spec = Composite(ends, shape=batch).to(self.device)
 
     @property
     def values(self) -> torch.Tensor:
-        """The parameters of each environment's episode, in their units, ``(N, d)`` float64."""
-        return self._values.clone()
+        """The parameters of each environment's episode, in their units, ``(N, d)`` float64, on the CPU."""
+        return self._values.cpu().clone()
 
     @property
     def states(self) -> torch.Tensor:
         """The true states ``[qpos, qvel]``, ``(N, nq + nv)`` float64; the last good ones where one diverged."""
         return self._states.clone()
+
+    def now(self) -> TensorDictBase:
+        """Return what the environments show at present, all of them in the midst of an episode."""
+        flags = ("terminated", "truncated", "done", "diverged")
+        return self._tensordict({key: torch.zeros_like(self._count, dtype=torch.bool) for key in flags})
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach().to(torch.float64)
@@ -135,21 +135,16 @@ class RandomizedEnv(EnvBase):
         if not torch.isfinite(controls).all():
             row = int((~torch.isfinite(controls)).any(1).nonzero()[0])
             raise InputError(f"action: {tensordict.get('action')[row].tolist()} in environment {row} is not finite")
-        signals = controls[:, None] if self._commands is None else self._commands(controls)
-        if self._commands is None and self._sensors is not None:
-            signals = signals.expand(-1, self.task.frame_skip, -1)
+        signals = self._commands(controls) if self._commands or self._sensors else controls[:, None]
         path = self._stepper.step(signals).to(self.device)
         good = (path.abs() < DIVERGED).flatten(1).all(1)
-        all_good = bool(good.all())
-        if not all_good:
+        if not bool(good.all()):
             path = torch.where(good[:, None, None], path, self._states[:, None])
             self.num_diverged += int((~good).sum())
         before, self._states = self._states, path[:, -1]
-        shown = self._states
-        if self._sensors is not None:
+        if self._sensors:
             self._sensors.record(path)
-            shown = self._sensors.show(shown)
-        observation = self.task.observe(shown).to(torch.float32)
+        observation = self._observed(slice(None))
         reward = self.task.reward(before, actions, self._states).to(torch.float32)
         terminated = self.task.terminated(self._states)
         sound = good & torch.isfinite(reward) & torch.isfinite(observation).all(1)
@@ -158,53 +153,49 @@ class RandomizedEnv(EnvBase):
             observation = torch.where(sound[:, None], observation, self._observation)
             reward, terminated = torch.where(sound, reward, 0.0), terminated | ~sound
         self._observation, self._count = observation, self._count + 1
-        truncated = self._count >= self.task.max_episode_steps
-        terminated = terminated[:, None]
-        return self._tensordict(
-            {
-                "reward": reward[:, None],
-                "terminated": terminated,
-                "truncated": truncated,
-                "done": terminated | truncated,
-                "diverged": ~good[:, None],
-            }
-        )
+        truncated, terminated = self._count >= self.task.max_episode_steps, terminated[:, None]
+        ends = {"terminated": terminated, "truncated": truncated, "done": terminated | truncated}
+        return self._tensordict({"reward": reward[:, None], **ends, "diverged": ~good[:, None]})
 
     def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
         mask = None if tensordict is None else tensordict.get("_reset", None)
         rows = torch.arange(self.num_envs) if mask is None else mask.reshape(self.num_envs).nonzero()[:, 0].cpu()
         if len(rows):
             self._restart(rows)
-        flags = ("terminated", "truncated", "done", "diverged")
-        return self._tensordict({key: torch.zeros_like(self._count, dtype=torch.bool) for key in flags})
+        return self.now()
 
     def _tensordict(self, entries: dict[str, torch.Tensor]) -> TensorDictBase:
-        entries["observation"], entries["step_count"] = self._observation, self._count
+        entries |= {"observation": self._observation, "step_count": self._count}
         if self._exposed:
-            entries["parameters"] = self._shared
+            entries["parameters"] = self._values.to(torch.float32)
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
+
+    def _observed(self, rows: torch.Tensor | slice) -> torch.Tensor:
+        """What the task observes of some environments, ``(k, n)`` float32."""
+        shown = self._sensors.show(self._states) if self._sensors else self._states
+        return self.task.observe(shown[rows]).to(torch.float32)
 
     def _restart(self, rows: torch.Tensor) -> None:
         """Begin new episodes in environments ``rows``; what was handed out before is not written to."""
         values = self.source.sample(len(rows), self._generator)
         start = self.task.initial_states(len(rows), self._generator).to(self.device, torch.float64)
-        self._values[rows] = values
         self._stepper.reset(rows, start, values)
         at = rows.to(self.device)
+        self._values = self._values.index_copy(0, at, values.to(self.device))
         self._states = self._states.index_copy(0, at, start)
         self._count = self._count.index_fill(0, at, 0)
-        if self._exposed:
-            self._shared = self._shared.index_copy(0, at, values.to(self.device, torch.float32))
-        if self._commands is not None:
-            self._commands.reset(at, values.numpy())
-        shown = start
-        if self._sensors is not None:
-            self._sensors.reset(at, start, values.numpy())
-            shown = self._sensors.show(self._states)[at]
-        observation = self.task.observe(shown).to(torch.float32)
+        self._reset_effects(at)
+        observation = self._observed(at)
         if not bool(torch.isfinite(observation).all()):
             raise InputError(f"task: {self.task.name}: observe gives a number that is not finite for a start state")
         self._observation = self._observation.index_copy(0, at, observation)
+
+    def _reset_effects(self, rows: torch.Tensor) -> None:
+        """Tell the effects outside the simulation that episodes begin in environments ``rows``."""
+        values = self._values[rows].cpu().numpy()
+        self._commands.reset(rows, values)
+        if self._sensors:
+            self._sensors.reset(rows, self._states[rows], values)
 
     def _set_seed(self, seed: int | None) -> None:
         if seed is not None:
@@ -212,17 +203,12 @@ class RandomizedEnv(EnvBase):
 
     def get_extra_state(self) -> dict[str, Any]:
         """Return all that the next steps depend on; it is what ``state_dict`` holds."""
-        state: dict[str, Any] = {
-            "stepper": self._stepper.state_dict(), "generator": self._generator.get_state(),
-            "values": self._values.clone(),
-            "states": self._states, "observation": self._observation, "count": self._count,
+        return {
+            "stepper": self._stepper.state_dict(), "commands": self._commands.state_dict(),
+            "sensors": self._sensors.state_dict(), "generator": self._generator.get_state(),
             "num_diverged": self.num_diverged, "num_repaired": self.num_repaired,
+            **{name: getattr(self, f"_{name}") for name in self._KEPT},
         }  # fmt: skip
-        if self._commands is not None:
-            state["commands"] = self._commands.state_dict()
-        if self._sensors is not None:
-            state["sensors"] = self._sensors.state_dict()
-        return state
 
     def set_extra_state(self, state: dict[str, Any]) -> None:
         """Go on from a state of :meth:`get_extra_state`."""
@@ -231,21 +217,14 @@ class RandomizedEnv(EnvBase):
                 f"environments: the saved state is of {len(state['states'])} environments with "
                 f"{state['values'].shape[1]} parameters; these are {self.num_envs} with {len(self.space)}"
             )
-        self._values = state["values"].clone()
+        for name in self._KEPT:
+            setattr(self, f"_{name}", state[name].to(self.device))
+        self.num_diverged, self.num_repaired = state["num_diverged"], state["num_repaired"]
         self._generator.set_state(state["generator"])
-        self._shared = self._values.to(self.device, torch.float32)
-        self._states, self._observation, self._count = (
-            state[k].to(self.device) for k in ("states", "observation", "count")
-        )
-        self.num_diverged, self.num_repaired = int(state["num_diverged"]), int(state["num_repaired"])
         self._stepper.load_state_dict(state["stepper"], self._values)
-        every = torch.arange(self.num_envs, device=self.device)
-        if self._commands is not None:
-            self._commands.reset(every, self._values.numpy())
-            self._commands.load_state_dict(state["commands"])
-        if self._sensors is not None:
-            self._sensors.reset(every, self._states, self._values.numpy())
-            self._sensors.load_state_dict(state["sensors"])
+        self._reset_effects(torch.arange(self.num_envs, device=self.device))
+        self._commands.load_state_dict(state["commands"])
+        self._sensors.load_state_dict(state["sensors"])
 
 
 def _checked_space(
@@ -259,10 +238,7 @@ def _checked_space(
     model = space.model
     if model is None:
         raise InputError("space: these parameters belong to no MuJoCo model")
-    for size in ("nq", "nv", "nu"):
-        ours, theirs = getattr(task.model, size), getattr(model, size)
-        if ours != theirs:
-            raise InputError(f"task: {task.name} is for a model with {size} {ours}; this one has {theirs}")
+    check_model(task, model, "this one")
     if effects is None:
         named = [p.name for p in space.parameters if p.effect]
         if named:

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import torch
-from torchrl.envs import EnvBase
 
+from dropo_torch.rl.env import RandomizedEnv
 from dropo_torch.rl.policy import Policy
 
 
@@ -48,9 +48,9 @@ class Returns:
 
 
 @torch.no_grad()
-def evaluate(policy: Policy, env: EnvBase) -> Returns:
+def evaluate(policy: Policy, env: RandomizedEnv) -> Returns:
     """Return the first episode of each environment of a fresh batch, acted without noise."""
-    count = env.batch_size[0]
+    count = env.num_envs
     total, length = torch.zeros(count, dtype=torch.float64), torch.zeros(count, dtype=torch.int64)
     going, diverged = torch.ones(count, dtype=torch.bool), torch.zeros(count, dtype=torch.bool)
     now = env.reset()
@@ -60,8 +60,6 @@ def evaluate(policy: Policy, env: EnvBase) -> Returns:
         after = after.get("next")
         total += torch.where(going, after.get("reward")[:, 0].cpu().double(), 0.0)
         length += going
-        found = after.get("diverged", None)
-        if found is not None:
-            diverged |= going & found[:, 0].cpu()
+        diverged |= going & after.get("diverged")[:, 0].cpu()
         going &= ~after.get("done")[:, 0].cpu()
     return Returns(tuple(total.tolist()), tuple(length.tolist()), int(diverged.sum()))

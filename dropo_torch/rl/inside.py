@@ -3,49 +3,42 @@
 from __future__ import annotations
 
 import copy
-from dataclasses import dataclass
 
 import mujoco
 import mujoco.batch
 import numpy as np
 
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects.engine import Force, Forces, Variant, VariantEngine
-from dropo_torch.effects.placing import EffectSet
+from dropo_torch.effects.placing import EffectSet, plain_setting
 from dropo_torch.effects.simulator import apply_native, finer_steps, overlap
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
 
 
-@dataclass(frozen=True)
-class Inside:
-    """The model that is simulated, and how.
-
-    Attributes:
-        model: a copy of the model, with the effects in it that are the same in every episode.
-        finer: its steps in one of the given model's.
-        varies: whether effects change the model from episode to episode.
-    """
-
-    model: mujoco.MjModel
-    finer: int
-    varies: bool
+def no_effects(space: ParameterSpace, frame_skip: int) -> EffectSet:
+    """Return an empty set of effects on a space's model."""
+    assert space.model is not None
+    return EffectSet((), plain_setting(space.model, parse_observation(space.model, None), frame_skip))
 
 
-def inside_model(space: ParameterSpace, effects: EffectSet | None) -> Inside:
+def inside_model(space: ParameterSpace, effects: EffectSet) -> tuple[mujoco.MjModel, int, bool]:
     """Return the model with effects that change it.
+
+    Returns:
+        A copy of the model, with the effects in it that are the same in every episode; its steps in one of the given
+        model's; whether effects change the model from episode to episode.
 
     Raises:
         InputError: effects whose finer steps do not fill the model's.
     """
     assert space.model is not None
-    applied = None if effects is None else effects.having("apply")
-    if applied is None or not len(applied):
-        return Inside(copy.copy(space.model), 1, False)
+    applied = effects.having("apply")
     if any(e.varies for e in applied.entries) or overlap(applied, space) is not None:
-        return Inside(copy.copy(space.model), 1, True)
-    model = apply_native(space.model, applied)
-    return Inside(model, finer_steps(space.model, model, applied), False)
+        return copy.copy(space.model), 1, True
+    model = apply_native(space.model, applied) if len(applied) else copy.copy(space.model)
+    return model, finer_steps(space.model, model, applied), False
 
 
 class RowFields:
@@ -55,13 +48,21 @@ class RowFields:
         batch: the batch.
         space: the parameters, over the batch's model.
         finer: steps of the batch's model in one of the given model's.
+
+    Attributes:
+        finer: the same for every simulation, ``(N,)``.
     """
 
     def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, finer: int) -> None:
         self._batch, self._space = batch, space
-        self._fields = {f: batch.expand(f) for f in derived_fields(batch.model, space)} if space.fields else {}
+        for field in space.fields:
+            batch.expand(field)
+        if space.fields:
+            batch.set_const()  # what it derives becomes each simulation's own, too
+        own = [f for f in sorted(mujoco.batch.MODEL_FIELDS) if batch.expanded(f) is not None]
+        self._fields = {f: batch.expand(f) for f in own if read_field(batch.model, f).dtype.kind == "f"}
         self._shared = {f: read_field(batch.model, f).copy() for f in self._fields}
-        self._groups = [(np.arange(batch.nsim, dtype=np.int32), finer)]
+        self.finer = np.full(batch.nsim, finer)
 
     def write(self, ids: np.ndarray, values: np.ndarray) -> None:
         """Give simulations ``ids`` the values ``(k, d)``; the others are untouched."""
@@ -78,70 +79,34 @@ class RowFields:
             row = int(np.flatnonzero(ids == error.ids[0])[0])
             raise _refused(self._space, values[row], self._batch.error(int(error.ids[0]))) from None
 
-    def groups(self) -> list[tuple[np.ndarray, int]]:
-        """Return all simulations, and how many of their steps make one of the given model's."""
-        return self._groups
-
 
 class RowModels:
-    """Writes the models of parameter vectors, effects included, into some simulations of a batch.
+    """Gives some simulations of a batch the models of parameter vectors, effects included.
 
     Args:
         batch: the batch, of the model without effects.
         space: the parameters.
         effects: the effects.
+
+    Attributes:
+        finer: steps of each simulation's model in one of the given model's, ``(N,)``.
     """
 
-    #: Parameter vectors at which the changed fields are looked for, beside the corners of the bounds.
-    PROBES = 8
-
     def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, effects: EffectSet) -> None:
-        self._space, self._effects = space, effects
+        self._batch, self._space, self._effects = batch, space, effects
         self._engine = VariantEngine(effects.setting, space, num_threads=1)
-        self._base = effects.setting.model
-        drawn = np.random.default_rng(0).uniform(space.low, space.high, (self.PROBES, len(space)))
-        models = [self._model(v) for v in (space.low, 0.5 * (space.low + space.high), space.high, *drawn)]
-        self._finer = np.ones(batch.nsim, dtype=int)
-        self._fields = {f: batch.expand(f) for f in _changed(self._base, models)}
+        self._models = [batch.model] * batch.nsim
+        self.finer = np.ones(batch.nsim, dtype=int)
 
     def write(self, ids: np.ndarray, values: np.ndarray) -> None:
         """Give simulations ``ids`` the models of values ``(k, d)``; the others are untouched."""
         for row, vector in zip(ids, values, strict=True):
-            model = self._model(vector)
-            self._finer[row] = finer_steps(self._base, model, self._effects)
-            for field, own in self._fields.items():
-                own[row] = read_field(model, field)
-
-    def groups(self) -> list[tuple[np.ndarray, int]]:
-        """Return simulations with steps of the same length, and how many of them make one of the model's."""
-        return [(np.flatnonzero(self._finer == n).astype(np.int32), int(n)) for n in np.unique(self._finer)]
-
-    def _model(self, vector: np.ndarray) -> mujoco.MjModel:
-        try:
-            return self._engine.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
-        except ValueError as error:
-            raise _refused(self._space, vector, str(error)) from None
-
-
-def _changed(base: mujoco.MjModel, models: list[mujoco.MjModel]) -> list[str]:
-    """Fields that a batch can hold per simulation and in which models differ from a base."""
-    return [
-        f for f in sorted(mujoco.batch.MODEL_FIELDS)
-        if any(not np.array_equal(read_field(base, f), read_field(m, f)) for m in models) and f != "opt.disableflags"
-    ]  # fmt: skip
-
-
-def derived_fields(model: mujoco.MjModel, space: ParameterSpace) -> list[str]:
-    """Return the real-valued model fields that the parameters write, and those that ``mj_setConst`` then does."""
-    probe = mujoco.batch.Batch(model, 1, 1)
-    for field in space.fields:
-        probe.expand(field)
-    probe.set_const()
-    return [
-        f
-        for f in sorted(mujoco.batch.MODEL_FIELDS)
-        if probe.expanded(f) is not None and read_field(model, f).dtype.kind == "f"
-    ]
+            try:
+                self._models[row] = self._engine.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
+            except ValueError as error:
+                raise _refused(self._space, vector, str(error)) from None
+            self.finer[row] = finer_steps(self._effects.setting.model, self._models[row], self._effects)
+        self._batch.set_models(self._models)
 
 
 def _refused(space: ParameterSpace, values: np.ndarray, reason: str) -> InputError:
@@ -167,7 +132,6 @@ class RowForces:
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
         self._force, self._wrench = batch.bind("qfrc_applied"), batch.bind("xfrc_applied")
         self._values = [np.full((batch.nsim, len(e.fixed)), e.fixed) for e in self._entries]
-        self._constant = np.zeros_like(self._wrench)
         self.any = bool(self._entries)
         self.before = np.zeros_like(self._qvel)
 
@@ -175,16 +139,14 @@ class RowForces:
         """Give simulations ``ids`` the numbers in values ``(k, d)``."""
         for entry, own in zip(self._entries, self._values, strict=True):
             own[ids] = entry.values(values)
+
+    def restart(self, ids: np.ndarray, values: np.ndarray) -> None:
+        """Begin episodes in simulations whose states have just been set, with values ``(k, d)``."""
+        self.before[ids] = self._qvel[ids]
         for row, vector in zip(ids, values, strict=True) if self._wrenches else ():
-            self._constant[row] = sum(
+            self._wrench[row] = sum(
                 e.effect.wrench(self._setting, e.target, e.values(vector[None])[0]) for e in self._wrenches
             )
-
-    def restart(self, ids: np.ndarray) -> None:
-        """Begin episodes in simulations whose states have just been set."""
-        self.before[ids] = self._qvel[ids]
-        if self._wrenches:
-            self._wrench[ids] = self._constant[ids]
 
     def apply(self, ids: np.ndarray, finer: int) -> None:
         """Set the forces that act in the next physics step of simulations ``ids``."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Any
 
 import torch
 from tensordict import TensorDict
@@ -12,6 +11,7 @@ from tensordict.nn import TensorDictModule
 from torchrl.modules import ProbabilisticActor
 
 from dropo_torch.errors import InputError
+from dropo_torch.rl.checkpoint import Stateful
 from dropo_torch.rl.networks import Normalizer
 from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.settings import TrainSettings
@@ -20,7 +20,7 @@ from dropo_torch.rl.settings import TrainSettings
 PATIENCE = 20
 
 
-class Learner(ABC):
+class Learner(Stateful, ABC):
     """Improves a policy from experience.
 
     Args:
@@ -29,15 +29,13 @@ class Learner(ABC):
         settings: how it learns.
     """
 
-    #: Numbers that further learning depends on, beside the networks, optimizers and the like.
-    counters: tuple[str, ...] = ("skipped", "in_a_row")
+    kept: tuple[str, ...] = ("skipped", "in_a_row")
 
     def __init__(self, policy: Policy, num_parameters: int, settings: TrainSettings) -> None:
         self.policy = policy
         self._device = policy.low.device
         self._seen = Normalizer(num_parameters if settings.privileged_critic else 0).to(self._device)
-        #: What holds state, by name: each has ``state_dict`` and ``load_state_dict``.
-        self._parts: dict[str, Any] = {"policy": policy, "seen": self._seen}
+        self.parts = {"policy": policy, "seen": self._seen}
         self.skipped = 0
         self.in_a_row = 0
 
@@ -47,26 +45,12 @@ class Learner(ABC):
         return self.policy.num_observations + len(self._seen.mean)
 
     @abstractmethod
-    def act(
-        self, observation: torch.Tensor, parameters: torch.Tensor
-    ) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
+    def act(self, observation: torch.Tensor) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
         """Return exploring actions in [-1, 1], ``(N, m)``, and what the update needs of them."""
 
     @abstractmethod
     def update(self, rollout: TensorDict, share: float) -> dict[str, float]:
         """Learn from steps ``(N, horizon)``; ``share`` of the run is done. Return scalars to look at."""
-
-    def state_dict(self) -> dict[str, Any]:
-        """Return everything that further learning depends on."""
-        parts = {name: part.state_dict() for name, part in self._parts.items()}
-        return {**parts, "counters": {name: getattr(self, name) for name in self.counters}}
-
-    def load_state_dict(self, state: Mapping[str, Any]) -> None:
-        """Go on from a state that :meth:`state_dict` returned."""
-        for name, part in self._parts.items():
-            part.load_state_dict(state[name])
-        for name, count in state["counters"].items():
-            setattr(self, name, count)
 
     def _actor(self, distribution: type) -> ProbabilisticActor:
         """The policy's network as the losses take it, with actions of the given distribution."""
@@ -86,21 +70,16 @@ class Learner(ABC):
     def _features(self, observation: torch.Tensor, parameters: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """The actor's and the critic's normalised inputs."""
         features = self.policy.normalizer(observation)
-        width = len(self._seen.mean)
-        if not width:
-            return features, features
-        return features, torch.cat([features, self._seen(parameters[..., :width])], -1)
+        return features, torch.cat([features, self._seen(parameters[..., : len(self._seen.mean)])], -1)
 
     def _is_sound(self, loss: torch.Tensor) -> bool:
         """Whether a loss may be followed; counts those that may not."""
-        if bool(torch.isfinite(loss)):
-            self.in_a_row = 0
-            return True
-        self.skipped += 1
-        self.in_a_row += 1
+        sound = bool(torch.isfinite(loss))
+        self.skipped += not sound
+        self.in_a_row = 0 if sound else self.in_a_row + 1
         if self.in_a_row >= PATIENCE:
             raise InputError(
                 f"train: the loss was not finite for {PATIENCE} updates in a row; lower train.learning_rate, "
                 "or scale the task's reward"
             )
-        return False
+        return sound

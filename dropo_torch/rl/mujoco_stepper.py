@@ -10,10 +10,10 @@ import numpy as np
 import torch
 
 from dropo_torch.effects.placing import EffectSet
-from dropo_torch.models.load import quiet_mujoco
+from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, unmark_frames
-from dropo_torch.rl.batch_stepper import BatchStepper
-from dropo_torch.rl.inside import RowFields, RowForces, RowModels, inside_model
+from dropo_torch.rl.inside import RowFields, RowForces, RowModels, inside_model, no_effects
+from dropo_torch.rl.stepper import BatchStepper
 from dropo_torch.simulators.mujoco import default_row
 
 
@@ -35,33 +35,30 @@ class MujocoStepper(BatchStepper):
         self, space: ParameterSpace, num_envs: int, *, frame_skip: int, effects: EffectSet | None = None,
         num_threads: int = 0,
     ) -> None:  # fmt: skip
-        assert space.model is not None
-        inside = inside_model(space, effects)
-        model = inside.model
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET  # a divergence must show
+        effects = effects or no_effects(space, frame_skip)
+        model, finer, varies = inside_model(space, effects)
+        show_divergence(model)
         unmark_frames(model, space)
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
         self._batch = mujoco.batch.Batch(model, num_envs, num_threads)
         self._row = default_row(model)
-        self._states = _adjacent(self._batch, "qpos", "qvel")
-        self._ctrl = self._batch.bind("ctrl")
+        self._qpos, self._qvel, self._ctrl = (self._batch.bind(name) for name in ("qpos", "qvel", "ctrl"))
         self._failed = np.zeros(num_envs, dtype=bool)
         self._models: RowModels | RowFields = (
-            RowModels(self._batch, space, effects)
-            if inside.varies and effects is not None
-            else RowFields(self._batch, space.on(model), inside.finer)
+            RowModels(self._batch, space, effects) if varies else RowFields(self._batch, space.on(model), finer)
         )
-        self._forces = RowForces(self._batch, effects) if effects is not None else None
+        self._forces = RowForces(self._batch, effects)
 
     def reset(self, rows: torch.Tensor, states: torch.Tensor, values: torch.Tensor) -> None:
         """Start new episodes; see :meth:`BatchStepper.reset`."""
         ids = rows.cpu().numpy()
-        self._set_parameters(ids, values.cpu().numpy())
+        numbers = values.cpu().numpy()
+        self._models.write(ids, numbers)
+        self._forces.write(ids, numbers)
         self._batch.state[ids] = self._row
-        self._states[ids] = states.cpu().numpy()
+        self._qpos[ids], self._qvel[ids] = np.split(states.cpu().numpy(), [self._qpos.shape[1]], axis=1)
         self._failed[ids] = False
-        if self._forces is not None:
-            self._forces.restart(ids)
+        self._forces.restart(ids, numbers)
 
     def step(self, controls: torch.Tensor) -> torch.Tensor:
         """Make an environment step; see :meth:`BatchStepper.step`."""
@@ -72,47 +69,34 @@ class MujocoStepper(BatchStepper):
             for s in range(count):
                 self._ctrl[:] = given[:, s]
                 self._advance(self.frame_skip // count)
-                out[:, s] = self._states
-        if self._failed.any():
-            out[self._failed] = np.nan
+                np.concatenate([self._qpos, self._qvel], axis=1, out=out[:, s])
+        out[self._failed] = np.nan
         return torch.from_numpy(out)
 
     def _advance(self, steps: int) -> None:
         """Make physics steps of the model's own length under the controls in place."""
-        forces = self._forces if self._forces is not None and self._forces.any else None
-        for ids, finer in self._models.groups():
-            for _ in range(1 if forces is None else steps * finer):
-                if forces is not None:
-                    forces.apply(ids, finer)
+        for finer in np.unique(self._models.finer).tolist():
+            ids = np.flatnonzero(self._models.finer == finer).astype(np.int32)
+            calls, length = (steps * finer, 1) if self._forces.any else (1, steps * finer)
+            for _ in range(calls):
+                if self._forces.any:
+                    self._forces.apply(ids, finer)
                 try:
-                    self._batch.step(ids, nstep=steps * finer if forces is None else 1)
+                    self._batch.step(ids, nstep=length)
                 except mujoco.batch.SimulationError as error:
                     self._failed[error.ids] = True
 
-    def _set_parameters(self, ids: np.ndarray, values: np.ndarray) -> None:
-        self._models.write(ids, values)
-        if self._forces is not None:
-            self._forces.write(ids, values)
-
     def state_dict(self) -> dict[str, Any]:
         """Return MuJoCo's integration states; see :meth:`BatchStepper.state_dict`."""
-        out = {"rows": torch.from_numpy(self._batch.state.copy()), "failed": torch.from_numpy(self._failed.copy())}
-        if self._forces is not None:
-            out["before"] = torch.from_numpy(self._forces.before.copy())
-        return out
+        return {name: torch.from_numpy(own.copy()) for name, own in self._kept().items()}
 
     def load_state_dict(self, state: dict[str, Any], values: torch.Tensor) -> None:
         """Go on from a state; see :meth:`BatchStepper.load_state_dict`."""
-        self._set_parameters(np.arange(self.num_envs), values.cpu().numpy())
-        self._batch.state[:] = state["rows"].numpy()
-        self._failed[:] = state["failed"].numpy()
-        if self._forces is not None:
-            self._forces.before[:] = state["before"].numpy()
+        for part in (self._models, self._forces):
+            part.write(np.arange(self.num_envs), values.cpu().numpy())
+        for name, own in self._kept().items():
+            own[:] = state[name].numpy()
 
-
-def _adjacent(batch: mujoco.batch.Batch, first: str, second: str) -> np.ndarray:
-    """Two neighbouring components of the state as one live array, ``(N, n)``."""
-    left, right = batch.bind(first), batch.bind(second)
-    start = (left.__array_interface__["data"][0] - batch.state.__array_interface__["data"][0]) // 8
-    assert right.__array_interface__["data"][0] == left.__array_interface__["data"][0] + 8 * left.shape[1]
-    return batch.state[:, start : start + left.shape[1] + right.shape[1]]
+    def _kept(self) -> dict[str, np.ndarray]:
+        """What the next steps depend on, as live arrays of a row for each environment."""
+        return {"rows": self._batch.state, "failed": self._failed, "before": self._forces.before}

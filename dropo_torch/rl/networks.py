@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from typing import Literal
 
 import torch
 from torch import nn
@@ -15,7 +14,6 @@ CLIP = 10.0
 #: Least and largest logarithm of a state-dependent standard deviation.
 LOG_STD = (-5.0, 2.0)
 
-Head = Literal["normal", "tanh"]
 ACTIVATIONS = {"tanh": nn.Tanh, "relu": nn.ReLU, "elu": nn.ELU}
 
 
@@ -59,7 +57,7 @@ class Actor(nn.Module):
     """Maps features ``(..., n)`` to mean and standard deviation of actions in [-1, 1], ``(..., m)`` each.
 
     Args:
-        num_features, num_actions: n and m.
+        num_observations, num_actions: n and m.
         hidden: widths of the hidden layers.
         head: ``"normal"``: a normal whose standard deviation is the same in every state, cut off at ±1 by whoever acts;
             ``"tanh"``: a squashed normal whose standard deviation depends on the state.
@@ -69,18 +67,17 @@ class Actor(nn.Module):
 
     def __init__(
         self,
-        num_features: int,
-        num_actions: int,
         *,
+        num_observations: int,
+        num_actions: int,
         hidden: Sequence[int],
-        head: Head,
+        head: str,
         activation: str,
         initial_std: float = 0.6,
     ) -> None:
         super().__init__()
         self.head = head
-        self.num_actions = num_actions
-        self.network = mlp(num_features, num_actions * (2 if head == "tanh" else 1), hidden, activation, 0.01)
+        self.network = mlp(num_observations, num_actions * (2 if head == "tanh" else 1), hidden, activation, 0.01)
         if head == "normal":
             self.log_std = nn.Parameter(torch.full((num_actions,), math.log(initial_std)))
 
@@ -99,16 +96,12 @@ class Actor(nn.Module):
         return torch.tanh(mean) if self.head == "tanh" else mean.clamp(-1, 1)
 
 
-class ActionValue(nn.Module):
-    """Maps features ``(..., n)`` and actions ``(..., m)`` to a value ``(..., 1)``."""
+class ActionValue(nn.Sequential):
+    """Layers that map features ``(..., n)`` and actions ``(..., m)`` to a value ``(..., 1)``."""
 
-    def __init__(self, num_features: int, num_actions: int, *, hidden: Sequence[int], activation: str) -> None:
-        super().__init__()
-        self.network = mlp(num_features + num_actions, 1, hidden, activation, 1.0)
-
-    def forward(self, features: torch.Tensor, action: torch.Tensor) -> torch.Tensor:
-        """Return the value."""
-        return self.network(torch.cat([features, action], -1))
+    def forward(self, *inputs: torch.Tensor) -> torch.Tensor:
+        """Return the value of features and actions."""
+        return super().forward(torch.cat(inputs, -1))
 
 
 def mlp(inputs: int, outputs: int, hidden: Sequence[int], activation: str, gain: float) -> nn.Sequential:

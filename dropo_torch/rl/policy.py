@@ -16,6 +16,7 @@ from dropo_torch.rl.networks import Actor, Normalizer
 from dropo_torch.support.given import reading
 
 SCHEMA = "dropo-torch/policy/1"
+Plain = Mapping[str, Any]
 
 
 class Policy(nn.Module):
@@ -29,32 +30,18 @@ class Policy(nn.Module):
     Attributes:
         actor: the network.
         normalizer: statistics of the observations.
-        low, high: bounds of the actions, ``(m,)`` each; where one is infinite, [-1, 1] is not scaled.
+        low, high: bounds of the actions, ``(m,)`` each, finite.
     """
 
     low: torch.Tensor
     high: torch.Tensor
 
-    def __init__(
-        self,
-        architecture: Mapping[str, Any],
-        *,
-        config: Mapping[str, Any] | None = None,
-        distribution: Mapping[str, Any] | None = None,
-    ) -> None:
+    def __init__(self, architecture: Plain, *, config: Plain | None = None, distribution: Plain | None = None) -> None:
         super().__init__()
-        size, num_actions = architecture["num_observations"], architecture["num_actions"]
-        self.actor = Actor(
-            size,
-            num_actions,
-            hidden=architecture["hidden"],
-            head=architecture["head"],
-            activation=architecture["activation"],
-            initial_std=architecture.get("initial_std", 0.6),
-        )
-        self.normalizer = Normalizer(size)
-        self.register_buffer("low", torch.full((num_actions,), -1.0))
-        self.register_buffer("high", torch.full((num_actions,), 1.0))
+        self.actor = Actor(**architecture)
+        self.normalizer = Normalizer(architecture["num_observations"])
+        self.register_buffer("low", -torch.ones(architecture["num_actions"]))
+        self.register_buffer("high", torch.ones(architecture["num_actions"]))
         self.architecture = dict(architecture)
         self.config = dict(config or {})
         self.distribution = dict(distribution or {})
@@ -87,20 +74,12 @@ class Policy(nn.Module):
 
     def to_action(self, unit: torch.Tensor) -> torch.Tensor:
         """Return actions in the environment's units of actions in [-1, 1]; what lies outside is cut off."""
-        bounded = torch.isfinite(self.low) & torch.isfinite(self.high)
-        low, high = torch.where(bounded, self.low, -1.0), torch.where(bounded, self.high, 1.0)
-        return low + (unit.clamp(-1, 1) + 1) * 0.5 * (high - low)
+        return self.low + (unit.clamp(-1, 1) + 1) * 0.5 * (self.high - self.low)
 
     def save(self, path: str | Path) -> None:
         """Write the policy with its config and distribution, whole or not at all."""
-        content = {
-            "schema": SCHEMA,
-            "architecture": self.architecture,
-            "weights": self.state_dict(),
-            "config": self.config,
-            "distribution": self.distribution,
-        }
-        save_tensors(Path(path), content)
+        plain = {name: getattr(self, name) for name in ("architecture", "config", "distribution")}
+        save_tensors(Path(path), {"schema": SCHEMA, "weights": self.state_dict(), **plain})
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -117,9 +96,8 @@ def load_policy(path: str | Path) -> Policy:
         raise InputError(f"policy: no file {path}; expected a policy.pt that dropo train has written")
     with reading(f"policy: {path}", "a policy that dropo train has written"):
         content = load_tensors(path)
-        schema = content["schema"]
+        if content["schema"] != SCHEMA:
+            raise InputError(f"policy: {path} is of schema {content['schema']!r}; expected {SCHEMA!r}")
         policy = Policy(content["architecture"], config=content["config"], distribution=content["distribution"])
         policy.load_state_dict(content["weights"])
-    if schema != SCHEMA:
-        raise InputError(f"policy: {path} is of schema {schema!r}; expected {SCHEMA!r}")
     return policy.eval()

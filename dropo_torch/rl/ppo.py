@@ -60,11 +60,9 @@ class PPO(Learner):
             [*policy.actor.parameters(), *network.parameters()], lr=settings.learning_rate, eps=1e-5, fused=True
         )
         self._scale = ReturnScale(settings.num_envs, settings.gamma).to(self._device)
-        self._parts |= {"critic": self._critic, "optimizer": self._optimizer, "scale": self._scale}
+        self.parts |= {"critic": self._critic, "optimizer": self._optimizer, "scale": self._scale}
 
-    def act(
-        self, observation: torch.Tensor, parameters: torch.Tensor
-    ) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
+    def act(self, observation: torch.Tensor) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
         """Return sampled actions, whose excess over ±1 the environment does not see, and their log-probabilities."""
         distribution = IndependentNormal(*self.policy.actor(self.policy.normalizer(observation)))
         action = distribution.sample()

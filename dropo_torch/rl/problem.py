@@ -23,7 +23,7 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.env import RandomizedEnv
 from dropo_torch.rl.sampling import ParameterSource, PointSource, load_source
 from dropo_torch.rl.settings import Settings, train_settings
-from dropo_torch.rl.task import Task, load_task
+from dropo_torch.rl.task import Task, check_model, load_task
 from dropo_torch.support.given import number
 
 #: Keys of a config that a training does not depend on, or whose meaning is told otherwise.
@@ -32,24 +32,22 @@ _FITTING = (
     "scaling", "lag", "common_random_numbers", "distribution", "train", "algorithm", "method", "method_options",
     "entropy", "covariance", "environment",
 )  # fmt: skip
-#: Distributions that need no file.
-KEYWORDS = ("uniform", "nominal")
 
 
 @dataclass(frozen=True)
 class World:
-    """A model of the robot with parameters that come from somewhere.
+    """A model of the robot with parameters that come from somewhere, as :class:`RandomizedEnv` takes them.
 
     Attributes:
         task: what is to be done, on its model.
         space: what varies; may be empty.
-        source: where an episode's parameters come from, or ``None`` where nothing varies.
+        source: where an episode's parameters come from.
         effects: the physical effects of the config, or ``None``.
     """
 
     task: Task
     space: ParameterSpace
-    source: ParameterSource | None
+    source: ParameterSource
     effects: EffectSet | None
 
 
@@ -65,8 +63,7 @@ class TrainingProblem:
         training: the world in which the policy learns.
         nominal: the model as it is; ``None`` where a number of an effect has no value of its own.
         target: the world of the config's ``target``, or ``None``.
-        distribution: where parameters come from, as plain data.
-        distribution_path: its file, or ``None``.
+        distribution_path: file of the distribution, or ``None``.
         fingerprint: identifies all of it; an interrupted run goes on only with the same.
     """
 
@@ -77,23 +74,24 @@ class TrainingProblem:
     training: World
     nominal: World | None
     target: World | None
-    distribution: dict[str, Any]
     distribution_path: Path | None
     fingerprint: str
 
     def env(self, world: World, num_envs: int, seed: int) -> RandomizedEnv:
         """Return environments of one of the worlds, on the config's backend."""
         return RandomizedEnv(
-            world.task,
-            num_envs,
-            space=world.space,
-            source=world.source,
-            effects=world.effects,
+            **vars(world),
+            num_envs=num_envs,
             backend=self.config.backend,
             seed=seed,
             num_threads=self.config.threads,
             device=self.device,
         )
+
+    @property
+    def distribution(self) -> dict[str, Any]:
+        """Where the parameters of a training's episodes come from, as plain data."""
+        return self.training.source.document()
 
     @property
     def device(self) -> str:
@@ -113,107 +111,95 @@ def make_training(config: Config) -> TrainingProblem:
     algorithm = config.algorithm or "ppo"
     settings = train_settings(algorithm, config.train)
     sim = None if config.sim is None else bundled_sim(config.sim)
-    task, model_path = _task(config, sim)
-    specs = config.parameters if config.parameters is not None else (dict(sim.parameters) if sim else {})
-    given, distribution_path = _given_distribution(config, bool(specs))
-    space, effects = _space_and_effects(config, sim, task, specs)
-    training = World(task, space, load_source(given, space) if len(space) else None, effects)
-    described = {"kind": "nominal", "parameters": {}} if training.source is None else training.source.document()
+    full = _completed(config, sim)
+    task, model_path = _task(full)
+    given = _given_distribution(full)
+    space, effects = _space_and_effects(full, task)
+    training = World(task, space, load_source(given, space), effects)
     return TrainingProblem(
         config=config,
         algorithm=algorithm,
         settings=settings,
         model_path=model_path,
         training=training,
-        nominal=_nominal_world(training),
-        target=_target_world(config, sim, task, specs) if config.target else None,
-        distribution=described,
-        distribution_path=distribution_path,
-        fingerprint=_fingerprint(config, algorithm, settings, task, described),
+        nominal=replace(training, source=PointSource.nominal(space)) if np.isfinite(space.nominal).all() else None,
+        target=_target_world(full, {} if sim is None else sim.parameters, task) if config.target else None,
+        distribution_path=given if isinstance(given, Path) else None,
+        fingerprint=_fingerprint(config, algorithm, settings, training),
     )
 
 
-def _task(config: Config, sim: BundledSim | None) -> tuple[Task, Path | None]:
-    """The task on the config's model, and that model's path."""
-    if config.model is not None and sim is not None:
+def _completed(config: Config, sim: BundledSim | None) -> Config:
+    """The config with what its bundled simulation says of the keys that it leaves out."""
+    if sim is None:
+        return config
+    if config.model is not None:
         raise InputError("config: both model and sim are given; expected one: model: robot.xml, or sim: hopper")
-    name = config.task if config.task is not None else config.sim
-    if name is None:
+    own = {"task": config.sim, "model": str(sim.model), "parameters": sim.parameters, "observation": sim.observation}
+    return config.model_copy(update={key: value for key, value in own.items() if getattr(config, key) is None})
+
+
+def _task(config: Config) -> tuple[Task, Path | None]:
+    """The task on the config's model, and that model's path."""
+    if config.task is None:
         raise InputError("config: no task given; expected task: file.py:Class of a Task, or sim: hopper")
-    task = load_task(name, base=config.base)
-    path = sim.model if sim is not None else (None if config.model is None else config.path(config.model))
-    if path is None:
+    task = load_task(config.task, base=config.base)
+    if config.model is None:
         return task, None
+    path = config.path(config.model)
     model = load_model(path, general=config.moves_centres)
-    for size in ("nq", "nv", "nu"):
-        if getattr(model, size) != getattr(task.model, size):
-            raise InputError(
-                f"task: {task.name} was made for a model of {size} {getattr(task.model, size)}; "
-                f"{path} has {getattr(model, size)}"
-            )
+    check_model(task, model, str(path))
     return task.on(model), path
 
 
-def _given_distribution(config: Config, varies: bool) -> tuple[str | dict[str, float], Path | None]:
-    """What the config says of the distribution (a keyword, values, or a file), and the file."""
+def _given_distribution(config: Config) -> str | dict[str, float] | Path:
+    """What the config says of the distribution: a keyword, values, or a file."""
     given = config.distribution
-    if not varies and given not in (None, "nominal"):
+    if not config.parameters and given not in (None, "nominal"):
         raise InputError(
             "distribution: no parameters are given that it could be of; give parameters, or distribution: nominal"
         )
     if isinstance(given, dict):
-        return {name: number(value, f"distribution.{name}") for name, value in given.items()}, None
-    if given in KEYWORDS:
-        return given, None
-    beside = config.base / "fit.json"
-    if given is None and not (varies and beside.is_file()):
-        return "uniform" if varies else "nominal", None
-    path = (beside if given is None else config.path(given)).resolve()
+        return {name: number(value, f"distribution.{name}") for name, value in given.items()}
+    if given is None and not (config.parameters and (config.base / "fit.json").is_file()):
+        return "uniform" if config.parameters else "nominal"
+    if given in ("uniform", "nominal"):
+        return given
+    path = config.path(given or "fit.json").resolve()
     if not path.is_file():
         raise InputError(
             f"distribution: no file {path}; expected a fit.json, uniform, nominal, or name: value of every parameter"
         )
-    return str(path), path
+    return path
 
 
-def _space_and_effects(
-    config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]
-) -> tuple[ParameterSpace, EffectSet | None]:
-    space = ParameterSpace(task.model, specs) if specs else ParameterSpace.empty(task.model)
-    if not config.effects and not any("effect" in p for p in specs.values()):
+def _space_and_effects(config: Config, task: Task) -> tuple[ParameterSpace, EffectSet | None]:
+    space = ParameterSpace(task.model, config.parameters) if config.parameters else ParameterSpace.empty(task.model)
+    if not config.has_effects:
         return space, None
-    entries = config.observation if config.observation is not None else (list(sim.observation) if sim else None)
-    observation = parse_observation(task.model, entries)
-    effects = place_effects(config.effects, space, plain_setting(task.model, observation, task.frame_skip), find_effect)
+    setting = plain_setting(task.model, parse_observation(task.model, config.observation), task.frame_skip)
+    effects = place_effects(config.effects, space, setting, find_effect)
     return space.with_limits(lowest(effects, space)), effects
 
 
-def _nominal_world(training: World) -> World | None:
-    """The same with the model's own values."""
-    if not len(training.space):
-        return training
-    if not np.isfinite(training.space.nominal).all():
-        return None
-    return replace(training, source=PointSource.nominal(training.space))
-
-
-def _target_world(config: Config, sim: BundledSim | None, task: Task, specs: Mapping[str, Mapping[str, Any]]) -> World:
+def _target_world(config: Config, bundled: Mapping[str, Mapping[str, Any]], task: Task) -> World:
     """The world of the config's ``target``: the model's own values but for those given."""
-    known = {**(sim.parameters if sim else {}), **specs}
-    wanted = dict(specs)
     values: dict[str, float] = {}
+    wanted: dict[str, Mapping[str, Any]] = {**(config.parameters or {})}
+    known = {**bundled, **wanted}
     for name, entry in config.target.items():
         if isinstance(entry, dict):
             spec = {k: v for k, v in entry.items() if k != "value"}
             values[name] = number(entry.get("value"), f"target.{name}.value")
-            wanted[name] = {"bounds": _around(values[name]), **spec}
+            bounds = sorted([0.5 * values[name], 2 * values[name]]) if values[name] else [0.0, 1.0]  # that hold it
+            wanted[name] = {"bounds": bounds, **spec}
         elif name in known:
             values[name] = number(entry, f"target.{name}")
             wanted[name] = known[name]
         else:
             other = f"; any other is given as {name}: {{field: body_mass, name: BODY, value: 1.0}}"
             raise InputError(f"target: unknown parameter {name!r}{choices(name, known)}{other}")
-    space, effects = _space_and_effects(config, sim, task, wanted)
+    space, effects = _space_and_effects(config.model_copy(update={"parameters": wanted}), task)
     vector = {**space.named(space.nominal), **values}
     for name, (low, high) in zip(space.names, space.limits, strict=True):
         if not np.isfinite(vector[name]):
@@ -223,24 +209,14 @@ def _target_world(config: Config, sim: BundledSim | None, task: Task, specs: Map
     return World(task, space, PointSource(vector), effects)
 
 
-def _around(value: float) -> list[float]:
-    """Bounds that hold a value, for a parameter that is only set."""
-    return sorted([0.5 * value, 2 * value]) if value else [0.0, 1.0]
-
-
-def _fingerprint(
-    config: Config, algorithm: str, settings: Settings, task: Task, distribution: Mapping[str, Any]
-) -> str:
+def _fingerprint(config: Config, algorithm: str, settings: Settings, training: World) -> str:
     """A digest of what decides a training's course."""
+    task, distribution = training.task, training.source.document()
     learning = settings.model_dump(mode="json", exclude={"checkpoint_seconds"})
-    text = json.dumps([config.fingerprint(*_FITTING), algorithm, learning, dict(distribution)], sort_keys=True)
-    digest = hashlib.sha256(text.encode())
-    digest.update(f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}".encode())
-    for name in (config.task or "", *config.own_effects):
-        where, _, _ = name.rpartition(":")
-        if where.endswith(".py"):
-            digest.update(config.path(where).read_bytes())
+    text = json.dumps([config.fingerprint(*_FITTING), algorithm, learning, distribution], sort_keys=True)
+    text += f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}"
+    places = (name.rpartition(":")[0] for name in (config.task or "", *config.own_effects))
+    code = [config.path(place).read_bytes() for place in places if place.endswith(".py")]
     buffer = np.empty(mujoco.mj_sizeModel(task.model), np.uint8)
     mujoco.mj_saveModel(task.model, None, buffer)
-    digest.update(buffer.tobytes())
-    return digest.hexdigest()[:32]
+    return hashlib.sha256(b"".join([text.encode(), *code, buffer.tobytes()])).hexdigest()[:32]

@@ -13,7 +13,7 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from dropo_torch.rl.learner import Learner
-from dropo_torch.rl.networks import ActionValue
+from dropo_torch.rl.networks import ActionValue, mlp
 from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.settings import SACSettings
 
@@ -27,16 +27,18 @@ class SAC(Learner):
         settings: how it learns.
     """
 
-    counters = (*Learner.counters, "seen_steps", "owed")
+    kept = (*Learner.kept, "seen_steps", "owed")
 
     def __init__(self, policy: Policy, num_parameters: int, settings: SACSettings) -> None:
         super().__init__(policy, num_parameters, settings)
         self.settings = settings
         self._num_actions = len(policy.low)
         entropy = -float(self._num_actions) if settings.target_entropy is None else settings.target_entropy
+        shape = self.num_features + self._num_actions, 1, settings.hidden, settings.activation, 1.0
+        in_keys, out_keys = ["critic_features", "action"], ["state_action_value"]
         self._loss = SACLoss(
             self._actor(TanhNormal),
-            [self._critic(), self._critic()],
+            [TensorDictModule(ActionValue(*mlp(*shape)), in_keys, out_keys) for _ in range(2)],
             loss_function="l2",
             target_entropy=entropy,
             alpha_init=0.2,
@@ -46,13 +48,11 @@ class SAC(Learner):
         self._targets = SoftUpdate(self._loss, tau=settings.tau)
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=settings.learning_rate, fused=True)
         self._memory = Memory(min(settings.buffer, max(settings.steps, 1)), settings.minibatch)
-        self._parts |= {"loss": self._loss, "optimizer": self._optimizer, "memory": self._memory}
+        self.parts |= {"loss": self._loss, "optimizer": self._optimizer, "memory": self._memory}
         self.seen_steps = 0
         self.owed = 0.0
 
-    def act(
-        self, observation: torch.Tensor, parameters: torch.Tensor
-    ) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
+    def act(self, observation: torch.Tensor) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
         """Return sampled actions; uniform ones during the warm-up."""
         if self.seen_steps < self.settings.warmup:
             return 2 * torch.rand(len(observation), self._num_actions, device=self._device) - 1, {}
@@ -74,12 +74,6 @@ class SAC(Learner):
             losses = self._gradient().detach()
         entries = {"loss_policy": "loss_actor", "loss_critic": "loss_qvalue", "alpha": "alpha", "entropy": "entropy"}
         return {name: float(losses[key]) for name, key in entries.items()} if updates else {}
-
-    def _critic(self) -> TensorDictModule:
-        network = ActionValue(
-            self.num_features, self._num_actions, hidden=self.settings.hidden, activation=self.settings.activation
-        )
-        return TensorDictModule(network, in_keys=["critic_features", "action"], out_keys=["state_action_value"])
 
     def _gradient(self) -> TensorDict:
         """One gradient of policy, critics and temperature, and a step of the targets."""

@@ -107,14 +107,13 @@ class UniformSource(ParameterSource):
 
     def __init__(self, space: ParameterSpace) -> None:
         self.names, self._space = space.names, space
-        self._is_log = space.is_log
         self._low, high = (to_coordinates(x, space.is_log) for x in (space.low, space.high))
         self._width = high - self._low
 
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Return values ``(count, d)`` inside the bounds."""
         uniforms = torch.rand(count, len(self.names), generator=generator, dtype=torch.float64).numpy()
-        return torch.from_numpy(to_values(self._low + uniforms * self._width, self._is_log))
+        return torch.from_numpy(to_values(self._low + uniforms * self._width, self._space.is_log))
 
     def document(self) -> dict[str, Any]:
         """Return each parameter's bounds, unit and scale."""
@@ -162,8 +161,6 @@ def load_source(
     """
     if isinstance(given, ParameterSource):
         return given.over(space)
-    if isinstance(given, Distribution):
-        return _checked(DistributionSource(given), space)
     if isinstance(given, Mapping):
         vector = space.vector(given)
         _check_limits(vector, vector, space)
@@ -172,12 +169,8 @@ def load_source(
         return UniformSource(space)
     if given == "nominal":
         return PointSource.nominal(space)
-    return _checked(DistributionSource(Distribution.load(given)), space)
-
-
-def _checked(source: DistributionSource, space: ParameterSpace) -> ParameterSource:
-    """A distribution in a space's order, all of whose values the model can have, in the model's units."""
-    found, ordered = source.distribution, source.over(space)
+    found = given if isinstance(given, Distribution) else Distribution.load(given)
+    ordered = DistributionSource(found).over(space)
     for name, unit in zip(found.names, found.units, strict=True):
         own = space.parameters[space.names.index(name)].unit
         if unit and own and unit != own:

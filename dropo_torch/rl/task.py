@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import abc
 import copy
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +16,23 @@ from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.support.usercode import load_callable, user_code
 
 
-class _FromModel:
-    """An attribute that is computed from the model each time, unless the task sets one of its own."""
+class _ControlRange:
+    """An end of the model's ``ctrlrange``, as the model has it by then, unless the task sets the attribute itself."""
 
-    def __init__(self, compute: Callable[[Task], np.ndarray]) -> None:
-        self._compute, self.__doc__ = compute, compute.__doc__
+    def __init__(self, column: int) -> None:
+        self._column = column
 
     def __get__(self, task: Task | None, kind: type | None = None) -> Any:
-        return self if task is None else self._compute(task)
+        if task is None:
+            return self
+        limited = task.model.actuator_ctrllimited.astype(bool)
+        if not limited.all():
+            name = task.model.actuator(int(np.flatnonzero(~limited)[0])).name
+            raise InputError(
+                f"task: {task.name}: actuator {name!r} has no ctrlrange; give it one in the model, or give the task "
+                "action_low and action_high"
+            )
+        return task.model.actuator_ctrlrange[:, self._column].copy()
 
 
 class Task(abc.ABC):
@@ -38,6 +46,8 @@ class Task(abc.ABC):
         frame_skip: physics steps of an environment step.
         max_episode_steps: environment steps after which an episode is cut off.
         num_observations: width of an observation.
+        action_low, action_high: lowest and highest actions, ``(num_actions,)`` each; by default the model's
+            ``ctrlrange``.
     """
 
     name: str
@@ -45,6 +55,8 @@ class Task(abc.ABC):
     frame_skip: int
     max_episode_steps: int
     num_observations: int
+    action_low = _ControlRange(0)
+    action_high = _ControlRange(1)
 
     @abc.abstractmethod
     def initial_states(self, count: int, generator: torch.Generator) -> torch.Tensor:
@@ -66,16 +78,6 @@ class Task(abc.ABC):
         """Return the model's controls ``(N, nu)`` of actions; the actions themselves by default."""
         return actions
 
-    @_FromModel
-    def action_low(self) -> np.ndarray:
-        """Lowest actions, ``(num_actions,)``; by default the model's ``ctrlrange``."""
-        return self._control_range()[0]
-
-    @_FromModel
-    def action_high(self) -> np.ndarray:
-        """Highest actions, ``(num_actions,)``; by default the model's ``ctrlrange``."""
-        return self._control_range()[1]
-
     @property
     def timestep(self) -> float:
         """Seconds of an environment step."""
@@ -86,21 +88,6 @@ class Task(abc.ABC):
         other = copy.copy(self)
         other.model = model
         return other
-
-    def _control_range(self) -> tuple[np.ndarray, np.ndarray]:
-        limited = self.model.actuator_ctrllimited.astype(bool)
-        if not limited.all():
-            name = self.model.actuator(int(np.flatnonzero(~limited)[0])).name
-            raise InputError(
-                f"task: {self.name}: actuator {name!r} has no ctrlrange; give it one in the model, or give the task "
-                "action_low and action_high"
-            )
-        low, high = self.model.actuator_ctrlrange.T
-        return low.copy(), high.copy()
-
-
-#: What a task must have, for errors.
-_NEEDED = ("name", "model", "frame_skip", "max_episode_steps", "num_observations")
 
 
 def load_task(task: str | Task, *, base: Path | None = None) -> Task:
@@ -115,12 +102,9 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
     """
     if isinstance(task, Task):
         return task
-    name = task
-    if ":" not in task:
-        sim = bundled_sim(task, key="task")
-        if sim.task is None:
-            raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
-        name = sim.task
+    name = task if ":" in task else bundled_sim(task, key="task").task
+    if name is None:
+        raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
     maker = load_callable(
         "task",
         name,
@@ -132,10 +116,18 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
         made = maker()
     if not isinstance(made, Task):
         raise InputError(f"task: {name} makes a {type(made).__name__}; expected a subclass of dropo_torch.rl.Task")
-    missing = [a for a in _NEEDED if not hasattr(made, a)]
+    missing = [a for a in Task.__annotations__ if not hasattr(made, a)]
     if missing:
-        raise InputError(f"task: {name} has no {missing[0]}; a task has {', '.join(_NEEDED)}")
+        raise InputError(f"task: {name} has no {missing[0]}; a task has {', '.join(Task.__annotations__)}")
     return made
+
+
+def check_model(task: Task, model: mujoco.MjModel, called: str) -> None:
+    """Raise an :class:`InputError` for a model of other sizes than the task's; ``called`` names it."""
+    for size in ("nq", "nv", "nu"):
+        ours, theirs = getattr(task.model, size), getattr(model, size)
+        if ours != theirs:
+            raise InputError(f"task: {task.name} is for a model with {size} {ours}; {called} has {theirs}")
 
 
 def check_task(task: Task) -> None:

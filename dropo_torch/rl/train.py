@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.rl.checkpoint import Checkpoints
+from dropo_torch.rl.checkpoint import Stateful, load_checkpoint, save_checkpoint
 from dropo_torch.rl.collect import Collector
 from dropo_torch.rl.evaluate import Returns, evaluate
 from dropo_torch.rl.learner import Learner
@@ -21,12 +21,14 @@ from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.ppo import PPO
 from dropo_torch.rl.problem import TrainingProblem, World
 from dropo_torch.rl.sac import SAC
-from dropo_torch.rl.settings import SACSettings, Settings
+from dropo_torch.rl.settings import SACSettings
 from dropo_torch.support.threads import single_thread
 
 SCHEMA = "dropo-torch/train/1"
-#: History entries that are kept: a run of many short iterations keeps some of them.
+#: History entries that are kept: a run of many short iterations keeps every second, fourth, ... of them.
 MAX_ENTRIES = 1000
+#: A checkpoint may take this share of the time since the last.
+SHARE = 0.05
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,7 @@ class Training:
     simulating: float
     learning: float
     seed: int
-    stop_reason: str
+    stop_reason: str = "all steps are done"
 
     def document(self) -> dict[str, Any]:
         """Return the training as plain data."""
@@ -151,8 +153,9 @@ def train(
     check_training(problem)
     with _own_random_numbers(problem.config.seed, problem.device), single_thread():
         run = _Run(problem, checkpoint)
-        if resume:
-            run.restore()
+        if resume and checkpoint is not None and checkpoint.is_file():
+            with torch.serialization.safe_globals([TrainEntry, EvaluationPoint]):
+                run.load_state_dict(load_checkpoint(checkpoint, problem.fingerprint))
         if on_start is not None:
             on_start(run.history, run.evaluations)
         while not run.done:
@@ -183,26 +186,28 @@ def check_training(problem: TrainingProblem) -> None:
     problem.env(problem.training, 1, 0).reset()
 
 
-class _Run:
+class _Run(Stateful):
     """A training that is under way."""
 
-    #: Numbers that a resumed run goes on with.
-    counters = ("steps", "iterations", "stride", "simulating", "learning")
+    kept = ("steps", "simulating", "learning", "history", "evaluations", "best")
 
     def __init__(self, problem: TrainingProblem, checkpoint: Path | None) -> None:
-        self.problem, settings = problem, problem.settings
+        self.problem, settings, self.checkpoint = problem, problem.settings, checkpoint
         self.env = problem.env(problem.training, settings.num_envs, problem.config.seed)
         self.policy = _fresh_policy(problem)
-        self.learner = make_learner(self.policy, len(problem.training.space), settings)
+        kind: type[Learner] = SAC if isinstance(settings, SACSettings) else PPO
+        self.learner = kind(self.policy, len(problem.training.space), settings)
         self.collector = Collector(self.env, self.policy.to_action)
+        self.parts = {"learner": self.learner, "collector": self.collector}
         self.per_iteration = settings.num_envs * settings.horizon
-        self.checkpoints = Checkpoints(checkpoint, problem.fingerprint, settings.checkpoint_seconds)
-        self.steps, self.iterations, self.stride = 0, 0, 1
-        self.simulating, self.learning = 0.0, 0.0
+        fullness = settings.steps // self.per_iteration / MAX_ENTRIES
+        self.stride = 2 ** max(0, math.ceil(math.log2(fullness)))  # iterations from entry to entry
+        self.steps, self.simulating, self.learning = 0, 0.0, 0.0
         self.history: list[TrainEntry] = []
         self.evaluations: list[EvaluationPoint] = []
-        self.best: tuple[float, dict[str, torch.Tensor]] | None = None
+        self.best: dict[str, torch.Tensor] = {}
         self.begun = time.monotonic()  # of a resumed run as if it had never been interrupted
+        self.next_checkpoint = 0.0
 
     @property
     def done(self) -> bool:
@@ -219,82 +224,67 @@ class _Run:
         self.simulating += collected - begun
         self.learning += time.monotonic() - collected
         self.steps += self.per_iteration
-        self.iterations += 1
         every = settings.steps / settings.evaluations
         evaluation = self._evaluate() if self.done or self.steps // every > before // every else None
         entry = self._entry(scalars)
-        self._remember(entry)
-        if self.checkpoints.due() or self.done:
-            self.checkpoints.save(self.state_dict())
+        if self.steps // self.per_iteration % self.stride == 0 or self.done:
+            self.history.append(entry)
+        if time.monotonic() >= self.next_checkpoint or self.done:
+            self._save()
         return entry, evaluation
 
     def result(self) -> Training:
         """Evaluate the best policy in all worlds, in episodes that did not choose it."""
-        assert self.best is not None
-        problem = self.problem
-        self.policy.load_state_dict(self.best[1])
+        problem, last = self.problem, self._entry({})
+        self.policy.load_state_dict(self.best)
         self.policy.eval()
-
-        nominal, target = problem.nominal, problem.target
         return Training(
             policy=self.policy,
             algorithm=problem.algorithm,
             history=tuple(self.history),
             evaluations=tuple(self.evaluations),
             training=self._episodes(problem.training, 1),
-            nominal=None if nominal is None else self._episodes(nominal, 2),
-            target=None if target is None else self._episodes(target, 3),
-            steps=self.steps,
-            episodes=self.collector.episodes,
-            diverged=int(self.env.num_diverged),
-            repaired=int(self.env.num_repaired),
+            nominal=None if problem.nominal is None else self._episodes(problem.nominal, 2),
+            target=None if problem.target is None else self._episodes(problem.target, 3),
+            steps=last.steps,
+            episodes=last.episodes,
+            diverged=last.diverged,
+            repaired=self.env.num_repaired,
             skipped=self.learner.skipped,
             seconds=self._seconds(),
             simulating=self.simulating,
             learning=self.learning,
             seed=problem.config.seed,
-            stop_reason="all steps are done",
         )
 
     def state_dict(self) -> dict[str, Any]:
         """Return everything that the rest of the run depends on."""
-        device = self.problem.device
-        return {
-            "learner": self.learner.state_dict(),
-            "collector": self.collector.state_dict(),
-            "random": torch.get_rng_state(),
-            "random_device": torch.cuda.get_rng_state(device) if device.startswith("cuda") else None,
-            "counters": {name: getattr(self, name) for name in self.counters},
-            "seconds": self._seconds(),
-            "history": [asdict(e) for e in self.history],
-            "evaluations": [asdict(e) for e in self.evaluations],
-            "best": None if self.best is None else list(self.best),
-        }
+        states = [torch.get_rng_state(), *map(torch.cuda.get_rng_state, _devices(self.problem.device))]
+        return {**super().state_dict(), "random": states, "seconds": self._seconds()}
 
-    def restore(self) -> None:
-        """Go on from the checkpoint, where there is one."""
-        state = self.checkpoints.load()
-        if state is None:
-            return
-        self.learner.load_state_dict(state["learner"])
-        self.collector.load_state_dict(state["collector"])
-        for name, count in state["counters"].items():
-            setattr(self, name, count)
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a state that :meth:`state_dict` returned."""
+        super().load_state_dict(state)
         self.begun -= state["seconds"]
-        self.history = [TrainEntry(**e) for e in state["history"]]
-        self.evaluations = [EvaluationPoint(**e) for e in state["evaluations"]]
-        self.best = None if state["best"] is None else (state["best"][0], state["best"][1])
-        torch.set_rng_state(state["random"])
-        if state["random_device"] is not None:
-            torch.cuda.set_rng_state(state["random_device"], self.problem.device)
+        torch.set_rng_state(state["random"][0])
+        for device, own in zip(_devices(self.problem.device), state["random"][1:], strict=True):
+            torch.cuda.set_rng_state(own, device)
+
+    def _save(self) -> None:
+        """Write a checkpoint, if one is wanted, and say when the next is due."""
+        if self.checkpoint is not None:
+            begun = time.monotonic()
+            save_checkpoint(self.checkpoint, self.problem.fingerprint, self.state_dict())
+            ended = time.monotonic()
+            self.next_checkpoint = ended + max(self.problem.settings.checkpoint_seconds, (ended - begun) / SHARE)
 
     def _evaluate(self) -> EvaluationPoint:
         """Evaluate under the training's distribution, and keep the policy if it is the best."""
         found = self._episodes(self.problem.training, 0)
-        score = found.mean if math.isfinite(found.mean) else -math.inf
-        better = self.best is None or score > self.best[0]
+        best = max((e.mean for e in self.evaluations if math.isfinite(e.mean)), default=-math.inf)
+        better = not self.evaluations or found.mean > best
         if better:
-            self.best = (score, {k: v.detach().cpu().clone() for k, v in self.policy.state_dict().items()})
+            self.best = {k: v.cpu().clone() for k, v in self.policy.state_dict().items()}
         self.evaluations.append(EvaluationPoint(self.steps, found.mean, found.std, better))
         return self.evaluations[-1]
 
@@ -312,17 +302,9 @@ class _Run:
             episodes=self.collector.episodes,
             mean_return=sum(returns) / len(returns) if returns else math.nan,
             mean_length=sum(lengths) / len(lengths) if lengths else math.nan,
-            diverged=int(self.env.num_diverged),
+            diverged=self.env.num_diverged,
             scalars=scalars,
         )
-
-    def _remember(self, entry: TrainEntry) -> None:
-        """Add an entry to the history; of very many, every second, fourth, ... is kept."""
-        if self.iterations % self.stride == 0 or self.done:
-            self.history.append(entry)
-        if len(self.history) > MAX_ENTRIES:
-            self.history = self.history[1::2]
-            self.stride *= 2
 
     def _seconds(self) -> float:
         return time.monotonic() - self.begun
@@ -333,10 +315,7 @@ def _fresh_policy(problem: TrainingProblem) -> Policy:
     architecture = {
         "num_observations": task.num_observations,
         "num_actions": len(task.action_low),
-        "hidden": list(settings.hidden),
-        "activation": settings.activation,
-        "head": settings.head,
-        "initial_std": settings.initial_std,
+        **{name: getattr(settings, name) for name in ("hidden", "activation", "head", "initial_std")},
     }
     policy = Policy(architecture, config=problem.config.document(), distribution=problem.distribution)
     policy.low.copy_(torch.as_tensor(task.action_low, dtype=torch.float32))
@@ -344,16 +323,14 @@ def _fresh_policy(problem: TrainingProblem) -> Policy:
     return policy.to(problem.device)
 
 
-def make_learner(policy: Policy, num_parameters: int, settings: Settings) -> Learner:
-    """Return what improves a policy by the settings' algorithm."""
-    if isinstance(settings, SACSettings):
-        return SAC(policy, num_parameters, settings)
-    return PPO(policy, num_parameters, settings)
+def _devices(device: str) -> list[str]:
+    """The devices with random numbers of their own, beside the CPU."""
+    return [device] if device.startswith("cuda") else []
 
 
 @contextlib.contextmanager
 def _own_random_numbers(seed: int, device: str) -> Iterator[None]:
     """Seed torch for a while; the caller's random numbers go on as if nothing had been."""
-    with torch.random.fork_rng([device] if device.startswith("cuda") else []):
+    with torch.random.fork_rng(_devices(device)):
         torch.manual_seed(seed)
         yield

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 from gymnasium.vector import AutoresetMode
 from gymnasium.vector.utils import batch_space
-from tensordict import TensorDict
 
 from dropo_torch.errors import InputError
 from dropo_torch.rl.env import RandomizedEnv
@@ -50,16 +49,14 @@ class RandomizedVectorEnv(gymnasium.vector.VectorEnv):
         super().reset(seed=seed)
         if seed is not None:
             self.env.set_seed(seed)
-        mask = np.ones(self.num_envs, dtype=bool)
-        if options and options.get("reset_mask") is not None:
-            mask = np.asarray(options["reset_mask"], dtype=bool)
-        after = self._reset(mask)
-        return _array(after.get("observation")), self._infos(np.zeros(self.num_envs, dtype=bool))
+        mask = (options or {}).get("reset_mask")
+        observations = self._reset(np.ones(self.num_envs, dtype=bool) if mask is None else np.asarray(mask, dtype=bool))
+        return observations, self._infos(np.zeros(self.num_envs, dtype=bool))
 
     def step(self, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Make a step in every environment, and begin new episodes where one ends."""
         given = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.env.device)
-        after = self.env.step(self._tensordict({"action": given})).get("next")
+        after = self.env.step(self.env.now().set("action", given)).get("next")
         observations = _array(after.get("observation"))
         rewards = _array(after.get("reward"))[:, 0].astype(np.float64)
         terminated, truncated, diverged = (
@@ -72,7 +69,7 @@ class RandomizedVectorEnv(gymnasium.vector.VectorEnv):
             for row in np.flatnonzero(done):
                 final[row] = observations[row].copy()
             infos |= {"final_obs": final, "_final_obs": done.copy()}
-            observations = _array(self._reset(done).get("observation"))
+            observations = self._reset(done)
         return observations, rewards, terminated, truncated, infos | self._infos(diverged)
 
     def _infos(self, diverged: np.ndarray) -> dict[str, Any]:
@@ -82,13 +79,10 @@ class RandomizedVectorEnv(gymnasium.vector.VectorEnv):
             infos |= {"parameters": self.env.values.numpy(), "_parameters": every.copy()}
         return infos
 
-    def _reset(self, mask: np.ndarray) -> TensorDict:
-        """Begin new episodes where ``mask`` is true; what comes back is of all environments."""
+    def _reset(self, mask: np.ndarray) -> np.ndarray:
+        """Begin new episodes where ``mask`` is true, and return the observations of all environments ``(N, n)``."""
         rows = torch.from_numpy(mask)[:, None].to(self.env.device)
-        return self.env._reset(self._tensordict({"_reset": rows}))
-
-    def _tensordict(self, entries: dict[str, torch.Tensor]) -> TensorDict:
-        return TensorDict(entries, batch_size=self.env.batch_size, device=self.env.device)
+        return _array(self.env._reset(self.env.now().set("_reset", rows)).get("observation"))
 
     def close_extras(self, **kwargs: Any) -> None:
         """Close the environments."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import os
 from typing import Any
 
@@ -13,8 +12,8 @@ import warp as wp
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.effects.simulator import check_backend
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.batch_stepper import BatchStepper
-from dropo_torch.rl.inside import inside_model
+from dropo_torch.rl.inside import inside_model, no_effects
+from dropo_torch.rl.stepper import BatchStepper
 from dropo_torch.simulators.warp.engine import Batch
 from dropo_torch.simulators.warp.simulator import make_engine
 
@@ -44,15 +43,13 @@ class WarpStepper(BatchStepper):
         self, space: ParameterSpace, num_envs: int, *, frame_skip: int, effects: EffectSet | None = None,
         num_threads: int = 0, device: str = "cpu",
     ) -> None:  # fmt: skip
-        if effects is not None:
-            check_backend("warp", effects, space)
-        inside = inside_model(space, effects)
-        model = copy.copy(inside.model)
+        effects = effects or no_effects(space, frame_skip)
+        check_backend("warp", effects, space)
+        model, self._finer, _ = inside_model(space, effects)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
-        self._finer = inside.finer
         self._engine, self._fields = make_engine(
-            model, space.on(model), skip=frame_skip * inside.finer,
+            model, space.on(model), skip=frame_skip * self._finer,
             chunk_size=self.CHUNK if device == "cpu" else num_envs, num_threads=num_threads or os.cpu_count() or 1,
             device=device,
         )  # fmt: skip
