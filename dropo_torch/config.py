@@ -6,7 +6,7 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -130,7 +130,7 @@ class Config(pydantic.BaseModel):
     def portable(self) -> dict[str, Any]:
         """Return the config as :meth:`document` does, with absolute paths: it means the same in any folder."""
         document = self.document()
-        absolute = dict.fromkeys(("model", "data"), self._absolute)
+        absolute: dict[str, Callable[[Any], Any]] = dict.fromkeys(("model", "data"), self._absolute)
         absolute |= dict.fromkeys(("environment", "task", "own_effects"), self._absolute_code)
         if self.distribution not in ("uniform", "nominal"):
             absolute["distribution"] = self._absolute
