@@ -6,7 +6,7 @@ import math
 import pickle
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -90,7 +90,6 @@ class Fit:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
-        same = len(set(self.epsilon)) == 1
         correlation = self.distribution.correlation
         return {
             "schema": SCHEMA,
@@ -99,7 +98,7 @@ class Fit:
             **({} if correlation is None else {"correlation": correlation.tolist()}),
             "log_likelihood": self.log_likelihood,
             "mse": self.mse,
-            "epsilon": self.epsilon[0] if same else list(self.epsilon),
+            "epsilon": self.epsilon[0] if len(set(self.epsilon)) == 1 else list(self.epsilon),
             "backend": self.backend,
             "optimizer": self.optimizer,
             "samples": self.samples,
@@ -186,16 +185,8 @@ def _run(
         evaluations += request.evaluations
         state.simulated_transitions += sums.simulated_transitions
         progress = search.progress
-        mean, std = search.candidates()[0]
-        entry = HistoryEntry(
-            evaluations=evaluations,
-            simulated_transitions=state.simulated_transitions,
-            seconds=time.monotonic() - begun,
-            log_likelihood=progress.log_likelihood,
-            stage=progress.stage,
-            mean=np.array(mean),
-            std=np.array(std),
-        )
+        cost = (evaluations, state.simulated_transitions, time.monotonic() - begun)
+        entry = HistoryEntry(*cost, progress.log_likelihood, progress.stage, *map(np.array, search.candidates()[0]))
         state.history.append(entry)
         if kept is not None:
             kept.save(search, state)
@@ -227,8 +218,7 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
         initial = objective.initial_noise_of(candidate)
         evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None], initial)[0]
         results.append((evaluation.log_likelihood + search.bonus(candidate), candidate, evaluation))
-        state.simulated_transitions += evaluation.simulated_transitions
-        state.simulated_transitions += initial.simulated_transitions if initial else 0
+        state.simulated_transitions += sum(x.simulated_transitions for x in (evaluation, initial) if x is not None)
     _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
     dropped = distribution.correlation is None and any(c.correlation is not None for _, c, _ in results)
     remark = "makes the log no likelier: parameters vary independently" if dropped else ""
@@ -265,7 +255,7 @@ class _Checkpoint:
         content = {
             "owner": self._owner(search),
             "optimizer": search.state(),
-            "history": [vars(entry) for entry in state.history],
+            "history": state.history,
             "simulated_transitions": state.simulated_transitions,
             "linearised": None if state.initial is None else (state.initial.mean, state.initial.std),
         }
@@ -278,27 +268,18 @@ class _Checkpoint:
         try:
             content = pickle.loads(self.path.read_bytes())
             is_own, linearised = content["owner"] == self._owner(search), content["linearised"]
-            history = [HistoryEntry(**entry) for entry in content["history"]]
-            state = _State(content["simulated_transitions"], history)
+            state = _State(content["simulated_transitions"], content["history"])
             if is_own:
                 search.restore(content["optimizer"])
         except Exception as error:
-            raise InputError(
-                f"resume: {self.path} is no checkpoint of a fit ({error}); start again without --resume"
-            ) from None
+            what = f"{self.path} is no checkpoint of a fit ({error})"
+            raise InputError(f"resume: {what}; start again without --resume") from None
         if not is_own:
-            raise InputError(
-                f"resume: {self.path} belongs to another config, log or optimizer; restore those, "
-                "or start again without --resume"
-            )
+            what = f"{self.path} belongs to another config, log or optimizer"
+            raise InputError(f"resume: {what}; restore those, or start again without --resume")
         if linearised is not None:
             state.initial = objective.initial_noise(*linearised)  # already counted
         return state
 
     def _owner(self, search: Optimizer) -> tuple[str, str]:
         return self.fingerprint, search.name
-
-
-def without_history(result: Fit) -> Fit:
-    """Return a fit without its history, for comparison."""
-    return replace(result, history=(), seconds=0.0)

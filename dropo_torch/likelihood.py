@@ -175,7 +175,8 @@ def _rotation_angles(
     angles = samples[..., plain:].unflatten(-1, (num_rotations, 3)).norm(dim=-1)
     rest = samples[..., :plain]
     both = torch.cat([torch.cat([rest, angles], -1), torch.cat([rest, -angles], -1)], -2)
-    axes = torch.full((3, 1), 3**-0.5, dtype=samples.dtype)  # an angle's variance is its rotation vector's, averaged
+    # an angle's variance is its rotation vector's, averaged over the axes
+    axes = torch.full((3, 1), 3**-0.5, dtype=samples.dtype)
     average = torch.block_diag(torch.eye(plain, dtype=samples.dtype), *num_rotations * [axes])
     flat = torch.cat([measured[..., :plain], torch.zeros_like(angles[..., 0, :])], -1)
     return both, flat, average.T @ covariance @ average
