@@ -15,6 +15,7 @@ import yaml
 from pydantic import Field
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.given import check_keys
 
 if TYPE_CHECKING:
     from dropo_torch.optimizers.settings import FitSettings
@@ -195,13 +196,11 @@ def make_config(
         raise InputError(f"{source}: an entry contains itself; expected plain keys and values") from None
     for dotted, value in (overrides or {}).items():
         _override(merged, dotted, value)
+    check_keys(merged, KEYS, source)
     for key, value in merged.items():
-        if key not in KEYS:
-            raise InputError(f"{source}: unknown key {key!r}" + choices(key, KEYS))
-        if isinstance(value, bool) and Config.model_fields[key].annotation is not bool:
-            raise InputError(
-                f"{source}: {key} is {str(value).lower()}; expected {Config.model_fields[key].description}"
-            )
+        known = Config.model_fields[key]
+        if isinstance(value, bool) and known.annotation is not bool:
+            raise InputError(f"{source}: {key} is {str(value).lower()}; expected {known.description}")
     try:
         return Config(**merged, base=base)
     except pydantic.ValidationError as error:

@@ -23,6 +23,7 @@ import numpy as np
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import CENTRES, load_model
+from dropo_torch.support.given import check_keys
 
 #: Fields whose values must be positive, whatever the search bounds.
 POSITIVE_FIELDS = frozenset({"body_mass", "body_inertia", "opt.timestep", "opt.impratio", "geom_size", "pair_friction"})
@@ -295,9 +296,7 @@ def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> 
     where = f"parameters.{name}"
     if not isinstance(spec, Mapping):
         raise InputError(f"{where}: expected keys such as field, name and bounds, got {spec!r}")
-    for key in spec:
-        if key not in _KEYS:
-            raise InputError(f"{where}: unknown key {key!r}" + choices(key, _KEYS))
+    check_keys(spec, _KEYS, where)
     for key in ("relative", "scale_inertia"):
         if not isinstance(spec.get(key, False), bool):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected true or false")
