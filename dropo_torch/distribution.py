@@ -24,6 +24,7 @@ import yaml
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.given import reading
 from dropo_torch.support.random import base_uniforms
 
 SCHEMA = "dropo-torch/distribution/1"
@@ -226,11 +227,10 @@ class Distribution:
         path = Path(path)
         if not path.is_file():
             raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
-        try:
-            text = path.read_text(encoding="utf-8")  # JSON is not quite YAML 1.1, which reads 1e-05 as text
-            document = yaml.safe_load(text) if path.suffix in (".yaml", ".yml") else json.loads(text)
-        except (yaml.YAMLError, ValueError) as error:
-            raise InputError(f"distribution: {path} cannot be read: {' '.join(str(error).split())}") from None
+        is_yaml = path.suffix in (".yaml", ".yml")  # JSON is not quite YAML 1.1, which reads 1e-05 as text
+        with reading(f"distribution: {path}", "YAML" if is_yaml else "JSON"):
+            text = path.read_text(encoding="utf-8")
+            document = yaml.safe_load(text) if is_yaml else json.loads(text)
         entries = document.get("parameters") if isinstance(document, Mapping) else None
         if not isinstance(entries, Mapping) or not entries:
             raise InputError(f"distribution: {path} has no 'parameters'; expected name → mean, std, low, high, unit")

@@ -18,7 +18,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.evaluator import Sums
 from dropo_torch.excitation import refuse_dead_parameters
 from dropo_torch.initial_noise import InitialStateNoise
-from dropo_torch.objective import Evaluation, Objective
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FitSettings, Optimizer, Progress, Request, make_optimizer
 from dropo_torch.support.files import write_atomically, write_json
 from dropo_torch.support.random import draw_uniforms
@@ -46,6 +46,10 @@ class HistoryEntry:
     stage: str
     mean: np.ndarray
     std: np.ndarray
+
+
+#: Called after every batch.
+OnProgress = Callable[[HistoryEntry, Progress], None]
 
 
 @dataclass(frozen=True)
@@ -124,7 +128,7 @@ def fit(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     fingerprint: str = "",
-    on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Fit:
     """Fit the distribution of a simulator's parameters to a log.
 
@@ -163,17 +167,18 @@ class _State:
     history: list[HistoryEntry] = field(default_factory=list)
     initial: InitialStateNoise | None = None
 
+    @property
+    def spent(self) -> tuple[int, float]:
+        """Evaluations and seconds so far."""
+        return (self.history[-1].evaluations, self.history[-1].seconds) if self.history else (0, 0.0)
+
 
 def _run(
-    search: Optimizer,
-    objective: Objective,
-    state: _State,
-    kept: _Checkpoint | None,
-    on_progress: Callable[[HistoryEntry, Progress], None] | None,
+    search: Optimizer, objective: Objective, state: _State, kept: _Checkpoint | None, on_progress: OnProgress | None
 ) -> None:
     """Ask and tell until the optimizer stops; keep the state after every batch."""
-    begun = time.monotonic() - (state.history[-1].seconds if state.history else 0.0)
-    evaluations = state.history[-1].evaluations if state.history else 0
+    evaluations, seconds = state.spent
+    begun = time.monotonic() - seconds
     while search.stop_reason is None:
         request = search.ask()
         at, std = request.linearise_at, request.linearise_std
@@ -210,10 +215,10 @@ def answer(objective: Objective, request: Request, initial: InitialStateNoise | 
 def _conclude(search: Optimizer, objective: Objective, state: _State, settings: FitSettings) -> Fit:
     """Evaluate the candidates on draws of their own and return the best."""
     begun = time.monotonic()
-    last = state.history[-1] if state.history else None
+    evaluations, seconds = state.spent
     space = objective.simulator.parameters
     uniforms = draw_uniforms(settings.samples, len(space), settings.seed, 0)
-    results: list[tuple[float, Distribution, Evaluation]] = []
+    results = []
     for candidate in search.distributions(space):
         initial = objective.initial_noise_of(candidate)
         evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None], initial)[0]
@@ -231,10 +236,10 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
         optimizer=search.name,
         samples=settings.samples,
         seed=settings.seed,
-        evaluations=last.evaluations if last else 0,
+        evaluations=evaluations,
         simulated_transitions=state.simulated_transitions,
         diverged=best.diverged,
-        seconds=(last.seconds if last else 0.0) + time.monotonic() - begun,
+        seconds=seconds + time.monotonic() - begun,
         stop_reason=(search.stop_reason or "") + (f", but {remark}" if remark else ""),
         history=tuple(state.history),
         caveat=f"a full covariance {remark}" if remark else search.caveat,
@@ -255,7 +260,7 @@ class _Checkpoint:
         content = {
             "owner": self._owner(search),
             "optimizer": search.state(),
-            "history": state.history,
+            "history": [vars(entry) for entry in state.history],
             "simulated_transitions": state.simulated_transitions,
             "linearised": None if state.initial is None else (state.initial.mean, state.initial.std),
         }
@@ -268,7 +273,8 @@ class _Checkpoint:
         try:
             content = pickle.loads(self.path.read_bytes())
             is_own, linearised = content["owner"] == self._owner(search), content["linearised"]
-            state = _State(content["simulated_transitions"], content["history"])
+            history = [HistoryEntry(**entry) for entry in content["history"]]
+            state = _State(content["simulated_transitions"], history)
             if is_own:
                 search.restore(content["optimizer"])
         except Exception as error:
