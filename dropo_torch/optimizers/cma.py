@@ -72,7 +72,7 @@ class CMAOptimizer(LikelihoodOptimizer):
             values=self._objective.values(mean, std, uniforms).flatten(0, 1).numpy(),
             reduce=self._likelihood(len(mean)),
             evaluations=len(mean),
-            linearise_at=self._box.denormalise(self._search.mean)[0] if self._noisy else None,
+            linearise_at=self._center() if self._noisy else None,
         )
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
@@ -89,6 +89,9 @@ class CMAOptimizer(LikelihoodOptimizer):
     @property
     def stop_reason(self) -> str | None:
         """Pycma's termination conditions, in words."""
+        met = self._search.stop()
+        if not met:
+            return None
         words = {
             "maxfevals": f"the budget of {self._settings.budget} evaluations is spent",
             "tolfun": "the likelihood no longer differs within a generation",
@@ -97,7 +100,7 @@ class CMAOptimizer(LikelihoodOptimizer):
             "tolstagnation": "the likelihood has not improved for long",
             "tolflatfitness": "the likelihood is flat",
         }
-        return "; ".join(words.get(k, f"pycma stopped: {k}") for k in self._search.stop()) or None
+        return "; ".join(words.get(k, f"pycma stopped: {k}") for k in met)
 
     @property
     def progress(self) -> Progress:
@@ -107,8 +110,10 @@ class CMAOptimizer(LikelihoodOptimizer):
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the search distribution's mean and the best φ that was evaluated."""
-        found = (self._search.result.xfavorite, self._best_phi)
-        return [self._box.denormalise(phi) for phi in found if phi is not None]
+        found = [np.asarray(self._search.result.xfavorite)]
+        if self._best_phi is not None:
+            found.append(self._best_phi)
+        return [self._box.denormalise(phi) for phi in found]
 
     def state(self) -> dict[str, Any]:
         """Return pycma's own pickle and what stands beside it."""
@@ -117,3 +122,7 @@ class CMAOptimizer(LikelihoodOptimizer):
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
         super().restore(state | {"_search": pickle.loads(state["_search"])})
+
+    def _center(self) -> np.ndarray:
+        """Return μ of the search distribution, in coordinates."""
+        return self._box.denormalise(np.asarray(self._search.mean))[0]
