@@ -45,7 +45,6 @@ _FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear",
 _OBJECTS = {kind: kind for kind in ("body", "geom", "actuator", "site", "tendon", "pair", "flex")}
 _OBJECTS |= dict.fromkeys(("jnt", "dof", "qpos0", "qpos"), "joint") | {"eq": "equality"}
 _KEYS = ("field", "name", "index", "bounds", "limits", "unit", "scale", "relative", "scale_inertia", "effect")
-_UNBOUNDED = (-np.inf, np.inf)
 #: Keys of a parameter that is a number of an effect.
 _EFFECT_KEYS = ("effect", "name", "index", "bounds", "limits", "unit", "scale")
 
@@ -82,8 +81,8 @@ class Parameter:
     """
 
     name: str
-    low: float
-    high: float
+    low: float = -np.inf
+    high: float = np.inf
     field: str = ""
     objects: tuple[str, ...] = ()
     index: int | None = None
@@ -322,7 +321,7 @@ def _at_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
         if not isinstance(spec.get(key, ""), str | None):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected a name")
     objects = (spec["name"],) if spec.get("name") else ()
-    return Parameter(name, *_UNBOUNDED, objects=objects, effect=str(spec["effect"]), quantity=spec.get("index") or "")
+    return Parameter(name, objects=objects, effect=str(spec["effect"]), quantity=spec.get("index") or "")
 
 
 def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
@@ -332,7 +331,7 @@ def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping
         for key in ("field", "relative", "scale_inertia"):
             if spec.get(key):
                 raise InputError(f"{where}: {key} {spec[key]!r} needs a MuJoCo model; this simulator has none")
-        return Parameter(name, *_UNBOUNDED)
+        return Parameter(name)
     if not field:
         raise InputError(f"{where}: no field given; expected one of MjModel's, such as field: body_mass")
     targets, objects, index = _targets(model, where, field, index, spec)
@@ -340,7 +339,7 @@ def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping
         targets = tuple(_scaled(model, where, t) for t in targets)
     if spec.get("scale_inertia"):
         targets = _with_inertia(model, where, field, targets, bool(spec.get("relative")))
-    return Parameter(name, *_UNBOUNDED, field=field, objects=objects, index=index, targets=targets)
+    return Parameter(name, field=field, objects=objects, index=index, targets=targets)
 
 
 def _field_and_index(where: str, spec: Mapping[str, Any]) -> tuple[str, int | None]:
@@ -381,12 +380,9 @@ def _targets(
     every: list[Target] = []
     for number in objects.values():
         rows = _rows(model, prefix, number)
-        if prefix in ("qpos0", "qpos") and len(rows) > 1 and index is None:
-            raise InputError(f"{where}: {field} of this joint has {len(rows)} entries; add index: 0 to {len(rows) - 1}")
-        if len(rows) > 1 and index is not None and size == 1:  # one degree of freedom of a free or ball joint
-            if index >= len(rows):
-                raise InputError(f"{where}: index {index} is outside {field} of this joint, which has {len(rows)}")
-            rows, component = [rows[index]], 0
+        is_chosen = index is not None or prefix in ("qpos0", "qpos")
+        if len(rows) > 1 and size == 1 and is_chosen:  # one degree of freedom of a free or ball joint
+            rows, component = [rows[_component(where, f"{field} of this joint", index, len(rows))]], 0
         else:
             component = _component(where, field, index, size)
         every += [Target(field, row * size + component) for row in rows]

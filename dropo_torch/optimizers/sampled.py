@@ -71,12 +71,12 @@ def sampled_scores(
     features, measured, covariance, lost = survivors(features, measured, covariance)
     mean, sampled = sample_moments(features)
     total = sampled + covariance
-    residual = measured - mean
+    residual, centred = measured - mean, features - mean[:, None]
     value = gaussian_log_density(residual, total).sum() + lost
     slope, bend = _regress(features, z)
     solved = torch.linalg.solve(total, residual[..., None])  # C⁻¹ r
-    pull = torch.linalg.solve(total, (features - mean[:, None]).mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
-    along = (features - mean[:, None]) @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
+    pull = torch.linalg.solve(total, centred.mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
+    along = centred @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
     # ∂ log N / ∂ s_k, with C's and s̄'s dependence on the samples (eq. 2)
     force = (along * solved.mT - pull) / (num_samples - 1) + solved.mT / num_samples
     flat = torch.einsum("tkm,tdm->tkd", force, slope) + torch.einsum("tkm,tdm->tkd", force, bend) * z
