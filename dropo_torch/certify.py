@@ -69,12 +69,7 @@ class Certificate:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``certificate.json``."""
-        return {
-            "schema": SCHEMA,
-            "transitions": self.transitions,
-            "state_error": self.state_error,
-            "parameters": [asdict(p) for p in self.parameters],
-        }
+        return {"schema": SCHEMA} | asdict(self)
 
     def check(self) -> None:
         """Raise an :class:`InputError` that names every parameter whose gradient cannot be used."""

@@ -45,8 +45,7 @@ def truncated_interval(
     a = torch.clamp(torch.where(torch.isfinite(low), (lower - mean) / std, -TRUNCATION), min=-TRUNCATION)
     b = torch.clamp(torch.where(torch.isfinite(high), (upper - mean) / std, TRUNCATION), max=TRUNCATION)
     a = torch.minimum(a, torch.full_like(a, TRUNCATION) - 1e-9)
-    b = torch.maximum(b, a + 1e-9)
-    return a, b
+    return a, torch.maximum(b, a + 1e-9)
 
 
 def truncated_normal_icdf(
@@ -66,10 +65,9 @@ def truncated_moments(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, t
     """Return E[z], E[z²] and E[z⁴] of a standard normal truncated to ``[a, b]``, shapes broadcast."""
     density_a, density_b = (torch.exp(-0.5 * z * z - _LOG_SQRT_2PI) for z in (a, b))
     mass = torch.clamp(torch.special.ndtr(b) - torch.special.ndtr(a), min=1e-300)
-    first = (density_a - density_b) / mass
     second = 1 + (a * density_a - b * density_b) / mass
     fourth = 3 * second + (a**3 * density_a - b**3 * density_b) / mass
-    return first, second, fourth
+    return (density_a - density_b) / mass, second, fourth
 
 
 #: Standard deviation of draws from a normal that ends :data:`TRUNCATION` σ from its mean, as a share of σ: 0.8796.

@@ -24,6 +24,11 @@ from dropo_torch.support.files import write_atomically, write_json
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/fit/1"
+#: Keys of ``fit.json``, before what a method adds; ``correlation`` only where parameters vary together.
+KEYS = (
+    "schema", "method", "parameters", "correlation", "log_likelihood", "mse", "epsilon", "backend", "optimizer",
+    "samples", "evaluations", "simulated_transitions", "diverged_simulations", "seconds", "seed", "stop_reason",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -95,25 +100,15 @@ class Fit:
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
         correlation = self.distribution.correlation
-        return {
+        plain = vars(self) | {
             "schema": SCHEMA,
-            "method": self.method,
             "parameters": self.distribution.summary(),
-            **({} if correlation is None else {"correlation": correlation.tolist()}),
-            "log_likelihood": self.log_likelihood,
-            "mse": self.mse,
+            "correlation": None if correlation is None else correlation.tolist(),
             "epsilon": self.epsilon[0] if len(set(self.epsilon)) == 1 else list(self.epsilon),
-            "backend": self.backend,
-            "optimizer": self.optimizer,
-            "samples": self.samples,
-            "evaluations": self.evaluations,
-            "simulated_transitions": self.simulated_transitions,
             "diverged_simulations": self.diverged,
             "seconds": round(self.seconds, 3),
-            "seed": self.seed,
-            "stop_reason": self.stop_reason,
-            **self.extras,
         }
+        return {key: plain[key] for key in KEYS if plain[key] is not None} | dict(self.extras)
 
     def save(self, path: str | Path) -> None:
         """Write ``fit.json``, whole or not at all."""
