@@ -6,17 +6,23 @@ import dataclasses
 import hashlib
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import pydantic
 import yaml
+from pydantic import Field
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.given import check_keys
 
 if TYPE_CHECKING:
     from dropo_torch.optimizers.settings import FitSettings
+
+
+#: An entry that is keys and values itself.
+Entries = dict[str, Any]
 
 
 class Config(pydantic.BaseModel):
@@ -24,75 +30,71 @@ class Config(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    model: str | None = pydantic.Field(None, description="path of the MJCF, URDF or .mjb model")
-    sim: str | None = pydantic.Field(None, description="a bundled simulation instead of a model")
-    environment: str | None = pydantic.Field(
+    model: str | None = Field(None, description="path of the MJCF, URDF or .mjb model")
+    sim: str | None = Field(None, description="a bundled simulation instead of a model")
+    environment: str | None = Field(
         None,
         description="with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter",
     )
-    data: Any = pydantic.Field(None, description="path of the log, a list of paths, or path and reading options")
-    trajectories: int | Annotated[list[int], pydantic.Field(min_length=1)] | None = pydantic.Field(
+    data: Any = Field(None, description="path of the log, a list of paths, or path and reading options")
+    trajectories: int | Annotated[list[int], Field(min_length=1)] | None = Field(
         None, description="how many of the log's episodes to use (the first ones), or which, counted from 0"
     )
-    frame_skip: int | None = pydantic.Field(None, ge=1, le=1_000_000, description="physics steps per logged transition")
-    observation: list[str] | None = pydantic.Field(
-        None, description="what the log's columns are, such as [qpos[1:], qvel]"
-    )
-    parameters: dict[str, dict[str, Any]] | None = pydantic.Field(
+    frame_skip: int | None = Field(None, ge=1, le=1_000_000, description="physics steps per logged transition")
+    observation: list[str] | None = Field(None, description="what the log's columns are, such as [qpos[1:], qvel]")
+    parameters: dict[str, Entries] | None = Field(
         None, description="name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
     )
-    effects: list[dict[str, Any]] = pydantic.Field(
+    effects: list[Entries] = Field(
         [], description="physical effects that the model lacks: effect, target and its numbers"
     )
-    own_effects: list[str] = pydantic.Field(
+    own_effects: list[str] = Field(
         [], description="file.py:Class (module:Class) of effects of one's own, which join the vocabulary"
     )
-    backend: Literal["mujoco", "warp", "gymnasium"] = pydantic.Field("mujoco", description="the simulator")
-    method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = pydantic.Field(
+    backend: Literal["mujoco", "warp", "gymnasium"] = Field("mujoco", description="the simulator")
+    method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = Field(
         "dropo", description="what finds the distribution"
     )
-    method_options: dict[str, Any] = pydantic.Field({}, description="of a method other than dropo; see docs/methods.md")
-    optimizer: Literal["fisher", "cma", "adam"] = pydantic.Field("fisher", description="how φ is searched")
-    entropy: float = pydantic.Field(0.0, ge=0, description="weight of the entropy of the distribution in the fit")
-    covariance: Literal["diagonal", "full"] = pydantic.Field("diagonal", description="whether parameters vary together")
-    epsilon: float | list[float] = pydantic.Field(1e-5, description="ε, variance added to every column, or one each")
-    noise: float | list[float] | None = pydantic.Field(
+    method_options: Entries = Field({}, description="of a method other than dropo; see docs/methods.md")
+    optimizer: Literal["fisher", "cma", "adam"] = Field("fisher", description="how φ is searched")
+    entropy: float = Field(0.0, ge=0, description="weight of the entropy of the distribution in the fit")
+    covariance: Literal["diagonal", "full"] = Field("diagonal", description="whether parameters vary together")
+    epsilon: float | list[float] = Field(1e-5, description="ε, variance added to every column, or one each")
+    noise: float | list[float] | None = Field(
         None, description="standard deviation of the measurement, or one per column; initial states are then uncertain"
     )
-    samples: int = pydantic.Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
-    lag: int = pydantic.Field(1, ge=1, description="λ, logged steps per window")
-    seed: int = pydantic.Field(0, ge=0, lt=2**63, description="seed of everything that is random")
-    mask: list[str | int] = pydantic.Field([], description="observed columns which the likelihood leaves out")
-    scaling: bool = pydantic.Field(False, description="divide each column by its standard deviation over the log")
-    budget: int = pydantic.Field(1000, ge=1, description="with cma: evaluations of the objective")
-    population: int | None = pydantic.Field(None, ge=2, description="with cma: φ per generation")
-    common_random_numbers: bool = pydantic.Field(False, description="with cma: the same samples in every generation")
-    adam: dict[str, Any] = pydantic.Field(
+    samples: int = Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
+    lag: int = Field(1, ge=1, description="λ, logged steps per window")
+    seed: int = Field(0, ge=0, lt=2**63, description="seed of everything that is random")
+    mask: list[str | int] = Field([], description="observed columns which the likelihood leaves out")
+    scaling: bool = Field(False, description="divide each column by its standard deviation over the log")
+    budget: int = Field(1000, ge=1, description="with cma: evaluations of the objective")
+    population: int | None = Field(None, ge=2, description="with cma: φ per generation")
+    common_random_numbers: bool = Field(False, description="with cma: the same samples in every generation")
+    adam: Entries = Field(
         {}, description="with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers"
     )
-    device: str = pydantic.Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
-    task: str | None = pydantic.Field(
+    device: str = Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
+    task: str | None = Field(
         None, description="what a policy learns: a bundled task, or file.py:Class (module:Class); the sim's by default"
     )
-    algorithm: Literal["ppo", "sac"] | None = pydantic.Field(
+    algorithm: Literal["ppo", "sac"] | None = Field(
         None, description="how a policy is trained: ppo (the default) or sac"
     )
-    distribution: str | dict[str, Any] | None = pydantic.Field(
+    distribution: str | Entries | None = Field(
         None,
         description="of the parameters in training: path of a fit.json, uniform, nominal, or name: value; "
         "fit.json beside the config by default, uniform where there is none",
     )
-    train: dict[str, Any] = pydantic.Field(
-        {}, description="how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md"
-    )
-    target: dict[str, Any] = pydantic.Field(
+    train: Entries = Field({}, description="how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md")
+    target: Entries = Field(
         {}, description="name: value, the model on which a trained policy is evaluated beside the nominal one"
     )
-    threads: int = pydantic.Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")
-    chunk_size: int = pydantic.Field(10_000, ge=1, description="simulations held in memory at once")
+    threads: int = Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")
+    chunk_size: int = Field(10_000, ge=1, description="simulations held in memory at once")
 
     #: Folder that relative paths start from; not a key of the file.
-    base: Path = pydantic.Field(Path(), exclude=True)
+    base: Path = Field(Path(), exclude=True)
 
     def path(self, given: str) -> Path:
         """Return a path of the config as one that can be opened."""
@@ -129,21 +131,16 @@ class Config(pydantic.BaseModel):
     def portable(self) -> dict[str, Any]:
         """Return the config as :meth:`document` does, with absolute paths: it means the same in any folder."""
         document = self.document()
-        if self.model is not None:
-            document["model"] = str(self.path(self.model).resolve())
-        if self.data is not None:
-            document["data"] = self._absolute(self.data)
-        for key in ("environment", "task"):
-            if key in document:
-                document[key] = self._absolute_code(document[key])
-        if isinstance(self.distribution, str) and self.distribution not in ("uniform", "nominal"):
-            document["distribution"] = str(self.path(self.distribution).resolve())
-        if self.own_effects:
-            document["own_effects"] = [self._absolute_code(name) for name in self.own_effects]
-        return document
+        absolute: dict[str, Callable[[Any], Any]] = dict.fromkeys(("model", "data"), self._absolute)
+        absolute |= dict.fromkeys(("environment", "task", "own_effects"), self._absolute_code)
+        if self.distribution not in ("uniform", "nominal"):
+            absolute["distribution"] = self._absolute
+        return document | {key: make(document[key]) for key, make in absolute.items() if key in document}
 
-    def _absolute_code(self, name: str) -> str:
-        """``file.py:function`` with an absolute path; other names as they are."""
+    def _absolute_code(self, name: Any) -> Any:
+        """``file.py:function``, or a list of such, with an absolute path; other names as they are."""
+        if isinstance(name, list):
+            return [self._absolute_code(entry) for entry in name]
         where, _, function = name.rpartition(":")
         return f"{self.path(where).resolve()}:{function}" if where.endswith(".py") else name
 
@@ -199,13 +196,11 @@ def make_config(
         raise InputError(f"{source}: an entry contains itself; expected plain keys and values") from None
     for dotted, value in (overrides or {}).items():
         _override(merged, dotted, value)
+    check_keys(merged, KEYS, source)
     for key, value in merged.items():
-        if key not in KEYS:
-            raise InputError(f"{source}: unknown key {key!r}" + choices(key, KEYS))
-        if isinstance(value, bool) and Config.model_fields[key].annotation is not bool:
-            raise InputError(
-                f"{source}: {key} is {str(value).lower()}; expected {Config.model_fields[key].description}"
-            )
+        known = Config.model_fields[key]
+        if isinstance(value, bool) and known.annotation is not bool:
+            raise InputError(f"{source}: {key} is {str(value).lower()}; expected {known.description}")
     try:
         return Config(**merged, base=base)
     except pydantic.ValidationError as error:
@@ -225,27 +220,19 @@ def explained(error: pydantic.ValidationError, document: Mapping[str, Any]) -> s
         if isinstance(place, dict | list) and part in (place if isinstance(place, dict) else range(len(place))):
             place = place[part]  # type: ignore[index]
             key.append(str(part))
-    near = (
-        choices(place, first["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", "))
-        if (first["type"] == "literal_error")
-        else ""
-    )
+    near = ""
+    if first["type"] == "literal_error":
+        near = choices(place, first["ctx"]["expected"].replace("'", "").replace(" or ", ", ").split(", "))
     return f"{'.'.join(key)} is {place!r}; expected {' or '.join(expected)}{near}"
 
 
 def _expectation(error: Any) -> str:
     """One of pydantic's messages, as what is expected."""
-    if error["type"] == "greater_than_equal":
-        return f"{error['ctx']['ge']} or more"
-    if error["type"] == "less_than_equal":
-        return f"{error['ctx']['le']} or less"
-    if error["type"] == "greater_than":
-        return f"more than {error['ctx']['gt']:g}"
-    text = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ")
-    text = {"a integer": "a whole number", "a dictionary": "keys and values"}.get(
-        text.split(",")[0], text.split(",")[0]
-    )
-    return text
+    for bound, words in {"ge": "{} or more", "le": "{} or less", "gt": "more than {:g}"}.items():
+        if bound in error.get("ctx", ()):
+            return words.format(error["ctx"][bound])
+    text = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ").split(",")[0]
+    return {"a integer": "a whole number", "a dictionary": "keys and values"}.get(text, text)
 
 
 def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:

@@ -62,16 +62,6 @@ class Diagnostics:
         """Measured minus simulated mean, ``(T, m)``."""
         return self.measured - self.mean
 
-    @property
-    def residual_rms(self) -> np.ndarray:
-        """Root mean square residual of each column, ``(m,)``."""
-        return np.sqrt(np.nanmean(self.residual**2, axis=0))
-
-    @property
-    def standardised_rms(self) -> np.ndarray:
-        """Root mean square of residual over what is expected, ``(m,)``: 1 where the model explains the log."""
-        return np.sqrt(np.nanmean((self.residual / self.expected) ** 2, axis=0))
-
 
 def diagnose(
     objective: Objective, distribution: Distribution, *, samples: int = 50, seed: int = 0, max_transitions: int = 5000
@@ -91,7 +81,6 @@ def diagnose(
     error, correlation = estimates(information)
     base = torch.diagonal(covariance, dim1=-2, dim2=-1)
     widened = torch.ones(1) if initial is None else initial.widening[:, None]
-    width = objective.box.width[:, None]
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
     return Diagnostics(
@@ -105,7 +94,7 @@ def diagnose(
         expected=(variance + base).sqrt().numpy(),
         given=(base / widened).sqrt().numpy(),
         at_center=center.numpy(),
-        sensitivity=0.01 * width * jacobian.square().mean(0).sqrt().numpy(),
+        sensitivity=0.01 * objective.box.width[:, None] * jacobian.square().mean(0).sqrt().numpy(),
         standard_error=error,
         correlation=correlation,
         confounded=tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs),
@@ -132,9 +121,8 @@ def _simulate(
         parts.append((mean, variance, around[:, 0], jacobian))
         return (~finite.all(-1)).sum()[None]
 
-    lost = objective.map(
-        np.concatenate([values.numpy(), objective.box.values(stencil.points())]), keep, initial=initial
-    )
+    every = np.concatenate([values.numpy(), objective.box.values(stencil.points())])
+    lost = objective.map(every, keep, initial=initial)
     mean, variance, center, jacobian = (torch.cat(p) for p in zip(*parts, strict=True))
     return mean, variance, center, jacobian, int(lost.total)
 

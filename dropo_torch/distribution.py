@@ -24,6 +24,7 @@ import yaml
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.given import reading
 from dropo_torch.support.random import base_uniforms
 
 SCHEMA = "dropo-torch/distribution/1"
@@ -44,8 +45,7 @@ def truncated_interval(
     a = torch.clamp(torch.where(torch.isfinite(low), (lower - mean) / std, -TRUNCATION), min=-TRUNCATION)
     b = torch.clamp(torch.where(torch.isfinite(high), (upper - mean) / std, TRUNCATION), max=TRUNCATION)
     a = torch.minimum(a, torch.full_like(a, TRUNCATION) - 1e-9)
-    b = torch.maximum(b, a + 1e-9)
-    return a, b
+    return a, torch.maximum(b, a + 1e-9)
 
 
 def truncated_normal_icdf(
@@ -65,10 +65,9 @@ def truncated_moments(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, t
     """Return E[z], E[z²] and E[z⁴] of a standard normal truncated to ``[a, b]``, shapes broadcast."""
     density_a, density_b = (torch.exp(-0.5 * z * z - _LOG_SQRT_2PI) for z in (a, b))
     mass = torch.clamp(torch.special.ndtr(b) - torch.special.ndtr(a), min=1e-300)
-    first = (density_a - density_b) / mass
     second = 1 + (a * density_a - b * density_b) / mass
     fourth = 3 * second + (a**3 * density_a - b**3 * density_b) / mass
-    return first, second, fourth
+    return (density_a - density_b) / mass, second, fourth
 
 
 #: Standard deviation of draws from a normal that ends :data:`TRUNCATION` σ from its mean, as a share of σ: 0.8796.
@@ -146,22 +145,21 @@ class Distribution:
         if self.is_uniform:
             low, high = (torch.as_tensor(x) for x in self.ends)
             return tensor_values(low + uniforms * (high - low), self.is_log)
-        normals = (self.mean, self.std, *coordinate_limits(self.limits, self.is_log))
-        return tensor_values(truncated_normal_icdf(uniforms, *map(torch.as_tensor, normals)), self.is_log)
+        return tensor_values(truncated_normal_icdf(uniforms, *self._normals), self.is_log)
 
     @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest value that occurs, in coordinates, ``(d,)`` each."""
         if self.is_uniform:
             return self.mean - math.sqrt(3) * self.std, self.mean + math.sqrt(3) * self.std
-        a, b = self._interval
+        a, b = truncated_interval(*self._normals)
         return self.mean + self.std * a.numpy(), self.mean + self.std * b.numpy()
 
     @property
-    def _interval(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Where the normals are truncated, in σ from μ, ``(d,)`` each."""
+    def _normals(self) -> tuple[torch.Tensor, ...]:
+        """μ, σ, and the low and high limits of the normals, in coordinates, ``(d,)`` each."""
         limits = coordinate_limits(self.limits, self.is_log)
-        return truncated_interval(*map(torch.as_tensor, (self.mean, self.std, *limits)))
+        return tuple(map(torch.as_tensor, (self.mean, self.std, *limits)))
 
     def sample(self, num_samples: int, generator: torch.Generator) -> torch.Tensor:
         """Return ``num_samples`` independent parameter vectors ``(num_samples, d)``, in units."""
@@ -171,21 +169,20 @@ class Distribution:
         """Return the log-density of values ``(..., d)``, in units; ``(...)``, -inf outside the support."""
         is_log = torch.as_tensor(self.is_log)
         x = torch.where(is_log, torch.log(values), values)
-        stretch = torch.where(is_log, x, torch.zeros_like(x))  # d(log v)/dv = 1/v
+        stretch = torch.where(is_log, x, 0.0)  # d(log v)/dv = 1/v
         if self.is_uniform:
             low, high = (torch.as_tensor(e) for e in self.ends)
             density = -torch.log(high - low) - stretch
-            return torch.where((x >= low) & (x <= high), density, torch.full_like(x, -torch.inf)).sum(-1)
-        mean, std = torch.as_tensor(self.mean), torch.as_tensor(self.std)
-        a, b = self._interval
+            return torch.where((x >= low) & (x <= high), density, -torch.inf).sum(-1)
+        mean, std, *_ = self._normals
+        a, b = truncated_interval(*self._normals)
         z = (x - mean) / std
-        mass = torch.special.ndtr(b) - torch.special.ndtr(a)
+        below = torch.special.ndtr(a)
+        mass = torch.special.ndtr(b) - below
         density = -0.5 * z * z - _LOG_SQRT_2PI - torch.log(std) - torch.log(mass) - stretch
-        inside = (z >= a) & (z <= b)
-        total = torch.where(inside, density, torch.full_like(density, -torch.inf)).sum(-1)
+        total = torch.where((z >= a) & (z <= b), density, -torch.inf).sum(-1)
         if self.correlation is None:
             return total
-        below = torch.special.ndtr(a)
         share = ((torch.special.ndtr(z) - below) / mass).clamp(1e-12, 1 - 1e-12)
         return total + copula_log_density(torch.special.ndtri(share), torch.as_tensor(self.correlation))
 
@@ -228,11 +225,10 @@ class Distribution:
         path = Path(path)
         if not path.is_file():
             raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
-        try:
-            text = path.read_text(encoding="utf-8")  # JSON is not quite YAML 1.1, which reads 1e-05 as text
-            document = yaml.safe_load(text) if path.suffix in (".yaml", ".yml") else json.loads(text)
-        except (yaml.YAMLError, ValueError) as error:
-            raise InputError(f"distribution: {path} cannot be read: {' '.join(str(error).split())}") from None
+        is_yaml = path.suffix in (".yaml", ".yml")  # JSON is not quite YAML 1.1, which reads 1e-05 as text
+        with reading(f"distribution: {path}", "YAML" if is_yaml else "JSON"):
+            text = path.read_text(encoding="utf-8")
+            document = yaml.safe_load(text) if is_yaml else json.loads(text)
         entries = document.get("parameters") if isinstance(document, Mapping) else None
         if not isinstance(entries, Mapping) or not entries:
             raise InputError(f"distribution: {path} has no 'parameters'; expected name → mean, std, low, high, unit")
@@ -247,16 +243,14 @@ class Distribution:
         if laws not in ({"normal"}, {"uniform"}):
             raise InputError(f"distribution: {path}: law {', '.join(sorted(laws))}; expected all normal or all uniform")
         mean, std, low, high = np.array(rows).T
-        limits = [entry.get("limits") or [None, None] for entry in entries.values()]
+        limits = np.array([entry.get("limits") or [None, None] for entry in entries.values()], dtype=np.float64)
         return cls(
             names=tuple(entries),
             mean=mean,
             std=std,
             low=low,
             high=high,
-            limits=np.array(
-                [[-np.inf if a is None else a, np.inf if b is None else b] for a, b in limits], dtype=float
-            ),
+            limits=np.where(np.isnan(limits), [-np.inf, np.inf], limits),
             is_log=np.array([entry.get("scale") == "log" for entry in entries.values()]),
             units=tuple(str(e.get("unit", "")) for e in entries.values()),
             correlation=correlation,

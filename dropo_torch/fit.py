@@ -6,7 +6,7 @@ import math
 import pickle
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,17 @@ from dropo_torch.errors import InputError
 from dropo_torch.evaluator import Sums
 from dropo_torch.excitation import refuse_dead_parameters
 from dropo_torch.initial_noise import InitialStateNoise
-from dropo_torch.objective import Evaluation, Objective
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FitSettings, Optimizer, Progress, Request, make_optimizer
 from dropo_torch.support.files import write_atomically, write_json
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/fit/1"
+#: Keys of ``fit.json``, before what a method adds; ``correlation`` only where parameters vary together.
+KEYS = (
+    "schema", "method", "parameters", "correlation", "log_likelihood", "mse", "epsilon", "backend", "optimizer",
+    "samples", "evaluations", "simulated_transitions", "diverged_simulations", "seconds", "seed", "stop_reason",
+)  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -46,6 +51,10 @@ class HistoryEntry:
     stage: str
     mean: np.ndarray
     std: np.ndarray
+
+
+#: Called after every batch.
+OnProgress = Callable[[HistoryEntry, Progress], None]
 
 
 @dataclass(frozen=True)
@@ -90,27 +99,16 @@ class Fit:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
-        same = len(set(self.epsilon)) == 1
         correlation = self.distribution.correlation
-        return {
+        plain = vars(self) | {
             "schema": SCHEMA,
-            "method": self.method,
             "parameters": self.distribution.summary(),
-            **({} if correlation is None else {"correlation": correlation.tolist()}),
-            "log_likelihood": self.log_likelihood,
-            "mse": self.mse,
-            "epsilon": self.epsilon[0] if same else list(self.epsilon),
-            "backend": self.backend,
-            "optimizer": self.optimizer,
-            "samples": self.samples,
-            "evaluations": self.evaluations,
-            "simulated_transitions": self.simulated_transitions,
+            "correlation": None if correlation is None else correlation.tolist(),
+            "epsilon": self.epsilon[0] if len(set(self.epsilon)) == 1 else list(self.epsilon),
             "diverged_simulations": self.diverged,
             "seconds": round(self.seconds, 3),
-            "seed": self.seed,
-            "stop_reason": self.stop_reason,
-            **self.extras,
         }
+        return {key: plain[key] for key in KEYS if plain[key] is not None} | dict(self.extras)
 
     def save(self, path: str | Path) -> None:
         """Write ``fit.json``, whole or not at all."""
@@ -125,7 +123,7 @@ def fit(
     checkpoint: str | Path | None = None,
     resume: bool = False,
     fingerprint: str = "",
-    on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
+    on_progress: OnProgress | None = None,
 ) -> Fit:
     """Fit the distribution of a simulator's parameters to a log.
 
@@ -164,17 +162,18 @@ class _State:
     history: list[HistoryEntry] = field(default_factory=list)
     initial: InitialStateNoise | None = None
 
+    @property
+    def spent(self) -> tuple[int, float]:
+        """Evaluations and seconds so far."""
+        return (self.history[-1].evaluations, self.history[-1].seconds) if self.history else (0, 0.0)
+
 
 def _run(
-    search: Optimizer,
-    objective: Objective,
-    state: _State,
-    kept: _Checkpoint | None,
-    on_progress: Callable[[HistoryEntry, Progress], None] | None,
+    search: Optimizer, objective: Objective, state: _State, kept: _Checkpoint | None, on_progress: OnProgress | None
 ) -> None:
     """Ask and tell until the optimizer stops; keep the state after every batch."""
-    begun = time.monotonic() - (state.history[-1].seconds if state.history else 0.0)
-    evaluations = state.history[-1].evaluations if state.history else 0
+    evaluations, seconds = state.spent
+    begun = time.monotonic() - seconds
     while search.stop_reason is None:
         request = search.ask()
         at, std = request.linearise_at, request.linearise_std
@@ -186,16 +185,8 @@ def _run(
         evaluations += request.evaluations
         state.simulated_transitions += sums.simulated_transitions
         progress = search.progress
-        mean, std = search.candidates()[0]
-        entry = HistoryEntry(
-            evaluations=evaluations,
-            simulated_transitions=state.simulated_transitions,
-            seconds=time.monotonic() - begun,
-            log_likelihood=progress.log_likelihood,
-            stage=progress.stage,
-            mean=np.array(mean),
-            std=np.array(std),
-        )
+        cost = (evaluations, state.simulated_transitions, time.monotonic() - begun)
+        entry = HistoryEntry(*cost, progress.log_likelihood, progress.stage, *map(np.array, search.candidates()[0]))
         state.history.append(entry)
         if kept is not None:
             kept.save(search, state)
@@ -219,16 +210,15 @@ def answer(objective: Objective, request: Request, initial: InitialStateNoise | 
 def _conclude(search: Optimizer, objective: Objective, state: _State, settings: FitSettings) -> Fit:
     """Evaluate the candidates on draws of their own and return the best."""
     begun = time.monotonic()
-    last = state.history[-1] if state.history else None
+    evaluations, seconds = state.spent
     space = objective.simulator.parameters
     uniforms = draw_uniforms(settings.samples, len(space), settings.seed, 0)
-    results: list[tuple[float, Distribution, Evaluation]] = []
+    results = []
     for candidate in search.distributions(space):
         initial = objective.initial_noise_of(candidate)
         evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None], initial)[0]
         results.append((evaluation.log_likelihood + search.bonus(candidate), candidate, evaluation))
-        state.simulated_transitions += evaluation.simulated_transitions
-        state.simulated_transitions += initial.simulated_transitions if initial else 0
+        state.simulated_transitions += sum(x.simulated_transitions for x in (evaluation, initial) if x is not None)
     _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
     dropped = distribution.correlation is None and any(c.correlation is not None for _, c, _ in results)
     remark = "makes the log no likelier: parameters vary independently" if dropped else ""
@@ -241,10 +231,10 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
         optimizer=search.name,
         samples=settings.samples,
         seed=settings.seed,
-        evaluations=last.evaluations if last else 0,
+        evaluations=evaluations,
         simulated_transitions=state.simulated_transitions,
         diverged=best.diverged,
-        seconds=(last.seconds if last else 0.0) + time.monotonic() - begun,
+        seconds=seconds + time.monotonic() - begun,
         stop_reason=(search.stop_reason or "") + (f", but {remark}" if remark else ""),
         history=tuple(state.history),
         caveat=f"a full covariance {remark}" if remark else search.caveat,
@@ -283,22 +273,14 @@ class _Checkpoint:
             if is_own:
                 search.restore(content["optimizer"])
         except Exception as error:
-            raise InputError(
-                f"resume: {self.path} is no checkpoint of a fit ({error}); start again without --resume"
-            ) from None
+            what = f"{self.path} is no checkpoint of a fit ({error})"
+            raise InputError(f"resume: {what}; start again without --resume") from None
         if not is_own:
-            raise InputError(
-                f"resume: {self.path} belongs to another config, log or optimizer; restore those, "
-                "or start again without --resume"
-            )
+            what = f"{self.path} belongs to another config, log or optimizer"
+            raise InputError(f"resume: {what}; restore those, or start again without --resume")
         if linearised is not None:
             state.initial = objective.initial_noise(*linearised)  # already counted
         return state
 
     def _owner(self, search: Optimizer) -> tuple[str, str]:
         return self.fingerprint, search.name
-
-
-def without_history(result: Fit) -> Fit:
-    """Return a fit without its history, for comparison."""
-    return replace(result, history=(), seconds=0.0)

@@ -101,6 +101,14 @@ def log_likelihood(
     return gaussian_log_density(measured - mean, covariance if extra is None else covariance + extra)
 
 
+def survivors(
+    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, float]:
+    """Return the transitions of which no simulation diverged, and the log-likelihood of the others together."""
+    alive = torch.isfinite(features).flatten(1).all(-1)
+    return features[alive], measured[alive], covariance[alive], float((~alive).sum()) * LOST_TRANSITION
+
+
 def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return shift ``(t, m)`` and covariance ``(t, m, m)`` of outcomes of noisy initial states.
 
@@ -108,8 +116,7 @@ def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor
         outcomes: the undisturbed one, then those of antithetic draws, ``(t, 1 + M, m)``.
         draws: standard normal, ``(1 + M, c)``, the first zero.
     """
-    outcomes = torch.where(torch.isfinite(outcomes), outcomes, outcomes[:, :1])
-    outcomes = torch.nan_to_num(outcomes)
+    outcomes = torch.nan_to_num(torch.where(torch.isfinite(outcomes), outcomes, outcomes[:, :1]))
     spread = outcomes[:, 1:] - outcomes[:, 1:].mean(1, keepdim=True)
     gain = (torch.linalg.pinv(draws[1:]) @ spread).mT  # G √ν, (t, m, c)
     left = spread - draws[1:] @ gain.mT
@@ -142,12 +149,10 @@ def likelihood_with_losses(
         return values, squared, lost.double()
     values = torch.full(lost.shape, LOST_TRANSITION, dtype=samples.dtype)
     squared = torch.full_like(values, torch.nan)
-    num_samples = samples.shape[2]
     for t, p in (finite.sum(-1) >= 2).nonzero().tolist():
         kept = samples[t, p, finite[t, p]]
-        one, error = _likelihood(kept, measured[t, 0], covariance[t, 0], num_rotations, log_density)
-        values[t, p] = one - DIVERGENCE_PENALTY * lost[t, p] / num_samples
-        squared[t, p] = error
+        one, squared[t, p] = _likelihood(kept, measured[t, 0], covariance[t, 0], num_rotations, log_density)
+        values[t, p] = one - DIVERGENCE_PENALTY * lost[t, p] / samples.shape[2]
     return values, squared, lost.double()
 
 
@@ -170,9 +175,8 @@ def _rotation_angles(
     angles = samples[..., plain:].unflatten(-1, (num_rotations, 3)).norm(dim=-1)
     rest = samples[..., :plain]
     both = torch.cat([torch.cat([rest, angles], -1), torch.cat([rest, -angles], -1)], -2)
-    average = torch.zeros(samples.shape[-1], plain + num_rotations, dtype=samples.dtype)
-    average[torch.arange(plain), torch.arange(plain)] = 1
-    for i in range(num_rotations):  # an angle's variance is its rotation vector's, averaged over the axes
-        average[plain + 3 * i : plain + 3 * i + 3, plain + i] = 3**-0.5
+    # an angle's variance is its rotation vector's, averaged over the axes
+    axes = torch.full((3, 1), 3**-0.5, dtype=samples.dtype)
+    average = torch.block_diag(torch.eye(plain, dtype=samples.dtype), *num_rotations * [axes])
     flat = torch.cat([measured[..., :plain], torch.zeros_like(angles[..., 0, :])], -1)
     return both, flat, average.T @ covariance @ average

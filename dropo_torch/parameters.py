@@ -23,6 +23,7 @@ import numpy as np
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import CENTRES, load_model
+from dropo_torch.support.given import check_keys
 
 #: Fields whose values must be positive, whatever the search bounds.
 POSITIVE_FIELDS = frozenset({"body_mass", "body_inertia", "opt.timestep", "opt.impratio", "geom_size", "pair_friction"})
@@ -40,14 +41,10 @@ _SERVO = {
     "actuator_kv": (("actuator_biasprm", 2, -1.0),),
 }
 _FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear", "actuator_gainprm"})
-_OBJECTS = {
-    "body": ("nbody", "body"), "geom": ("ngeom", "geom"), "jnt": ("njnt", "joint"), "dof": ("nv", "joint"),
-    "qpos0": ("nq", "joint"), "qpos": ("nq", "joint"), "actuator": ("nactuator", "actuator"), "site": ("nsite", "site"),
-    "tendon": ("ntendon", "tendon"), "eq": ("neq", "equality"), "pair": ("npair", "pair"),
-    "flex": ("nflex", "flex"),
-}  # fmt: skip
+#: First word of a field → the kind of object that carries it.
+_OBJECTS = {kind: kind for kind in ("body", "geom", "actuator", "site", "tendon", "pair", "flex")}
+_OBJECTS |= dict.fromkeys(("jnt", "dof", "qpos0", "qpos"), "joint") | {"eq": "equality"}
 _KEYS = ("field", "name", "index", "bounds", "limits", "unit", "scale", "relative", "scale_inertia", "effect")
-_UNBOUNDED = (-np.inf, np.inf)
 #: Keys of a parameter that is a number of an effect.
 _EFFECT_KEYS = ("effect", "name", "index", "bounds", "limits", "unit", "scale")
 
@@ -84,8 +81,8 @@ class Parameter:
     """
 
     name: str
-    low: float
-    high: float
+    low: float = -np.inf
+    high: float = np.inf
     field: str = ""
     objects: tuple[str, ...] = ()
     index: int | None = None
@@ -126,7 +123,7 @@ class ParameterSpace:
         if not parameters:
             raise InputError("parameters: none given; name at least one, such as 'mass: {field: body_mass, ...}'")
         self.parameters = tuple(_parse(self.model, str(name), spec) for name, spec in parameters.items())
-        _refuse_overlap(self.parameters)
+        _refuse_overlap(self)
         if self.model is not None:
             _refuse_derived(self)
 
@@ -172,7 +169,12 @@ class ParameterSpace:
     @cached_property
     def fields(self) -> tuple[str, ...]:
         """The model fields that the parameters write."""
-        return tuple(dict.fromkeys(t.field for p in self.parameters for t in p.targets))
+        return tuple(dict.fromkeys(t.field for _, t in self.targets))
+
+    @property
+    def targets(self) -> list[tuple[int, Target]]:
+        """Every number that is written, with the column of its parameter."""
+        return [(column, t) for column, p in enumerate(self.parameters) for t in p.targets]
 
     @property
     def nominal(self) -> np.ndarray:
@@ -195,11 +197,9 @@ class ParameterSpace:
 
     def with_limits(self, low: np.ndarray) -> ParameterSpace:
         """Return the same space with the lower physical limits ``(d,)`` raised to those given."""
-        other = copy.copy(self)
-        other.parameters = tuple(
-            replace(p, limits=(max(p.limits[0], float(least)), p.limits[1]))
-            for p, least in zip(self.parameters, low, strict=True)
-        )
+        other, raised = copy.copy(self), np.maximum(self.limits[:, 0], low).tolist()
+        pairs = zip(self.parameters, raised, strict=True)
+        other.parameters = tuple(replace(p, limits=(least, p.limits[1])) for p, least in pairs)
         return other
 
     def on(self, model: mujoco.MjModel) -> ParameterSpace:
@@ -214,10 +214,8 @@ class ParameterSpace:
 
     def write(self, fields: Mapping[str, np.ndarray], values: np.ndarray) -> None:
         """Write parameter vectors ``(K, d)`` into per-simulation model fields ``(K, ...)``, in place."""
-        for column, parameter in enumerate(self.parameters):
-            for target in parameter.targets:
-                rows = fields[target.field].reshape(len(values), -1)
-                rows[:, target.index] = target.factor * values[:, column]
+        for column, target in self.targets:
+            fields[target.field].reshape(len(values), -1)[:, target.index] = target.factor * values[:, column]
 
     def apply(self, values: np.ndarray | Mapping[str, float]) -> mujoco.MjModel:
         """Return a copy of the model with the given values and everything derived from them."""
@@ -225,18 +223,14 @@ class ParameterSpace:
             raise InputError("parameters: these belong to no MuJoCo model")
         vector = self.vector(values) if isinstance(values, Mapping) else np.asarray(values, dtype=np.float64)
         model = copy.copy(self.model)
-        for column, parameter in enumerate(self.parameters):
-            for target in parameter.targets:
-                write_field(model, target.field, target.index, target.factor * vector[column])
+        for column, target in self.targets:
+            write_field(model, target.field, target.index, target.factor * vector[column])
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 
 
-#: Fields that move a frame → what marks it as coinciding with another, so that MuJoCo need not compute it.
-_FRAMES = {
-    "body_ipos": "body_sameframe", "body_iquat": "body_sameframe", "geom_pos": "geom_sameframe",
-    "geom_quat": "geom_sameframe", "site_pos": "site_sameframe", "site_quat": "site_sameframe",
-}  # fmt: skip
+#: Fields that move a frame; ``body_sameframe`` marks one as coinciding, so that MuJoCo need not compute it.
+_FRAMES = ("body_ipos", "body_iquat", "geom_pos", "geom_quat", "site_pos", "site_quat")
 
 
 def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
@@ -248,21 +242,20 @@ def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
         InputError: the centre of mass of a body that is compiled as simple.
     """
     none = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
-    for parameter in space.parameters:
-        for target in parameter.targets:
-            if target.field not in _FRAMES:
-                continue
-            row = target.index // read_field(model, target.field).shape[-1]
-            getattr(model, _FRAMES[target.field])[row] = none
-            if target.field not in CENTRES:
-                continue
-            if model.body_simple[row]:
-                raise InputError(
-                    f"parameters: {parameter.name!r}: body {row} ({model.body(row).name}) is compiled as simple, its "
-                    'centre of mass in its frame; give the path of the model, or compile it with simple="false"'
-                )
-            model.geom_sameframe[model.geom_bodyid == row] = none  # some coincide with the body's inertial frame
-            model.site_sameframe[model.site_bodyid == row] = none
+    for column, target in space.targets:
+        if target.field not in _FRAMES:
+            continue
+        row = target.index // read_field(model, target.field).shape[-1]
+        getattr(model, target.field.split("_")[0] + "_sameframe")[row] = none
+        if target.field not in CENTRES:
+            continue
+        if model.body_simple[row]:
+            raise InputError(
+                f"parameters: {space.names[column]!r}: body {row} ({model.body(row).name}) is compiled as simple, its "
+                'centre of mass in its frame; give the path of the model, or compile it with simple="false"'
+            )
+        model.geom_sameframe[model.geom_bodyid == row] = none  # some coincide with the body's inertial frame
+        model.site_sameframe[model.site_bodyid == row] = none
 
 
 def read_field(model: mujoco.MjModel, field: str) -> np.ndarray:
@@ -285,8 +278,8 @@ def object_names(model: mujoco.MjModel, prefix: str) -> list[str]:
 
     An actuator without a name is called by its joint's, where it is the first that would be.
     """
-    count, accessor = _OBJECTS[prefix]
-    number = model.njnt if accessor == "joint" else getattr(model, count)
+    accessor = _OBJECTS[prefix]
+    number = model.njnt if accessor == "joint" else getattr(model, f"n{prefix}")
     names = []
     for i in range(number):
         name = getattr(model, accessor)(i).name
@@ -302,9 +295,7 @@ def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> 
     where = f"parameters.{name}"
     if not isinstance(spec, Mapping):
         raise InputError(f"{where}: expected keys such as field, name and bounds, got {spec!r}")
-    for key in spec:
-        if key not in _KEYS:
-            raise InputError(f"{where}: unknown key {key!r}" + choices(key, _KEYS))
+    check_keys(spec, _KEYS, where)
     for key in ("relative", "scale_inertia"):
         if not isinstance(spec.get(key, False), bool):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected true or false")
@@ -330,20 +321,17 @@ def _at_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
         if not isinstance(spec.get(key, ""), str | None):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected a name")
     objects = (spec["name"],) if spec.get("name") else ()
-    return Parameter(name, *_UNBOUNDED, objects=objects, effect=str(spec["effect"]), quantity=spec.get("index") or "")
+    return Parameter(name, objects=objects, effect=str(spec["effect"]), quantity=spec.get("index") or "")
 
 
 def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
     """The numbers of the model that a field, its objects and component stand for, without bounds."""
     field, index = _field_and_index(where, spec)
     if model is None:
-        if field:
-            raise InputError(f"{where}: field {field!r} needs a MuJoCo model; this simulator has none")
-        if spec.get("relative"):
-            raise InputError(f"{where}: relative needs a MuJoCo model whose value it multiplies")
-        if spec.get("scale_inertia"):
-            raise InputError(f"{where}: scale_inertia is for field body_mass, not {field!r}")
-        return Parameter(name, *_UNBOUNDED)
+        for key in ("field", "relative", "scale_inertia"):
+            if spec.get(key):
+                raise InputError(f"{where}: {key} {spec[key]!r} needs a MuJoCo model; this simulator has none")
+        return Parameter(name)
     if not field:
         raise InputError(f"{where}: no field given; expected one of MjModel's, such as field: body_mass")
     targets, objects, index = _targets(model, where, field, index, spec)
@@ -351,7 +339,7 @@ def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping
         targets = tuple(_scaled(model, where, t) for t in targets)
     if spec.get("scale_inertia"):
         targets = _with_inertia(model, where, field, targets, bool(spec.get("relative")))
-    return Parameter(name, *_UNBOUNDED, field=field, objects=objects, index=index, targets=targets)
+    return Parameter(name, field=field, objects=objects, index=index, targets=targets)
 
 
 def _field_and_index(where: str, spec: Mapping[str, Any]) -> tuple[str, int | None]:
@@ -387,18 +375,14 @@ def _targets(
     prefix = field.split("_", 1)[0]
     if prefix not in _OBJECTS:
         raise InputError(f"{where}: field {field!r} belongs to no named object; it cannot vary")
-    objects = _select_objects(where, spec, object_names(model, prefix), _OBJECTS[prefix][1])
+    objects = _select_objects(where, spec, object_names(model, prefix), _OBJECTS[prefix])
     size = int(np.prod(array.shape[1:], dtype=int))
     every: list[Target] = []
     for number in objects.values():
         rows = _rows(model, prefix, number)
-        if prefix in ("qpos0", "qpos") and len(rows) > 1 and index is None:
-            raise InputError(f"{where}: {field} of this joint has {len(rows)} entries; add index: 0 to {len(rows) - 1}")
-        if len(rows) > 1 and index is not None and size == 1:  # one degree of freedom of a free or ball joint
-            if index >= len(rows):
-                raise InputError(f"{where}: index {index} is outside {field} of this joint, which has {len(rows)}")
-            rows = rows[index : index + 1]
-            component = 0
+        is_chosen = index is not None or prefix in ("qpos0", "qpos")
+        if len(rows) > 1 and size == 1 and is_chosen:  # one degree of freedom of a free or ball joint
+            rows, component = [rows[_component(where, f"{field} of this joint", index, len(rows))]], 0
         else:
             component = _component(where, field, index, size)
         every += [Target(field, row * size + component) for row in rows]
@@ -421,9 +405,7 @@ def _servo_targets(
         parts = _SERVO[field] + ((("actuator_gainprm", 0, 1.0),) if field == "actuator_kv" and is_velocity else ())
         if model.actuator_gaintype[number] == mujoco.mjtGain.mjGAIN_PID:  # its gains stand in biasprm alone
             parts = tuple(p for p in parts if p[0] == "actuator_biasprm")
-        for part, component, factor in parts:
-            width = read_field(model, part).shape[1]
-            targets.append(Target(part, number * width + component, factor))
+        targets += [Target(p, number * read_field(model, p).shape[1] + index, factor) for p, index, factor in parts]
     return tuple(targets), tuple(objects), None
 
 
@@ -434,9 +416,8 @@ def _select_objects(where: str, spec: Mapping[str, Any], names: Sequence[str], k
         raise InputError(f"{where}: no name given; expected a {kind}" + choices("", names).replace("; ", " ", 1))
     if not isinstance(wanted, (str, list, tuple)):
         raise InputError(f"{where}: name is {wanted!r}; expected a {kind}'s name, or a list of them")
-    entries = [wanted] if isinstance(wanted, str) else list(wanted)
     found: dict[str, int] = {}
-    for entry in map(str, entries):
+    for entry in map(str, [wanted] if isinstance(wanted, str) else wanted):
         matches = fnmatch.filter(names, entry) if "*" in entry else [n for n in names if n == entry]
         if not matches:
             raise InputError(f"{where}: the model has no {kind} {entry!r}" + choices(entry, names))
@@ -487,11 +468,8 @@ def _with_inertia(
 
 
 def _interval(where: str, key: str, pair: Any) -> tuple[float, float]:
-    if (
-        not isinstance(pair, (list, tuple, np.ndarray))
-        or len(pair) != 2
-        or any(isinstance(x, (bool, str)) or not np.isscalar(x) for x in pair)
-    ):
+    is_pair = isinstance(pair, (list, tuple, np.ndarray)) and len(pair) == 2
+    if not is_pair or any(isinstance(x, (bool, str)) or not np.isscalar(x) for x in pair):
         raise InputError(f"{where}: {key} is {pair!r}; expected [low, high]")
     low, high = (float(x) for x in pair)
     if np.isnan(low) or np.isnan(high) or (key == "bounds" and not np.isfinite([low, high]).all()):
@@ -523,10 +501,9 @@ def _limits(where: str, field: str, spec: Mapping[str, Any], low: float, high: f
 
 
 def _nominal(model: mujoco.MjModel | None, parameter: Parameter) -> float:
-    if model is None or not parameter.targets:
+    if model is None or not parameter.targets or not parameter.targets[0].factor:
         return float("nan")
-    target = parameter.targets[0]
-    return target.read(model) / target.factor if target.factor else float("nan")
+    return parameter.targets[0].read(model) / parameter.targets[0].factor
 
 
 def _refuse_derived(space: ParameterSpace) -> None:
@@ -535,20 +512,18 @@ def _refuse_derived(space: ParameterSpace) -> None:
     try:
         model = space.apply(values)
     except mujoco.FatalError as error:
-        raise InputError(
-            f"parameters: MuJoCo refuses the middle of the bounds: {' '.join(str(error).split())}"
-        ) from None
-    for column, p in enumerate(space.parameters):
-        for t in p.targets:
-            if not np.isclose(t.read(model), t.factor * values[column], rtol=1e-6):
-                raise InputError(f"parameters.{p.name}: MuJoCo derives {t.field} from other fields; vary those instead")
+        raise InputError(f"parameters: MuJoCo refuses the middle of the bounds: {error}") from None
+    for column, t in space.targets:
+        if not np.isclose(t.read(model), t.factor * values[column], rtol=1e-6):
+            where = f"parameters.{space.names[column]}"
+            raise InputError(f"{where}: MuJoCo derives {t.field} from other fields; vary those instead")
 
 
-def _refuse_overlap(parameters: Sequence[Parameter]) -> None:
+def _refuse_overlap(space: ParameterSpace) -> None:
     """Two parameters must not write the same number."""
-    owner: dict[tuple[str, int], str] = {}
-    for p in parameters:
-        for t in p.targets:
-            other = owner.setdefault((t.field, t.index), p.name)
-            if other != p.name:
-                raise InputError(f"parameters.{p.name}: writes the same {t.field} as {other!r}; keep one of them")
+    owner: dict[tuple[str, int], int] = {}
+    for column, t in space.targets:
+        other = owner.setdefault((t.field, t.index), column)
+        if other != column:
+            here, there = space.names[column], space.names[other]
+            raise InputError(f"parameters.{here}: writes the same {t.field} as {there!r}; keep one of them")

@@ -6,7 +6,6 @@ import hashlib
 import re
 import warnings
 from collections.abc import Mapping
-from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -87,8 +86,8 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     effects, history = None, 0
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
-        observation = _observation(config, space.model, num_states, width)
-        space, effects = _effects(config, space, observation, frame_skip)
+        effects = _effects(config, space, _observation(config, space.model, num_states, width), frame_skip)
+        space = space.with_limits(lowest(effects, space))
         simulator, history = _with_effects(config, source, effects, space, trajectories)
     else:
         simulator = _backend(config, source, frame_skip, space)
@@ -156,14 +155,11 @@ def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace
     )
 
 
-def _effects(
-    config: Config, space: ParameterSpace, observation: Observation, frame_skip: int
-) -> tuple[ParameterSpace, EffectSet]:
-    """The effects of a config, and its parameters with their limits."""
+def _effects(config: Config, space: ParameterSpace, observation: Observation, frame_skip: int) -> EffectSet:
+    """The effects of a config."""
     if space.model is None or len(observation.default_state) != space.model.nq + space.model.nv:
         raise InputError("effects: they need a MuJoCo model; this simulator has none")
-    effects = place_effects(config.effects, space, plain_setting(space.model, observation, frame_skip), find_effect)
-    return space.with_limits(lowest(effects, space)), effects
+    return place_effects(config.effects, space, plain_setting(space.model, observation, frame_skip), find_effect)
 
 
 def _with_effects(
@@ -218,7 +214,7 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
     )  # fmt: skip
     path = None if config.model is None else config.path(config.model)
     space = _space(None if path is None else load_model(path), config)
-    with _user_code(name):
+    with user_code("environment", name):
         adapter = maker(space)
     return path, space, _CheckedAdapter(adapter, name)
 
@@ -234,10 +230,9 @@ class _CheckedAdapter:
                     "num_states, num_controls, timestep, set_parameters(values), set_state(state) and step(control)"
                 )
         for width in ("num_states", "num_controls"):
-            if not isinstance(getattr(adapter, width, None), int | np.integer):
-                raise InputError(
-                    f"environment: {width} of {name} is {getattr(adapter, width, None)!r}; expected a number"
-                )
+            given = getattr(adapter, width, None)
+            if not isinstance(given, int | np.integer):
+                raise InputError(f"environment: {width} of {name} is {given!r}; expected a number")
         timestep = getattr(adapter, "timestep", None)
         if timestep is not None and not (isinstance(timestep, int | float | np.number) and timestep > 0):
             raise InputError(f"environment: timestep of {name} is {timestep!r}; expected seconds of a step, or None")
@@ -246,15 +241,15 @@ class _CheckedAdapter:
         self.timestep = None if timestep is None else float(timestep)
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
-        with _user_code(self._name):
+        with user_code("environment", self._name):
             self._adapter.set_parameters(values)
 
     def set_state(self, state: np.ndarray) -> None:
-        with _user_code(self._name):
+        with user_code("environment", self._name):
             self._adapter.set_state(state)
 
     def step(self, control: np.ndarray) -> np.ndarray:
-        with _user_code(self._name):
+        with user_code("environment", self._name):
             given: Any = self._adapter.step(control)
         try:
             after = np.asarray(given, dtype=np.float64)
@@ -262,15 +257,9 @@ class _CheckedAdapter:
             after = np.empty(0)
         if given is None or after.shape != (self.num_states,):
             shape = repr(given) if given is None or isinstance(given, str) else f"shape {np.shape(given)}"
-            raise InputError(
-                f"environment: step of {self._name} returns {shape}; expected ({self.num_states},) numbers"
-            )
+            what = f"step of {self._name} returns {shape}"
+            raise InputError(f"environment: {what}; expected ({self.num_states},) numbers")
         return after
-
-
-def _user_code(name: str) -> AbstractContextManager[None]:
-    """Turn what an adapter raises into an :class:`InputError` that says where."""
-    return user_code("environment", name)
 
 
 def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:
@@ -282,13 +271,12 @@ def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:
             raise InputError("data: preprocess needs dt, the seconds of one transition (or frame_skip, and a model)")
         step = float(model.opt.timestep) * config.frame_skip
         source = {**source, "preprocess": {"dt": step, **source["preprocess"]}}
-    log = read_trajectories(source, base=config.base)
-    if config.trajectories is None:
-        return log
-    wanted = config.trajectories
-    if isinstance(wanted, int) and not 1 <= wanted <= log.num_episodes:
-        raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")
-    return log.select_episodes(range(wanted) if isinstance(wanted, int) else wanted)
+    log, wanted = read_trajectories(source, base=config.base), config.trajectories
+    if isinstance(wanted, int):
+        if not 1 <= wanted <= log.num_episodes:
+            raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")
+        wanted = list(range(wanted))
+    return log if wanted is None else log.select_episodes(wanted)
 
 
 def _frame_skip(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> int:

@@ -66,8 +66,7 @@ class AdamOptimizer(LikelihoodOptimizer):
         self._phi = np.concatenate([np.full(d, SearchBox.WIDTH / 2), np.zeros(d)])
         self._first, self._second = np.zeros(2 * d), np.zeros(2 * d)
         self._basis, self._curvature, self._refreshed = np.eye(d), np.zeros(d), -1
-        self._step = 0
-        self._smoothed = float("nan")
+        self._step, self._smoothed = 0, math.nan
         self._linearised: np.ndarray | None = None
 
     def ask(self) -> Request:
@@ -85,7 +84,7 @@ class AdamOptimizer(LikelihoodOptimizer):
                 is_stencil=True,
             )
         return Request(
-            values=self._values(torch.from_numpy(self._phi)).detach().numpy(),
+            values=self._values(torch.from_numpy(self._phi)).numpy(),
             reduce=self._likelihood(1) if self._is_joint else self._means_reduction(),
             evaluations=1,
             linearise_at=self._linearised,
@@ -142,8 +141,8 @@ class AdamOptimizer(LikelihoodOptimizer):
         """One step of Adam along a gradient ``(2d,)`` whose part of the means is in the basis."""
         taken = self._step % self._adam.steps
         if taken >= _WARM_UP:
-            usual = np.sqrt(self._second / (1 - _BETAS[1] ** taken))
-            force = np.clip(force, -self._adam.clip * usual, self._adam.clip * usual)
+            most = self._adam.clip * np.sqrt(self._second / (1 - _BETAS[1] ** taken))
+            force = np.clip(force, -most, most)
         self._first = _BETAS[0] * self._first + (1 - _BETAS[0]) * force
         self._second = _BETAS[1] * self._second + (1 - _BETAS[1]) * force**2
         first, second = (m / (1 - b ** (taken + 1)) for m, b in zip((self._first, self._second), _BETAS, strict=True))
@@ -158,10 +157,8 @@ class AdamOptimizer(LikelihoodOptimizer):
     def _to_basis(self, force: np.ndarray) -> np.ndarray:
         """A gradient by φ with its means in the basis, and variances in the place of log σ."""
         d, ratio = len(self._space), np.log(self._box.max_std / self._box.min_std)
-        if not self._is_joint:
-            return np.concatenate([self._basis.T @ force[:d], np.zeros(d)])
         variance = np.exp(2 * ratio * self._phi[d:] / SearchBox.WIDTH)  # in units of its floor
-        return np.concatenate([self._basis.T @ force[:d], force[d:] / variance])
+        return np.concatenate([self._basis.T @ force[:d], force[d:] / variance if self._is_joint else np.zeros(d)])
 
     def _refresh(self, sums: torch.Tensor) -> None:
         """Take eigenvectors and eigenvalues of the Gauss-Newton matrix, and turn the moments along.
@@ -177,7 +174,7 @@ class AdamOptimizer(LikelihoodOptimizer):
         self._first = np.concatenate([turn @ self._first[:d], self._first[d:]])
         self._second = np.concatenate([turn**2 @ self._second[:d], self._second[d:]])
         if self._is_new_stage:
-            self._first, self._second, self._smoothed = np.zeros(2 * d), np.zeros(2 * d), float("nan")
+            self._first, self._second, self._smoothed = np.zeros(2 * d), np.zeros(2 * d), math.nan
             guess = stage.first_std(self._box, significance=_SIGNIFICANCE)
             self._phi = np.concatenate([self._phi[:d], self._box.normalise(stage.point, guess)[d:]])
         self._basis, self._refreshed = basis, self._step

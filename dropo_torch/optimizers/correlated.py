@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.distribution import DRAWN_STD, Distribution
+from dropo_torch.likelihood import survivors
 from dropo_torch.objective import Objective, Reduce
 from dropo_torch.optimizers.base import Progress, Request
 from dropo_torch.optimizers.fisher import FisherOptimizer
@@ -95,14 +96,10 @@ class CorrelatedOptimizer(FisherOptimizer):
             self._center, self._rounds = self._at, _ROUNDS
             return
         scale = torch.from_numpy(self._box.width)  # parameters of very different size, as shares of their boxes
-        start = self._covariance if self._covariance is not None else self._first_guess()
-        found, shift = random_effects(
-            gram * torch.outer(scale, scale),
-            force * scale,
-            torch.from_numpy(start) / torch.outer(scale, scale),
-            entropy=self._settings.entropy,
-        )
-        self._covariance = (found * torch.outer(scale, scale)).numpy()
+        area = torch.outer(scale, scale)
+        start = torch.from_numpy(self._first_guess() if self._covariance is None else self._covariance) / area
+        found, shift = random_effects(gram * area, force * scale, start, self._settings.entropy)
+        self._covariance = (found * area).numpy()
         moved = np.clip(self._at + (shift * scale).numpy(), self._box.low, self._box.high)
         converged = bool((np.abs(moved - self._at) <= _AT_REST * self._box.width).all())
         self._center, self._rounds = moved, (_ROUNDS if converged else self._rounds + 1)
@@ -145,11 +142,11 @@ class CorrelatedOptimizer(FisherOptimizer):
         gathered = self._gathered
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-            alive = torch.isfinite(features).flatten(1).all(-1)
-            base, moved = features[alive, 0], features[alive, 1:]
-            jacobian = (moved - base[:, None]) / steps[:, None]
-            residual = (measured[alive] - base)[:, None]
-            solved = torch.linalg.solve(covariance[alive], torch.cat([residual, jacobian], 1).mT)
+            features, measured, covariance, _ = survivors(features, measured, covariance)
+            base = features[:, 0]
+            jacobian = (features[:, 1:] - base[:, None]) / steps[:, None]
+            residual = (measured - base)[:, None]
+            solved = torch.linalg.solve(covariance, torch.cat([residual, jacobian], 1).mT)
             gathered.append((jacobian @ solved[..., 1:], (jacobian @ solved[..., :1])[..., 0]))
             return torch.zeros(1, dtype=features.dtype)
 

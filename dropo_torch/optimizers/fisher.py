@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import ClassVar
 
 import numpy as np
@@ -100,9 +101,8 @@ class FisherOptimizer(LikelihoodOptimizer):
             share = self._scoring.BEGUN_AT + 0.3 * min(1.0, self._scoring.iterations / 10)
             return Progress(self._scoring.TITLE, self._scoring.log_likelihood, share)
         done = self._round / (NOISY_ROUNDS + 1) if self._noisy else 0.0
-        return Progress(
-            "Gauss-Newton on the means", float("nan"), 0.4 * (done + (1 - done) * min(1.0, self._means.iterations / 10))
-        )
+        share = 0.4 * (done + (1 - done) * min(1.0, self._means.iterations / 10))
+        return Progress("Gauss-Newton on the means", math.nan, share)
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the φ at which the last stage stopped."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import scipy.optimize
@@ -52,12 +53,7 @@ class MeansStage:
 
     def reduction(self) -> Reduce:
         """Return the reduction to cost, losses, normal equations and moments, ``(2 + 2d + 2d²,)``."""
-        steps = torch.from_numpy(self.steps)
-
-        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-            return normal_equations(features, measured, covariance, steps)
-
-        return reduce
+        return partial(normal_equations, steps=torch.from_numpy(self.steps))
 
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one."""
@@ -68,9 +64,8 @@ class MeansStage:
             gain = self.cost - cost
             self.point = self._center
             self.cost, self.lost = cost, float(sums[1])
-            vectors, matrices = sums[2 : 2 + 2 * d].numpy(), sums[2 + 2 * d :].numpy()
-            self.gradient, self.excess = vectors.reshape(2, d).copy()
-            self.hessian, self.squares = matrices.reshape(2, d, d).copy()
+            self.gradient, self.excess = sums[2 : 2 + 2 * d].numpy().reshape(2, d).copy()
+            self.hessian, self.squares = sums[2 + 2 * d :].numpy().reshape(2, d, d).copy()
             self.damping = max(self.damping / 8, 1e-12)
             if np.isfinite(gain) and (gain < 1e-4 * self.reduced_chi2 or step < 1e-10):
                 self.reason = "the means no longer improve"
@@ -84,9 +79,8 @@ class MeansStage:
         if self.iterations >= MAX_ITERATIONS and self.reason is None:
             self.reason = f"{MAX_ITERATIONS} iterations of the means"
         if self.reason is None:
-            move = bounded_step(
-                self.hessian, -self.gradient, self.low - self.point, self.high - self.point, self.damping
-            )
+            below, above = self.low - self.point, self.high - self.point
+            move = bounded_step(self.hessian, -self.gradient, below, above, self.damping)
             self.candidate = np.clip(self.point + move, self.low, self.high)
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
@@ -148,19 +142,17 @@ def normal_equations(
     alive = torch.isfinite(base).all(-1)
     lost = (~alive).sum().to(base.dtype)
     jacobian = torch.nan_to_num((moved - base[:, None]) / steps[:, None])  # a diverged column says nothing
-    jacobian = torch.where(alive[:, None, None], jacobian, torch.zeros_like(jacobian))
-    residual = torch.where(alive[:, None], measured - base, torch.zeros_like(base))
+    jacobian = torch.where(alive[:, None, None], jacobian, 0.0)
+    residual = torch.where(alive[:, None], measured - base, 0.0)
     factor = robust_cholesky(covariance)
-    white = torch.linalg.solve_triangular(
-        factor, torch.cat([residual[..., None], jacobian.mT], -1), upper=False
-    )  # (t, m, 1 + d)
+    both = torch.cat([residual[..., None], jacobian.mT], -1)
+    white = torch.linalg.solve_triangular(factor, both, upper=False)  # (t, m, 1 + d)
     r, jac = white[..., 0], white[..., 1:]
     gradient = -(jac * r[..., None]).sum((0, 1))
     flat = jac.flatten(0, 1)
     gram = jac.mT @ jac
     pulled = (jac.mT @ r[..., None])[..., 0]
     excess = (pulled.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0)
-    squares = gram.square().sum(0)
-    matrices = [(flat.T @ flat).flatten(), squares.flatten()]
     cost = 0.5 * r.square().sum() + lost * DIVERGENCE_PENALTY
-    return torch.cat([cost[None], lost[None], gradient, excess, *matrices])
+    parts = (cost, lost, gradient, excess, flat.T @ flat, gram.square().sum(0))
+    return torch.cat([part.flatten() for part in parts])

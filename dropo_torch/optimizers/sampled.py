@@ -8,11 +8,12 @@ its gradient follows from how the samples' next states regress on z: no further 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import torch
 
-from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density, sample_moments
+from dropo_torch.likelihood import gaussian_log_density, sample_moments, survivors
 from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.ascent import Ascent
 
@@ -40,12 +41,7 @@ class SampledStage(Ascent):
         """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d²,)``."""
         mean, std = self.phi
         z = torch.from_numpy((self.points() - mean) / std)
-        sigma = torch.from_numpy(std)
-
-        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-            return sampled_scores(features, measured, covariance, sigma, z)
-
-        return reduce
+        return partial(sampled_scores, std=torch.from_numpy(std), z=z)
 
     def with_exact_scores(self, sums: torch.Tensor, gradient: torch.Tensor) -> torch.Tensor:
         """Return the sums with the chain rule's scores of (μ, log σ) in the place of the regressed ones.
@@ -72,17 +68,15 @@ def sampled_scores(
         z: how far the samples lie from μ, in σ, ``(K, d)``.
     """
     num_samples = len(z)
-    alive = torch.isfinite(features).flatten(1).all(-1)
-    lost = float((~alive).sum()) * LOST_TRANSITION
-    features, measured, covariance = features[alive], measured[alive], covariance[alive]
+    features, measured, covariance, lost = survivors(features, measured, covariance)
     mean, sampled = sample_moments(features)
     total = sampled + covariance
-    residual = measured - mean
+    residual, centred = measured - mean, features - mean[:, None]
     value = gaussian_log_density(residual, total).sum() + lost
     slope, bend = _regress(features, z)
     solved = torch.linalg.solve(total, residual[..., None])  # C⁻¹ r
-    pull = torch.linalg.solve(total, (features - mean[:, None]).mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
-    along = (features - mean[:, None]) @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
+    pull = torch.linalg.solve(total, centred.mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
+    along = centred @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
     # ∂ log N / ∂ s_k, with C's and s̄'s dependence on the samples (eq. 2)
     force = (along * solved.mT - pull) / (num_samples - 1) + solved.mT / num_samples
     flat = torch.einsum("tkm,tdm->tkd", force, slope) + torch.einsum("tkm,tdm->tkd", force, bend) * z
@@ -100,7 +94,6 @@ def _regress(features: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, tor
     num_samples, d = z.shape
     quadratic = num_samples >= 6 * d
     columns = [torch.ones(num_samples, 1, dtype=z.dtype), z] + ([0.5 * z.square()] if quadratic else [])
-    inverse = torch.linalg.pinv(torch.cat(columns, 1))  # (1 + d [+ d], K)
-    fitted = inverse @ features
+    fitted = torch.linalg.pinv(torch.cat(columns, 1)) @ features  # (t, 1 + d [+ d], m)
     slope = fitted[:, 1 : 1 + d]
     return slope, fitted[:, 1 + d :] if quadratic else torch.zeros_like(slope)

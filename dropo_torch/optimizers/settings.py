@@ -7,6 +7,7 @@ from dataclasses import dataclass, fields
 from typing import Any
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.given import check_keys
 
 OPTIMIZERS = ("fisher", "cma", "adam")
 #: Adam's first learning rate of the second stage, as a share of the first stage's.
@@ -38,9 +39,9 @@ class AdamSettings:
     common_random_numbers: bool = False
 
     def __post_init__(self) -> None:
-        for name in ("steps", "batch", "samples", "learning_rate", "refresh", "clip"):
-            if not getattr(self, name) > 0:
-                raise InputError(f"adam.{name}: {getattr(self, name)} given; expected a positive number")
+        for name, value in vars(self).items():
+            if name != "common_random_numbers" and not value > 0:
+                raise InputError(f"adam.{name}: {value} given; expected a positive number")
         if self.samples < 2:
             raise InputError("adam.samples: 1 given; a covariance needs 2 or more")
 
@@ -56,10 +57,8 @@ def adam_settings(given: Mapping[str, Any]) -> AdamSettings:
     Raises:
         InputError: an unknown key, or a value that is no positive number.
     """
-    known = {f.name: f.type for f in fields(AdamSettings)}
+    check_keys(given, [f.name for f in fields(AdamSettings)], "adam")
     for key, value in given.items():
-        if key not in known:
-            raise InputError(f"adam: unknown key {key!r}" + choices(key, known))
         if not isinstance(value, (int, float)):
             raise InputError(f"adam.{key}: {value!r} given; expected a number")
     return AdamSettings(**given)

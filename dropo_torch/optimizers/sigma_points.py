@@ -7,12 +7,13 @@ The likelihood's Gaussians come from a quadratic model of the simulation around 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import torch
 
 from dropo_torch.distribution import truncated_interval, truncated_moments
-from dropo_torch.likelihood import LOST_TRANSITION, gaussian_log_density
+from dropo_torch.likelihood import gaussian_log_density, survivors
 from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.ascent import MAX_DAMPING, Ascent
 
@@ -42,12 +43,7 @@ class SigmaPointStage(Ascent):
         a, b = truncated_interval(*map(torch.as_tensor, (mean, std, *self.box.limits)))
         moments = torch.stack(truncated_moments(a, b))
         reach = torch.from_numpy(np.stack([up / std, down / std]))
-        sigma = torch.from_numpy(std)
-
-        def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-            return scores(features, measured, covariance, sigma, reach, moments)
-
-        return reduce
+        return partial(scores, std=torch.from_numpy(std), reach=reach, moments=moments)
 
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one where it promises to gain anything."""
@@ -94,9 +90,7 @@ def scores(
         moments: E[z], E[z²], E[z⁴] of the truncated standard normal, ``(3, d)``.
     """
     d = len(std)
-    alive = torch.isfinite(features).flatten(1).all(-1)
-    lost = float((~alive).sum()) * LOST_TRANSITION
-    features, measured, covariance = features[alive], measured[alive], covariance[alive]
+    features, measured, covariance, lost = survivors(features, measured, covariance)
     base = features[:, 0]
     slope, bend = _divided_differences(base, features[:, 1 : 1 + d], features[:, 1 + d :], reach)
     first, second, fourth = moments[..., None]
@@ -110,12 +104,12 @@ def scores(
     solved = torch.linalg.solve(total, torch.cat([residual[:, None], slope], 1).mT)  # C⁻¹[r, A], (t, m, 1 + d)
     weighted = (slope @ solved[..., :1])[..., 0]  # Aᵀ C⁻¹ r
     gram = slope @ solved[..., 1:]  # Aᵀ C⁻¹ A
-    v = variance[:, 0]
+    v, shift = variance[:, 0], first[:, 0]
     score_mean = weighted.sum(0) / std
-    drift = (first[:, 0] * weighted).sum(0)  # the mean of z moves with σ where the truncation is lopsided
+    drift = (shift * weighted).sum(0)  # the mean of z moves with σ where the truncation is lopsided
     score_log = v * (weighted.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0) + drift
     fisher_mean = gram.sum(0) / torch.outer(std, std)
-    fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0) + torch.outer(first[:, 0], first[:, 0]) * gram.sum(0)
+    fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0) + torch.outer(shift, shift) * gram.sum(0)
     bending = (curved * torch.linalg.solve(total, curved.mT).mT).sum()
     return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten(), bending[None]])
 
@@ -124,11 +118,9 @@ def _divided_differences(
     base: torch.Tensor, upper: torch.Tensor, lower: torch.Tensor, reach: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Slopes A and bends B per unit of z, ``(t, d, m)`` each, from points at +p and −q σ."""
-    p, q = reach[0][:, None], reach[1][:, None]
+    p, q = reach[..., None]
     rise, fall = upper - base[:, None], base[:, None] - lower
-    safe_p, safe_q = (torch.where(x > 0, x, torch.ones_like(x)) for x in (p, q))
-    right, left = rise / safe_p, fall / safe_q
+    right, left = rise / torch.where(p > 0, p, 1.0), fall / torch.where(q > 0, q, 1.0)
     both = (p > 0) & (q > 0)
     slope = torch.where(both, (q * right + p * left) / (p + q).clamp(min=1e-300), torch.where(p > 0, right, left))
-    bend = torch.where(both, 2 * (right - left) / (p + q).clamp(min=1e-300), torch.zeros_like(slope))
-    return slope, bend
+    return slope, torch.where(both, 2 * (right - left) / (p + q).clamp(min=1e-300), 0.0)
