@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Placed
+from dropo_torch.effects.base import Placed, applied
 from dropo_torch.errors import InputError
 from dropo_torch.models.export import read_spec, write_inertials
 from dropo_torch.models.load import quiet_mujoco, unsimplify
@@ -43,7 +43,6 @@ def write_model(
         InputError: a source that is no XML file, or numbers that MuJoCo refuses.
     """
     spec, path = read_spec(source), Path(path)
-    native = [p for p in placed if p.effect.native]
     unsimplify(spec)
     write_inertials(spec)
     model = spec.compile()
@@ -51,8 +50,7 @@ def write_model(
         for column, parameter in enumerate(space.parameters):
             for target in parameter.targets:
                 write_field(model, target.field, target.index, target.factor * values[column])
-    for effect in native:
-        effect.effect.apply(model, effect.target, np.asarray(effect.values))
+    model = applied(model, [p for p in placed if p.effect.native])
     try:
         with quiet_mujoco():
             mujoco.mj_setConst(model, mujoco.MjData(model))
