@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 
 import mujoco
 import numpy as np
@@ -16,7 +17,7 @@ class ContactEffect(Effect):
     kind = "geom"
 
     def targets(self, setting: Setting) -> list[str | None]:
-        return [n for n, touches in zip(setting.names("geom"), setting.signals.contacts, strict=True) if touches]
+        return list(itertools.compress(setting.names("geom"), setting.signals.contacts))
 
     @staticmethod
     def partners(model: mujoco.MjModel, geom: int) -> list[int]:

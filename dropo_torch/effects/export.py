@@ -82,8 +82,7 @@ def _compare(path: Path, model: mujoco.MjModel) -> None:
     except ValueError as error:
         path.unlink()
         raise InputError(f"export: MuJoCo refuses the model with these effects: {error}") from None
-    rng = np.random.default_rng(0)
-    errors = []
+    rng, errors = np.random.default_rng(0), []
     for _ in range(STATES):
         state, velocity = model.qpos0.copy(), rng.normal(0, 1.0, model.nv)
         mujoco.mj_integratePos(model, state, rng.normal(0, 0.3, model.nv), 1.0)

@@ -259,11 +259,10 @@ class JointLimit(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         """Begin at the model's stops and at the ends of the measured motion."""
-        low, high = setting.model.jnt_range[setting.joint(target)]
-        seen = setting.signals.position[setting.coordinate(target)]
+        low, high = ends = setting.model.jnt_range[setting.joint(target)]
         out, inwards = 0.2 * (high - low), 0.4 * (high - low)
-        lower = float(np.clip(seen[0] - low, -out, inwards))
-        upper = float(np.clip(seen[1] - high, -inwards, out))
+        seen = setting.signals.position[setting.coordinate(target)]
+        lower, upper = np.clip(seen - ends, (-out, -inwards), (inwards, out)).tolist()
         return [np.array(s) for s in ((0.0, 0.0), (lower, 0.0), (0.0, upper), (lower, upper))]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:

@@ -189,7 +189,7 @@ class EffectSimulator(Simulator):
         columns, slope, curvature = (
             torch.from_numpy(x.reshape(-1, *x.shape[2:])) for x in (fine[..., index], rates[..., index], curved)
         )
-        past = extended(columns, slope, curvature, self._late * skip, self._step)
+        past = extended(columns, slope, curvature[:, None], self._late * skip, self._step)
         instants = (fine.shape[2] - 1) // skip + 1
         path = SensedPath.of(past, instants, skip, self._step, self._observed_rates)
         return sensed(path, sensors).numpy().reshape(*fine.shape[:2], instants, len(index))

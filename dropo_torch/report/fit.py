@@ -251,10 +251,9 @@ def _shortfall(history: Sequence[HistoryEntry], spans: Sequence[tuple[int, int]]
     values = np.array([entry.log_likelihood for entry in history])
     values[~np.isfinite(values)] = np.nan
     gap = np.maximum(np.fmax.reduce(values) - values, 0.1)
-    lines = np.full((len(history), len(spans)), np.nan)
-    for column, (a, b) in enumerate(spans):
-        lines[a:b, column] = gap[a:b]
-    return lines
+    stages = np.arange(len(spans))
+    stage = np.repeat(stages, [b - a for a, b in spans])
+    return np.where(stage[:, None] == stages, gap[:, None], np.nan)
 
 
 def _line_colours(means: np.ndarray) -> list[str]:
