@@ -5,44 +5,16 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Callable, Sequence
 
-from dropo_torch.effects.actuator import (
-    ActuatorBacklash,
-    ActuatorBias,
-    ActuatorDamping,
-    ActuatorDeadband,
-    ActuatorDelay,
-    ActuatorGain,
-    ActuatorLag,
-    ActuatorSaturation,
-)
+from dropo_torch.effects import actuator, body, contact, joint, sensor, world
 from dropo_torch.effects.base import VOCABULARY, Effect, Placed, Quantity, Setting, Signals, find_effect
-from dropo_torch.effects.body import CenterOfMass, ExternalForce, FluidDrag, Inertia, Payload
-from dropo_torch.effects.contact import ContactFriction, ContactMargin, ContactStiffness
-from dropo_torch.effects.joint import (
-    Armature,
-    JointCogging,
-    JointCoupling,
-    JointDamping,
-    JointFriction,
-    JointLimit,
-    JointQuadraticDamping,
-    JointStiffness,
-    JointStribeck,
-)
 from dropo_torch.effects.path import SensedPath
-from dropo_torch.effects.sensor import SensorBias, SensorDelay, SensorScale
-from dropo_torch.effects.world import GravityTilt, GroundSlope, Integration
 from dropo_torch.errors import InputError
 from dropo_torch.support.usercode import load_callable, user_code
 
-for _effect in (
-    JointDamping(), JointQuadraticDamping(), JointFriction(), JointStribeck(), JointStiffness(), JointCogging(),
-    Armature(), JointLimit(), JointCoupling(), Payload(), CenterOfMass(), Inertia(), ExternalForce(), FluidDrag(),
-    GravityTilt(), GroundSlope(), Integration(), ActuatorGain(), ActuatorBias(), ActuatorDamping(),
-    ActuatorDelay(), ActuatorLag(), ActuatorDeadband(), ActuatorBacklash(), ActuatorSaturation(), SensorBias(),
-    SensorScale(), SensorDelay(), ContactFriction(), ContactStiffness(), ContactMargin(),
-):  # fmt: skip
-    VOCABULARY[_effect.name] = _effect
+for _module in (joint, body, world, actuator, sensor, contact):
+    for _class in vars(_module).values():  # in the order in which they stand there
+        if isinstance(_class, type) and issubclass(_class, Effect) and hasattr(_class, "name"):
+            VOCABULARY[_class.name] = _class()
 
 
 def register(effect: Effect) -> Effect:
@@ -51,8 +23,8 @@ def register(effect: Effect) -> Effect:
     Raises:
         InputError: a name that is taken.
     """
-    taken = VOCABULARY.get(effect.name)
-    if taken is not None and _source(taken) != _source(effect):
+    taken = VOCABULARY.get(effect.name, effect)
+    if _source(taken) != _source(effect):
         raise InputError(f"effect: the name {effect.name!r} is taken; choose another")
     VOCABULARY[effect.name] = effect
     return effect

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import mujoco
 import numpy as np
 import torch
@@ -18,23 +20,18 @@ class ActuatorEffect(Effect):
     kind = "actuator"
 
     def targets(self, setting: Setting) -> list[str | None]:
-        names = setting.names("actuator")
-        return [
-            n for i, n in enumerate(names)
-            if setting.model.actuator_ctrlnum[i] == 1 and setting.signals.command[setting.model.actuator_ctrladr[i]] > 0
-        ]  # fmt: skip
+        m, command = setting.model, setting.signals.command
+        commanded = [m.actuator_ctrlnum[i] == 1 and command[m.actuator_ctrladr[i]] > 0 for i in range(m.nu)]
+        return list(itertools.compress(setting.names("actuator"), commanded))
 
     @staticmethod
     def force_scale(setting: Setting, target: str | None) -> float:
         """Return the typical force of an actuator, in its own units."""
         m, i = setting.model, object_number(setting.model, "actuator", target)
-        gain = abs(float(m.actuator_gainprm[i, 0]))
-        command = float(setting.signals.command[setting.command_column(target)])
-        if m.actuator_biasprm[i, 1] != 0 or m.actuator_biasprm[i, 2] != 0:  # a servo's force is of the error
-            dof = transmission_dof(m, i)
-            if dof is not None:
-                return float(setting.signals.force[dof]) / max(abs(float(m.actuator_gear[i, 0])), 1e-9)
-        return 0.3 * gain * command
+        joint, servo = driven_joint(m, i), m.actuator_biasprm[i, 1:3].any()
+        if servo and joint is not None:  # its force is of the error
+            return float(setting.signals.force[m.jnt_dofadr[joint]]) / gear(m, i)
+        return 0.3 * abs(float(m.actuator_gainprm[i, 0])) * ActuatorEffect.command_scale(setting, target)
 
     @staticmethod
     def command_scale(setting: Setting, target: str | None) -> float:
@@ -42,19 +39,20 @@ class ActuatorEffect(Effect):
         return float(setting.signals.command[setting.command_column(target)])
 
 
-def transmission_dof(model: mujoco.MjModel, actuator: int) -> int | None:
-    """Return the degree of freedom that an actuator drives through a joint."""
-    if model.actuator_trntype[actuator] != mujoco.mjtTrn.mjTRN_JOINT:
-        return None
-    return int(model.jnt_dofadr[model.actuator_trnid[actuator, 0]])
+def driven_joint(model: mujoco.MjModel, actuator: int) -> int | None:
+    """Return the joint through which an actuator drives."""
+    through = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    return int(model.actuator_trnid[actuator, 0]) if through else None
+
+
+def gear(model: mujoco.MjModel, actuator: int) -> float:
+    """Return the size of an actuator's gear ratio."""
+    return max(abs(float(model.actuator_gear[actuator, 0])), 1e-9)
 
 
 def _unit(setting: Setting, target: str | None, hinge: str, slide: str) -> str:
-    m, i = setting.model, object_number(setting.model, "actuator", target)
-    slides = (
-        m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT
-        and m.jnt_type[m.actuator_trnid[i, 0]] == mujoco.mjtJoint.mjJNT_SLIDE
-    )
+    joint = driven_joint(setting.model, object_number(setting.model, "actuator", target))
+    slides = joint is not None and setting.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
     return slide if slides else hinge
 
 
@@ -104,9 +102,7 @@ class ActuatorDamping(ActuatorEffect):
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m, i = setting.model, object_number(setting.model, "actuator", target)
-        dof = transmission_dof(m, i)
-        gear = max(abs(float(m.actuator_gear[i, 0])), 1e-9)
-        speed = gear * float(setting.signals.speed[dof if dof is not None else 0])
+        speed = gear(m, i) * float(setting.signals.speed[m.jnt_dofadr[driven_joint(m, i)]])
         scale = self.force_scale(setting, target) / max(speed, 1e-12)
         own = max(-float(m.actuator_biasprm[i, 2]), 0.0)
         unit = _unit(setting, target, "N·m·s/rad", "N·s/m")
@@ -114,43 +110,12 @@ class ActuatorDamping(ActuatorEffect):
 
     def targets(self, setting: Setting) -> list[str | None]:
         m = setting.model
-        found = super().targets(setting)
-        return [t for t in found if transmission_dof(m, object_number(m, "actuator", t)) is not None]
+        return [t for t in super().targets(setting) if driven_joint(m, object_number(m, "actuator", t)) is not None]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         i = object_number(model, "actuator", target)
         make_affine(model, i)
         model.actuator_biasprm[i, 2] -= values[0]
-
-
-class ActuatorSaturation(ActuatorEffect):
-    """A force that an actuator cannot exceed."""
-
-    name = "actuator_saturation"
-    sentence = "actuator {target} cannot give more than a certain force"
-    shares = (0.3, 0.5, 0.7, 0.85)
-
-    def targets(self, setting: Setting) -> list[str | None]:
-        m = setting.model
-        found = super().targets(setting)
-        return [t for t in found if not m.actuator_forcelimited[object_number(m, "actuator", t)]]
-
-    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        largest = self.largest(setting, target)
-        low = 0.02 * largest
-        return (Quantity("limit", _unit(setting, target, "N·m", "N"), 4 * largest, low, 4 * largest, largest),)
-
-    def largest(self, setting: Setting, target: str | None) -> float:
-        """Return the largest force that the log asks for, roughly."""
-        m, i = setting.model, object_number(setting.model, "actuator", target)
-        if m.actuator_biasprm[i, 1] != 0:
-            return 3 * self.force_scale(setting, target)
-        return abs(float(m.actuator_gainprm[i, 0])) * self.command_scale(setting, target)
-
-    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        i = object_number(model, "actuator", target)
-        model.actuator_forcelimited[i] = 1
-        model.actuator_forcerange[i] = (-values[0], values[0])
 
 
 class ActuatorDelay(ActuatorEffect):
@@ -283,3 +248,28 @@ class ActuatorBacklash(ActuatorEffect):
             reach *= 2
         held = state.clamp(low, high)
         return held, held[:, -1:]
+
+
+class ActuatorSaturation(ActuatorEffect):
+    """A force that an actuator cannot exceed."""
+
+    name = "actuator_saturation"
+    sentence = "actuator {target} cannot give more than a certain force"
+    shares = (0.3, 0.5, 0.7, 0.85)
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        return [t for t in super().targets(setting) if not m.actuator_forcelimited[object_number(m, "actuator", t)]]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        m, i = setting.model, object_number(setting.model, "actuator", target)
+        largest = abs(float(m.actuator_gainprm[i, 0])) * self.command_scale(setting, target)
+        if m.actuator_biasprm[i, 1] != 0:  # of a servo, roughly
+            largest = 3 * self.force_scale(setting, target)
+        unit = _unit(setting, target, "N·m", "N")
+        return (Quantity("limit", unit, 4 * largest, 0.02 * largest, 4 * largest, largest),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        i = object_number(model, "actuator", target)
+        model.actuator_forcelimited[i] = 1
+        model.actuator_forcerange[i] = (-values[0], values[0])

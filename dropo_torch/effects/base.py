@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import abc
+import copy
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal
 
@@ -274,3 +275,11 @@ class Placed:
     def summary(self, setting: Setting) -> dict[str, Any]:
         """Return the values by name."""
         return {q.name: v for q, v in zip(self.effect.quantities(setting, self.target), self.values, strict=True)}
+
+
+def applied(model: mujoco.MjModel, placed: Iterable[Placed]) -> mujoco.MjModel:
+    """Return a copy of a model with effects written into it, but not yet what is derived from them."""
+    out = copy.copy(model)
+    for p in placed:
+        p.effect.apply(out, p.target, np.asarray(p.values))
+    return out

@@ -20,10 +20,8 @@ class BodyEffect(Effect):
 
     def targets(self, setting: Setting) -> list[str | None]:
         """Return every body with mass that moves in the log."""
-        m = setting.model
-        names = setting.names("body")
-        moving = [b for b in range(1, m.nbody) if m.body_mass[b] > 0 and setting.signals.linear_speed[b] > 0]
-        return [names[b] for b in moving]
+        moving = (setting.model.body_mass > 0) & (setting.signals.linear_speed > 0)
+        return [n for n, moves in zip(setting.names("body")[1:], moving[1:], strict=True) if moves]
 
     @staticmethod
     def extent(setting: Setting, body: int) -> tuple[np.ndarray, np.ndarray]:
@@ -31,20 +29,22 @@ class BodyEffect(Effect):
         m = setting.model
         low, high = m.body_ipos[body] - 0.02, m.body_ipos[body] + 0.02
         for g in range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body]):
-            turn = np.empty(9)
-            mujoco.mju_quat2Mat(turn, m.geom_quat[g])
-            reach = np.abs(turn.reshape(3, 3)) @ m.geom_aabb[g, 3:]
-            center = m.geom_pos[g] + turn.reshape(3, 3) @ m.geom_aabb[g, :3]
+            turn = _rotation(m.geom_quat[g])
+            reach, center = np.abs(turn) @ m.geom_aabb[g, 3:], m.geom_pos[g] + turn @ m.geom_aabb[g, :3]
             low, high = np.minimum(low, center - reach), np.maximum(high, center + reach)
         return low, high
+
+
+def _rotation(quaternion: np.ndarray) -> np.ndarray:
+    turn = np.empty(9)
+    mujoco.mju_quat2Mat(turn, quaternion)
+    return turn.reshape(3, 3)
 
 
 def add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: np.ndarray) -> None:
     """Weld a point mass at ``position`` in a body's frame: its mass, centre and inertia follow."""
     own, center = float(model.body_mass[body]), model.body_ipos[body].copy()
-    turn = np.empty(9)
-    mujoco.mju_quat2Mat(turn, model.body_iquat[body])
-    axes = turn.reshape(3, 3)
+    axes = _rotation(model.body_iquat[body])
     total = own + mass
     shared = (own * center + mass * position) / total
     inertia = axes @ np.diag(model.body_inertia[body]) @ axes.T
@@ -52,11 +52,6 @@ def add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: np.n
         arm = at - shared
         inertia += m * (arm @ arm * np.eye(3) - np.outer(arm, arm))
     model.body_mass[body], model.body_ipos[body] = total, shared
-    _write_inertia(model, body, inertia)
-
-
-def _write_inertia(model: mujoco.MjModel, body: int, inertia: np.ndarray) -> None:
-    """Write an inertia tensor as principal moments and axes."""
     moments, axes = np.linalg.eigh(inertia)
     if np.linalg.det(axes) < 0:
         axes[:, 0] *= -1
@@ -83,21 +78,18 @@ class Payload(BodyEffect):
         low, high = self.extent(setting, body)
         size = float(np.linalg.norm(high - low))
         center = setting.model.body_ipos[body]
-        places = tuple(
-            Quantity(n, "m", float(c), float(a - 0.5 * size), float(b + 0.5 * size), 0.5 * size)
-            for n, c, a, b in zip("xyz", center, low, high, strict=True)
-        )
+        ends = zip("xyz", center.tolist(), (low - 0.5 * size).tolist(), (high + 0.5 * size).tolist(), strict=True)
+        places = [Quantity(n, "m", at, least, most, 0.5 * size) for n, at, least, most in ends]
         return (Quantity("mass", "kg", 0.0, 0.0, 5 * own, own), *places)
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         """Begin with a small mass at the body's centre and at the ends of its longest side."""
         body = body_number(setting.model, target)
         low, high = self.extent(setting, body)
-        center, longest = setting.model.body_ipos[body], int(np.argmax(high - low))
-        places = [center.copy() for _ in range(3)]
-        places[1][longest], places[2][longest] = low[longest], high[longest]
-        mass = 0.05 * float(setting.model.body_mass[body])
-        return [np.concatenate([[mass], p]) for p in places]
+        longest, mass = int(np.argmax(high - low)), 0.05 * setting.model.body_mass[body]
+        starts = np.tile([mass, *setting.model.body_ipos[body]], (3, 1))
+        starts[1:, 1 + longest] = low[longest], high[longest]
+        return list(starts)
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
         """Begin with masses, where they are in reach, that shift the centre of mass as far."""
@@ -196,10 +188,9 @@ class FluidDrag(BodyEffect):
         return max(own, key=lambda g: float(np.prod(model.geom_aabb[g, 3:])), default=None)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        m, body = setting.model, body_number(setting.model, target)
-        speed = float(setting.signals.linear_speed[body])
-        weight = float(m.body_mass[body]) * 10.0
-        scale = 0.1 * weight / speed**2
+        body = body_number(setting.model, target)
+        weight = float(setting.model.body_mass[body]) * 10.0
+        scale = 0.1 * weight / float(setting.signals.linear_speed[body]) ** 2
         return (Quantity("coefficient", "N·s²/m²", 0.0, 0.0, 300 * scale, scale),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:

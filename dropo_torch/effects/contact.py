@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import itertools
 
 import mujoco
 import numpy as np
@@ -16,27 +17,22 @@ class ContactEffect(Effect):
     kind = "geom"
 
     def targets(self, setting: Setting) -> list[str | None]:
-        return [n for n, touches in zip(setting.names("geom"), setting.signals.contacts, strict=True) if touches]
+        return list(itertools.compress(setting.names("geom"), setting.signals.contacts))
 
     @staticmethod
     def partners(model: mujoco.MjModel, geom: int) -> list[int]:
         """Return the geoms that may touch this one."""
-        kind, affinity = model.geom_contype, model.geom_conaffinity
-        body = model.geom_bodyid
-        return [
-            g for g in range(model.ngeom)
-            if body[g] != body[geom] and ((kind[g] & affinity[geom]) or (kind[geom] & affinity[g]))
-        ]  # fmt: skip
+        kind, affinity, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
+        fits = (kind & affinity[geom]) | (kind[geom] & affinity)
+        return [int(g) for g in np.flatnonzero((body != body[geom]) & (fits != 0))]
 
 
 def take_over(model: mujoco.MjModel, geom: int, partners: list[int]) -> None:
     """Let one geom alone decide its contacts' properties, which stay as they were mixed."""
     same = [g for g in [geom, *partners] if model.geom_priority[g] == model.geom_priority[geom]]
-    higher = [g for g in partners if model.geom_priority[g] > model.geom_priority[geom]]
-    if higher:
-        other = higher[0]
+    if higher := [g for g in partners if model.geom_priority[g] > model.geom_priority[geom]]:
         for field in ("geom_friction", "geom_solref", "geom_solimp", "geom_condim"):
-            getattr(model, field)[geom] = getattr(model, field)[other]
+            getattr(model, field)[geom] = getattr(model, field)[higher[0]]
     elif len(same) > 1:
         other = same[1]
         model.geom_friction[geom] = model.geom_friction[same].max(0)
@@ -70,8 +66,7 @@ class ContactFriction(ContactEffect):
         return float(max(model.geom_friction[g, 0] for g in same if model.geom_priority[g] == top))
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        own = self.own(setting.model, target)
-        return [np.array([0.9 * own]), np.array([0.6 * own]), np.array([1.4 * own])]
+        return [np.array([share * self.own(setting.model, target)]) for share in (0.9, 0.6, 1.4)]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         geom = object_number(model, "geom", target)
@@ -122,9 +117,8 @@ class ContactMargin(ContactEffect):
     shares = (0.3, 1.5)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        m = setting.model
-        size = float(m.geom_rbound[object_number(m, "geom", target)]) or 0.1
-        own = float(m.geom_margin[object_number(m, "geom", target)])
+        m, geom = setting.model, object_number(setting.model, "geom", target)
+        size, own = float(m.geom_rbound[geom]) or 0.1, float(m.geom_margin[geom])
         return (Quantity("margin", "m", 0.0, -own, 0.5 * size, 0.02 * size),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:

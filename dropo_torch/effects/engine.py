@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import mujoco
 import mujoco.batch
@@ -17,6 +17,7 @@ from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.mujoco import control_range, default_row, filter_activations
 
+Models = Sequence[mujoco.MjModel | None]
 #: Simulations below which handing work to threads costs more than it saves.
 ALONE = 200
 
@@ -75,22 +76,6 @@ class Forces:
         return out
 
 
-@dataclass(frozen=True)
-class _Work:
-    """Variants that go together: their models and states ``(K, W, n)``, commands ``(K, W, S, nu)``, other forces.
-
-    ``finer`` steps of the models make one of the base's, of which ``every`` lie between states that are wanted.
-    """
-
-    models: list[mujoco.MjModel | None]
-    variants: list[Variant]
-    starts: np.ndarray
-    signals: np.ndarray
-    pushes: np.ndarray | None
-    finer: int
-    every: int
-
-
 class VariantEngine:
     """Simulates a model under variants of it, from full states and under commands as they act.
 
@@ -103,7 +88,11 @@ class VariantEngine:
 
     def __init__(self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, warp: bool = False) -> None:
         self._setting, self._space, self._num_threads = setting, space, num_threads
-        self._warp = _warp_variants(space, num_threads) if warp else None
+        self._warp = None
+        if warp:  # imported only where it is asked for
+            from dropo_torch.simulators.warp.variants import Variants
+
+            self._warp = Variants(space, num_threads=num_threads)
         self._base = copy.copy(setting.model)
         self._base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
         self._filters = filter_activations(self._base)
@@ -133,18 +122,16 @@ class VariantEngine:
             raise ValueError(str(error)) from None
         return model
 
-    def models(self, variants: Sequence[Variant]) -> list[mujoco.MjModel | None]:
+    def models(self, variants: Sequence[Variant]) -> Models:
         """Return the models of variants, ``None`` where MuJoCo refuses the values."""
-        found: list[mujoco.MjModel | None] = []
-        for variant in variants:
-            try:
-                found.append(self.model(variant))
-            except ValueError:
-                found.append(None)
+        found: list[mujoco.MjModel | None] = [None] * len(variants)
+        for k, variant in enumerate(variants):
+            with contextlib.suppress(ValueError):
+                found[k] = self.model(variant)
         return found
 
     def paths(
-        self, variants: Sequence[Variant], models: Sequence[mujoco.MjModel | None], starts: np.ndarray,
+        self, variants: Sequence[Variant], models: Models, starts: np.ndarray,
         signals: np.ndarray, *, fine: bool = False, pushes: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
         """Simulate.
@@ -169,12 +156,12 @@ class VariantEngine:
         out = np.full((*starts.shape[:2], signals.shape[2] // every, starts.shape[2]), np.nan)
         for (finer, *_), members in groups.items():
             rows = members if len(members) < len(variants) else slice(None)  # all of them need no copy
-            work = _Work(
-                [models[k] for k in members], [variants[k] for k in members], starts[rows], signals[rows],
-                None if pushes is None else pushes[rows], finer, every,
+            own, their = [models[k] for k in members], [variants[k] for k in members]
+            forced = pushes is not None or self._filters or any(v.has("force", "wrench") for v in their)
+            found = None if forced else self._by_warp(own, starts[rows], signals[rows], finer, every)
+            out[rows] = found if found is not None else self._by_mujoco(
+                own, their, starts[rows], signals[rows], None if pushes is None else pushes[rows], finer, every
             )  # fmt: skip
-            found = self._by_warp(work)
-            out[rows] = self._by_mujoco(work) if found is None else found
         return out
 
     def _kind(self, variant: Variant, model: mujoco.MjModel) -> tuple:
@@ -183,34 +170,45 @@ class VariantEngine:
         natives = () if self._warp is None else tuple(p.key for p in variant.placed if p.effect.native)
         return finer, variant.has("force"), self._warp is not None and variant.has("wrench"), natives
 
-    def _by_warp(self, work: _Work) -> np.ndarray | None:
+    def _by_warp(
+        self, models: Models, starts: np.ndarray, signals: np.ndarray, finer: int, every: int
+    ) -> np.ndarray | None:
         """Do what :meth:`_by_mujoco` does with Warp, or return ``None`` where it cannot."""
-        forced = work.pushes is not None or any(v.has("force", "wrench") for v in work.variants)
-        if self._warp is None or forced or self._filters:
-            return None
-        every, out = work.finer * work.every, []
-        for model, starts, signals in zip(work.models, work.starts, work.signals, strict=True):
-            path = self._warp.rollout(model, starts, np.repeat(signals, work.finer, axis=1))
+        out = []
+        for model, start, signal in zip(models, starts, signals, strict=True):
+            path = None if self._warp is None else self._warp.rollout(model, start, np.repeat(signal, finer, axis=1))
             if path is None:
                 return None
-            out.append(path[:, every - 1 :: every])
+            out.append(path[:, finer * every - 1 :: finer * every])
         return np.stack(out)
 
-    def _by_mujoco(self, work: _Work) -> np.ndarray:
-        """Return states after each logged (or physics) step, ``(K, W, S / every, nq + nv)``."""
-        num_k, num_w, total = work.signals.shape[:3]
-        rows, nq, finer, every = num_k * num_w, self._base.nq, work.finer, work.every
+    def _by_mujoco(
+        self, models: Models, variants: Sequence[Variant], starts: np.ndarray, signals: np.ndarray,
+        pushes: np.ndarray | None, finer: int, every: int,
+    ) -> np.ndarray:  # fmt: skip
+        """Return states after each logged (or physics) step, ``(K, W, S / every, nq + nv)``.
+
+        Args:
+            models, variants: K that go together.
+            starts: states, ``(K, W, nq + nv)``.
+            signals: commands of every physics step of the base model, ``(K, W, S, nu)``.
+            pushes: further generalised forces, as for :meth:`paths`.
+            finer: steps of the models that make one of the base's.
+            every: steps of the base from one wanted state to the next.
+        """
+        num_k, num_w, total = signals.shape[:3]
+        rows, nq = num_k * num_w, self._base.nq
         batch = self._batch(rows)
-        batch.set_models([m for m in work.models for _ in range(num_w)])
+        batch.set_models([m for m in models for _ in range(num_w)])
         batch.state[:] = self._row
         qpos, qvel, ctrl, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
-        starts, control = work.starts.reshape(rows, -1), work.signals.reshape(rows, total, -1)
+        starts, control = starts.reshape(rows, -1), signals.reshape(rows, total, -1)
         qpos[:], qvel[:] = starts[:, :nq], starts[:, nq:]
         if self._filters:
             activation, source = (list(x) for x in zip(*self._filters, strict=True))
             batch.bind("act")[:, activation] = np.clip(control[:, 0], *control_range(self._base))[:, source]
         forces = []
-        for k, variant in enumerate(work.variants):
+        for k, variant in enumerate(variants):
             own = slice(k * num_w, (k + 1) * num_w)
             for p in variant.placed:
                 if p.effect.has("force"):
@@ -226,9 +224,9 @@ class VariantEngine:
                 if forces:
                     found = self._forces(forces, qpos, qvel, before, self._base.opt.timestep / finer)
                     applied[:], before = found, qvel.copy()
-                if work.pushes is not None:
-                    pushes = np.repeat(work.pushes[:, step // self._setting.frame_skip], num_w, axis=0)
-                    applied[:] = applied + pushes if forces else pushes
+                if pushes is not None:
+                    held_pushes = np.repeat(pushes[:, step // self._setting.frame_skip], num_w, axis=0)
+                    applied[:] = applied + held_pushes if forces else held_pushes
                 try:
                     with quiet_mujoco():
                         batch.step(nstep=steps)
@@ -252,11 +250,9 @@ class VariantEngine:
         return self._batches[rows]
 
 
-def _warp_variants(space: ParameterSpace, num_threads: int) -> Any:
-    """The Warp backend, imported only where it is asked for."""
-    from dropo_torch.simulators.warp.variants import Variants
-
-    return Variants(space, num_threads=num_threads)
+def parts(total: int, size: int) -> list[slice]:
+    """Return slices of at most ``size`` that make up ``total``."""
+    return [slice(a, min(a + size, total)) for a in range(0, total, size)]
 
 
 def _varies(control: np.ndarray, every: int) -> bool:

@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Placed
+from dropo_torch.effects.base import Placed, applied
 from dropo_torch.errors import InputError
 from dropo_torch.models.export import read_spec, write_inertials
 from dropo_torch.models.load import quiet_mujoco, unsimplify
@@ -43,7 +43,6 @@ def write_model(
         InputError: a source that is no XML file, or numbers that MuJoCo refuses.
     """
     spec, path = read_spec(source), Path(path)
-    native = [p for p in placed if p.effect.native]
     unsimplify(spec)
     write_inertials(spec)
     model = spec.compile()
@@ -51,8 +50,7 @@ def write_model(
         for column, parameter in enumerate(space.parameters):
             for target in parameter.targets:
                 write_field(model, target.field, target.index, target.factor * values[column])
-    for effect in native:
-        effect.effect.apply(model, effect.target, np.asarray(effect.values))
+    model = applied(model, [p for p in placed if p.effect.native])
     try:
         with quiet_mujoco():
             mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -84,8 +82,7 @@ def _compare(path: Path, model: mujoco.MjModel) -> None:
     except ValueError as error:
         path.unlink()
         raise InputError(f"export: MuJoCo refuses the model with these effects: {error}") from None
-    rng = np.random.default_rng(0)
-    errors = []
+    rng, errors = np.random.default_rng(0), []
     for _ in range(STATES):
         state, velocity = model.qpos0.copy(), rng.normal(0, 1.0, model.nv)
         mujoco.mj_integratePos(model, state, rng.normal(0, 0.3, model.nv), 1.0)

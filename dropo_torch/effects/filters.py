@@ -83,16 +83,14 @@ def extended(
     Args:
         fine: columns at every physics step, ``(R, F, n)``.
         rates: their time derivatives at the first, ``(R, n)``.
-        curvature: the second derivatives, ``(R, n)``.
+        curvature: the second derivatives, ``(R, 1, n)``.
         count: physics steps of the past.
         step: seconds of a physics step.
     """
     if not count:
         return fine
     before = step * torch.arange(-count, 0, dtype=fine.dtype, device=fine.device)[:, None]
-    curved = torch.as_tensor(curvature, dtype=fine.dtype, device=fine.device)
-    curved = curved[:, None] if curved.ndim else curved
-    past = fine[:, :1] + before * rates[:, None] + 0.5 * before * (before + step) * curved
+    past = fine[:, :1] + before * rates[:, None] + 0.5 * before * (before + step) * curvature
     return torch.cat([past, fine], 1)
 
 

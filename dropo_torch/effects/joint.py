@@ -26,11 +26,8 @@ class JointEffect(Effect):
     def targets(self, setting: Setting) -> list[str | None]:
         """Return every hinge and slide joint that moves in the log."""
         m = setting.model
-        return [
-            joint_name(m, j)
-            for j in range(m.njnt)
-            if int(m.jnt_type[j]) in (_HINGE, _SLIDE) and setting.signals.speed[m.jnt_dofadr[j]] > 0
-        ]
+        moving = np.isin(m.jnt_type, (_HINGE, _SLIDE)) & (setting.signals.speed[m.jnt_dofadr] > 0)
+        return [joint_name(m, int(j)) for j in np.flatnonzero(moving)]
 
     @staticmethod
     def dof(model: mujoco.MjModel, target: str | None) -> int:
@@ -136,7 +133,7 @@ class JointStribeck(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         force, _, speed = (q.scale for q in self.quantities(setting, target))
-        return [np.array([0.1 * force, 0.2 * force, 0.1 * speed]), np.array([0.1 * force, 0.2 * force, 0.4 * speed])]
+        return [np.array([0.1 * force, 0.2 * force, share * speed]) for share in (0.1, 0.4)]
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
         if simpler.effect.name != JointFriction.name or simpler.values[0] <= 0:
@@ -150,10 +147,8 @@ class JointStribeck(JointEffect):
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        dof = setting.dof(target)
-        v = velocity[:, dof]
-        out = np.zeros_like(velocity)
-        coulomb, static, speed = values.T
+        dof, out = setting.dof(target), np.zeros_like(velocity)
+        v, (coulomb, static, speed) = velocity[:, dof], values.T
         out[:, dof] = np.maximum(static - coulomb, 0.0) * -np.expm1(-((v / speed) ** 2)) * np.sign(v)
         return out
 
@@ -179,19 +174,16 @@ class JointStiffness(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         stiffness, reference = self.quantities(setting, target)
-        middle = float(np.mean(setting.signals.position[setting.coordinate(target)]))
-        begin = [reference.neutral] if abs(reference.neutral - middle) < 0.2 * reference.scale else [
-            reference.neutral, middle,
-        ]  # fmt: skip
+        rest, middle = reference.neutral, float(np.mean(setting.signals.position[setting.coordinate(target)]))
+        begin = [rest] if abs(rest - middle) < 0.2 * reference.scale else [rest, middle]
         return [np.array([0.05 * stiffness.scale, at]) for at in begin]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         joint = object_number(model, "jnt", target)
-        own, coordinate = float(model.jnt_stiffness[joint]), int(model.jnt_qposadr[joint])
-        rest = float(model.qpos_spring[coordinate])
+        own, at = float(model.jnt_stiffness[joint]), model.jnt_qposadr[joint]
         total = own + values[0]
         if total > 0:
-            model.qpos_spring[coordinate] = (own * rest + values[0] * values[1]) / total
+            model.qpos_spring[at] = (own * model.qpos_spring[at] + values[0] * values[1]) / total
         model.jnt_stiffness[joint] = total
 
 
@@ -205,8 +197,7 @@ class JointCogging(JointEffect):
     POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(target)
-        scale = float(setting.signals.force[dof])
+        scale = float(setting.signals.force[setting.dof(target)])
         return (
             Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),
             Quantity("poles", unit(setting, target, "1/rad", "1/m"), 1.0, 0.1, 1e4, 1.0),
@@ -235,8 +226,7 @@ class JointCogging(JointEffect):
     ) -> np.ndarray:
         out = np.zeros_like(velocity)
         amplitude, poles, phase = values.T
-        angle = poles * position[:, setting.coordinate(target)] + phase
-        out[:, setting.dof(target)] = amplitude * np.sin(angle)
+        out[:, setting.dof(target)] = amplitude * np.sin(poles * position[:, setting.coordinate(target)] + phase)
         return out
 
 
@@ -269,11 +259,10 @@ class JointLimit(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         """Begin at the model's stops and at the ends of the measured motion."""
-        low, high = setting.model.jnt_range[setting.joint(target)]
-        seen = setting.signals.position[setting.coordinate(target)]
+        low, high = ends = setting.model.jnt_range[setting.joint(target)]
         out, inwards = 0.2 * (high - low), 0.4 * (high - low)
-        lower = float(np.clip(seen[0] - low, -out, inwards))
-        upper = float(np.clip(seen[1] - high, -inwards, out))
+        seen = setting.signals.position[setting.coordinate(target)]
+        lower, upper = np.clip(seen - ends, (-out, -inwards), (inwards, out)).tolist()
         return [np.array(s) for s in ((0.0, 0.0), (lower, 0.0), (0.0, upper), (lower, upper))]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
@@ -301,9 +290,8 @@ class JointCoupling(JointEffect):
         return before[-1] if before and m.jnt_type[before[-1]] == m.jnt_type[joint] else None
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof = setting.dof(target)
         low, high = setting.signals.position[setting.coordinate(target)]
-        scale = float(setting.signals.force[dof] / max(high - low, 1e-9))
+        scale = float(setting.signals.force[setting.dof(target)] / max(high - low, 1e-9))
         return (Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), 0.0, -30 * scale, 30 * scale, scale),)
 
     def force(

@@ -54,8 +54,8 @@ class Entry:
 
     def at(self, vector: np.ndarray) -> Placed:
         """Return the effect under a parameter vector ``(d,)``."""
-        numbers = (f if c < 0 else float(vector[c]) for f, c in zip(self.fixed, self.columns, strict=True))
-        return Placed(self.effect, self.target, tuple(numbers))
+        numbers = tuple(f if c < 0 else float(vector[c]) for f, c in zip(self.fixed, self.columns, strict=True))
+        return Placed(self.effect, self.target, numbers)
 
 
 @dataclass(frozen=True)
@@ -134,30 +134,24 @@ def place_effects(given: Sequence[Mapping[str, Any]], space: ParameterSpace, set
     Raises:
         InputError: an unknown effect, target or number (the nearest is offered), a number that is missing.
     """
-    numbers: dict[tuple[str, str | None], dict[str, float]] = {}
-    effects: dict[tuple[str, str | None], Effect] = {}
+    known: dict[tuple[Effect, str | None], dict[str, tuple[float, int]]] = {}
     for i, document in enumerate(given):
-        effect, target = _located(f"effects[{i}]", document, "target", setting, find)
-        if (effect.name, target) in numbers:
-            raise InputError(f"effects[{i}]: {effect.name} stands there twice for {target or 'the world'}; keep one")
-        effects[effect.name, target] = effect
-        numbers[effect.name, target] = _numbers(f"effects[{i}]", document, effect.quantities(setting, target))
-    columns: dict[tuple[str, str | None], dict[str, int]] = {}
+        where = f"effects[{i}]"
+        effect, target = key = _located(where, document, "target", setting, find)
+        if key in known:
+            raise InputError(f"{where}: {effect.name} stands there twice for {target or 'the world'}; keep one")
+        numbers = _numbers(where, document, effect.quantities(setting, target))
+        known[key] = {name: (value, -1) for name, value in numbers.items()}
     for column, parameter in enumerate(space.parameters):
         if parameter.effect:
             where = f"parameters.{parameter.name}"
             document = {"effect": parameter.effect, "name": next(iter(parameter.objects), None)}
-            effect, target = _located(where, document, "name", setting, find)
-            key = effect.name, target
+            effect, target = key = _located(where, document, "name", setting, find)
             quantity = _quantity(where, parameter, effect.quantities(setting, target))
-            effects[key] = effect
-            if quantity in columns.setdefault(key, {}):
+            if known.setdefault(key, {}).get(quantity, (0.0, -1))[1] >= 0:
                 raise InputError(f"{where}: {quantity} of {effect.name} is already a parameter; keep one of them")
-            columns[key][quantity] = column
-    entries = [
-        _entry(effect, key[1], effect.quantities(setting, key[1]), numbers.get(key, {}), columns.get(key, {}))
-        for key, effect in effects.items()
-    ]
+            known[key][quantity] = math.nan, column
+    entries = [_entry(effect, target, effect.quantities(setting, target), of) for (effect, target), of in known.items()]
     return EffectSet(tuple(entries), setting)
 
 
@@ -239,18 +233,14 @@ def _quantity(where: str, parameter: Parameter, quantities: Sequence[Quantity]) 
 
 
 def _entry(
-    effect: Effect, target: str | None, quantities: Sequence[Quantity], fixed: dict[str, float],
-    columns: dict[str, int],
-) -> Entry:  # fmt: skip
-    missing = [q for q in quantities if q.name not in fixed and q.name not in columns]
-    entry = Entry(
-        effect, target,
-        tuple(math.nan if q.name in columns else fixed.get(q.name, math.nan) for q in quantities),
-        tuple(columns.get(q.name, -1) for q in quantities),
-    )  # fmt: skip
-    if missing:
+    effect: Effect, target: str | None, quantities: Sequence[Quantity], known: Mapping[str, tuple[float, int]]
+) -> Entry:
+    """The entry of an effect whose numbers are fixed, or in columns of parameter vectors."""
+    found = [known.get(q.name, (math.nan, -1)) for q in quantities]
+    entry = Entry(effect, target, tuple(fixed for fixed, _ in found), tuple(column for _, column in found))
+    if missing := next((q for q in quantities if q.name not in known), None):
         raise InputError(
-            f"effects: {entry.place} has no {missing[0].name}; give {missing[0].name}: a number in {missing[0].unit} "
+            f"effects: {entry.place} has no {missing.name}; give {missing.name}: a number in {missing.unit} "
             "in its entry of effects, or make it a parameter"
         )
     return entry

@@ -15,10 +15,9 @@ class SensorEffect(Effect):
     kind = "sensor"
 
     def targets(self, setting: Setting) -> list[str | None]:
-        turned = {c for q in setting.observation.quaternions for c in q}
-        labels = setting.observation.labels
-        left_out = turned | setting.masked
-        return [n for c, n in enumerate(labels) if c not in left_out and setting.signals.column[c] > 0]
+        left_out = setting.masked.union(*setting.observation.quaternions)
+        labels = enumerate(setting.observation.labels)
+        return [n for c, n in labels if c not in left_out and setting.signals.column[c] > 0]
 
 
 class SensorBias(SensorEffect):

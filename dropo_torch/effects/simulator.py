@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import ClassVar
 
 import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.effects.base import Setting
-from dropo_torch.effects.engine import Variant, VariantEngine
+from dropo_torch.effects.base import Placed, applied
+from dropo_torch.effects.engine import Variant, VariantEngine, parts
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -27,7 +26,7 @@ from dropo_torch.effects.filters import (
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.errors import InputError
-from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
 
 #: Logged steps of history for a filter that remembers all of its past.
@@ -40,37 +39,32 @@ LONGEST_HISTORY = 200
 Engine = Callable[[np.ndarray, np.ndarray, np.ndarray, bool], np.ndarray]
 
 
-class InnerEngine:
-    """MuJoCo, with every kind of effect."""
+def inner_engine(effects: EffectSet, space: ParameterSpace, num_threads: int) -> Engine:
+    """Return MuJoCo, with every kind of effect."""
+    inner = VariantEngine(effects.setting, space, num_threads=num_threads)
 
-    def __init__(self, effects: EffectSet, space: ParameterSpace, num_threads: int) -> None:
-        self._engine, self._effects = VariantEngine(effects.setting, space, num_threads=num_threads), effects
+    def engine(values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
+        variants = [Variant(tuple(v.tolist()), effects.at(v)) for v in values]
+        return inner.paths(variants, inner.models(variants), starts, signals, fine=fine)
 
-    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Simulate; see :data:`Engine`."""
-        variants = [Variant(tuple(v.tolist()), self._effects.at(v)) for v in values]
-        return self._engine.paths(variants, self._engine.models(variants), starts, signals, fine=fine)
+    return engine
 
 
-class OuterEngine:
-    """Another simulator, which takes one physics step a control; effects stay outside of it."""
+def outer_engine(effects: EffectSet, inner: Simulator) -> Engine:
+    """Return another simulator, which takes one physics step a control; effects stay outside of it."""
 
-    def __init__(self, effects: EffectSet, inner: Simulator) -> None:
-        self._inner, self._effects, self._skip = inner, effects, effects.setting.frame_skip
-
-    def __call__(self, values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
-        """Simulate; parameter vectors whose effects are the same go together. See :data:`Engine`."""
-        first, kind = self._effects.kinds(values)
-        every = 1 if fine else self._skip
+    @torch.no_grad()
+    def engine(values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
+        first, kind = effects.kinds(values)  # parameter vectors whose effects are the same go together
+        every = 1 if fine else effects.setting.frame_skip
         out = np.empty((len(values), starts.shape[1], signals.shape[2] // every, starts.shape[2]))
         for number, row in enumerate(first):
-            with torch.no_grad():
-                found = self._inner.rollout(
-                    torch.from_numpy(starts[row]), torch.from_numpy(np.ascontiguousarray(signals[row])),
-                    torch.from_numpy(values[kind == number]),
-                )  # fmt: skip
-            out[kind == number] = found.numpy().swapaxes(0, 1)[:, :, every - 1 :: every]
+            given = (starts[row], np.ascontiguousarray(signals[row]), values[kind == number])
+            found = inner.rollout(*map(torch.from_numpy, given)).numpy().swapaxes(0, 1)
+            out[kind == number] = found[:, :, every - 1 :: every]
         return out
+
+    return engine
 
 
 class EffectSimulator(Simulator):
@@ -131,12 +125,11 @@ class EffectSimulator(Simulator):
             )
 
     def _run(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, *, last: bool) -> torch.Tensor:
-        self.check_arguments(states, controls, values)
-        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+        start, control, vectors = self.arrays(states, controls, values)
         lag = control.shape[1] - self.history
         out = np.empty((len(start), len(vectors), 1 if last else lag, self.num_states))
-        for k in _parts(len(vectors), self._chunk_size):
-            for t in _parts(len(start), max(1, self._chunk_size // len(vectors[k]))):
+        for k in parts(len(vectors), self._chunk_size):
+            for t in parts(len(start), max(1, self._chunk_size // len(vectors[k]))):
                 found = self._chunk(start[t], control[t], vectors[k])
                 out[t, k] = (found[:, :, -1:] if last else found).swapaxes(0, 1)
         return torch.from_numpy(out)
@@ -196,7 +189,7 @@ class EffectSimulator(Simulator):
         columns, slope, curvature = (
             torch.from_numpy(x.reshape(-1, *x.shape[2:])) for x in (fine[..., index], rates[..., index], curved)
         )
-        past = extended(columns, slope, curvature, self._late * skip, self._step)
+        past = extended(columns, slope, curvature[:, None], self._late * skip, self._step)
         instants = (fine.shape[2] - 1) // skip + 1
         path = SensedPath.of(past, instants, skip, self._step, self._observed_rates)
         return sensed(path, sensors).numpy().reshape(*fine.shape[:2], instants, len(index))
@@ -204,9 +197,7 @@ class EffectSimulator(Simulator):
 
 def apply_native(model: mujoco.MjModel, effects: EffectSet) -> mujoco.MjModel:
     """Return a copy of a model with the fixed native effects in it, and its derived constants."""
-    out = copy.copy(model)
-    for entry in effects.entries:
-        entry.effect.apply(out, entry.target, np.asarray(entry.fixed))
+    out = applied(model, effects.at(np.empty(0)))
     try:
         mujoco.mj_setConst(out, mujoco.MjData(out))
     except mujoco.FatalError as error:
@@ -222,13 +213,10 @@ def overlap(effects: EffectSet, space: ParameterSpace) -> tuple[Entry, str] | No
     """Return a native effect and a parameter that write the same number of the model, or ``None``."""
     model = effects.setting.model
     for entry in effects.entries:
-        changed = copy.copy(model)
-        entry.effect.apply(changed, entry.target, np.asarray(entry.fixed))
+        changed = applied(model, [Placed(entry.effect, entry.target, entry.fixed)])
         for parameter in space.parameters:
-            for target in parameter.targets:
-                ours, theirs = (read_field(m, target.field).reshape(-1)[target.index] for m in (changed, model))
-                if ours != theirs:
-                    return entry, parameter.name
+            if any(target.read(changed) != target.read(model) for target in parameter.targets):
+                return entry, parameter.name
     return None
 
 
@@ -273,12 +261,11 @@ def effect_simulator(
     """
     setting = effects.setting
     native, outer = effects.native, effects.outer
-    check_backend(backend, effects, space)
-    if obstacle(backend, effects, space) is not None:
+    if check_backend(backend, effects, space):
         make(setting.model, setting.frame_skip, space)  # for what it refuses
-        engine: Engine = InnerEngine(effects, space, num_threads)
-        kept = effects
-        _check_timestep(setting, effects, space)
+        engine, kept = inner_engine(effects, space, num_threads), effects
+        for vector in (space.low, 0.5 * (space.low + space.high)):  # the finer steps must fill the model's
+            finer_steps(setting.model, applied(setting.model, native.at(vector)), native)
     else:
         if len(native) and not owns_model:
             raise InputError(
@@ -294,36 +281,38 @@ def effect_simulator(
         inner_space = space.on(model)
         if not len(outer):
             return make(model, setting.frame_skip * finer, inner_space), 0
-        engine, kept = OuterEngine(outer, make(model, finer, inner_space)), outer
+        engine, kept = outer_engine(outer, make(model, finer, inner_space)), outer
     history = history_steps(kept, space, timestep, longest)
     return EffectSimulator(
         engine, kept, parameters=space, history=history, timestep=timestep, name=backend, chunk_size=chunk_size
     ), history  # fmt: skip
 
 
-def obstacle(backend: str, effects: EffectSet, space: ParameterSpace) -> str | None:
-    """Return why a backend other than MuJoCo cannot have the effects: forces, or a model that varies; or ``None``."""
-    for entry in effects.entries:
-        if not (entry.effect.native or entry.effect.outer):
-            return f"backend {backend} cannot have {entry.place}, a force in the simulation; backend: mujoco can"
-    for entry in effects.native.entries:
-        if entry.varies:
-            return (
-                f"{entry.place} has a number that varies, which backend {backend} cannot; "
-                "vary a field of the model instead, or use backend: mujoco"
-            )
-    shared = overlap(effects.native, space)
-    return None if shared is None else (
-        f"{shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
-        f"which backend {backend} cannot; leave one of them out, or use backend: mujoco"
-    )  # fmt: skip
+def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> bool:
+    """Return whether the effects need MuJoCo's own engine with effects: for forces, or a model that varies.
 
-
-def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> None:
-    """Raise an :class:`InputError` for an effect that a backend cannot have; it says what could."""
-    reason = obstacle(backend, effects, space)
-    if backend != "mujoco" and reason is not None:
+    Raises:
+        InputError: effects that another backend cannot have; it says what could.
+    """
+    forces = [e for e in effects.entries if not (e.effect.native or e.effect.outer)]
+    varying = [e for e in effects.native.entries if e.varies]
+    if forces:
+        reason = f"backend {backend} cannot have {forces[0].place}, a force in the simulation; backend: mujoco can"
+    elif varying:
+        reason = (
+            f"{varying[0].place} has a number that varies, which backend {backend} cannot; "
+            "vary a field of the model instead, or use backend: mujoco"
+        )
+    elif shared := overlap(effects.native, space):
+        reason = (
+            f"{shared[0].place} writes the same number of the model as parameter {shared[1]!r}, "
+            f"which backend {backend} cannot; leave one of them out, or use backend: mujoco"
+        )
+    else:
+        return False
+    if backend != "mujoco":
         raise InputError(f"effects: {reason}")
+    return True
 
 
 def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSet) -> int:
@@ -340,20 +329,3 @@ def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSe
             f"model's {model.opt.timestep:g} s"
         )
     return round(ratio)
-
-
-def _check_timestep(setting: Setting, effects: EffectSet, space: ParameterSpace) -> None:
-    """Raise unless the finer steps of the effects fill the model's."""
-    native = effects.native
-    for vector in (space.low, 0.5 * (space.low + space.high)):
-        changed = copy.copy(setting.model)
-        for placed in native.at(vector):
-            placed.effect.apply(changed, placed.target, np.asarray(placed.values))
-        finer_steps(setting.model, changed, native)
-
-
-def _parts(total: int, size: int) -> Iterator[slice]:
-    return (slice(a, min(a + size, total)) for a in range(0, total, size))
-
-
-__all__ = ["EffectSimulator", "effect_simulator", "history_steps"]

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import copy
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import mujoco
 import numpy as np
 import torch
 
 from dropo_torch.effects.base import Placed, Setting
-from dropo_torch.effects.engine import Variant, VariantEngine
+from dropo_torch.effects.engine import Variant, VariantEngine, parts
 from dropo_torch.effects.filters import filtered, observed_rates, placed_filters, sensed, unsensed
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.parameters import ParameterSpace
@@ -46,10 +46,7 @@ class Windows:
 
     def select(self, rows: np.ndarray | slice) -> Windows:
         """Return the given windows."""
-        return replace(
-            self, measured=self.measured[rows], rates=self.rates[rows], episodes=self.episodes[rows],
-            steps=self.steps[rows],
-        )  # fmt: skip
+        return replace(self, **{k: getattr(self, k)[rows] for k in ("measured", "rates", "episodes", "steps")})
 
 
 class Twin:
@@ -112,33 +109,22 @@ class Twin:
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
         valid = np.ones(out.shape, dtype=bool)
-        per_call = max(1, self._chunk // max(1, num_w))
-        models = self._engine.models(variants)
+        models, index = self._engine.models(variants), self.setting.observation.index
         for fine in (False, True):
             members = [k for k, v in enumerate(variants) if models[k] is not None and v.has("sense") == fine]
-            for a in range(0, len(members), per_call):
-                part = members[a : a + per_call]
-                for b in range(0, num_w, self._chunk):
-                    rows = slice(b, b + self._chunk)
-                    columns = self._columns(
-                        [variants[k] for k in part], [models[k] for k in part], windows.select(rows), shown[part, rows],
-                        fine, None if pushes is None else pushes[part],
-                    )  # fmt: skip
-                    for k, path in zip(part, columns, strict=True):
-                        out[k, rows], valid[k, rows] = self._shown(variants[k], path, length)
+            calls = parts(len(members), max(1, self._chunk // max(1, num_w)))
+            for part, rows in itertools.product([members[c] for c in calls], parts(num_w, self._chunk)):
+                chosen, given = [variants[k] for k in part], windows.select(rows)
+                states = np.stack([self._states(variants[k], shown[k, rows], given.rates) for k in part])
+                signals = np.stack([self._signals(v, given) for v in chosen])
+                forces = None if pushes is None else pushes[part]
+                own = [models[k] for k in part]
+                path = self._engine.paths(chosen, own, states, signals, fine=fine, pushes=forces)
+                truth = np.concatenate([states[:, :, None, index], path[..., index]], 2)
+                for k, columns in zip(part, truth, strict=True):
+                    out[k, rows], valid[k, rows] = self._shown(variants[k], columns, length)
         self.simulated_transitions += num_k * num_w * length
         return out, valid
-
-    def _columns(
-        self, variants: list[Variant], models: list[mujoco.MjModel | None], windows: Windows, shown: np.ndarray,
-        fine: bool, pushes: np.ndarray | None,
-    ) -> np.ndarray:  # fmt: skip
-        """Return the true observed columns from the starts on, at logged (or physics) steps."""
-        starts = np.stack([self._states(v, s, windows.rates) for v, s in zip(variants, shown, strict=True)])
-        signals = np.stack([self._signals(v, windows) for v in variants])
-        path = self._engine.paths(variants, models, starts, signals, fine=fine, pushes=pushes)
-        index = self.setting.observation.index
-        return np.concatenate([starts[:, :, None, index], path[..., index]], 2)
 
     def _shown(self, variant: Variant, path: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         """Return what a variant's sensors show of true paths ``(W, ·, n)``, and what is known: nothing lies before."""

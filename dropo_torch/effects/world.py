@@ -63,10 +63,8 @@ class GroundSlope(TiltEffect):
 
 
 def _planes(model: mujoco.MjModel) -> list[int]:
-    return [
-        g for g in range(model.ngeom)
-        if model.geom_type[g] == mujoco.mjtGeom.mjGEOM_PLANE and model.geom_bodyid[g] == 0
-    ]  # fmt: skip
+    planes = (model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE) & (model.geom_bodyid == 0)
+    return [int(g) for g in np.flatnonzero(planes)]
 
 
 class Integration(WorldEffect):

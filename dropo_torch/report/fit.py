@@ -57,17 +57,16 @@ def write_fit_report(
     ok, verdict = words.verdict(fit, diagnostics)
     nominal = np.full(len(fit.distribution), np.nan) if space is None else space.nominal
     content = {
-        "headline": words.headline(fit, diagnostics),
+        "fit": fit,
+        "diagnostics": diagnostics,
+        "words": words,
         "explained": ok,
         "tag": "Not judged" if fit.method == "udr" else "✓ Explained" if ok else "! Not fully explained",
-        "has_errors": words.has_standard_errors(fit),
         "verdict": verdict,
         "findings": words.findings(fit, diagnostics),
-        "notes": list(notes),
+        "notes": notes,
         "tiles": _tiles(fit, diagnostics),
         "parameters": _parameters(fit, diagnostics, config, space, nominal),
-        "shape": words.shape(fit.distribution),
-        "meaning_of_std": words.meaning_of_std(fit),
         "has_nominal": bool(np.isfinite(nominal).any()),
         **_posterior(fit),
         **_columns(diagnostics),
@@ -252,10 +251,9 @@ def _shortfall(history: Sequence[HistoryEntry], spans: Sequence[tuple[int, int]]
     values = np.array([entry.log_likelihood for entry in history])
     values[~np.isfinite(values)] = np.nan
     gap = np.maximum(np.fmax.reduce(values) - values, 0.1)
-    lines = np.full((len(history), len(spans)), np.nan)
-    for column, (a, b) in enumerate(spans):
-        lines[a:b, column] = gap[a:b]
-    return lines
+    stages = np.arange(len(spans))
+    stage = np.repeat(stages, [b - a for a, b in spans])
+    return np.where(stage[:, None] == stages, gap[:, None], np.nan)
 
 
 def _line_colours(means: np.ndarray) -> list[str]:
@@ -286,8 +284,7 @@ def _identifiability(fit: Fit, diagnostics: Diagnostics) -> dict[str, Any]:
 
 def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
     """How the result came about."""
-    same = len(set(fit.epsilon)) == 1
-    epsilon = ", ".join(plain(e) for e in (fit.epsilon[:1] if same else fit.epsilon))
+    epsilon = fit.epsilon[:1] if len(set(fit.epsilon)) == 1 else fit.epsilon
     return [
         ("Log-likelihood", f"{nats(fit.log_likelihood)} nats, on samples that the optimizer has not used"),
         ("Mean squared difference", f"{number(fit.mse)}, between measured and mean simulated next states"),
@@ -299,10 +296,7 @@ def _facts(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
         ("Simulated transitions", f"{fit.simulated_transitions:,}"),
         ("Computing time", f"{fit.seconds:,.1f} s" if np.isfinite(fit.seconds) else "n/a"),
         ("Parameter vectors per transition (K)", f"{fit.samples:,}"),
-        ("ε, variance added to each column", epsilon),
+        ("ε, variance added to each column", ", ".join(map(plain, epsilon))),
         ("Seed", str(fit.seed)),
-        (
-            "Diverged simulations",
-            f"{fit.diverged:,} in the final evaluation, {diagnostics.diverged:,} in diagnostics",
-        ),
+        ("Diverged simulations", f"{fit.diverged:,} in the final evaluation, {diagnostics.diverged:,} in diagnostics"),
     ]

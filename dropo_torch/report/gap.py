@@ -12,7 +12,7 @@ from dropo_torch.gap.result import Gap, Ranked, Residuals
 from dropo_torch.report import gap_words as words
 from dropo_torch.report.figures.drawing import BLUE, ORANGE
 from dropo_torch.report.figures.gap import force_frame, force_panel, score_panel
-from dropo_torch.report.formatting import duration, nats, percent, plain, whole
+from dropo_torch.report.formatting import duration, nats, percent, whole
 from dropo_torch.report.page import Config, Versions, write_page
 
 #: Rounds of the search that the ranking shows, and candidates in each.
@@ -49,12 +49,12 @@ def write_gap_report(
     """
     named = [e for e in gap.effects if words.is_named(e)]
     headline, items = words.answer(gap)
+    folder = Path(path).parent  # as a command takes it; of one elsewhere on the machine, but its name
     content = {
         "gap": gap,
         "words": words,
         "headline": headline,
         "items": items,
-        "change": words.change(gap),
         "named": len(named),
         "known": len(VOCABULARY),
         "has_config": has_config,
@@ -66,9 +66,7 @@ def write_gap_report(
         "residuals": [(r.title, _residual(r, bool(named))) for r in gap.residuals[:MAX_RESIDUALS]],
         "more_residuals": len(gap.residuals) - MAX_RESIDUALS,
         **_ranking(gap),
-        "chi": words.chi(gap),
-        "cannot_judge": words.places(gap.cannot_judge),
-        "folder": _folder(Path(path)),
+        "folder": folder.name if folder.is_absolute() else folder.as_posix(),
         "facts": _facts(gap, bool(named)),
     }
     write_page(path, "gap.html", title, content, config=config, versions=versions)
@@ -79,13 +77,12 @@ def _scores(gap: Gap, named: bool) -> list[tuple[str, str, Any]]:
     models = {"before" if named else "your model": gap.before} | ({"after": gap.after} if named else {})
     models["noise floor"] = gap.noise_floor
     unit = words.position_unit(gap)
-    span = f" over {plain(gap.rollout_seconds)} s" if gap.rollout_seconds > 0 else ""
     positions = {name: s.rollout_rmse for name, s in models.items()}
     steps = {name: float(np.sqrt(s.mse)) if s.mse >= 0 else float("nan") for name, s in models.items()}
     likelihoods = {name: s.log_likelihood for name, s in models.items()}
     label = f"RMS error of positions{f' ({unit})' if unit else ''}"
     return [
-        (f"Open loop{span}", "less is better", score_panel(positions, label, log=True)),
+        (f"Open loop{words.span(gap)}", "less is better", score_panel(positions, label, log=True)),
         ("One step ahead", "less is better", score_panel(steps, "RMS error over all columns", log=True)),
         ("Log-likelihood", "more is better", score_panel(likelihoods, "nats", log=False)),
     ]
@@ -136,12 +133,6 @@ def _left(left: float, decades: int) -> tuple[float, str]:
     if left <= 0:
         return 1.0, "nothing"
     return -float(np.log10(min(left, 1.0))) / decades, percent(left) if left <= 1.0005 else "more than before"
-
-
-def _folder(path: Path) -> str:
-    """The folder of the page as a command takes it; of one elsewhere on the machine, but its name."""
-    folder = path.parent
-    return folder.name if folder.is_absolute() else folder.as_posix()
 
 
 def _facts(gap: Gap, named: bool) -> list[tuple[str, str]]:

@@ -138,9 +138,8 @@ def strength(given: Strength) -> tuple[str, str, str]:
 
 def degrees(given: Strength) -> str:
     """Return an angle in degrees, or nothing where it is none."""
-    if given.unit != "rad" or not np.isfinite(given.value):
-        return ""
-    return f"{short(float(np.degrees(given.value)))}°"
+    is_angle = given.unit == "rad" and np.isfinite(given.value)
+    return f"{short(float(np.degrees(given.value)))}°" if is_angle else ""
 
 
 def with_interval(given: Strength) -> str:
@@ -151,10 +150,8 @@ def with_interval(given: Strength) -> str:
 
 def numbers(parameters: Mapping[str, Strength]) -> str:
     """Return all numbers of an effect, or the first of many."""
-    if not parameters:
-        return "strength not known"
-    if len(parameters) == 1:
-        return with_interval(next(iter(parameters.values())))
+    if len(parameters) < 2:
+        return next(map(with_interval, parameters.values()), "strength not known")
     shown = list(parameters.items())[: MOST_NUMBERS if len(parameters) <= MOST_NUMBERS else 1]
     more = "" if len(shown) == len(parameters) else "; more in the table"
     return ", ".join(f"{quantity(n)} {with_interval(s)}" for n, s in shown) + more
@@ -177,9 +174,8 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     if len(named) < len(gap.effects):
         items.append(f"something that {unexplained}")
     count = _COUNTS[len(items)] if len(items) < len(_COUNTS) else str(len(items))
-    if any(_too_much(e) or e.effect in _CLAUSES for e in named):
-        return f"Your model and the robot differ in {count} things:", items
-    return f"Your model lacks {count} things:", items
+    differ = any(_too_much(e) or e.effect in _CLAUSES for e in named)
+    return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things:", items
 
 
 def shows(gap: Gap) -> str:
@@ -196,14 +192,12 @@ def change(gap: Gap) -> str:
     values = [s.rollout_rmse for s in (gap.before, gap.after, gap.noise_floor)]
     before, after, floor = (_error(v, position_unit(gap)) for v in values)
     bottom = f"(noise floor {floor})"
-    span = f" over {plain(gap.rollout_seconds)} s" if gap.rollout_seconds > 0 else ""
-    what = f"open-loop error{span} on held-out data"
     named = sum(map(is_named, gap.effects))
     if not named:
         whose = "" if np.isnan(values[0]) else " of your model"
-        start = f"The open-loop error{whose}{span} on held-out data is {before} {bottom}."
+        start = f"The open-loop error{whose}{span(gap)} on held-out data is {before} {bottom}."
         return start if gap.found else f"{start} {_CANNOT_RULE_OUT}"
-    start = f"With {'it' if named == 1 else 'them'} in the model, the {what}"
+    start = f"With {'it' if named == 1 else 'them'} in the model, the open-loop error{span(gap)} on held-out data"
     if np.isnan(values[:2]).any():
         return f"{start} goes from {before} to {after} {bottom}."
     if values[1] == values[0]:
@@ -216,9 +210,13 @@ def change(gap: Gap) -> str:
 def shrinkage(gap: Gap) -> float:
     """Return the share of the open-loop error above the noise floor that is gone; NaN where that says nothing."""
     before, after, floor = (s.rollout_rmse for s in (gap.before, gap.after, gap.noise_floor))
-    if not np.isfinite([before, after, floor]).all() or before <= floor:
-        return float("nan")
-    return float(min((before - after) / (before - floor), 1.0))
+    sound = np.isfinite([before, after, floor]).all() and before > floor
+    return float(min((before - after) / (before - floor), 1.0)) if sound else float("nan")
+
+
+def span(gap: Gap) -> str:
+    """Return how long open-loop predictions go, as it follows on what they are."""
+    return f" over {plain(gap.rollout_seconds)} s" if gap.rollout_seconds > 0 else ""
 
 
 def position_unit(gap: Gap) -> str:
@@ -270,7 +268,7 @@ def _at(effect: str, target: str | None) -> str:
 
 def _all(effect: str) -> str:
     kind = VOCABULARY[effect].kind if effect in VOCABULARY else "joint"
-    return {"body": "all bodies"}.get(kind, f"all {kind}s")
+    return "all bodies" if kind == "body" else f"all {kind}s"
 
 
 def _digits(value: float, half: float) -> str:

@@ -69,10 +69,8 @@ def evaluations(training: Training) -> dict[str, Returns]:
 
 def headline(training: Training) -> str:
     """Return how good the policy is, in a sentence or two."""
-    found = {
-        name: f"{number(e.mean, e.standard_error)} ± {number(e.std, e.std)}"
-        for name, e in evaluations(training).items()
-    }
+    judged = evaluations(training).items()
+    found = {name: f"{number(e.mean, e.standard_error)} ± {number(e.std, e.std)}" for name, e in judged}
     parts = [f"{text} in {WORLDS[name]}" for name, text in found.items() if name != "distribution"]
     returns = ", and ".join(parts) or f"{found['distribution']} under {WORLDS['distribution']}"
     episodes = whole(len(training.training.returns), "episode")
@@ -97,8 +95,7 @@ def _tiles(training: Training) -> list[tuple[str, str]]:
 
 def _findings(training: Training) -> Iterator[Finding]:
     """What the reader should know before relying on the policy."""
-    nominal, target = training.nominal, training.target
-    if nominal is not None and target is not None:
+    if (nominal := training.nominal) is not None and (target := training.target) is not None:
         error = float(np.hypot(nominal.standard_error, target.standard_error))
         lost = nominal.mean - target.mean
         if lost > 3 * error and lost > 0.1 * abs(nominal.mean):

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import partial
+from itertools import compress
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -46,14 +48,8 @@ class Finding:
     text: str
 
 
-def attention(title: str, text: str) -> Finding:
-    """Return a finding that asks for a decision."""
-    return Finding("attention", title, text)
-
-
-def note(title: str, text: str) -> Finding:
-    """Return a finding that is good to know."""
-    return Finding("note", title, text)
+#: A finding that asks for a decision, and one that is good to know.
+attention, note = partial(Finding, "attention"), partial(Finding, "note")
 
 
 def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
@@ -89,8 +85,7 @@ def headline(fit: Fit, diagnostics: Diagnostics) -> str:
 
 def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
     """Return whether the model explains the log without reservation, and that in words."""
-    standardised = column_rms(diagnostics)
-    overall = overall_rms(diagnostics)
+    standardised, overall = column_rms(diagnostics), overall_rms(diagnostics)
     if not np.isfinite(overall):
         return False, "No residual is finite, so the fit cannot be judged."
     worst = int(np.nanargmax(np.where(np.isfinite(standardised), standardised, -1)))
@@ -269,30 +264,28 @@ def _standard_deviations(distribution: Distribution) -> Iterator[Finding]:
 def _of_method(fit: Fit) -> Iterator[Finding]:
     """What to know about the standard deviations of a method other than DROPO."""
     instead = "Use the means, and choose σ yourself."
-    texts: dict[str, tuple[Level, str]] = {
-        "droid": ("attention", f"They shrink with every generation, whatever the noise. {instead}"),
-        "simopt": ("attention", f"They depend on the number of iterations and on the step bound. {instead}"),
-        "laplace": ("note", "A longer log makes them smaller; a missing effect does not make them larger."),
-        "udr": ("note", "The log does not affect them."),
-        "bayessim": ("note", "They come from simulations that resemble the log; see the posterior below."),
+    texts = {
+        "droid": (attention, f"They shrink with every generation, whatever the noise. {instead}"),
+        "simopt": (attention, f"They depend on the number of iterations and on the step bound. {instead}"),
+        "laplace": (note, "A longer log makes them smaller; a missing effect does not make them larger."),
+        "udr": (note, "The log does not affect them."),
+        "bayessim": (note, "They come from simulations that resemble the log; see the posterior below."),
     }
     if fit.extras.get("extrapolates"):
-        texts["bayessim"] = ("attention", f"But the posterior is a guess: {fit.caveat}.")
-    level, text = texts.get(fit.method, ("note", ""))
-    yield Finding(level, "What the standard deviations are", f"{meaning_of_std(fit)}. {text}")
+        texts["bayessim"] = (attention, f"But the posterior is a guess: {fit.caveat}.")
+    finding, text = texts.get(fit.method, (note, ""))
+    yield finding("What the standard deviations are", f"{meaning_of_std(fit)}. {text}")
     if fit.method != "bayessim":
         return
-    several = _several_peaks(fit)
-    if several:
+    if several := _several_peaks(fit):
         yield attention(
             "Several values explain the log",
             f"{joined([f'{name}: {joined(values)}' for name, values in several.items()])}. The normal distribution "
             "above also covers the values in between, which the log rules out: do not train on it. Narrow the "
             "bounds to one of the peaks, or log a motion that distinguishes them.",
         )
-    share = fit.distribution.std / search_box(fit.distribution).width
-    names = zip(fit.distribution.names, share, strict=True)
-    if vague := [name for name, s in names if s > 0.8 / math.sqrt(12) and name not in several]:
+    share = zip(fit.distribution.names, fit.distribution.std / search_box(fit.distribution).width, strict=True)
+    if vague := [name for name, s in share if s > 0.8 / math.sqrt(12) and name not in several]:
         yield attention(
             "Hardly narrower than the search box",
             f"{joined(vague)}. Either the log barely constrains the parameter on its own, or the network has "
@@ -303,20 +296,15 @@ def _of_method(fit: Fit) -> Iterator[Finding]:
 
 def _several_peaks(fit: Fit) -> dict[str, list[str]]:
     """The parameters whose posterior has more than one peak, and where the peaks are."""
-    mixture = Mixture.of(fit.extras["mixture"])
-    found = {}
-    for i, (name, is_log) in enumerate(zip(fit.distribution.names, fit.distribution.is_log, strict=True)):
-        peaks = to_values(mixture.peaks(i), is_log)
-        if len(peaks) > 1:
-            found[name] = [number(float(v), 0.01 * abs(float(v))) for v in peaks]
-    return found
+    mixture, distribution = Mixture.of(fit.extras["mixture"]), fit.distribution
+    peaks = [to_values(mixture.peaks(i), is_log).tolist() for i, is_log in enumerate(distribution.is_log)]
+    found = zip(distribution.names, peaks, strict=True)
+    return {name: [number(v, 0.01 * abs(v)) for v in values] for name, values in found if len(values) > 1}
 
 
 def _residuals(diagnostics: Diagnostics) -> Iterator[Finding]:
-    standardised = column_rms(diagnostics)
-    count, limit = len(standardised), unexplained_above(diagnostics)
+    standardised, labels, limit = column_rms(diagnostics), diagnostics.labels, unexplained_above(diagnostics)
     order = np.argsort(-np.nan_to_num(standardised, nan=-1))
-    labels = diagnostics.labels
     if bad := [f"{labels[i]} ({rms(standardised[i])})" for i in order if standardised[i] > limit]:
         yield attention(
             "The model does not explain every column",
@@ -324,14 +312,14 @@ def _residuals(diagnostics: Diagnostics) -> Iterator[Finding]:
             "(rms of standardized residuals; 1 is ideal). Either the model is missing or misrepresents something "
             "that acts on these columns, or their noise is larger than ε allows.",
         )
-    if drowned := [labels[i] for i in range(count) if _is_drowned(diagnostics, i)]:
+    if drowned := [label for i, label in enumerate(labels) if _is_drowned(diagnostics, i)]:
         yield note(
             "Columns that barely count",
-            f"{len(drowned)} of {count} columns: {joined(drowned)}. Their residuals are far smaller "
+            f"{len(drowned)} of {len(labels)} columns: {joined(drowned)}. Their residuals are far smaller "
             "than expected: the ε (or noise) given for them exceeds the simulation error, so the fit barely uses "
             "them. Set ε per column, or lower it.",
         )
-    if lost := [labels[i] for i in range(count) if not np.isfinite(standardised[i])]:
+    if lost := list(compress(labels, ~np.isfinite(standardised))):
         yield attention("Columns without a finite residual", f"{joined(lost)}.")
 
 
@@ -373,9 +361,9 @@ def _failures(fit: Fit, diagnostics: Diagnostics) -> Iterator[Finding]:
 
 
 def _chosen(distribution: Distribution, mask: np.ndarray) -> str:
-    return joined([name for name, chosen in zip(distribution.names, mask, strict=True) if chosen])
+    return joined(list(compress(distribution.names, mask)))
 
 
 def _with_values(distribution: Distribution, mask: np.ndarray, values: np.ndarray) -> list[str]:
-    columns = zip(distribution.names, values, distribution.units, mask, strict=True)
-    return [f"{name} ({with_unit(plain(float(v)), unit)})" for name, v, unit, chosen in columns if chosen]
+    columns = compress(zip(distribution.names, values, distribution.units, strict=True), mask)
+    return [f"{name} ({with_unit(plain(float(v)), unit)})" for name, v, unit in columns]
