@@ -14,7 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
 from dropo_torch.support.given import reading
 
-SCHEMA = "dropo-torch/training/1"
+SCHEMA = "dropo-torch/training/2"
 
 
 class Stateful:
