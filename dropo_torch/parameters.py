@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import fnmatch
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -103,6 +104,11 @@ class Parameter:
         of = f" of {', '.join(self.objects)}" if self.objects else ""
         return f"{self.field or 'parameter'}{component}{of}"
 
+    def nominal(self, model: mujoco.MjModel | None) -> float:
+        """Return a model's own value; NaN for a parameter outside the model."""
+        found = None if model is None else next(iter(self.targets), None)
+        return found.read(model) / found.factor if found and found.factor else math.nan
+
 
 class ParameterSpace:
     """The parameters that may vary, in order, and the vectors of their values ``(..., d)``.
@@ -179,7 +185,7 @@ class ParameterSpace:
     @property
     def nominal(self) -> np.ndarray:
         """The model's own values, ``(d,)``; NaN for a parameter outside the model."""
-        return np.array([_nominal(self.model, p) for p in self.parameters])
+        return np.array([p.nominal(self.model) for p in self.parameters])
 
     def vector(self, values: Mapping[str, float]) -> np.ndarray:
         """Return named values as a vector ``(d,)``.
@@ -498,12 +504,6 @@ def _limits(where: str, field: str, spec: Mapping[str, Any], low: float, high: f
     if positive or spec.get("scale") == "log":
         return 0.1 * low, np.inf
     return floor, np.inf
-
-
-def _nominal(model: mujoco.MjModel | None, parameter: Parameter) -> float:
-    if model is None or not parameter.targets or not parameter.targets[0].factor:
-        return float("nan")
-    return parameter.targets[0].read(model) / parameter.targets[0].factor
 
 
 def _refuse_derived(space: ParameterSpace) -> None:

@@ -102,17 +102,8 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         mask=config.mask,
         scaling=config.scaling,
     )
-    return Problem(
-        config=given,
-        model_path=model_path,
-        space=space,
-        simulator=simulator,
-        trajectories=trajectories,
-        observation=observation,
-        objective=objective,
-        fingerprint=_fingerprint(given, space.model, trajectories),
-        effects=effects,
-    )
+    digest = _fingerprint(given, space.model, trajectories)
+    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)
 
 
 def _completed(config: Config) -> Config:
