@@ -34,7 +34,7 @@ MODEL = """
   </worldbody>
   <actuator><motor name="motor" joint="pivot"/></actuator>
 </mujoco>"""
-#: Deviations of the noise, rad and rad/s.
+#: σ of the noise, rad and rad/s.
 NOISE = np.array([1e-4, 5e-4])
 #: Name → what the config of the method has beside the common keys.
 METHODS: dict[str, dict[str, Any]] = {

@@ -211,7 +211,7 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
 
 
 class _CheckedAdapter:
-    """An adapter of the user's own: what it lacks, raises or returns amiss is told in one line."""
+    """An adapter of the user's own: what it lacks, raises or returns wrongly becomes one line."""
 
     def __init__(self, adapter: Adapter, name: str) -> None:
         for method in ("set_parameters", "set_state", "step"):

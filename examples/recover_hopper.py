@@ -22,7 +22,7 @@ from dropo_sims.hopper.record import NOISE_VARIANCE, SPREAD, record
 
 import dropo_torch as dropo
 
-#: Standard deviation of a normal of deviation 1 that is truncated at plus and minus 2.
+#: Standard deviation of a normal with σ = 1 that is truncated at ±2.
 TRUNCATED = 0.8796
 EPSILON = {"point": 1e-5, "noisy": 1e-8, "distribution": 1e-7}
 
@@ -89,8 +89,8 @@ def show(result: dict[str, Any]) -> None:
     for i, name in enumerate(result["names"]):
         spread = ""
         if name in SPREAD and result["true_std"][i] > 1e-9:
-            deviation = TRUNCATED * result["std"][i]
-            spread = f", deviation {deviation:.3f}, realised {result['true_std'][i]:.3f}"
+            std = TRUNCATED * result["std"][i]
+            spread = f", standard deviation {std:.3f}, realized {result['true_std'][i]:.3f}"
         print(f"    {name:<12} mean {result['mean'][i]:.4f} ({error[i]:+.3f} %)  std {result['std'][i]:.2g}{spread}")
 
 

@@ -161,7 +161,7 @@ def test_laplace_does_not_depend_on_the_size_of_epsilon(folder: Path, epsilon: f
 
 
 def test_laplace_keeps_a_direction_that_the_log_knows_where_another_is_unknown() -> None:
-    """Only a + b is seen: its deviation is the log's, though a's and b's are their boxes'."""
+    """Only a + b is seen: its σ is the log's, though a's and b's are their boxes'."""
     rng = np.random.default_rng(0)
     simulator = LinearSimulator(space_of(a=[0, 1], b=[0, 100]), np.array([[1.0, 1.0]]))
     objective = linear_objective(simulator, 30.0 + 0.01 * rng.standard_normal((40, 1)), epsilon=1e-4)
@@ -266,7 +266,7 @@ def test_a_mixture_stays_in_its_box() -> None:
 
 @pytest.mark.parametrize("features", ["mdnn", "mdrff"])
 def test_a_mixture_density_network_learns_a_gaussian_posterior(features: str) -> None:
-    """x = θ + noise of deviation 0.1: the posterior of θ in [0, 1] is normal around x with that deviation."""
+    """x = θ + noise with σ = 0.1: the posterior of θ in [0, 1] is normal around x with that σ."""
     rng = np.random.default_rng(0)
     shares = rng.uniform(size=(1500, 1))
     x = shares + 0.1 * rng.standard_normal((1500, 1))
@@ -877,7 +877,7 @@ def test_bayessim_summarises_orientations_of_log_and_replays_alike(tmp_path: Pat
 
 
 def test_what_varies_is_no_outlier_where_the_starts_are_noisy(folder: Path) -> None:
-    """Deviations are found as well with noise on every measurement as on the ends alone, where no window is widened."""
+    """σ is found as well with noise on every measurement as on the ends alone, where no window is widened."""
     noise = np.array([1e-4, 5e-4])
     found, true = [], []
     for seed in range(3):

@@ -38,7 +38,7 @@ LAWS = [
 
 
 def truncnorm(mean, std, low, high):
-    """The law of redrawing a normal until it is within two deviations and within the limits."""
+    """The distribution of a normal redrawn until it is within 2σ and within the limits."""
     a, b = max(-2.0, (low - mean) / std), min(2.0, (high - mean) / std)
     return scipy.stats.truncnorm(a, b, loc=mean, scale=std)
 

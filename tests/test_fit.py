@@ -157,7 +157,7 @@ def killed_and_resumed(folder: Folder, config: Path, kills: int, seed: int) -> d
 
 
 def noisy_fisher(folder: Folder) -> Path:
-    """Several refits of the means around the start noise, then the deviations."""
+    """Several refits of the means around the noise of the initial states, then σ."""
     folder.log("noisy.npz", **record(steps=120, noise=1e-2))
     return folder.config(data="noisy.npz", noise=1e-2, epsilon=1e-6)
 

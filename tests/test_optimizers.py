@@ -39,7 +39,7 @@ from dropo_torch.support.random import draw_uniforms
 from dropo_torch.testing import KnownProblem, LinearSimulator, check_optimizer, linear_objective, linear_problem
 from dropo_torch.testing.optimizers import MakeOptimizer
 
-#: Variance of a standard normal truncated at two deviations.
+#: Variance of a standard normal truncated at 2σ.
 VARIANCE = float(truncated_moments(*truncated_interval(*torch.tensor([0.0, 1.0, -torch.inf, torch.inf])))[1])
 EPSILON = 1e-4
 GAINS = np.array([2.0, -0.5])

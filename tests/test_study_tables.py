@@ -22,7 +22,7 @@ def result(cell: Cell, mean: float, std: float, *, truth: float = 4.0, **about: 
 
 
 def study(**changes: tuple[float, float]) -> list[dict[str, Any]]:
-    """Table 1 and the sweeps as the paper has them; ``changes`` sets mean and deviation of ``method_variant``."""
+    """Table 1 and the sweeps as the paper has them; ``changes`` sets mean and σ of ``method_variant``."""
     usual = {"dropo": 1e-5, "droid": 1e-5, "bayessim": 0.5}
     found = []
     for method, std in usual.items():
