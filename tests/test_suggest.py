@@ -83,5 +83,6 @@ def test_what_no_motion_tells_is_said() -> None:
     ],
 )  # fmt: skip
 def test_what_a_log_must_show_to_judge_the_rest(silent: list[tuple[str, str | None]], words: str) -> None:
-    assert excite(silent) == f"To judge what this log cannot, record a motion that {words}."
+    placed = [Placed(find_effect(effect), target) for effect, target in silent]
+    assert excite(placed) == f"To judge what this log cannot, record a motion that {words}."
     assert excite([]) is None
