@@ -2,7 +2,7 @@
 
 >>> import dropo_torch as dropo
 >>> problem = dropo.make_problem(dropo.load_config("robot.yaml"))
->>> result = dropo.fit(problem.objective)
+>>> result = dropo.fit_problem(problem)
 >>> result.distribution.save("distribution.json")
 
 The public names stand in ``__init__.pyi``; each is imported when it is first used.

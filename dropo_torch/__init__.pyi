@@ -1,6 +1,7 @@
 # The public names, read by type checkers and, at import, by lazy_loader.
 from . import baselines as baselines
 from . import gap as gap
+from .baselines import fit_problem as fit_problem
 from .config import Config as Config
 from .config import load_config as load_config
 from .config import make_config as make_config

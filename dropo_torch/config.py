@@ -55,7 +55,7 @@ class Config(pydantic.BaseModel):
     method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = Field(
         "dropo", description="what finds the distribution"
     )
-    method_options: Entries = Field({}, description="of a method other than dropo; see docs/methods.md")
+    method_options: Entries = Field({}, description="options of a method other than dropo; see docs/methods.md")
     optimizer: Literal["fisher", "cma", "adam"] = Field("fisher", description="how φ is searched")
     entropy: float = Field(0.0, ge=0, description="weight of the entropy of the distribution in the fit")
     covariance: Literal["diagonal", "full"] = Field("diagonal", description="whether parameters vary together")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 import pickle
 import time
@@ -135,16 +136,20 @@ def fit(
             :mod:`dropo_torch.baselines`.
         checkpoint: file in which the fit's state is kept after every batch.
         resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
-        fingerprint: identifies the config and log; a checkpoint of another one is refused.
+        fingerprint: identifies the config, beside the log, its noise, the bounds and the settings, which are compared
+            anyway; a checkpoint of another fit is refused.
         on_progress: called after every batch.
 
     Raises:
-        InputError: a parameter without effect on this log, a checkpoint that does not fit;
+        InputError: a parameter without effect on this log, a checkpoint that does not fit, or ``resume`` without one;
             with Adam, a gradient that the differences of MuJoCo do not confirm on 20 transitions.
     """
     settings = settings or FitSettings()
     search = search or make_optimizer(objective, settings)
-    kept = None if checkpoint is None else _Checkpoint(Path(checkpoint), fingerprint)
+    if resume and checkpoint is None:
+        raise InputError("resume: there is no checkpoint to go on from; name its file: checkpoint=PATH")
+    owner = (fingerprint, search.method, search.name, repr(settings), _digest(objective))
+    kept = None if checkpoint is None else _Checkpoint(Path(checkpoint), owner)
     state = kept.restore(search, objective) if resume and kept is not None else None
     if state is None:
         state = _State(simulated_transitions=refuse_dead_parameters(objective))
@@ -248,12 +253,12 @@ class _Checkpoint:
     """The file in which a fit's state is kept, and whose fit it is."""
 
     path: Path
-    fingerprint: str
+    owner: tuple[str, ...]
 
     def save(self, search: Optimizer, state: _State) -> None:
         """Write the state, whole or not at all."""
         content = {
-            "owner": self._owner(search),
+            "owner": self.owner,
             "optimizer": search.state(),
             "history": [vars(entry) for entry in state.history],
             "simulated_transitions": state.simulated_transitions,
@@ -267,7 +272,7 @@ class _Checkpoint:
             return None
         try:
             content = pickle.loads(self.path.read_bytes())
-            is_own, linearised = content["owner"] == self._owner(search), content["linearised"]
+            is_own, linearised = content["owner"] == self.owner, content["linearised"]
             history = [HistoryEntry(**entry) for entry in content["history"]]
             state = _State(content["simulated_transitions"], history)
             if is_own:
@@ -282,5 +287,12 @@ class _Checkpoint:
             state.initial = objective.initial_noise(*linearised)  # already counted
         return state
 
-    def _owner(self, search: Optimizer) -> tuple[str, str]:
-        return self.fingerprint, search.name
+
+def _digest(objective: Objective) -> str:
+    """What tells one log, its noise and its parameters from another."""
+    log, found = objective.transitions, hashlib.sha256()
+    noise = () if objective.noise is None else (objective.noise.numpy(),)
+    box = objective.box
+    for array in (log.states, log.controls, log.measured, objective.epsilon.numpy(), *noise, box.low, box.high):
+        found.update(np.ascontiguousarray(array, dtype=np.float64).tobytes())
+    return found.hexdigest()

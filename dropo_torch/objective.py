@@ -67,7 +67,7 @@ class Objective:
         chunk_size: rows (transition, parameter vector) held at once.
 
     Raises:
-        InputError: ε or noise that is not positive or has the wrong length; a masked column that is none.
+        InputError: ε that is not positive, noise that is negative, or a wrong number of either; a mask of no column.
     """
 
     def __init__(
@@ -242,5 +242,6 @@ def _per_entry(key: str, given: float | Sequence[float], count: int, what: str, 
     entries = entries.expand(count).clone()
     lowest = float(entries.min())
     if not bool(torch.isfinite(entries).all()) or lowest < 0 or (key == "epsilon" and lowest <= 0):
-        raise InputError(f"{key}: {given} given; expected positive numbers")
+        least = "positive numbers" if key == "epsilon" else "numbers of at least 0"
+        raise InputError(f"{key}: {given} given; expected {least}")
     return entries

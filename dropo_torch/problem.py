@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import re
 import warnings
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +24,7 @@ from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators import Adapter, MujocoEnvAdapter, Simulator, make_simulator
+from dropo_torch.simulators import CheckedAdapter, MujocoEnvAdapter, Simulator, make_simulator
 from dropo_torch.support.extras import extra
 from dropo_torch.support.usercode import load_callable, user_code
 
@@ -207,50 +206,7 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
     space = _space(None if path is None else load_model(path), config)
     with user_code("environment", name):
         adapter = maker(space)
-    return path, space, _CheckedAdapter(adapter, name)
-
-
-class _CheckedAdapter:
-    """An adapter of the user's own: what it lacks, raises or returns wrongly becomes one line."""
-
-    def __init__(self, adapter: Adapter, name: str) -> None:
-        for method in ("set_parameters", "set_state", "step"):
-            if not callable(getattr(adapter, method, None)):
-                raise InputError(
-                    f"environment: {name} gives {type(adapter).__name__}, which has no method {method}; an adapter has "
-                    "num_states, num_controls, timestep, set_parameters(values), set_state(state) and step(control)"
-                )
-        for width in ("num_states", "num_controls"):
-            given = getattr(adapter, width, None)
-            if not isinstance(given, int | np.integer):
-                raise InputError(f"environment: {width} of {name} is {given!r}; expected a number")
-        timestep = getattr(adapter, "timestep", None)
-        if timestep is not None and not (isinstance(timestep, int | float | np.number) and timestep > 0):
-            raise InputError(f"environment: timestep of {name} is {timestep!r}; expected seconds of a step, or None")
-        self._adapter, self._name = adapter, name
-        self.num_states, self.num_controls = int(adapter.num_states), int(adapter.num_controls)
-        self.timestep = None if timestep is None else float(timestep)
-
-    def set_parameters(self, values: Mapping[str, float]) -> None:
-        with user_code("environment", self._name):
-            self._adapter.set_parameters(values)
-
-    def set_state(self, state: np.ndarray) -> None:
-        with user_code("environment", self._name):
-            self._adapter.set_state(state)
-
-    def step(self, control: np.ndarray) -> np.ndarray:
-        with user_code("environment", self._name):
-            given: Any = self._adapter.step(control)
-        try:
-            after = np.asarray(given, dtype=np.float64)
-        except (TypeError, ValueError):
-            after = np.empty(0)
-        if given is None or after.shape != (self.num_states,):
-            shape = repr(given) if given is None or isinstance(given, str) else f"shape {np.shape(given)}"
-            what = f"step of {self._name} returns {shape}"
-            raise InputError(f"environment: {what}; expected ({self.num_states},) numbers")
-        return after
+    return path, space, CheckedAdapter(adapter, name)
 
 
 def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:

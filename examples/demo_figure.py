@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=Path("docs/demo.png"))
     given = parser.parse_args(arguments)
     problem = dropo.make_problem(dropo.make_config({"sim": "hopper"}))
-    fit = dropo.fit(problem.objective)
+    fit = dropo.fit_problem(problem)
     measured = problem.objective.measured
     before, after = problem.objective.simulated(np.stack([problem.space.nominal, fit.distribution.center])).unbind(1)
     scale = measured.std(0)

@@ -156,9 +156,9 @@ WRONG_LINES: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown command": ("fitt CONFIG --out OUT", ("unknown command 'fitt'", "did you mean 'fit'")),
     "option before the command": (
         "--foo fit CONFIG --out OUT",
-        ("--foo", "fit|gap|train|sweep-epsilon|certify|compare|reproduce|demo"),
+        ("--foo", "fit, gap, train, sweep-epsilon, certify, compare, reproduce, demo"),
     ),
-    "no command": ("--foo", ("--foo", "fit|gap|train|sweep-epsilon|certify|compare|reproduce|demo")),
+    "no command": ("--foo", ("--foo", "fit, gap, train, sweep-epsilon, certify, compare, reproduce, demo")),
     "no config": ("fit --out OUT", ("CONFIG", "usage: dropo fit")),
     "no folder": ("fit CONFIG", ("--out", "usage: dropo fit")),
     "folder without value": ("fit CONFIG --out", ("--out: expected one argument",)),

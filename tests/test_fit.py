@@ -18,6 +18,7 @@ from conftest import LinearSimulator, linear_objective, space_of
 from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, fit
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FitSettings
 from dropo_torch.problem import make_problem
 
@@ -191,3 +192,16 @@ def test_a_fit_killed_at_any_moment_resumes_to_the_same_result(make: Callable[[F
 @pytest.mark.parametrize("make", [noisy_fisher, small_cma])
 def test_a_fit_killed_twenty_times_resumes_to_the_same_result(make: Callable[[Folder], Path], folder: Folder) -> None:
     check_resume(folder, make(folder), kills=20, seed=2)
+
+
+def test_a_checkpoint_of_another_log_is_refused_without_a_fingerprint(tmp_path: Path) -> None:
+    path, settings = tmp_path / "checkpoint.pkl", FitSettings(samples=10)
+
+    def objective(truth: float) -> Objective:
+        return linear_objective(LinearSimulator(space_of(a=[0.0, 3.0]), np.eye(1)), np.full((20, 1), truth))
+
+    fit(objective(1.2), settings, checkpoint=path)
+    with pytest.raises(InputError, match="belongs to another config, log or optimizer"):
+        fit(objective(1.7), settings, checkpoint=path, resume=True)
+    with pytest.raises(InputError, match="resume: there is no checkpoint to go on from"):
+        fit(objective(1.2), settings, resume=True)

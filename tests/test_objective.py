@@ -161,7 +161,7 @@ def test_masked_columns_leave_the_likelihood(hopper):
         ({"epsilon": [1e-5] * 10}, "epsilon: 10 values given; expected one, or one per feature: rootz"),
         ({"epsilon": [1e-5] * 10 + [np.nan]}, "expected positive numbers"),
         ({"epsilon": "small"}, "epsilon: 'small' given"),
-        ({"noise": -1.0}, "noise: -1.0 given; expected positive"),
+        ({"noise": -1.0}, "noise: -1.0 given; expected numbers of at least 0"),
         ({"noise": [1.0]}, "noise: 1 values given; expected one, or one per column"),
     ],
 )

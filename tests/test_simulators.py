@@ -345,8 +345,19 @@ def test_an_adapter_may_be_made_from_the_parameter_space():
 def test_an_adapter_that_lacks_something_is_refused(missing):
     members = {k: getattr(Pendulum, k) for k in ("set_parameters", "set_state", "step", "num_states", "num_controls")}
     del members[missing]
-    with pytest.raises(InputError, match=f"Half has no {missing}; an adapter has"):
+    with pytest.raises(InputError, match=rf"environment: .*{missing}.*; an adapter has"):
         GymnasiumSimulator(type("Half", (), members)(), parameters=pendulum_space())
+
+
+def test_an_adapter_that_returns_another_shape_is_refused():
+    class Short(Pendulum):
+        def step(self, control: np.ndarray) -> np.ndarray:
+            return super().step(control)[:1]
+
+    simulator = GymnasiumSimulator(Short(), parameters=pendulum_space())
+    one = (torch.ones(shape, dtype=torch.float64) for shape in ((1, 2), (1, 1, 1), (1, 2)))
+    with pytest.raises(InputError, match=r"step of Short returns shape \(1,\); expected \(2,\) numbers"):
+        simulator.simulate(*one)
 
 
 def test_an_adapter_that_returns_nan_has_diverged_for_that_value_only():

@@ -68,7 +68,7 @@ def _dispatch(given: list[str]) -> None:
     command = given[0] if given else ""
     if command not in (*COMMANDS, "", "-h", "--help", "--version"):
         if command.startswith("-"):
-            raise InputError(f"{command} stands before a command; expected {'|'.join(COMMANDS)} first")
+            raise InputError(f"unknown option {command}; a command comes first: {', '.join(COMMANDS)}")
         raise InputError(f"unknown command {command!r}" + choices(command, COMMANDS))
     parser = _parser(command)
     parsed, rest = parser.parse_known_args(given)

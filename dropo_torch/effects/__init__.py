@@ -21,8 +21,11 @@ def register(effect: Effect) -> Effect:
     """Add an effect of one's own to the vocabulary; a class that is defined again takes its own place.
 
     Raises:
-        InputError: a name that is taken.
+        InputError: a class that does not say what it is, or a name that is taken.
     """
+    for what, example in (("name", "'slip'"), ("kind", "'joint'"), ("sentence", "'joint {target} slips'")):
+        if not isinstance(getattr(effect, what, None), str):
+            raise InputError(f"own_effects: {type(effect).__name__} has no {what}; add a line {what} = {example}")
     taken = VOCABULARY.get(effect.name, effect)
     if _source(taken) != _source(effect):
         raise InputError(f"effect: the name {effect.name!r} is taken; choose another")

@@ -76,6 +76,10 @@ class Forces:
         return out
 
 
+class ModelRefused(ValueError):
+    """MuJoCo refuses a model with these values."""
+
+
 class VariantEngine:
     """Simulates a model under variants of it, from full states and under commands as they act.
 
@@ -105,7 +109,7 @@ class VariantEngine:
         """Return the model of a variant, with its derived constants.
 
         Raises:
-            ValueError: values that MuJoCo refuses.
+            ModelRefused: values that MuJoCo refuses.
         """
         model = copy.copy(self._base)
         for column, parameter in enumerate(self._space.parameters):
@@ -114,19 +118,19 @@ class VariantEngine:
         for placed in variant.placed:
             placed.effect.apply(model, placed.target, np.asarray(placed.values))
         if (model.body_mass < 0).any() or (model.body_inertia < 0).any() or (model.dof_armature < 0).any():
-            raise ValueError("a mass or an inertia is negative")
+            raise ModelRefused("a mass or an inertia is negative")
         try:
             with quiet_mujoco():
                 mujoco.mj_setConst(model, self._data)
         except mujoco.FatalError as error:
-            raise ValueError(str(error)) from None
+            raise ModelRefused(str(error)) from None
         return model
 
     def models(self, variants: Sequence[Variant]) -> Models:
         """Return the models of variants, ``None`` where MuJoCo refuses the values."""
         found: list[mujoco.MjModel | None] = [None] * len(variants)
         for k, variant in enumerate(variants):
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ModelRefused):
                 found[k] = self.model(variant)
         return found
 

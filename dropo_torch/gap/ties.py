@@ -73,7 +73,7 @@ def canonical(
     told = list(tied)
     for index, rivals in enumerate(told):
         own = state.current.hypothesis.placed[index]
-        first = min((own, *rivals), key=lambda p: (len(p.values), order.get(p.effect.name, 99)))
+        first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name]))
         if first is not own:
             state = replace(state, current=ground.refit(state.current.hypothesis.instead(index, first)))
             told[index] = tuple(own if p is first else p for p in rivals)

@@ -9,7 +9,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.data.observation import parse_observation
-from dropo_torch.effects.engine import Force, Forces, Variant, VariantEngine
+from dropo_torch.effects.engine import Force, Forces, ModelRefused, Variant, VariantEngine
 from dropo_torch.effects.placing import EffectSet, plain_setting
 from dropo_torch.effects.simulator import apply_native, finer_steps, overlap
 from dropo_torch.errors import InputError
@@ -103,7 +103,7 @@ class RowModels:
         for row, vector in zip(ids, values, strict=True):
             try:
                 self._models[row] = self._engine.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
-            except ValueError as error:
+            except ModelRefused as error:
                 raise _refused(self._space, vector, str(error)) from None
             self.finer[row] = finer_steps(self._effects.setting.model, self._models[row], self._effects)
         self._batch.set_models(self._models)

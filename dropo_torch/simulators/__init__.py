@@ -8,10 +8,18 @@ from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
-from dropo_torch.simulators.gymnasium import Adapter, GymnasiumSimulator, MujocoEnvAdapter
+from dropo_torch.simulators.gymnasium import Adapter, CheckedAdapter, GymnasiumSimulator, MujocoEnvAdapter
 from dropo_torch.simulators.mujoco import MujocoSimulator
 
-__all__ = ["Adapter", "GymnasiumSimulator", "MujocoEnvAdapter", "MujocoSimulator", "Simulator", "make_simulator"]
+__all__ = [
+    "Adapter",
+    "CheckedAdapter",
+    "GymnasiumSimulator",
+    "MujocoEnvAdapter",
+    "MujocoSimulator",
+    "Simulator",
+    "make_simulator",
+]
 
 BACKENDS = ("mujoco", "warp", "gymnasium")
 

@@ -14,6 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.support.usercode import user_code
 
 if TYPE_CHECKING:
     import gymnasium
@@ -95,6 +96,61 @@ class MujocoEnvAdapter:
         return after if (np.abs(after) < DIVERGED).all() else np.full_like(after, np.nan)
 
 
+class CheckedAdapter:
+    """An adapter of the user's own: what it lacks, raises or returns wrongly becomes one line.
+
+    Args:
+        adapter: the adapter.
+        name: what messages call it.
+
+    Raises:
+        InputError: a method or a width that it lacks.
+    """
+
+    def __init__(self, adapter: Adapter, name: str) -> None:
+        has = (
+            "; an adapter has num_states, num_controls, timestep, set_parameters(values), set_state(state) and "
+            "step(control)"
+        )
+        for method in ("set_parameters", "set_state", "step"):
+            if not callable(getattr(adapter, method, None)):
+                raise InputError(f"environment: {name} has no method {method}{has}")
+        for width in ("num_states", "num_controls"):
+            given = getattr(adapter, width, None)
+            if not isinstance(given, int | np.integer):
+                raise InputError(f"environment: {width} of {name} is {given!r}; expected a number{has}")
+        timestep = getattr(adapter, "timestep", None)
+        if timestep is not None and not (isinstance(timestep, int | float | np.number) and timestep > 0):
+            raise InputError(f"environment: timestep of {name} is {timestep!r}; expected seconds of a step, or None")
+        self._adapter, self._name = adapter, name
+        self.num_states, self.num_controls = int(adapter.num_states), int(adapter.num_controls)
+        self.timestep = None if timestep is None else float(timestep)
+
+    def set_parameters(self, values: Mapping[str, float]) -> None:
+        """Hand the values on."""
+        with user_code("environment", self._name):
+            self._adapter.set_parameters(values)
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Hand the state on."""
+        with user_code("environment", self._name):
+            self._adapter.set_state(state)
+
+    def step(self, control: np.ndarray) -> np.ndarray:
+        """Step, and check what comes back."""
+        with user_code("environment", self._name):
+            given: Any = self._adapter.step(control)
+        try:
+            after = np.asarray(given, dtype=np.float64)
+        except (TypeError, ValueError):
+            after = np.empty(0)
+        if given is None or after.shape != (self.num_states,):
+            shape = repr(given) if given is None or isinstance(given, str) else f"shape {np.shape(given)}"
+            what = f"step of {self._name} returns {shape}"
+            raise InputError(f"environment: {what}; expected ({self.num_states},) numbers")
+        return after
+
+
 class GymnasiumSimulator(Simulator):
     """Transitions on one environment, one after the other.
 
@@ -113,13 +169,9 @@ class GymnasiumSimulator(Simulator):
         parameters: ParameterSpace,
         frame_skip: int = 1,
     ) -> None:
-        self._adapter: Adapter = adapter(parameters) if callable(adapter) else adapter
-        for needed in ("set_parameters", "set_state", "step", "num_states", "num_controls"):
-            if not hasattr(self._adapter, needed):
-                raise InputError(
-                    f"environment: {type(self._adapter).__name__} has no {needed}; an adapter has num_states, "
-                    "num_controls, timestep, set_parameters(values), set_state(state) and step(control)"
-                )
+        made: Adapter = adapter(parameters) if callable(adapter) else adapter
+        own = isinstance(made, CheckedAdapter | MujocoEnvAdapter)
+        self._adapter: Adapter = made if own else CheckedAdapter(made, type(made).__name__)
         self.parameters = parameters
         self.frame_skip = frame_skip
         self.num_states, self.num_controls = int(self._adapter.num_states), int(self._adapter.num_controls)
