@@ -28,10 +28,10 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import lowest, place_effects, plain_setting
 from dropo_torch.effects.sensor import SensorScale
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
-from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
 from dropo_torch.gap.config import search_box, write_config
+from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem

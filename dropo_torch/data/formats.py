@@ -1,5 +1,14 @@
 """The file formats of logs.
 
+=================================  ===============================================================
+``.npz``                           arrays ``observations``, ``next_observations``, ``actions``, ``terminals``
+folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_actions``, ``*_terminals``
+``.h5``, ``.hdf5``                 data sets in the layout of D4RL, or any others by a column map
+``.csv``, ``.tsv``, ``.parquet``   by a column map
+``.mat``                           MATLAB variables (all versions), by a column map
+``minari:ID``, a Minari folder     a local Minari dataset
+=================================  ===============================================================
+
 A new one is a function that opens such a file as tables, and an entry of :data:`FORMATS`.
 """
 

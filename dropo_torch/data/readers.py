@@ -1,16 +1,8 @@
-"""Read a robot's log, in any of the formats listed here, into :class:`~dropo_torch.data.trajectory.Trajectories`.
+"""From the tables of a robot's log to :class:`~dropo_torch.data.trajectory.Trajectories`: columns, episodes, time.
 
-=================================  ===============================================================
-``.npz``                           arrays ``observations``, ``next_observations``, ``actions``, ``terminals``
-folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_actions``, ``*_terminals``
-``.h5``, ``.hdf5``                 data sets in the layout of D4RL, or any others by a column map
-``.csv``, ``.tsv``, ``.parquet``   by a column map
-``.mat``                           MATLAB variables (all versions), by a column map
-``minari:ID``, a Minari folder     a local Minari dataset
-=================================  ===============================================================
-
-The column map is described in :mod:`dropo_torch.data.tables`; :mod:`dropo_torch.data.formats` opens the files. Where a
-log has no next observations, they are the observations of the next row of the same episode.
+File formats, and how to add one, are in :mod:`dropo_torch.data.formats`. The column map is described in
+:mod:`dropo_torch.data.tables`. Where a log has no next observations, they are the observations of the next row of the
+same episode.
 """
 
 from __future__ import annotations

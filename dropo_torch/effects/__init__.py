@@ -1,4 +1,7 @@
-"""The physical effects that a model may lack, and how each enters a simulation."""
+"""The physical effects that a model may lack, and how each enters a simulation.
+
+A new one is a class in the module of its kind: ``joint``, ``body``, ``world``, ``actuator``, ``sensor`` or ``contact``.
+"""
 
 from __future__ import annotations
 

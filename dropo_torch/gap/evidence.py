@@ -15,7 +15,7 @@ import numpy as np
 
 from dropo_torch.data.features import Features
 from dropo_torch.effects.engine import Variant
-from dropo_torch.effects.twin import Twin, Windows
+from dropo_torch.gap.twin import Twin, Windows
 
 #: Antithetic pairs of noise on the initial states by which rough windows are linearised, and their seed.
 PAIRS, SEED = 16, 11

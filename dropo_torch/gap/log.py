@@ -11,7 +11,7 @@ from dropo_torch.data.features import Features, masked_columns
 from dropo_torch.data.observation import Observation
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting, Signals
-from dropo_torch.effects.twin import Windows
+from dropo_torch.gap.twin import Windows
 from dropo_torch.problem import Problem
 
 #: Configurations of the log at which the typical forces are computed.

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dropo_torch.effects.engine import Variant
-from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import feature_sizes
+from dropo_torch.gap.twin import Twin, Windows
 
 #: Logged steps of a window, and coefficients of a force in it.
 LENGTH, ORDER = 6, 3

@@ -9,8 +9,8 @@ import numpy as np
 
 from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
-from dropo_torch.effects.twin import Twin
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors, robust_loss
+from dropo_torch.gap.twin import Twin
 from dropo_torch.optimizers.least_squares import bounded_step
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.

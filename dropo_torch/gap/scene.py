@@ -9,12 +9,12 @@ import numpy as np
 from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting
-from dropo_torch.effects.twin import Twin, Windows
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, make_setting, spread, start_values
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
 

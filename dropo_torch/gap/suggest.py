@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.effects.base import Placed
-from dropo_torch.effects.twin import Windows
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import spread
 from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.twin import Windows
 
 #: Windows of a motion that is tried.
 WINDOWS = 16

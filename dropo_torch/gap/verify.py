@@ -9,11 +9,11 @@ import numpy as np
 from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting
-from dropo_torch.effects.twin import Windows
 from dropo_torch.gap.evidence import LOST, Evidence
 from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, spread
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Score
+from dropo_torch.gap.twin import Windows
 
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)

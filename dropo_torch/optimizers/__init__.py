@@ -1,4 +1,8 @@
-"""Optimizers of φ, each asked for parameter vectors to simulate and told what came out."""
+"""Optimizers of φ, each asked for parameter vectors to simulate and told what came out.
+
+A new one is a module here, named in :func:`make_optimizer`, in ``OPTIMIZERS`` of :mod:`dropo_torch.optimizers.settings`
+and in the config's key ``optimizer``.
+"""
 
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.adam import AdamOptimizer as AdamOptimizer
