@@ -42,24 +42,13 @@ PLANE = wp.constant(3)
 
 
 @wp.func
-def column(r: mat33, i: int) -> vec3:
-    """Column ``i`` of a rotation."""
-    return vec3(r[0, i], r[1, i], r[2, i])
-
-
-@wp.func
 def corner(which: int, size: vec3) -> vec3:
     """Corner ``which`` of a box: its bits are the signs."""
-    x = size[0]
-    y = size[1]
-    z = size[2]
-    if which % 2 == 0:
-        x = -x
-    if (which // 2) % 2 == 0:
-        y = -y
-    if (which // 4) % 2 == 0:
-        z = -z
-    return vec3(x, y, z)
+    x = size
+    for i in range(3):
+        if (which >> i) % 2 == 0:
+            x[i] = -size[i]
+    return x
 
 
 @wp.func
@@ -73,7 +62,7 @@ def plane_point(n: vec3, origin: vec3, x: vec3, radius: f64) -> vec7:
 @wp.func
 def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3:
     """Point ``which`` of a cylinder that a plane with normal ``n`` touches: near rim, far rim, two on the near disk."""
-    axis = column(rot, 2)
+    axis = rot[:, 2]
     prj = wp.dot(n, axis)
     sign = ONE
     if prj > ZERO:
@@ -81,7 +70,7 @@ def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3
     a = axis * sign
     v = a * (prj * sign) - n
     length = wp.length(v)
-    radial = column(rot, 0) * size[0]
+    radial = rot[:, 0] * size[0]
     if length >= MINVAL:
         radial = v * (size[0] / length)
     x = c + radial + a * size[1]
@@ -96,23 +85,12 @@ def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3
 
 
 @wp.func
-def ellipsoid_point(n: vec3, c: vec3, rot: mat33, size: vec3) -> vec3:
-    """The point of an ellipsoid farthest along −n."""
-    y = wp.cw_mul(wp.transpose(rot) * n, size)
-    return c - rot * (wp.cw_mul(y, size) / wp.length(y))
-
-
-@wp.func
 def support_point(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3:
     """The point of a cylinder or an ellipsoid that a plane with normal ``n`` touches."""
     if kind == PLANE_CYLINDER:
         return cylinder_point(n, c, rot, size, which)
-    return ellipsoid_point(n, c, rot, size)
-
-
-@wp.func
-def _clip(x: f64) -> f64:
-    return wp.min(ONE, wp.max(-ONE, x))
+    y = wp.cw_mul(wp.transpose(rot) * n, size)
+    return c - rot * (wp.cw_mul(y, size) / wp.length(y))
 
 
 @wp.func
@@ -132,37 +110,24 @@ def closest(c1: vec3, a1: vec3, c2: vec3, a2: vec3, which: int) -> vec2:
     if ma > ZERO and mc > ZERO:
         if which == 0:
             det = ma * mc - mb * mb
-            p = (mc * u - mb * v) / det
-            x1 = p
+            x1 = (mc * u - mb * v) / det
             x2 = (ma * v - mb * u) / det
-            if p > ONE:
-                x1 = ONE
-                x2 = (v - mb) / mc
-            elif p < -ONE:
-                x1 = -ONE
-                x2 = (v + mb) / mc
-            if x2 > ONE:
-                x2 = ONE
-                x1 = _clip((u - mb) / ma)
-            elif x2 < -ONE:
-                x2 = -ONE
-                x1 = _clip((u + mb) / ma)
-        elif which == 1:
-            x1 = ONE
-            x2 = _clip((v - mb) / mc)
-        elif which == 2:
-            x1 = -ONE
-            x2 = _clip((v + mb) / mc)
-        elif which == 3:
-            x2 = ONE
-            x1 = _clip((u - mb) / ma)
+            if wp.abs(x1) > ONE:
+                x1 = wp.sign(x1)
+                x2 = (v - x1 * mb) / mc
+            if wp.abs(x2) > ONE:
+                x2 = wp.sign(x2)
+                x1 = wp.clamp((u - x2 * mb) / ma, -ONE, ONE)
+        elif which <= 2:
+            x1 = f64(3 - 2 * which)
+            x2 = wp.clamp((v - x1 * mb) / mc, -ONE, ONE)
         else:
-            x2 = -ONE
-            x1 = _clip((u + mb) / ma)
+            x2 = f64(7 - 2 * which)
+            x1 = wp.clamp((u - x2 * mb) / ma, -ONE, ONE)
     elif mc > ZERO:
-        x2 = _clip(v / mc)
+        x2 = wp.clamp(v / mc, -ONE, ONE)
     elif ma > ZERO:
-        x1 = _clip(u / ma)
+        x1 = wp.clamp(u / ma, -ONE, ONE)
     return vec2(x1, x2)
 
 
@@ -218,11 +183,7 @@ def round_contact(c1: vec3, a1: vec3, r1: f64, c2: vec3, a2: vec3, r2: f64, whic
 @wp.func
 def pair7(x: vec7, dbar: f64, pbar: vec3, nbar: vec3) -> f64:
     """⟨x, x̄⟩ of a contact's geometry and its adjoint."""
-    return (
-        x[0] * dbar
-        + (x[1] * pbar[0] + x[2] * pbar[1] + x[3] * pbar[2])
-        + (x[4] * nbar[0] + x[5] * nbar[1] + x[6] * nbar[2])
-    )
+    return x[0] * dbar + wp.dot(x[1:4], pbar) + wp.dot(x[4:7], nbar)
 
 
 @wp.func
@@ -243,11 +204,7 @@ def support_dual(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int
 def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
     """Contact of a ball about ``x`` (first geom) with a box (second): MuJoCo's sphere-box."""
     local = wp.transpose(rot) * (x - c)
-    q = vec3(
-        wp.min(size[0], wp.max(-size[0], local[0])),
-        wp.min(size[1], wp.max(-size[1], local[1])),
-        wp.min(size[2], wp.max(-size[2], local[2])),
-    )
+    q = wp.min(size, wp.max(-size, local))
     away = q - local
     dist = wp.length(away)
     n = vec3(ONE, ZERO, ZERO)
@@ -258,28 +215,12 @@ def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
         point = (q + local + n * radius) * HALF
     else:
         # centre inside: leave through the nearest face
-        k = int(0)
-        best = size[0] - wp.abs(local[0])
-        g1 = size[1] - wp.abs(local[1])
-        g2 = size[2] - wp.abs(local[2])
-        if g1 < best:
-            best = g1
-            k = 1
-        if g2 < best:
-            best = g2
-            k = 2
-        n0 = ZERO
-        n1 = ZERO
-        n2 = ZERO
-        if k == 0:
-            n0 = wp.where(local[0] > ZERO, -ONE, ONE)
-        elif k == 1:
-            n1 = wp.where(local[1] > ZERO, -ONE, ONE)
-        else:
-            n2 = wp.where(local[2] > ZERO, -ONE, ONE)
-        n = vec3(n0, n1, n2)
-        depth = -best
-        point = local + n * (HALF * (radius - best))
+        gap = size - wp.abs(local)
+        k = int(wp.argmin(gap))
+        n = vec3()
+        n[k] = wp.where(local[k] > ZERO, -ONE, ONE)
+        depth = -gap[k]
+        point = local + n * (HALF * (radius - gap[k]))
     d = depth - radius
     p = c + rot * point
     nw = rot * n

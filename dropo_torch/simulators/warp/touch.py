@@ -24,7 +24,6 @@ from dropo_torch.simulators.warp.collide import (
     capsule_box_codes,
     capsule_box_contact,
     capsule_box_dual,
-    column,
     corner,
     overlap_end,
     plane_point,
@@ -34,7 +33,7 @@ from dropo_torch.simulators.warp.collide import (
     support_point,
     vec7,
 )
-from dropo_torch.simulators.warp.spatial import join, nothing, wrench
+from dropo_torch.simulators.warp.spatial import join, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 
@@ -54,7 +53,7 @@ def geom_rotation(m: Tables, w: World, g: int) -> mat33:
 @wp.func(inline=True)
 def geom_axis(m: Tables, w: World, g: int) -> vec3:
     """Third axis of a geom: a plane's normal, the axis of a capsule."""
-    return w.xmat[w.t, m.geom_body[g]] * column(m.geom_mat[g], 2)
+    return w.xmat[w.t, m.geom_body[g]] * m.geom_mat[g][:, 2]
 
 
 @wp.func(inline=True)
@@ -69,8 +68,8 @@ def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
     w.con_pair[w.t, n] = k
     w.con_which[w.t, n] = which
     w.con_dist[w.t, n] = x[0]
-    w.con_point[w.t, n] = vec3(x[1], x[2], x[3])
-    normal = vec3(x[4], x[5], x[6])
+    w.con_point[w.t, n] = x[1:4]
+    normal = x[4:7]
     y = hint
     if wp.dot(hint, hint) < f64(0.25):
         y = vec3(ZERO, ONE, ZERO)
@@ -82,8 +81,7 @@ def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
     t1 = vec3(ONE, ZERO, ZERO)
     if length > MINVAL:
         t1 = y / length
-    t2 = wp.cross(normal, t1)
-    w.con_frame[w.t, n] = mat33(normal[0], normal[1], normal[2], t1[0], t1[1], t1[2], t2[0], t2[1], t2[2])
+    w.con_frame[w.t, n] = wp.matrix_from_rows(normal, t1, wp.cross(normal, t1))
 
 
 @wp.func(inline=True)
@@ -175,11 +173,7 @@ def find_contacts(m: Tables, w: World) -> int:
 @wp.func
 def _turned(r: mat33, rbar: mat33) -> vec3:
     """Torque that a rotation's adjoint is: Σ columns r × r̄."""
-    return (
-        wp.cross(column(r, 0), column(rbar, 0))
-        + wp.cross(column(r, 1), column(rbar, 1))
-        + wp.cross(column(r, 2), column(rbar, 2))
-    )
+    return wp.cross(r[:, 0], rbar[:, 0]) + wp.cross(r[:, 1], rbar[:, 1]) + wp.cross(r[:, 2], rbar[:, 2])
 
 
 @wp.func
@@ -191,15 +185,13 @@ def _pull(f: vec3, p: vec3, torque: vec3) -> vec6:
 @wp.func(inline=True)
 def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar0: vec3, t1bar0: vec3, t2bar: vec3):
     """From the adjoints of distance, point and frame to spatial forces on the two geoms' bodies."""
-    _late = wp.grad(nothing)(ONE)
     k = w.con_pair[w.t, c]
     which = w.con_which[w.t, c]
     kind = m.pair_kind[k]
     g1 = m.pair_geom1[k]
     g2 = m.pair_geom2[k]
-    frame = w.con_frame[w.t, c]
-    n = vec3(frame[0, 0], frame[0, 1], frame[0, 2])
-    t1 = vec3(frame[1, 0], frame[1, 1], frame[1, 2])
+    n = w.con_frame[w.t, c][0]
+    t1 = w.con_frame[w.t, c][1]
     hint = w.con_hint[w.t, c]
     # t2 = n × t1, t1 = (hint − n n·hint) / |...|
     nbar = nbar0 + wp.cross(t1, t2bar)
