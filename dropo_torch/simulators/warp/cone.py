@@ -13,7 +13,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
 from dropo_torch.simulators.warp.spatial import theta_vec5
-from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec2, vec5, vec6
+from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat66, vec2, vec5, vec6
 
 #: Piece number of the curved part of an elliptic cone, where the cost is not quadratic.
 CURVED = wp.constant(2)
@@ -126,70 +126,48 @@ def cone_force(cone: Cone, w: vec6) -> vec6:
 @wp.func
 def cone_hessian(cone: Cone, w: vec6):
     """Hessian of the cost: blocks (directions, directions), (directions, rotations), (rotations, rotations)."""
-    ll = mat33()
-    la = mat33()
-    aa = mat33()
+    hess = mat66()
     d = cone.d
     piece = cone_piece(cone, w)
     if cone.dim == 1:
         if piece == 1:
-            ll[0, 0] = d
+            hess[0, 0] = d
     elif cone.elliptic == 0:
         for k in range(1, cone.dim):
             mu = cone.mu[k - 1]
             plus = d * f64(piece % 2)
             minus = d * f64((piece // 2) % 2)
             piece = piece // 4
-            ll[0, 0] += plus + minus
-            off = mu * (plus - minus)
-            diag = mu * mu * (plus + minus)
-            if k < 3:
-                ll[0, k] = off
-                ll[k, 0] = off
-                ll[k, k] = diag
-            else:
-                la[0, k - 3] = off
-                aa[k - 3, k - 3] = diag
+            hess[0, 0] += plus + minus
+            hess[0, k] = mu * (plus - minus)
+            hess[k, 0] = hess[0, k]
+            hess[k, k] = mu * mu * (plus + minus)
     else:
         mu1 = cone.mu[0]
         if piece == 1:
-            ll[0, 0] = d
+            hess[0, 0] = d
             for k in range(1, cone.dim):
                 mu = cone.mu[k - 1]
-                diag = d * cone.impratio * mu * mu / (mu1 * mu1)
-                if k < 3:
-                    ll[k, k] = diag
-                else:
-                    aa[k - 3, k - 3] = diag
+                hess[k, k] = d * cone.impratio * mu * mu / (mu1 * mu1)
         elif piece == CURVED:
             reg = mu1 / wp.sqrt(cone.impratio)
             tan = _tangential(cone, w)
             n = w[0] * reg
             dm = d / (reg * reg * (ONE + reg * reg))
             # in cone coordinates: first row (1, −μ/T U), block μN/T³ U Uᵀ + (μ² − μN/T) I
-            ll[0, 0] = dm * reg * reg
+            hess[0, 0] = dm * reg * reg
             for i in range(1, cone.dim):
                 ci = cone.mu[i - 1]
                 ui = ci * w[i]
-                off = -dm * reg * ci * reg / tan * ui
-                if i < 3:
-                    ll[0, i] = off
-                    ll[i, 0] = off
-                else:
-                    la[0, i - 3] = off
+                hess[0, i] = -dm * reg * ci * reg / tan * ui
+                hess[i, 0] = hess[0, i]
                 for j in range(1, cone.dim):
                     cj = cone.mu[j - 1]
                     y = reg * n / (tan * tan * tan) * ui * (cj * w[j])
                     if i == j:
                         y += reg * reg - reg * n / tan
-                    y = y * dm * ci * cj
-                    if i < 3 and j < 3:
-                        ll[i, j] = y
-                    elif i < 3:
-                        la[i, j - 3] = y
-                    elif j >= 3:
-                        aa[i - 3, j - 3] = y
-    return ll, la, aa
+                    hess[i, j] = y * dm * ci * cj
+    return hess[0:3, 0:3], hess[0:3, 3:6], hess[3:6, 3:6]
 
 
 @wp.func

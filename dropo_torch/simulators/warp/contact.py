@@ -15,7 +15,17 @@ import warp as wp
 from dropo_torch.simulators.warp.cone import cone_force, cone_of, cone_piece, elliptic_power, normal_d
 from dropo_torch.simulators.warp.impedance import damping, regularisation
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
-from dropo_torch.simulators.warp.spatial import ang, at, cross_force, join, nothing, theta_vec2, theta_vec5, wrench
+from dropo_torch.simulators.warp.spatial import (
+    add_at,
+    ang,
+    at,
+    cross_force,
+    join,
+    nothing,
+    theta_vec2,
+    theta_vec5,
+    wrench,
+)
 from dropo_torch.simulators.warp.touch import geometry_adjoint
 from dropo_torch.simulators.warp.types import ONE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
@@ -23,9 +33,7 @@ from dropo_torch.simulators.warp.types import ONE, ZERO, Tables, World, f64, mat
 @wp.func
 def in_frame(frame: mat33, x: vec6, p: vec3) -> vec6:
     """The motion ``x`` at ``p`` along the contact's axes, then its rotation about them."""
-    v = frame * at(x, p)
-    w = frame * ang(x)
-    return vec6(v[0], v[1], v[2], w[0], w[1], w[2])
+    return join(frame * at(x, p), frame * ang(x))
 
 
 @wp.func(inline=True)
@@ -58,11 +66,8 @@ def make_contacts(m: Tables, w: World, ncon: int):
         p = w.con_point[w.t, c]
         frame = w.con_frame[w.t, c]
         for side in range(2):
-            sign = -ONE
-            i = m.body_lastdof[b1]
-            if side == 1:
-                sign = ONE
-                i = m.body_lastdof[b2]
+            sign = f64(2 * side - 1)
+            i = m.body_lastdof[wp.where(side == 0, b1, b2)]
             while i >= 0:
                 column_i = in_frame(frame, w.motion[w.t, i], p) * sign
                 w.con_jac[w.t, c * m.nv + i] = w.con_jac[w.t, c * m.nv + i] + column_i
@@ -113,7 +118,6 @@ def contacts_adjoint(m: Tables, w: World, ncon: int):
 @wp.func(inline=True)
 def _elliptic_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
     """Adjoints of J a, J q̇, Jλ and the distance of a contact with an elliptic cone; adds that of θ."""
-    _late = wp.grad(nothing)(ONE)
     k = w.con_pair[w.t, c]
     o_mu = m.o_pair_friction + 5 * k
     o_ref = m.o_pair_solref + 2 * k
@@ -126,12 +130,10 @@ def _elliptic_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6)
     )  # fmt: skip
     w.grad[w.t, m.o_pair_margin + k] += marginbar
     w.grad[w.t, m.o_pair_invweight + k] += wbar
-    for i in range(2):
-        w.grad[w.t, o_ref + i] += refbar[i]
-        w.grad[w.t, o_fref + i] += frefbar[i]
-    for i in range(5):
-        w.grad[w.t, o_mu + i] += mubar[i]
-        w.grad[w.t, o_imp + i] += impbar[i]
+    add_at(w.grad, w.t, o_ref, refbar)
+    add_at(w.grad, w.t, o_fref, frefbar)
+    add_at(w.grad, w.t, o_mu, mubar)
+    add_at(w.grad, w.t, o_imp, impbar)
     return ub, vb, lb, distbar
 
 

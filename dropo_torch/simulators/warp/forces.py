@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import add_vec3, inverse_right_jacobian_t, quat_log, quat_mul, vec3_at, vec4_at
+from dropo_torch.simulators.warp.spatial import add_at, chart_rate, quat_log, quat_mul, vec3_at, vec4_at
 from dropo_torch.simulators.warp.types import BALL, MINVAL, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
 
 
@@ -20,8 +20,7 @@ def spring_deflection(m: Tables, w: World, r: int, k: int) -> vec3:
     """Deflection of spring ``k`` (a joint, or a half of a free joint): x, or a vector of three."""
     iq = m.link_qpos[k]
     o = m.o_spring + iq
-    kind = m.link_kind[k]
-    if kind == BALL:
+    if m.link_kind[k] == BALL:
         q = vec4_at(w.qpos, r, iq)
         ref = vec4(w.th[o], -w.th[o + 1], -w.th[o + 2], -w.th[o + 3])
         return quat_log(quat_mul(ref, q / wp.length(q)))
@@ -45,8 +44,7 @@ def add_springs(m: Tables, w: World, r: int):
                 w.load[w.t, d] += x[0] * (stiff + x[0] * (p0 + x[0] * p1))
             else:
                 n = wp.length(x)
-                f = x * (stiff + n * (p0 + n * p1))
-                add_vec3(w.load, w.t, d, f)
+                add_at(w.load, w.t, d, x * (stiff + n * (p0 + n * p1)))
 
 
 @wp.func(inline=True)
@@ -60,7 +58,6 @@ def springs_adjoint(m: Tables, w: World, r: int):
         p1 = w.th[ip + 1]
         d = m.link_dof[k]
         x = spring_deflection(m, w, r, k)
-        kind = m.link_kind[k]
         if m.link_ndof[k] == 1:
             y = x[0]
             jl = w.lam[w.t, d]
@@ -80,12 +77,11 @@ def springs_adjoint(m: Tables, w: World, r: int):
             g = lam * (stiff + n * (p0 + n * p1))
             if n > MINVAL:
                 g += x * (lx * (p0 + TWO * n * p1) / n)
-            if kind != BALL:
-                add_vec3(w.tangent, w.t, d, g)
-                add_vec3(w.grad, w.t, m.o_spring + m.link_qpos[k], -g)
+            if m.link_kind[k] == BALL:
+                g = chart_rate(-x, g)
             else:
-                g = inverse_right_jacobian_t(x, g)
-                add_vec3(w.tangent, w.t, d, g)
+                add_at(w.grad, w.t, m.o_spring + m.link_qpos[k], -g)
+            add_at(w.tangent, w.t, d, g)
 
 
 @wp.func(inline=True)

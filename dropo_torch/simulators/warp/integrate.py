@@ -12,11 +12,10 @@ from dropo_torch.simulators.warp.forces import actuator_slope, actuator_slope_ad
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
 from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
 from dropo_torch.simulators.warp.spatial import (
-    add_vec3,
+    add_at,
     chart_rate,
     chart_rate_dual,
     nothing,
-    quat_conj,
     quat_integrate,
     quat_mul,
     right_jacobian_t,
@@ -54,8 +53,8 @@ def move_adjoint(m: Tables, w: World, vel: Reals2, rv: int, h: f64, bar: Reals2,
             # q' = q exp(r): δ' = exp(−[r]) δ + J_r(r) δr
             r = vec3_at(vel, rv, d) * h
             g = vec3_at(bar, w.t, d)
-            add_vec3(w.pos_bar0, w.t, d, turn(r, g))
-            add_vec3(vel_bar, w.t, o + d, right_jacobian_t(r, g) * h)
+            add_at(w.pos_bar0, w.t, d, turn(r, g))
+            add_at(vel_bar, w.t, o + d, right_jacobian_t(r, g) * h)
         else:
             for i in range(d, d + m.link_ndof[k]):
                 w.pos_bar0[w.t, i] += bar[w.t, i]
@@ -79,15 +78,14 @@ def chart_rates(m: Tables, w: World, r: int, c: f64):
 @wp.func(inline=True)
 def chart_rates_adjoint(m: Tables, w: World, r: int, c: f64, o: int):
     """Adjoint of :func:`chart_rates`: ``w.stage_rate_bar[o:]`` to ``w.vel_bar`` and the stage before."""
-    _late = wp.grad(nothing)(ONE)
     for k in range(m.nlink):
         d = m.link_dof[k]
         if m.link_kind[k] == BALL:
             turnedbar, velbar, _bar = wp.grad(chart_rate_dual)(
                 vec3_at(w.rate, r - 1, d) * c, vec3_at(w.qvel, r, d), vec3_at(w.stage_rate_bar, w.t, o + d)
             )
-            add_vec3(w.vel_bar, w.t, d, velbar)
-            add_vec3(w.stage_rate_bar, w.t, o - m.nv + d, turnedbar * c)
+            add_at(w.vel_bar, w.t, d, velbar)
+            add_at(w.stage_rate_bar, w.t, o - m.nv + d, turnedbar * c)
         else:
             for i in range(d, d + m.link_ndof[k]):
                 w.vel_bar[w.t, i] += w.stage_rate_bar[w.t, o + i]
@@ -294,9 +292,9 @@ def to_tangent(m: Tables, w: World, r: int, bar: Reals2, rb: int):
         iq = m.link_qpos[k]
         d = m.link_dof[k]
         if m.link_kind[k] == BALL:
-            g = quat_mul(quat_conj(vec4_at(w.qpos, r, iq)), vec4_at(bar, rb, iq))
-            for i in range(3):
-                w.pos_bar[w.t, d + i] += HALF * g[i + 1]
+            q = vec4_at(w.qpos, r, iq)
+            g = quat_mul(vec4(q[0], -q[1], -q[2], -q[3]), vec4_at(bar, rb, iq))
+            add_at(w.pos_bar, w.t, d, HALF * g[1:4])
         else:
             for i in range(m.link_ndof[k]):
                 w.pos_bar[w.t, d + i] += bar[rb, iq + i]

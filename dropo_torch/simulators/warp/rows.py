@@ -14,7 +14,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.impedance import regularisation
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
-from dropo_torch.simulators.warp.spatial import add_vec3, inverse_right_jacobian_t, nothing, quat_log, vec3_at, vec4_at
+from dropo_torch.simulators.warp.spatial import add_at, chart_rate, nothing, quat_log, vec3_at, vec4_at
 from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, TWO, ZERO, Reals2, Tables, World, f64, vec3, vec3i
 
 FOUR = wp.constant(wp.float64(4.0))
@@ -156,12 +156,9 @@ def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
                     x = wp.max(w.th[o], w.th[o + 1]) - angle - w.th[m.o_jnt_margin + j]
                     coef = -rot / wp.max(angle, MINVAL)
                     dof2 = dof + 1
-            elif side == 0:
-                x = w.qpos[r, iq] - w.th[o] - w.th[m.o_jnt_margin + j]
-                coef = vec3(ONE, ZERO, ZERO)
             else:
-                x = w.th[o + 1] - w.qpos[r, iq] - w.th[m.o_jnt_margin + j]
-                coef = vec3(-ONE, ZERO, ZERO)
+                coef = vec3(f64(1 - 2 * side), ZERO, ZERO)
+                x = coef[0] * (w.qpos[r, iq] - w.th[o + side]) - w.th[m.o_jnt_margin + j]
         if kind == ROW_EQUALITY or (kind == ROW_FRICTION and loss > ZERO) or (kind == ROW_LIMIT and x < ZERO):
             dof3 = int(-1)
             if dof2 >= 0 and kind == ROW_LIMIT:
@@ -208,10 +205,8 @@ def rows_adjoint(m: Tables, w: World, r: int, nrow: int):
                     if w.row_dof[w.t, n][1] >= 0:
                         w.grad[w.t, m.o_dof_invweight + w.row_dof[w.t, n][1]] += weightbar
                     _equality_adjoint(m, w, r, n, xbar, ubar, soft.b * ubar, lbar)
-            elif state == 2:
-                w.grad[w.t, m.o_frictionloss + dof] -= jl
             else:
-                w.grad[w.t, m.o_frictionloss + dof] += jl
+                w.grad[w.t, m.o_frictionloss + dof] += wp.where(state == 2, -jl, jl)
 
 
 @wp.func(inline=True)
@@ -228,21 +223,14 @@ def _limit_adjoint(m: Tables, w: World, r: int, n: int, xbar: f64, ubar: f64, vb
         q = vec4_at(w.qpos, r, iq)
         rot = quat_log(q / wp.length(q))
         angle = wp.length(rot)
-        if w.th[o] >= w.th[o + 1]:
-            w.grad[w.t, o] += xbar
-        else:
-            w.grad[w.t, o + 1] += xbar
+        w.grad[w.t, wp.where(w.th[o] >= w.th[o + 1], o, o + 1)] += xbar
         cbar = vec3_at(w.acc, r, d) * ubar + vec3_at(w.qvel, r, d) * vbar + vec3_at(w.lam, w.t, d) * lbar
         # c = −φ/|φ|, x = ... − |φ|
         g = c * xbar - (cbar - c * wp.dot(c, cbar)) / angle
-        g = inverse_right_jacobian_t(rot, g)
-        add_vec3(w.tangent, w.t, d, g)
+        add_at(w.tangent, w.t, d, chart_rate(-rot, g))
     else:
         w.tangent[w.t, d] += c[0] * xbar
-        if c[0] > ZERO:
-            w.grad[w.t, o] -= xbar
-        else:
-            w.grad[w.t, o + 1] += xbar
+        w.grad[w.t, wp.where(c[0] > ZERO, o, o + 1)] -= c[0] * xbar
 
 
 @wp.func(inline=True)

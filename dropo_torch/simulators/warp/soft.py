@@ -9,7 +9,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.cone import contact_scalars
 from dropo_torch.simulators.warp.impedance import damping, impedance_slope, stiffness
-from dropo_torch.simulators.warp.spatial import nothing, theta_vec2, theta_vec5
+from dropo_torch.simulators.warp.spatial import add_at, theta_vec2, theta_vec5
 from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, f64
 
 
@@ -51,7 +51,6 @@ def soft_adjoint(m: Tables, w: World, soft: Soft, dim: int, mu: f64, d: f64, dba
 
     ⟨D, D̄⟩ + ⟨B, B̄⟩ + ⟨K d(x) x, s̄⟩ is the number.
     """
-    _late = wp.grad(nothing)(ONE)
     # D is inverse to R = (1 − d)/d · A, of a pyramid to 2 μ² (1 + μ²) R
     xbar = sbar * soft.k * (soft.imp + soft.slope * soft.x)
     weightbar = ZERO
@@ -68,8 +67,6 @@ def soft_adjoint(m: Tables, w: World, soft: Soft, dim: int, mu: f64, d: f64, dba
             dim, soft.x, ZERO, mu, theta_vec2(w.th, soft.o_ref), theta_vec5(w.th, soft.o_imp), soft.weight, m.impratio,
             m.h, m.refsafe, dbar, bbar, sbar,
         )  # fmt: skip
-        for i in range(2):
-            w.grad[w.t, soft.o_ref + i] += refbar[i]
-        for i in range(5):
-            w.grad[w.t, soft.o_imp + i] += impbar[i]
+        add_at(w.grad, w.t, soft.o_ref, refbar)
+        add_at(w.grad, w.t, soft.o_imp, impbar)
     return xbar, weightbar, mubar

@@ -94,34 +94,27 @@ def _add_contact_hessian(m: Tables, w: World, dense: int, c: int, ll: mat33, la:
     """H += Jᵀ C J of one contact."""
     base = c * m.nv
     k = w.con_pair[w.t, c]
-    one_sided = int(0)
+    which = int(1)
     i = m.nv - 1
     if m.pair_dense[k] == 0 and dense == 0:
-        one_sided = 1
-        i = m.body_lastdof[m.pair_body2[k]]
-        if i < m.body_lastdof[m.pair_body1[k]]:
-            i = m.body_lastdof[m.pair_body1[k]]
-    which = 1 - one_sided
+        which = 0
+        i = wp.max(m.body_lastdof[m.pair_body1[k]], m.body_lastdof[m.pair_body2[k]])
     while i >= 0:
         ri = packed(i, 0)
         ji = w.con_jac[w.t, base + i]
-        jl = vec3(ji[0], ji[1], ji[2])
-        cl = ll * jl
+        cl = ll * wp.spatial_top(ji)
+        ca = vec3()
         if m.pair_dim[k] > 3:
-            ja = vec3(ji[3], ji[4], ji[5])
-            cl += la * ja
-            ca = wp.transpose(la) * jl + aa * ja
-            j = i
-            while j >= 0:
-                x = w.con_jac[w.t, base + j]
-                w.hess[r, ri + j] += wp.dot(cl, vec3(x[0], x[1], x[2])) + wp.dot(ca, vec3(x[3], x[4], x[5]))
-                j = m.dof_parent[which, j]
-        else:
-            j = i
-            while j >= 0:
-                x = w.con_jac[w.t, base + j]
-                w.hess[r, ri + j] += cl[0] * x[0] + cl[1] * x[1] + cl[2] * x[2]
-                j = m.dof_parent[which, j]
+            cl += la * wp.spatial_bottom(ji)
+            ca = wp.transpose(la) * wp.spatial_top(ji) + aa * wp.spatial_bottom(ji)
+        j = i
+        while j >= 0:
+            x = w.con_jac[w.t, base + j]
+            y = wp.dot(cl, wp.spatial_top(x))
+            if m.pair_dim[k] > 3:
+                y += wp.dot(ca, wp.spatial_bottom(x))
+            w.hess[r, ri + j] += y
+            j = m.dof_parent[which, j]
         i = m.dof_parent[which, i]
 
 
@@ -185,8 +178,8 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
         if cone_piece(cone, jar6) != 0:
             d1 -= wp.dot(cone_force(cone, jar6), dw)
             ll, la, aa = cone_hessian(cone, jar6)
-            yl = vec3(dw[0], dw[1], dw[2])
-            ya = vec3(dw[3], dw[4], dw[5])
+            yl = wp.spatial_top(dw)
+            ya = wp.spatial_bottom(dw)
             d2 += wp.dot(yl, ll * yl) + f64(2.0) * wp.dot(yl, la * ya) + wp.dot(ya, aa * ya)
     return d1, d2
 

@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import warp as wp
 
 from dropo_torch.simulators.warp.types import (
@@ -24,6 +26,10 @@ from dropo_torch.simulators.warp.types import (
     vec6,
     vec10,
 )
+
+#: Of a spatial vector the angular and the linear part; a × b of two motions; a ×* f of a motion and a force, its dual:
+#: ⟨f, a × b⟩ = −⟨a ×* f, b⟩.
+ang, lin, cross_motion, cross_force = wp.spatial_top, wp.spatial_bottom, wp.spatial_cross, wp.spatial_cross_dual
 
 
 @wp.func
@@ -57,9 +63,9 @@ def vec4_at(x: Reals2, r: int, i: int) -> vec4:
 
 
 @wp.func(inline=True)
-def add_vec3(x: Reals2, r: int, i: int, y: vec3):
-    """Add to three consecutive numbers of a row."""
-    for k in range(3):
+def add_at(x: Reals2, r: int, i: int, y: Any):
+    """Add a vector to consecutive numbers of a row."""
+    for k in range(len(y)):
         x[r, i + k] += y[k]
 
 
@@ -67,18 +73,6 @@ def add_vec3(x: Reals2, r: int, i: int, y: vec3):
 def join(w: vec3, v: vec3) -> vec6:
     """The spatial vector of an angular and a linear part."""
     return vec6(w[0], w[1], w[2], v[0], v[1], v[2])
-
-
-@wp.func
-def ang(x: vec6) -> vec3:
-    """The angular part."""
-    return vec3(x[0], x[1], x[2])
-
-
-@wp.func
-def lin(x: vec6) -> vec3:
-    """The linear part."""
-    return vec3(x[3], x[4], x[5])
 
 
 @wp.func
@@ -94,27 +88,11 @@ def wrench(f: vec3, p: vec3) -> vec6:
 
 
 @wp.func
-def cross_motion(a: vec6, b: vec6) -> vec6:
-    """a × b of two motions."""
-    wa = ang(a)
-    wb = ang(b)
-    return join(wp.cross(wa, wb), wp.cross(wa, lin(b)) + wp.cross(lin(a), wb))
-
-
-@wp.func
-def cross_force(a: vec6, f: vec6) -> vec6:
-    """a ×* f of a motion and a force: the dual of ×, so that ⟨f, a × b⟩ = −⟨a ×* f, b⟩."""
-    wa = ang(a)
-    fl = lin(f)
-    return join(wp.cross(wa, ang(f)) + wp.cross(lin(a), fl), wp.cross(wa, fl))
-
-
-@wp.func
 def inertia_about_origin(mass: f64, c: vec3, rot: mat33, moments: vec3) -> vec10:
     """Spatial inertia of a body with principal ``moments`` along the columns of ``rot``, centred at ``c``."""
-    r0 = vec3(rot[0, 0], rot[1, 0], rot[2, 0])
-    r1 = vec3(rot[0, 1], rot[1, 1], rot[2, 1])
-    r2 = vec3(rot[0, 2], rot[1, 2], rot[2, 2])
+    r0 = rot[:, 0]
+    r1 = rot[:, 1]
+    r2 = rot[:, 2]
     a = r0 * moments[0]
     b = r1 * moments[1]
     d = r2 * moments[2]
@@ -195,12 +173,6 @@ def quat_mul(a: vec4, b: vec4) -> vec4:
 
 
 @wp.func
-def quat_conj(q: vec4) -> vec4:
-    """q*: the inverse of a unit quaternion."""
-    return vec4(q[0], -q[1], -q[2], -q[3])
-
-
-@wp.func
 def quat_integrate(q: vec4, r: vec3) -> vec4:
     """q turned by the local rotation vector ``r``, normalised."""
     angle = wp.length(r)
@@ -208,8 +180,7 @@ def quat_integrate(q: vec4, r: vec3) -> vec4:
     if angle > f64(1.0e-8):
         s = wp.sin(HALF * angle) / angle
     out = quat_mul(q, vec4(wp.cos(HALF * angle), s * r[0], s * r[1], s * r[2]))
-    n = wp.length(out)
-    return out / n
+    return out / wp.length(out)
 
 
 @wp.func
@@ -244,24 +215,14 @@ def turn(r: vec3, x: vec3) -> vec3:
 def right_jacobian_t(r: vec3, x: vec3) -> vec3:
     """J_r(r)ᵀ x, with exp([r + d]) ≈ exp([r]) exp([J_r(r) d]); J_rᵀ = I + (1−cos a)/a² [r] + (a−sin a)/a³ [r]²."""
     a2 = wp.dot(r, r)
-    c = HALF
-    e = ONE / f64(6.0)
+    c = HALF - a2 / f64(24.0)
+    e = ONE / f64(6.0) - a2 / f64(120.0)
     if a2 > f64(1.0e-6):
         a = wp.sqrt(a2)
         c = TWO * wp.sin(HALF * a) * wp.sin(HALF * a) / a2
         e = (a - wp.sin(a)) / (a2 * a)
-    else:
-        c = HALF - a2 / f64(24.0)
-        e = ONE / f64(6.0) - a2 / f64(120.0)
     u = wp.cross(r, x)
     return x + c * u + e * wp.cross(r, u)
-
-
-@wp.func
-def inverse_right_jacobian_t(r: vec3, x: vec3) -> vec3:
-    """J_r(r)⁻ᵀ x = x − ½ r × x + k r × (r × x): what a change of log(q) sees of a local turn of q."""
-    u = wp.cross(r, x)
-    return x - HALF * u + _curl(wp.dot(r, r)) * wp.cross(r, u)
 
 
 @wp.func
@@ -276,7 +237,10 @@ def _curl(a2: f64) -> f64:
 
 @wp.func
 def chart_rate(r: vec3, w: vec3) -> vec3:
-    """J_r(r)⁻¹ w: how fast the rotation vector r of q₀⁻¹q changes while q turns at the local rate w."""
+    """J_r(r)⁻¹ w: how fast the rotation vector r of q₀⁻¹q changes while q turns at the local rate w.
+
+    J_r(r)⁻ᵀ = J_r(−r)⁻¹: what a change of log(q) sees of a local turn of q.
+    """
     u = wp.cross(r, w)
     return w + HALF * u + _curl(wp.dot(r, r)) * wp.cross(r, u)
 

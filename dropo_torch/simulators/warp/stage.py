@@ -20,7 +20,7 @@ from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sw
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.solver import factor, newton, solve
 from dropo_torch.simulators.warp.spatial import (
-    add_vec3,
+    add_at,
     ang,
     at,
     cross_force,
@@ -92,7 +92,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         contacts_adjoint(m, w, ncon)
     carry_in(m, w, posed)
     if softening == 0:
-        add_vec3(w.grad, w.t, m.o_gravity, -lin(w.f_accel[w.t, 0]))
+        add_at(w.grad, w.t, m.o_gravity, -lin(w.f_accel[w.t, 0]))
 
 
 @wp.func(inline=True)
@@ -143,12 +143,11 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
                     a += g * gc
                     w.grad[w.t, m.o_gravcomp + b] += wp.dot(fa, g)
                     w.f_pose[w.t, b] = cross_force(g, fa) * -gc
-                    add_vec3(w.grad, w.t, m.o_gravity, lin(fa) * gc)
+                    add_at(w.grad, w.t, m.o_gravity, lin(fa) * gc)
                 iv = inertia_mul(i, v)
                 w.f_velocity[w.t, b] = inertia_mul(i, lv) - cross_force(dual, iv)
-                w.f_dual[w.t, b] = inertia_mul(i, a) + cross_force(v, iv)
-            else:
-                w.f_dual[w.t, b] = inertia_mul(i, a)
+                w.f_dual[w.t, b] = cross_force(v, iv)
+            w.f_dual[w.t, b] = w.f_dual[w.t, b] + inertia_mul(i, a)
             w.f_accel[w.t, b] = fa
             if m.want_inertial != 0:
                 _inertia_adjoint(m, w, b, dual, a, lv, v)
@@ -168,15 +167,11 @@ def _inertia_adjoint(m: Tables, w: World, b: int, x: vec6, y: vec6, z: vec6, v: 
     w.grad[w.t, m.o_mass + b] += wp.dot(xc, yc) + wp.dot(zc, vc)
     if m.want_ipos != 0:
         cbar = wp.cross(yc, ang(x)) + wp.cross(xc, ang(y)) + wp.cross(vc, ang(z)) + wp.cross(zc, ang(v))
-        pbar = wp.transpose(rot) * (cbar * w.th[m.o_mass + b])
-        add_vec3(w.grad, w.t, m.o_ipos + 3 * b, pbar)
+        add_at(w.grad, w.t, m.o_ipos + 3 * b, wp.transpose(rot) * (cbar * w.th[m.o_mass + b]))
     if m.want_inertia != 0:
         frame = wp.transpose(rot * m.body_imat[b])
-        xw = frame * ang(x)
-        yw = frame * ang(y)
-        zw = frame * ang(z)
-        vw = frame * ang(v)
-        add_vec3(w.grad, w.t, m.o_inertia + 3 * b, wp.cw_mul(xw, yw) + wp.cw_mul(zw, vw))
+        moments = wp.cw_mul(frame * ang(x), frame * ang(y)) + wp.cw_mul(frame * ang(z), frame * ang(v))
+        add_at(w.grad, w.t, m.o_inertia + 3 * b, moments)
 
 
 @wp.func(inline=True)
@@ -200,10 +195,9 @@ def _fluid_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
     w.grad[w.t, m.o_mass + b] += massbar
     w.grad[w.t, m.o_density] += denbar
     w.grad[w.t, m.o_viscosity] += visbar
-    for k in range(3):
-        w.grad[w.t, m.o_wind + k] -= fv[k]
-        w.grad[w.t, m.o_inertia + 3 * b + k] += xbar[k]
-        w.grad[w.t, m.o_ipos + 3 * b + k] += cbar[k]
+    add_at(w.grad, w.t, m.o_wind, -fv)
+    add_at(w.grad, w.t, m.o_inertia + 3 * b, xbar)
+    add_at(w.grad, w.t, m.o_ipos + 3 * b, cbar)
 
 
 @wp.func(inline=True)

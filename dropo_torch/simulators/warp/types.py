@@ -24,6 +24,7 @@ vec3 = wp.vec3d
 vec4 = wp.vec4d
 vec3i = wp.vec3i
 mat33 = wp.mat33d
+mat66 = wp.types.matrix((6, 6), wp.float64)
 vec5 = wp.types.vector(5, wp.float64)
 #: Spatial vectors (motions and forces): angular part first, about the world's origin of the sweep.
 vec6 = wp.types.vector(6, wp.float64)
