@@ -197,11 +197,11 @@ def test_derived_weights_are_those_of_set_const(xml):
     theta = fields(torch.tensor(values))
     for row, vector in zip(theta.numpy(), values, strict=True):
         applied = space.apply(vector)
-        np.testing.assert_allclose(row[fields.layout.columns("dof_invweight")], applied.dof_invweight0, rtol=1e-11)
+        np.testing.assert_allclose(row[fields.columns("dof_invweight")], applied.dof_invweight0, rtol=1e-11)
         weights = [
             applied.body_invweight0[model.geom_bodyid[[g1, g2]], 0].sum() for g1, g2, _p in candidate_pairs(model)
         ]
-        np.testing.assert_allclose(row[fields.layout.columns("pair_invweight")], weights, rtol=1e-11)
+        np.testing.assert_allclose(row[fields.columns("pair_invweight")], weights, rtol=1e-11)
 
 
 REFUSED = """<mujoco><option solver="CG" integrator="implicit" noslip_iterations="3">

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from typing import Any
 
 import mujoco
@@ -14,8 +13,7 @@ from dropo_torch.effects.simulator import check_backend
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.inside import inside_model, no_effects
 from dropo_torch.rl.stepper import BatchStepper
-from dropo_torch.simulators.warp.engine import Batch
-from dropo_torch.simulators.warp.simulator import make_engine
+from dropo_torch.simulators.warp.engine import Batch, Engine
 
 
 class WarpStepper(BatchStepper):
@@ -48,20 +46,19 @@ class WarpStepper(BatchStepper):
         model, self._finer, _ = inside_model(space, effects)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
-        self._engine, self._fields = make_engine(
+        self._engine = Engine(
             model, space.on(model), skip=frame_skip * self._finer,
-            chunk_size=self.CHUNK if device == "cpu" else num_envs, num_threads=num_threads or os.cpu_count() or 1,
-            device=device,
+            chunk_size=self.CHUNK if device == "cpu" else num_envs, num_threads=num_threads, device=device,
         )  # fmt: skip
         self._device = wp.device_to_torch(device)
-        base = torch.from_numpy(self._fields.constant())
+        base = torch.from_numpy(self._engine.fields.constant())
         self._theta = base.repeat(num_envs, 1).to(self._device)
         self._states = torch.zeros(num_envs, self.num_states, dtype=torch.float64, device=self._device)
 
     def reset(self, rows: torch.Tensor, states: torch.Tensor, values: torch.Tensor) -> None:
         """Start new episodes; see :meth:`BatchStepper.reset`."""
         at = rows.to(self._device)
-        self._theta[at] = self._fields(values.cpu()).to(self._device)
+        self._theta[at] = self._engine.fields(values.cpu()).to(self._device)
         self._states[at] = states.to(self._device)
 
     def step(self, controls: torch.Tensor) -> torch.Tensor:

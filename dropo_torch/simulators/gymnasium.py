@@ -163,20 +163,16 @@ class GymnasiumSimulator(Simulator):
     name = "gymnasium"
 
     def __init__(
-        self,
-        adapter: Adapter | Callable[[ParameterSpace], Adapter],
-        *,
-        parameters: ParameterSpace,
-        frame_skip: int = 1,
+        self, adapter: Adapter | Callable[[ParameterSpace], Adapter], *, parameters: ParameterSpace, frame_skip: int = 1
     ) -> None:
         made: Adapter = adapter(parameters) if callable(adapter) else adapter
         own = isinstance(made, CheckedAdapter | MujocoEnvAdapter)
         self._adapter: Adapter = made if own else CheckedAdapter(made, type(made).__name__)
         self.parameters = parameters
         self.frame_skip = frame_skip
-        self.num_states, self.num_controls = int(self._adapter.num_states), int(self._adapter.num_controls)
-        step = getattr(self._adapter, "timestep", None)
-        self.timestep = None if step is None else float(step) * frame_skip
+        self.num_states, self.num_controls = self._adapter.num_states, self._adapter.num_controls
+        step = self._adapter.timestep
+        self.timestep = None if step is None else step * frame_skip
 
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""

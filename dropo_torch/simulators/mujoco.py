@@ -142,8 +142,7 @@ class MujocoSimulator(Simulator):
             except mujoco.batch.SimulationError as error:
                 failed[error.ids] = True
             out[:, step, : model.nq], out[:, step, model.nq :] = qpos, qvel
-        with np.errstate(invalid="ignore"):
-            failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
+        failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
         out[failed] = np.nan
         return out.reshape(len(start), num_k, *out.shape[1:])
 
@@ -156,10 +155,9 @@ def _own_values(batch: mujoco.batch.Batch) -> dict[str, np.ndarray]:
 
 def default_row(model: mujoco.MjModel) -> np.ndarray:
     """The integration state of a simulation that has just been reset, ``(nstate,)``."""
-    data = mujoco.MjData(model)
     spec = int(mujoco.mjtState.mjSTATE_INTEGRATION)
     row = np.empty(mujoco.mj_stateSize(model, spec))
-    mujoco.mj_getState(model, data, row, spec)
+    mujoco.mj_getState(model, mujoco.MjData(model), row, spec)
     return row
 
 
@@ -178,13 +176,12 @@ def filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
     Any other hidden state (integrators, muscles, delays) is not in a log of positions and velocities.
     """
     pairs, hidden = [], []
-    names = [model.actuator(i).name or f"actuator{i}" for i in range(model.nactuator)]
     for i in range(model.nactuator):
         kind = int(model.actuator_dyntype[i])  # a numpy integer equals no enum on the left
         if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
             pairs.append((int(model.actuator_actadr[i]), int(model.actuator_ctrladr[i])))
         elif model.actuator_actnum[i] > 0 or model.actuator_delay[i] > 0:
-            hidden.append(names[i])
+            hidden.append(model.actuator(i).name or f"actuator{i}")
     if hidden:
         raise InputError(
             f"model: actuators {', '.join(hidden)} keep a hidden state (integrator, muscle or delay) which a log of "

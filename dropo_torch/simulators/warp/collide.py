@@ -64,9 +64,7 @@ def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3
     """Point ``which`` of a cylinder that a plane with normal ``n`` touches: near rim, far rim, two on the near disk."""
     axis = rot[:, 2]
     prj = wp.dot(n, axis)
-    sign = ONE
-    if prj > ZERO:
-        sign = -ONE
+    sign = wp.where(prj > ZERO, -ONE, ONE)
     a = axis * sign
     v = a * (prj * sign) - n
     length = wp.length(v)
@@ -78,9 +76,7 @@ def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3
         x = c + radial - a * size[1]
     elif which >= 2:
         side = wp.normalize(wp.cross(radial, a)) * (size[0] * wp.sqrt(f64(3.0)) * HALF)
-        if which == 3:
-            side = -side
-        x = c + side + a * size[1] - radial * HALF
+        x = c + wp.where(which == 3, -side, side) + a * size[1] - radial * HALF
     return x
 
 
@@ -148,9 +144,7 @@ def overlap_end(c1: vec3, a1: vec3, c2: vec3, a2: vec3, upper: int) -> int:
     """
     sign = f64(2 * upper - 1)
     mb = -wp.dot(a1, a2)
-    far = sign
-    if mb > ZERO:
-        far = -sign
+    far = wp.where(mb > ZERO, -sign, sign)
     x1 = (-wp.dot(a1, c1 - c2) - far * mb) / wp.dot(a1, a1)
     which = int(wp.where(far > ZERO, 3, 4))
     if x1 > ONE:
@@ -240,13 +234,9 @@ def capsule_place(pos: vec3, half: vec3, size: vec3, code: int) -> f64:
     edge = (code // 32) % 4
     step = (code // 128) % 4
     axis = (code // 512) % 4
-    sign = ONE
-    if (code // 2048) % 2 != 0:
-        sign = -ONE
-    t = -ONE
-    if base == 1:
-        t = ONE
-    elif base >= AT_CORNER:
+    sign = wp.where((code // 2048) % 2 != 0, -ONE, ONE)
+    t = wp.where(base == 1, ONE, -ONE)
+    if base >= AT_CORNER:
         e = corner((code // 4) % 8, size) - pos
         mc = wp.dot(half, half)
         if base == AT_CORNER:
@@ -342,12 +332,8 @@ def capsule_box_first(pos: vec3, half: vec3, size: vec3, limit: f64):
                 if q < best - MINVAL:
                     best = q
                     edge = j
-                    near = i
-                    at_corner = 1
-                    if s1 == 2:
-                        near = i + (1 << j)
-                    elif s1 == 1:
-                        at_corner = 0
+                    near = i + wp.where(s1 == 2, 1 << j, 0)
+                    at_corner = wp.where(s1 == 1, 0, 1)
                     t = x2
                     x = x1
                     code = s2 // 2
@@ -387,19 +373,17 @@ def _second_by_corner(half: vec3, size: vec3, near: int, t: f64, first: int) -> 
             way = f64(-1.0)
             rel = 7 - rel
         ax = rel // 2
-        if half[ax] * half[ax] > HALF * wp.dot(half, half):
-            code = _end(way)
-            if (size[ax] + size[ax]) / wp.abs(half[ax]) < ONE - way * t:
-                code = first + _place_code(END, 0, 0, ACROSS, ax, 1 - _end(way), 0)
-        else:
-            code = _end(-way)
-            best = ONE + way * t
-            for turn in range(1, 3):
-                i = (ax + turn) % 3
-                reach = (size[i] + size[i]) / wp.abs(half[i])
-                if reach < best:
-                    best = reach
-                    code = first + _place_code(END, 0, 0, ACROSS, i, _end(way), 0)
+        along = half[ax] * half[ax] > HALF * wp.dot(half, half)
+        if not along:
+            way = -way
+        code = _end(way)
+        best = ONE - way * t
+        for turn in range(3):
+            i = (ax + turn) % 3
+            reach = (size[i] + size[i]) / wp.abs(half[i])
+            if (turn == 0) == along and reach < best:
+                best = reach
+                code = first + _place_code(END, 0, 0, ACROSS, i, 1 - _end(way), 0)
     return code
 
 
@@ -425,12 +409,8 @@ def _second_by_edge(half: vec3, size: vec3, near: int, edge: int, t: f64, x: f64
         if reach < best:
             best = reach
             code = first + _place_code(END, 0, 0, ACROSS, ax2, 1 - ahead, 0)
-        less = int(0)
-        if ((axisdir >> edge) & 1) == ahead:
-            less = 1
-        rest = ONE + x
-        if less != 0:
-            rest = ONE - x
+        less = wp.where(((axisdir >> edge) & 1) == ahead, 1, 0)
+        rest = wp.where(less != 0, ONE - x, ONE + x)
         if size[edge] * rest / wp.abs(half[edge]) < best:
             # the first code has the edge unless it is one of the ends
             code = first % 32 + _place_code(END, 0, edge, ALONG, edge, 1 - ahead, less)

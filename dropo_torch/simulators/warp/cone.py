@@ -43,13 +43,7 @@ class Cone:
 @wp.func(inline=True)
 def cone_of(m: Tables, w: World, k: int, d: f64) -> Cone:
     """The cone of pair ``k``."""
-    cone = Cone()
-    cone.dim = m.pair_dim[k]
-    cone.elliptic = m.elliptic
-    cone.impratio = m.impratio
-    cone.d = d
-    cone.mu = theta_vec5(w.th, m.o_pair_friction + 5 * k)
-    return cone
+    return Cone(m.pair_dim[k], m.elliptic, m.impratio, d, theta_vec5(w.th, m.o_pair_friction + 5 * k))
 
 
 @wp.func
@@ -176,14 +170,9 @@ def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f
     reg = mu[0] / wp.sqrt(impratio)
     y1 = mu[0] * w[1]
     y2 = mu[1] * w[2]
-    y3 = ZERO
-    y4 = ZERO
-    y5 = ZERO
-    if dim > 3:
-        y3 = mu[2] * w[3]
-    if dim > 4:
-        y4 = mu[3] * w[4]
-        y5 = mu[4] * w[5]
+    y3 = wp.where(dim > 3, mu[2] * w[3], ZERO)
+    y4 = wp.where(dim > 4, mu[3] * w[4], ZERO)
+    y5 = wp.where(dim > 4, mu[4] * w[5], ZERO)
     tt = y1 * y1 + y2 * y2 + y3 * y3 + y4 * y4 + y5 * y5
     n = w[0] * reg
     out = ZERO

@@ -15,17 +15,7 @@ import warp as wp
 from dropo_torch.simulators.warp.cone import cone_force, cone_of, cone_piece, elliptic_power, normal_d
 from dropo_torch.simulators.warp.impedance import damping, regularisation
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
-from dropo_torch.simulators.warp.spatial import (
-    add_at,
-    ang,
-    at,
-    cross_force,
-    join,
-    nothing,
-    theta_vec2,
-    theta_vec5,
-    wrench,
-)
+from dropo_torch.simulators.warp.spatial import add_at, ang, at, cross_force, join, late, pull, theta_vec2, theta_vec5
 from dropo_torch.simulators.warp.touch import geometry_adjoint
 from dropo_torch.simulators.warp.types import ONE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
@@ -90,7 +80,7 @@ def make_contacts(m: Tables, w: World, ncon: int):
 @wp.func(inline=True)
 def contacts_adjoint(m: Tables, w: World, ncon: int):
     """Add the gradient of Σ −f Jλ over the contacts to the bodies' F and Y and to θ."""
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     for c in range(ncon):
         k = w.con_pair[w.t, c]
         frame = w.con_frame[w.t, c]
@@ -143,7 +133,7 @@ def _pyramid_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
 
     With the force f and the Hessian C of the cost at jar6 = J a − aref, −f Jλ has the gradient C Jλ in jar6.
     """
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     k = w.con_pair[w.t, c]
     o_mu = m.o_pair_friction + 5 * k
     soft = contact_softness(m, w, c)
@@ -182,7 +172,7 @@ def _pyramid_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
 @wp.func(inline=True)
 def _hang(m: Tables, w: World, c: int, u: vec6, v: vec6, dual: vec6, ub: vec6, vb: vec6, lb: vec6, distbar: f64):
     """Hang the adjoints of J a, J q̇, Jλ and the distance on the two bodies: F_U, F_V, F_Λ and Y."""
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     k = w.con_pair[w.t, c]
     p = w.con_point[w.t, c]
     back = wp.transpose(w.con_frame[w.t, c])
@@ -220,4 +210,4 @@ def _hang_on(w: World, b: int, y: vec6, fu: vec6, fv: vec6, fl: vec6):
 @wp.func
 def _spread(back: mat33, x: vec6, p: vec3) -> vec6:
     """Adjoint of :func:`in_frame` in its motion."""
-    return wrench(back * vec3(x[0], x[1], x[2]), p) + join(back * vec3(x[3], x[4], x[5]), vec3())
+    return pull(back * wp.spatial_top(x), p, back * wp.spatial_bottom(x))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -10,12 +11,20 @@ from functools import cached_property
 from itertools import pairwise
 from typing import Any
 
+import mujoco
 import numpy as np
 import torch
 import warp as wp
 
+from dropo_torch.errors import InputError
+from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import kernel_backward, kernel_forward
-from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJECTORY, Chunk, Tables, World
+from dropo_torch.simulators.warp.fields import Fields
+from dropo_torch.simulators.warp.pairs import candidate_pairs
+from dropo_torch.simulators.warp.start import LOADING, start_warp
+from dropo_torch.simulators.warp.support import check_support
+from dropo_torch.simulators.warp.tables import build_tables
+from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJECTORY, Chunk, World, fill
 
 #: Stages kept from the forward for the backward, at most; beyond it the backward simulates again, chunk by chunk.
 KEEP_BYTES = 1 << 30
@@ -79,28 +88,41 @@ class Engine:
     """Simulates and differentiates worlds of one model on one device.
 
     Args:
-        tables: the model.
-        size: length of θ.
-        wanted: columns of θ whose gradient is wanted.
+        model: the model, with everything ``mj_setConst`` derives up to date.
+        space: what varies.
         skip: physics steps of a logged step.
         chunk_size: worlds in memory at a time.
-        num_threads: threads of a CPU.
+        num_threads: threads of a CPU, 0 for all processors.
         device: Warp's name of the device.
+
+    Attributes:
+        fields: what maps parameter vectors to θ.
+
+    Raises:
+        InputError: a model or a parameter outside the subset, or an unknown device.
     """
 
     def __init__(
-        self, tables: Tables, size: int, wanted: np.ndarray, *, skip: int, chunk_size: int, num_threads: int,
-        device: str,
-    ) -> None:  # fmt: skip
-        m = self.tables = tables
+        self, model: mujoco.MjModel, space: ParameterSpace, *, skip: int, chunk_size: int, num_threads: int, device: str
+    ) -> None:
+        pairs = candidate_pairs(model)
+        check_support(model, space, pairs)
+        self.fields = Fields(model, space, pairs)
         self.skip, self.chunk_size, self.device = skip, chunk_size, device
-        self.is_cpu = wp.get_device(device).is_cpu
-        self.num_threads = num_threads if self.is_cpu else 1
-        self.columns = wp.array(wanted, dtype=wp.int32, device=device)
-        self.wanted = torch.from_numpy(wanted.astype(np.int64))
+        start_warp()
+        with LOADING:
+            try:
+                self.is_cpu = wp.get_device(device).is_cpu
+            except Exception:
+                names = ", ".join(str(d) for d in wp.get_devices())
+                raise InputError(f"device: Warp has no {device!r}; there are: {names}") from None
+            m = self.tables = build_tables(model, space, pairs, self.fields.sections, device)
+            self.columns = wp.array(self.fields.wanted, dtype=wp.int32, device=device)
+        self.num_threads = (num_threads or os.cpu_count() or 1) if self.is_cpu else 1
+        self.wanted = torch.from_numpy(self.fields.wanted.astype(np.int64))
         self._sizes = {
             "qpos": m.nq, "dof": m.nv, "triangle": m.nh, "body": m.nb, "row": m.maxrow, "contact": m.maxcon,
-            "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": size,
+            "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
         }  # fmt: skip
         self._worlds: dict[tuple[int, bool], World] = {}
         self._free: list[dict[str, Any]] = []
@@ -154,21 +176,20 @@ class Engine:
             ``(T·K, J, wanted)`` and by the initial states ``(T·K, J, nq + nv)``.
         """
         last = slice(batch.lag - 1, None, batch.lag)
-        after, by_theta, by_state = [], [], []
+        parts = []
         with self._lock, self._stream(batch):
             for first, count in self._chunks(batch):
                 out = batch.empty(count * batch.lag, batch.states.shape[1])
                 trace = self._forward(batch, out, first, count, True)
-                after.append(out[last])
                 bars = []
                 for direction in directions:
                     bar = torch.zeros_like(out)
                     bar[last] = direction
                     bars.append([wp.to_torch(x).clone() for x in self._backward(batch, trace, bar)[:2]])
                 self.release([trace])
-                by_theta.append(torch.stack([b[0] for b in bars], 1))
-                by_state.append(torch.stack([b[1] for b in bars], 1))
-        return torch.cat(after), torch.cat(by_theta), torch.cat(by_state)
+                parts.append((out[last], *(torch.stack(bar, 1) for bar in zip(*bars, strict=True))))
+        after, by_theta, by_state = (torch.cat(part) for part in zip(*parts, strict=True))
+        return after, by_theta, by_state
 
     def release(self, traces: list[Trace]) -> None:
         """Take the memory of traces back for the next call."""
@@ -221,7 +242,7 @@ class Engine:
         world = self._world(slots, trace.memory, kernel is kernel_backward.adjoint_kernel)
 
         def launch(local: int, number: int, slot: int) -> None:
-            chunk = _fill(Chunk(), {
+            chunk = fill(Chunk(), {
                 "first": trace.first + local, "local": local, "nparam": len(batch.theta), "each": batch.each,
                 "lag": batch.lag, "skip": batch.skip, "period": _period(batch, keep), "slot": slot,
                 "slot_stride": int(not self.is_cpu), "keep": int(keep),
@@ -265,8 +286,8 @@ class Engine:
         key = (slots, adjoint)
         if key not in self._worlds:
             # a gap between slots, so that no two threads write one cache line
-            self._worlds[key] = _fill(World(), self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16))
-        return _fill(self._worlds[key], memory)
+            self._worlds[key] = fill(World(), self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16))
+        return fill(self._worlds[key], memory)
 
     def _allocate(self, fields: dict[str, tuple[Any, str]], rows: int, gap: int = 0) -> dict[str, Any]:
         """Arrays of fields of a world, with a number of rows."""
@@ -280,13 +301,6 @@ class Engine:
 def _period(batch: Batch, keep: bool) -> int:
     """Steps of a trajectory that are in memory."""
     return batch.lag * batch.skip + 1 if keep else 2
-
-
-def _fill(struct: Any, fields: dict[str, Any]) -> Any:
-    """A Warp struct with fields set."""
-    for name, value in fields.items():
-        setattr(struct, name, value)
-    return struct
 
 
 def _flat(x: torch.Tensor) -> torch.Tensor:

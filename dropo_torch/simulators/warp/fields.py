@@ -6,17 +6,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
+
 import mujoco
 import numpy as np
 import torch
 
 from dropo_torch.parameters import ParameterSpace, read_field
-from dropo_torch.simulators.warp.layout import DIRECT, MIXED, PAIR, Layout
+from dropo_torch.simulators.warp.layout import DIRECT, MIXED, PAIR
 from dropo_torch.simulators.warp.pairs import mixing
 
 _INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature"})
 _MINVAL = 1e-15
 _MINMU = 1e-5
+#: The numbers of a section by its name, ``(K, n, width)``.
+Section = Callable[[str], torch.Tensor]
 
 
 class Fields:
@@ -26,32 +31,38 @@ class Fields:
         model: the model, with everything ``mj_setConst`` derives up to date.
         space: the parameters.
         pairs: geoms that may touch, see :func:`candidate_pairs`.
+
+    Attributes:
+        sections: where θ's sections start, name → (offset, size).
+        size: length of θ.
+        wanted: columns of θ whose gradient is wanted.
     """
 
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> None:
-        self.pairs = pairs
-        base, sections, columns, start = [], {}, {}, 0
+        base, columns, start = [], {}, 0
+        self._raw_sections = {}
         for name, field, keep in (*DIRECT, *((f, f, 0) for f in MIXED)):
-            array, column = _numbers(model, field, keep)
-            base.append(array)
-            columns[field] = np.where(column >= 0, column + start, -1)
-            sections[name] = (start, array.size)
-            start += array.size
-        self._raw_sections = sections
+            array = np.atleast_1d(read_field(model, field)).astype(np.float64)
+            kept = np.ones(array.shape, dtype=bool)
+            if keep:
+                kept[:, keep:] = False
+            base.append(array[kept])
+            columns[field] = np.where(kept.ravel(), kept.cumsum() - 1 + start, -1)
+            self._raw_sections[name] = (start, base[-1].size, keep or int(np.prod(array.shape[1:], dtype=int)))
+            start += base[-1].size
         self._raw = torch.from_numpy(np.concatenate(base))
-        self._direct = sum(sections[name][1] for name, _f, _k in DIRECT)
-        self._mixing = _Mixing(model, pairs)
-        self._weights = _Weights(model)
         if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
             self._raw[:3] = 0.0
-        own = {name: sections[name] for name, _f, _k in DIRECT}
-        start = self._direct
-        for name, width in PAIR.items():
-            own[f"pair_{name}"] = (start, width * len(pairs))
-            start += width * len(pairs)
-        own["dof_invweight"] = (start, model.nv)
-        self.layout = Layout(own, start + model.nv)
+        self.sections = {name: self._raw_sections[name][:2] for name, _f, _k in DIRECT}
+        self._direct = self.size = sum(size for _, size in self.sections.values())
+        widths = {f"pair_{name}": width * len(pairs) for name, width in PAIR.items()} | {"dof_invweight": model.nv}
+        for name, width in widths.items():
+            self.sections[name] = (self.size, width)
+            self.size += width
         self._targets(space, columns)
+        self._derive: tuple[Callable[[Section], torch.Tensor], ...] = (_Mixing(model, pairs), _Weights(model, pairs))
+        with torch.no_grad():
+            self._constant = [derive(partial(self._section, self._raw[None])) for derive in self._derive]
 
     def _targets(self, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
         """Columns that the parameters write, and those of θ whose gradient is wanted."""
@@ -60,15 +71,16 @@ class Fields:
         self._written = torch.tensor([int(columns[t.field][t.index]) for _, t in targets], dtype=torch.long)
         self._factors = torch.tensor([t.factor for _, t in targets], dtype=torch.float64)
         self._sources = torch.tensor([source for source, _ in targets], dtype=torch.long)
-        self._mixes = bool(fields & set(MIXED))
-        self._weighs = bool(fields & _INERTIAL)
-        derived = [f"pair_{name}" for name in PAIR if name != "invweight"] if self._mixes else []
-        derived += ["pair_invweight", "dof_invweight"] if self._weighs else []
+        self._varies = bool(fields & set(MIXED)), bool(fields & _INERTIAL)
+        derived = [name for name in self.sections if name.startswith("pair_") or name == "dof_invweight"]
+        own = [self.columns(name) for name in derived if self._varies[name.endswith("invweight")]]
         direct = self._written[self._written < self._direct].numpy()
-        wanted = np.concatenate([direct, *(self.layout.columns(name) for name in derived)])
-        self.wanted = np.unique(wanted).astype(np.int32)
-        with torch.no_grad():
-            self._constant = self._mix(self._raw[None]), self._weigh(self._raw[None])
+        self.wanted = np.unique(np.concatenate([direct, *own])).astype(np.int32)
+
+    def columns(self, name: str) -> np.ndarray:
+        """Return the columns of a section of θ."""
+        start, size = self.sections[name]
+        return np.arange(start, start + size)
 
     def with_derivative(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Return θ ``(K, P)`` and the derivative of its wanted columns by each of the values ``(K, wanted, d)``."""
@@ -82,125 +94,83 @@ class Fields:
         """Return θ of the model itself, ``(1, P)``."""
         return torch.cat([self._raw[None, : self._direct], *self._constant], dim=1).numpy()
 
-    def _section(self, raw: torch.Tensor, name: str, width: int) -> torch.Tensor:
-        start, size = self._raw_sections[name]
-        return raw[:, start : start + size].reshape(len(raw), -1, width)
-
-    def _mix(self, raw: torch.Tensor) -> torch.Tensor:
-        widths = (3, 2, 5, 1, 5, 2, 2, 5, 1)
-        return self._mixing(*(self._section(raw, n, w) for n, w in zip(MIXED, widths, strict=True)))
-
-    def _weigh(self, raw: torch.Tensor) -> torch.Tensor:
-        body, dof = self._weights(
-            self._section(raw, "mass", 1)[..., 0], self._section(raw, "inertia", 3), self._section(raw, "ipos", 3),
-            self._section(raw, "armature", 1)[..., 0],
-        )  # fmt: skip
-        pair = body[:, self._mixing.body1] + body[:, self._mixing.body2]
-        return torch.cat([pair, dof], dim=1)
+    def _section(self, raw: torch.Tensor, name: str) -> torch.Tensor:
+        start, size, width = self._raw_sections[name]
+        return raw[:, start : start + size].reshape(len(raw), size // width, width)
 
     def __call__(self, values: torch.Tensor) -> torch.Tensor:
         """Return θ ``(K, P)`` of parameter vectors ``(K, d)``, differentiable."""
-        count = len(values)
-        raw = self._raw.expand(count, -1)
+        raw = self._raw.expand(len(values), -1)
         raw = raw.index_copy(1, self._written, values[:, self._sources] * self._factors)
-        mixed = self._mix(raw) if self._mixes else self._constant[0].expand(count, -1)
-        weighed = self._weigh(raw) if self._weighs else self._constant[1].expand(count, -1)
-        return torch.cat([raw[:, : self._direct], mixed, weighed], dim=1)
-
-
-def _numbers(model: mujoco.MjModel, field: str, keep: int) -> tuple[np.ndarray, np.ndarray]:
-    """The numbers of a field that are kept, flat, and the place of each of its numbers among them (or −1)."""
-    array = np.atleast_1d(read_field(model, field)).astype(np.float64)
-    place = np.arange(array.size).reshape(array.shape)
-    if keep:
-        array = array[:, :keep]
-        kept = np.full(place.shape, -1)
-        kept[:, :keep] = np.arange(array.size).reshape(array.shape)
-        place = kept
-    return array.reshape(-1).copy(), place.reshape(-1)
+        derived = [
+            derive(partial(self._section, raw)) if varies else constant.expand(len(values), -1)
+            for derive, varies, constant in zip(self._derive, self._varies, self._constant, strict=True)
+        ]
+        return torch.cat([raw[:, : self._direct], *derived], dim=1)
 
 
 class _Mixing:
     """Contact parameters of geom pairs."""
 
     def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
-        table = np.array(pairs, dtype=np.int64).reshape(-1, 3)
-        self.g1, self.g2, pair = (torch.from_numpy(table[:, i].copy()) for i in range(3))
-        self.explicit = pair >= 0
-        self.pair = pair.clamp(min=0)
-        body = torch.from_numpy(model.geom_bodyid.astype(np.int64))
-        self.body1, self.body2 = body[self.g1], body[self.g2]
+        self.g1, self.g2, self.pair = torch.tensor(pairs, dtype=torch.long).reshape(-1, 3).T
         self.weight = torch.from_numpy(mixing(model, pairs))[:, None]
-        priority = torch.from_numpy(model.geom_priority.astype(np.int64))
-        self.first, self.second = priority[self.g1] > priority[self.g2], priority[self.g1] < priority[self.g2]
+        priority = torch.from_numpy(model.geom_priority)
+        self.rank = (priority[self.g1] - priority[self.g2])[:, None]
 
-    def __call__(
-        self, friction: torch.Tensor, solref: torch.Tensor, solimp: torch.Tensor, margin: torch.Tensor,
-        *given: torch.Tensor,
-    ) -> torch.Tensor:  # fmt: skip
-        """Return friction, solref, solreffriction, solimp and margin of the pairs, ``(K, 15 n)``.
-
-        The geoms' numbers come first, then those same five as they are ``given`` for explicit pairs.
-        """
+    def __call__(self, section: Section) -> torch.Tensor:
+        """Return friction, solref, solreffriction, solimp and margin of the pairs, ``(K, 15 n)``."""
+        # the geoms' numbers come first, then those same five as they are given for explicit pairs
+        friction, solref, solimp, margin, *given = map(section, MIXED)
         f1, f2 = friction[:, self.g1], friction[:, self.g2]
         mu = torch.maximum(f1, f2)
-        mu = torch.where(self.first[:, None], f1, torch.where(self.second[:, None], f2, mu))
+        mu = torch.where(self.rank > 0, f1, torch.where(self.rank < 0, f2, mu))
         mu = mu[..., [0, 0, 1, 2, 2]]
         r1, r2 = solref[:, self.g1], solref[:, self.g2]
         blend = self.weight * r1 + (1 - self.weight) * r2
-        standard = ((r1[..., :1] > 0) & (r2[..., :1] > 0)) | (self.first | self.second)[:, None]
+        standard = ((r1[..., :1] > 0) & (r2[..., :1] > 0)) | (self.rank != 0)
         ref = torch.where(standard, blend, torch.minimum(r1, r2))
         imp = self.weight * solimp[:, self.g1] + (1 - self.weight) * solimp[:, self.g2]
-        inflation = margin[:, self.g1] + margin[:, self.g2]
-        parts = [mu, ref, torch.zeros_like(ref), imp, inflation]
-        if self.explicit.any():
-            own = self.explicit[:, None]
+        parts = [mu, ref, torch.zeros_like(ref), imp, margin[:, self.g1] + margin[:, self.g2]]
+        own = (self.pair >= 0)[:, None]
+        if own.any():
             parts = [torch.where(own, g[:, self.pair], part) for g, part in zip(given, parts, strict=True)]
         parts[0] = parts[0].clamp(min=_MINMU)
         return torch.cat([p.flatten(1) for p in parts], dim=1)
 
 
 class _Weights:
-    """``body_invweight0`` (translation) and ``dof_invweight0`` as functions of the inertial parameters."""
+    """``body_invweight0`` (translation) of pairs and ``dof_invweight0`` as functions of the inertial parameters."""
 
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
         data = mujoco.MjData(model)
-        data.qpos[:] = model.qpos0
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
-        nv, nb = model.nv, model.nbody
-        jac = np.zeros((nb, 2, 3, nv))
-        for b in range(1, nb):
-            mujoco.mj_jac(model, data, jac[b, 0], jac[b, 1], data.xpos[b], b)
-        self.linear, self.angular = torch.from_numpy(jac[:, 0].copy()), torch.from_numpy(jac[:, 1].copy())
-        self.rotation = torch.from_numpy(data.xmat.reshape(-1, 3, 3).copy())
-        self.principal = torch.from_numpy(data.ximat.reshape(-1, 3, 3).copy())
-        self.moving = torch.from_numpy(model.body_weldid != 0)
-        self.simple = torch.from_numpy(model.body_simple == 2)
-        self.dof_simple = self.simple[torch.from_numpy(model.dof_bodyid.astype(np.int64))]
-        self.dof_body = torch.from_numpy(model.dof_bodyid.astype(np.int64))
-        average = np.eye(nv)
-        for j in range(model.njnt):
-            start = model.jnt_dofadr[j]
-            groups = {0: (start, start + 3), 1: (start,)}.get(int(model.jnt_type[j]), ())
-            for g in groups:
-                average[g : g + 3, g : g + 3] = 1 / 3
-        self.average = torch.from_numpy(average)
+        jac = np.zeros((2, model.nbody, 3, model.nv))
+        for b in range(1, model.nbody):
+            mujoco.mj_jac(model, data, jac[0, b], jac[1, b], data.xpos[b], b)
+        self.linear, self.angular = torch.from_numpy(jac)
+        self.rotation, self.principal = (torch.tensor(x).reshape(-1, 3, 3) for x in (data.xmat, data.ximat))
+        self.moving, self.simple = torch.tensor(model.body_weldid != 0), torch.tensor(model.body_simple == 2)
+        self.dof_body = torch.tensor(model.dof_bodyid, dtype=torch.long)
+        self.bodies = torch.tensor([[model.geom_bodyid[g] for g in pair[:2]] for pair in pairs]).long().reshape(-1, 2)
+        self.average = torch.eye(model.nv, dtype=torch.float64)
+        for start, kind in zip(model.jnt_dofadr, model.jnt_type, strict=True):
+            for g in range(start, start + {0: 6, 1: 3}.get(int(kind), 0), 3):  # of a free or a ball joint
+                self.average[g : g + 3, g : g + 3] = 1 / 3
 
-    def __call__(
-        self, mass: torch.Tensor, inertia: torch.Tensor, ipos: torch.Tensor, armature: torch.Tensor
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the weights of bodies ``(K, nbody)`` and dofs ``(K, nv)`` of inertial parameters ``(K, ...)``."""
-        arm = torch.einsum("bij,kbj->kbi", self.rotation, ipos)
+    def __call__(self, section: Section) -> torch.Tensor:
+        """Return the sum of the two bodies' weights of each pair and the weights of dofs, ``(K, n + nv)``."""
+        mass, armature, inertia = section("mass")[..., 0], section("armature")[..., 0], section("inertia")
+        arm = torch.einsum("bij,kbj->kbi", self.rotation, section("ipos"))
         linear = self.linear + torch.linalg.cross(self.angular.expand(len(arm), -1, -1, -1), arm[..., None], dim=2)
         local = self.principal.transpose(1, 2) @ self.angular
         matrix = torch.einsum("kb,kbij,kbil->kjl", mass, linear, linear)
         matrix = matrix + torch.einsum("kbi,bij,bil->kjl", inertia, local, local) + torch.diag_embed(armature)
-        if matrix.shape[-1] == 0:
-            return mass.new_zeros(mass.shape), armature
         inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L)
         body = torch.einsum("kbij,kjl,kbil->kb", linear, inverse, linear) / 3
         light = 1 / mass.clamp(min=_MINVAL)
         body = torch.where(self.moving, torch.where(self.simple, light, body), torch.zeros_like(body))
         dof = torch.diagonal(inverse, dim1=1, dim2=2) @ self.average
-        return body, torch.where(self.dof_simple, light[:, self.dof_body], dof)
+        dof = torch.where(self.simple[self.dof_body], light[:, self.dof_body], dof)
+        return torch.cat([body[:, self.bodies[:, 0]] + body[:, self.bodies[:, 1]], dof], dim=1)

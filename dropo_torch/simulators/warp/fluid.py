@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import ang, at, join, theta_vec3, wrench
+from dropo_torch.simulators.warp.spatial import ang, at, pull, theta_vec3
 from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 PI = wp.constant(wp.float64(wp.pi))
@@ -89,4 +89,4 @@ def fluid_wrench(m: Tables, w: World, b: int) -> vec6:
     mass = w.th[m.o_mass + b]
     f = rot * box_force(back * (at(vel, c) - wind), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
     n = rot * box_torque(back * ang(vel), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
-    return wrench(f, c) + join(n, vec3())
+    return pull(f, c, n)

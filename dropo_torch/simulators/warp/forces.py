@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.spatial import add_at, chart_rate, quat_log, quat_mul, vec3_at, vec4_at
+from dropo_torch.simulators.warp.rotations import chart_rate, quat_log, quat_mul
+from dropo_torch.simulators.warp.spatial import add_at, vec3_at, vec4_at
 from dropo_torch.simulators.warp.types import BALL, MINVAL, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
 
 
@@ -85,35 +86,11 @@ def springs_adjoint(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def add_dampers(m: Tables, w: World, r: int):
-    """Load from dampers: F = −v (b + p0 |v| + p1 v²)."""
-    for i in range(m.nv):
-        v = w.qvel[r, i]
-        n = wp.abs(v)
-        ip = m.o_dampingpoly + 2 * i
-        w.load[w.t, i] += v * (w.th[m.o_damping + i] + n * (w.th[ip] + n * w.th[ip + 1]))
-
-
-@wp.func(inline=True)
 def damping_slope(m: Tables, w: World, v: f64, i: int) -> f64:
     """B = b + 2 p0 |v| + 3 p1 v²: what the implicit integrators take of the damper."""
     n = wp.abs(v)
     ip = m.o_dampingpoly + 2 * i
     return w.th[m.o_damping + i] + n * (TWO * w.th[ip] + THREE * n * w.th[ip + 1])
-
-
-@wp.func(inline=True)
-def dampers_adjoint(m: Tables, w: World, r: int):
-    """Adjoint of :func:`add_dampers`."""
-    for i in range(m.nv):
-        v = w.qvel[r, i]
-        n = wp.abs(v)
-        jl = w.lam[w.t, i]
-        ip = m.o_dampingpoly + 2 * i
-        w.vel_bar[w.t, i] += jl * damping_slope(m, w, v, i)
-        w.grad[w.t, m.o_damping + i] += jl * v
-        w.grad[w.t, ip] += jl * v * n
-        w.grad[w.t, ip + 1] += jl * v * n * n
 
 
 @wp.func(inline=True)
@@ -139,7 +116,7 @@ def clamp_adjoint(w: World, o: int, x: f64, bar: f64) -> f64:
 def control(m: Tables, w: World, i: int) -> f64:
     """Control of an actuator, clamped to its range."""
     u = w.ctrl[w.rc, i]
-    if m.clampctrl != 0 and m.act_ctrllimited[i] != 0:
+    if m.act_ctrllimited[i] != 0:
         u = clamp(w, m.o_ctrlrange + 2 * i, u)
     return u
 
@@ -148,7 +125,7 @@ def control(m: Tables, w: World, i: int) -> f64:
 def control_adjoint(m: Tables, w: World, i: int, bar: f64):
     """Adjoint of :func:`control`."""
     ubar = bar
-    if m.clampctrl != 0 and m.act_ctrllimited[i] != 0:
+    if m.act_ctrllimited[i] != 0:
         ubar = clamp_adjoint(w, m.o_ctrlrange + 2 * i, w.ctrl[w.rc, i], bar)
     w.ctrl_bar[w.rb, i] += ubar
 
@@ -289,9 +266,12 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
 
 @wp.func(inline=True)
 def add_forces(m: Tables, w: World, r: int):
-    """Load from dampers, springs and actuators."""
-    if m.has_damper != 0:
-        add_dampers(m, w, r)
+    """Load from dampers, F = −v (b + p0 |v| + p1 v²), springs and actuators."""
+    for i in range(m.nv * m.has_damper):
+        v = w.qvel[r, i]
+        n = wp.abs(v)
+        ip = m.o_dampingpoly + 2 * i
+        w.load[w.t, i] += v * (w.th[m.o_damping + i] + n * (w.th[ip] + n * w.th[ip + 1]))
     if m.has_spring != 0:
         add_springs(m, w, r)
     add_actuators(m, w, r)
@@ -300,8 +280,15 @@ def add_forces(m: Tables, w: World, r: int):
 @wp.func(inline=True)
 def forces_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_forces`."""
-    if m.has_damper != 0:
-        dampers_adjoint(m, w, r)
+    for i in range(m.nv * m.has_damper):
+        v = w.qvel[r, i]
+        n = wp.abs(v)
+        jl = w.lam[w.t, i]
+        ip = m.o_dampingpoly + 2 * i
+        w.vel_bar[w.t, i] += jl * damping_slope(m, w, v, i)
+        w.grad[w.t, m.o_damping + i] += jl * v
+        w.grad[w.t, ip] += jl * v * n
+        w.grad[w.t, ip + 1] += jl * v * n * n
     if m.has_spring != 0:
         springs_adjoint(m, w, r)
     actuators_adjoint(m, w, r)

@@ -21,14 +21,11 @@ def _limit(x: f64) -> f64:
 @wp.func
 def _power(x: f64, p: f64) -> f64:
     """x to the power p, x > 0; at p = 2 and 1 without ``pow``, and with the slope in p, which is x^p log x."""
-    y = x
     if p == TWO:
-        y = x * x * (ONE + (p - TWO) * wp.log(x))
-    elif p == ONE:
-        y = x * (ONE + (p - ONE) * wp.log(x))
-    else:
-        y = wp.pow(x, p)
-    return y
+        return x * x * (ONE + (p - TWO) * wp.log(x))
+    if p == ONE:
+        return x * (ONE + (p - ONE) * wp.log(x))
+    return wp.pow(x, p)
 
 
 @wp.func

@@ -10,19 +10,16 @@ import warp as wp
 
 from dropo_torch.simulators.warp.forces import actuator_slope, actuator_slope_adjoint, damping_slope
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
-from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
-from dropo_torch.simulators.warp.spatial import (
-    add_at,
+from dropo_torch.simulators.warp.rotations import (
     chart_rate,
     chart_rate_dual,
-    nothing,
     quat_integrate,
     quat_mul,
     right_jacobian_t,
     turn,
-    vec3_at,
-    vec4_at,
 )
+from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
+from dropo_torch.simulators.warp.spatial import add_at, late, vec3_at, vec4_at
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
 from dropo_torch.simulators.warp.types import BALL, HALF, ONE, RK4, THREE, TWO, ZERO, Reals2, Tables, World, f64, vec4
 
@@ -206,7 +203,7 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
 @wp.func(inline=True)
 def step_adjoint(m: Tables, w: World, r: int, nxt: int):
     """Adjoint of :func:`step`: ``w.pos_bar`` (tangent) and ``w.rate_bar`` of the end become those of the start."""
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     h = m.h
     nv = m.nv
     _end_adjoint(m, w, r, nxt)

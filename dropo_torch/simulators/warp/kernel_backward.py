@@ -11,7 +11,8 @@ from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, su
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
-from dropo_torch.simulators.warp.spatial import chart_rate_dual, theta_vec2, theta_vec3, theta_vec5
+from dropo_torch.simulators.warp.rotations import chart_rate_dual
+from dropo_torch.simulators.warp.spatial import theta_vec2, theta_vec3, theta_vec5
 from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals, Reals2, Tables, World, mat33, vec6
 
 # LLVM's own thresholds: what must be inlined says so, and more makes this kernel slower
@@ -37,9 +38,8 @@ def adjoint_kernel(
     for row in range(i * chunk.lag, (i + 1) * chunk.lag):
         for k in range(m.nq + m.nv):
             seen += wp.abs(out_bar[row, k])
-    blank = ZERO
-    if alive[i] == 0 and seen != ZERO:  # a gradient that arrives at a simulation that diverged
-        blank = wp.float64(wp.nan)
+    # a gradient that arrives at a simulation that diverged
+    blank = wp.where(alive[i] == 0 and seen != ZERO, wp.float64(wp.nan), ZERO)
     for j in range(columns.shape[0]):  # whatever else is added up is never read
         w.grad[w.t, columns[j]] = blank
     for j in range(m.nv):

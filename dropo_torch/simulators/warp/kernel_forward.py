@@ -26,9 +26,7 @@ def simulate_kernel(
     w.th = theta[world % chunk.nparam]
     w.ctrl = controls
     w.t = chunk.slot + tid * chunk.slot_stride
-    base = w.t * chunk.period * m.nstage
-    if chunk.keep != 0:
-        base = i * chunk.period * m.nstage
+    base = wp.where(chunk.keep != 0, i, w.t) * chunk.period * m.nstage
     for j in range(m.nq):
         w.qpos[base, j] = states[tr, j]
     for j in range(m.nv):

@@ -12,14 +12,13 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.fluid import fluid_wrench
+from dropo_torch.simulators.warp.rotations import quat_matrix, rotation
 from dropo_torch.simulators.warp.spatial import (
     cross_force,
     cross_motion,
     inertia_about_origin,
     inertia_mul,
     join,
-    quat_matrix,
-    rotation,
     theta_vec3,
     vec3_at,
     vec4_at,
@@ -73,9 +72,7 @@ def sweep_out(m: Tables, w: World, r: int):
             elif kind == TRANSLATION:
                 pos = vec3_at(w.qpos, r, iq) - o
                 for i in range(3):
-                    e = vec3()
-                    e[i] = wp.float64(1.0)
-                    w.motion[w.t, d + i] = join(vec3(), e)
+                    w.motion[w.t, d + i] = join(vec3(), w.xmat[w.t, 0][i])
                 sv = join(vec3(), vec3_at(w.qvel, r, d))
             else:
                 anchor = pos + rot * m.link_pos[k]

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
-import numpy as np
-
 #: Sections of θ that are fields of MjModel: name in the tables, field, columns kept of each row (0: all).
 DIRECT = (
     ("gravity", "opt.gravity", 0), ("density", "opt.density", 0), ("viscosity", "opt.viscosity", 0),
@@ -30,16 +26,3 @@ PAIR = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 
 FIELDS = (*(field for _, field, _ in DIRECT), *MIXED)
 #: All sections of θ, in order.
 SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight")
-
-
-@dataclass(frozen=True)
-class Layout:
-    """Where θ's sections start: name → (offset, size), and the length of θ."""
-
-    sections: dict[str, tuple[int, int]]
-    size: int
-
-    def columns(self, name: str) -> np.ndarray:
-        """Columns of a section."""
-        start, size = self.sections[name]
-        return np.arange(start, start + size)

@@ -13,8 +13,9 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.impedance import regularisation
+from dropo_torch.simulators.warp.rotations import chart_rate, quat_log
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
-from dropo_torch.simulators.warp.spatial import add_at, chart_rate, nothing, quat_log, vec3_at, vec4_at
+from dropo_torch.simulators.warp.spatial import add_at, late, vec3_at, vec4_at
 from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, TWO, ZERO, Reals2, Tables, World, f64, vec3, vec3i
 
 FOUR = wp.constant(wp.float64(4.0))
@@ -24,29 +25,28 @@ ROW_FRICTION = wp.constant(1)
 ROW_LIMIT = wp.constant(2)
 
 
-@wp.func
-def row_force(kind: int, jar: f64, d: f64, loss: f64) -> f64:
-    """Constraint force at J a − aref = ``jar``."""
-    f = -d * jar
-    if kind == ROW_LIMIT:
+@wp.func(inline=True)
+def row_force(w: World, n: int, jar: f64) -> f64:
+    """Constraint force of row ``n`` at J a − aref = ``jar``."""
+    f = -w.row_d[w.t, n] * jar
+    if w.row_kind[w.t, n] == ROW_LIMIT:
         f = wp.max(ZERO, f)
-    elif kind == ROW_FRICTION:
-        f = wp.min(loss, wp.max(-loss, f))
+    elif w.row_kind[w.t, n] == ROW_FRICTION:
+        f = wp.clamp(f, -w.row_loss[w.t, n], w.row_loss[w.t, n])
     return f
 
 
-@wp.func
-def row_state(kind: int, jar: f64, d: f64, loss: f64) -> int:
-    """Which piece of the cost ``jar`` is on; 1 is the quadratic one."""
+@wp.func(inline=True)
+def row_state(w: World, n: int, jar: f64) -> int:
+    """Which piece of the cost of row ``n`` ``jar`` is on; 1 is the quadratic one."""
     state = int(1)
-    if kind == ROW_LIMIT:
+    if w.row_kind[w.t, n] == ROW_LIMIT:
         if jar >= ZERO:
             state = int(0)
-    elif kind == ROW_FRICTION:
-        if d * jar <= -loss:
-            state = int(2)
-        elif d * jar >= loss:
-            state = int(3)
+    elif w.row_kind[w.t, n] == ROW_FRICTION:
+        y = w.row_d[w.t, n] * jar
+        if wp.abs(y) >= w.row_loss[w.t, n]:
+            state = wp.where(y < ZERO, 2, 3)
     return state
 
 
@@ -160,9 +160,7 @@ def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
                 coef = vec3(f64(1 - 2 * side), ZERO, ZERO)
                 x = coef[0] * (w.qpos[r, iq] - w.th[o + side]) - w.th[m.o_jnt_margin + j]
         if kind == ROW_EQUALITY or (kind == ROW_FRICTION and loss > ZERO) or (kind == ROW_LIMIT and x < ZERO):
-            dof3 = int(-1)
-            if dof2 >= 0 and kind == ROW_LIMIT:
-                dof3 = dof + 2
+            dof3 = wp.where(dof2 >= 0 and kind == ROW_LIMIT, dof + 2, -1)
             w.row_kind[w.t, n] = kind
             w.row_index[w.t, n] = index
             w.row_dof[w.t, n] = vec3i(dof, dof2, dof3)
@@ -180,15 +178,15 @@ def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
 @wp.func(inline=True)
 def rows_adjoint(m: Tables, w: World, r: int, nrow: int):
     """Adjoint of the rows: the gradient of Σ −f Jλ, with J where it moves."""
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     for n in range(nrow):
         kind = w.row_kind[w.t, n]
         soft = row_softness(m, w, n)
-        loss = w.row_loss[w.t, n]
         v = row_dot(w, n, w.qvel, r)
         jar = row_dot(w, n, w.acc, r) + soft.b * v + soft.k * soft.imp * soft.x
         d = ONE / regularisation(soft.imp, soft.weight)
-        state = row_state(kind, jar, d, loss)
+        w.row_d[w.t, n] = d
+        state = row_state(w, n, jar)
         if state != 0:
             jl = row_dot(w, n, w.lam, w.t)
             dof = w.row_dof[w.t, n][0]

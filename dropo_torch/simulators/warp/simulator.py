@@ -14,11 +14,6 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
 from dropo_torch.simulators.warp.engine import Batch, Engine, Simulate
-from dropo_torch.simulators.warp.fields import Fields
-from dropo_torch.simulators.warp.pairs import candidate_pairs
-from dropo_torch.simulators.warp.start import LOADING, start_warp
-from dropo_torch.simulators.warp.support import check_support
-from dropo_torch.simulators.warp.tables import build_tables
 
 
 class WarpSimulator(Simulator):
@@ -54,7 +49,7 @@ class WarpSimulator(Simulator):
         num_threads: int | None = None,
         device: str = "cpu",
     ) -> None:
-        threads = os.cpu_count() or 1 if num_threads is None else num_threads
+        threads = (os.cpu_count() or 1) if num_threads is None else num_threads
         for option, value in (("frame_skip", frame_skip), ("chunk_size", chunk_size), ("num_threads", threads)):
             if value < 1:
                 raise InputError(f"{option}: {value} given; expected 1 or more")
@@ -63,27 +58,22 @@ class WarpSimulator(Simulator):
         self.parameters, self.frame_skip = parameters, frame_skip
         self.num_states, self.num_controls = model.nq + model.nv, model.nu
         self.timestep = model.opt.timestep * frame_skip
-        self._engine, self._fields = make_engine(
+        self._engine = Engine(
             model, parameters, skip=frame_skip, chunk_size=chunk_size, num_threads=threads, device=device
         )
         self._device = wp.device_to_torch(device)
 
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return the states after ``lag`` transitions, differentiable in all three arguments.
-
-        A quaternion in ``states`` need not be normalised; those returned are. Arguments and result as in
-        :meth:`Simulator.simulate`.
-        """
-        return self.rollout(states, controls, values)[:, :, -1]
-
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        """Return the states after each transition ``(T, K, lag, nq + nv)``; see :meth:`Simulator.rollout`."""
+        """Return the states after each transition ``(T, K, lag, nq + nv)``, differentiable in all three arguments.
+
+        A quaternion in ``states`` need not be normalised; those returned are. See :meth:`Simulator.rollout`.
+        """
         self.check_arguments(states, controls, values)
         origin = states.device
         shape = (len(states), len(values), controls.shape[1], self.num_states)
         if 0 in shape[:2]:
             return states.new_zeros(shape, dtype=torch.float64)
-        theta = self._fields(values.to("cpu", torch.float64)).to(self._device)
+        theta = self._engine.fields(values.to("cpu", torch.float64)).to(self._device)
         start, inputs = (x.to(self._device, torch.float64).contiguous() for x in (states, controls))
         out: torch.Tensor = Simulate.apply(theta.contiguous(), start, inputs, self._engine)
         lost = ~(out.detach().abs() < DIVERGED).flatten(2).all(-1)
@@ -108,40 +98,10 @@ class WarpSimulator(Simulator):
         """
         self.check_arguments(states, controls, values)
         rows = torch.eye(self.num_states, dtype=torch.float64) if directions is None else directions
-        theta, slope = self._fields.with_derivative(values.detach().to("cpu", torch.float64))
+        theta, slope = self._engine.fields.with_derivative(values.detach().to("cpu", torch.float64))
         start, inputs = (x.detach().to(self._device, torch.float64).contiguous() for x in (states, controls))
         theta, rows = (x.to(self._device).contiguous() for x in (theta, rows))
         after, by_theta, by_state = self._engine.per_world(Batch(theta, start, inputs, self.frame_skip), rows)
         shape = (len(states), len(values))
         by_values = torch.einsum("tkjw,kwd->tkjd", by_theta.cpu().unflatten(0, shape), slope)
         return after.cpu().unflatten(0, shape), by_values, by_state.cpu().unflatten(0, shape)
-
-
-def make_engine(
-    model: mujoco.MjModel, parameters: ParameterSpace, *, skip: int, chunk_size: int, num_threads: int, device: str
-) -> tuple[Engine, Fields]:
-    """Return what simulates a model, and what maps parameter vectors to its numbers.
-
-    Args:
-        model: the model, with everything ``mj_setConst`` derives up to date.
-        parameters: what varies.
-        skip, chunk_size, num_threads, device: as for :class:`WarpSimulator`.
-
-    Raises:
-        InputError: a model or a parameter outside the subset, or an unknown device.
-    """
-    pairs = candidate_pairs(model)
-    check_support(model, parameters, pairs)
-    fields = Fields(model, parameters, pairs)
-    start_warp()
-    with LOADING:
-        try:
-            wp.get_device(device)
-        except Exception:
-            names = ", ".join(str(d) for d in wp.get_devices())
-            raise InputError(f"device: Warp has no {device!r}; there are: {names}") from None
-        engine = Engine(
-            build_tables(model, parameters, pairs, fields.layout, device), fields.layout.size, fields.wanted,
-            skip=skip, chunk_size=chunk_size, num_threads=num_threads, device=device,
-        )  # fmt: skip
-    return engine, fields

@@ -33,16 +33,8 @@ def softness(m: Tables, w: World, o_ref: int, o_imp: int, weight: f64, x: f64) -
     solref = theta_vec2(w.th, o_ref)
     solimp = theta_vec5(w.th, o_imp)
     imp = impedance_slope(x, solimp)
-    soft = Soft()
-    soft.o_ref = o_ref
-    soft.o_imp = o_imp
-    soft.weight = weight
-    soft.x = x
-    soft.imp = imp[0]
-    soft.slope = imp[1]
-    soft.b = damping(solref, solimp, m.h, m.refsafe)
-    soft.k = stiffness(solref, solimp, m.h, m.refsafe)
-    return soft
+    b = damping(solref, solimp, m.h, m.refsafe)
+    return Soft(o_ref, o_imp, weight, x, imp[0], imp[1], b, stiffness(solref, solimp, m.h, m.refsafe))
 
 
 @wp.func(inline=True)

@@ -140,10 +140,9 @@ def assemble(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
     for i in range(m.nv):
         w.step[w.t, i] = -w.product[w.t, i]
     for n in range(nrow):
-        kind = w.row_kind[w.t, n]
         jar = w.row_jar[w.t, n]
-        row_add(w, n, row_force(kind, jar, w.row_d[w.t, n], w.row_loss[w.t, n]), w.step, w.t)
-        if row_state(kind, jar, w.row_d[w.t, n], w.row_loss[w.t, n]) == 1:
+        row_add(w, n, row_force(w, n, jar), w.step, w.t)
+        if row_state(w, n, jar) == 1:
             _add_row_hessian(m, w, n, r)
     for c in range(ncon):
         k = w.con_pair[w.t, c]
@@ -164,13 +163,11 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
     d1 = linear + alpha * quad
     d2 = quad
     for n in range(nrow):
-        kind = w.row_kind[w.t, n]
         y = w.row_dir[w.t, n]
         jar = w.row_jar[w.t, n] + alpha * y
-        d = w.row_d[w.t, n]
-        d1 -= row_force(kind, jar, d, w.row_loss[w.t, n]) * y
-        if row_state(kind, jar, d, w.row_loss[w.t, n]) == 1:
-            d2 += d * y * y
+        d1 -= row_force(w, n, jar) * y
+        if row_state(w, n, jar) == 1:
+            d2 += w.row_d[w.t, n] * y * y
     for c in range(ncon):
         cone = cone_of(m, w, w.con_pair[w.t, c], w.con_d[w.t, c])
         dw = w.con_dir[w.t, c]
@@ -246,11 +243,8 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
         for n in range(nrow):
             y = row_dot(w, n, w.step, w.t)
             w.row_dir[w.t, n] = y
-            kind = w.row_kind[w.t, n]
             jar = w.row_jar[w.t, n]
-            d = w.row_d[w.t, n]
-            loss = w.row_loss[w.t, n]
-            if row_state(kind, jar, d, loss) != row_state(kind, jar + y, d, loss):
+            if row_state(w, n, jar) != row_state(w, n, jar + y):
                 same = 0
         for c in range(ncon):
             y6 = contact_dot(m, w, c, w.step, w.t)

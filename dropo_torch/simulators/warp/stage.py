@@ -27,8 +27,8 @@ from dropo_torch.simulators.warp.spatial import (
     cross_motion,
     inertia_mul,
     join,
+    late,
     lin,
-    nothing,
     theta_vec3,
     wrench,
 )
@@ -66,7 +66,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     and velocity in ``w.qacc`` and ``w.qd``. With ``softening`` it is instead the part of M in the adjoint of an
     implicit integrator: λᵀ M a alone, of bodies at rest without gravity, with λ solved with ``soft_hess``.
     """
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     nrow = int(0)
     ncon = int(0)
     if softening != 0:
@@ -120,7 +120,7 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
 
     ``moving`` 0 leaves out V, gravity compensation and drag: the adjoint of λᵀ M a alone.
     """
-    _late = wp.grad(nothing)(ONE)
+    _late = wp.grad(late)(ONE)
     zero = vec6()
     for b in range(m.nb):
         w.f_velocity[w.t, b] = zero

@@ -10,7 +10,8 @@ import numpy as np
 from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
-from dropo_torch.simulators.warp.tables import KINDS
+from dropo_torch.simulators.warp.tables import KINDS, link_table
+from dropo_torch.simulators.warp.types import BALL
 
 #: Fields of which only the first columns act, and how many.
 _KEPT = {field: keep for _, field, keep in DIRECT if keep}
@@ -86,22 +87,14 @@ def _structure(model: mujoco.MjModel) -> Iterator[str]:
             yield f"tendon {model.tendon(i).name or i!r}"
     for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
         yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[g]!r}"
+    acting = set(model.jnt_bodyid[model.jnt_actgravcomp.astype(bool)])  # bodies compensated through actuators
     for i in range(1, model.nbody):
-        moving = model.body_weldid[i] != 0
+        if model.body_parentid[i] in acting:
+            acting.add(i)
         if model.body_gravcomp[i] < 0:
             yield f"negative gravcomp of body {model.body(i).name!r} (MuJoCo ignores it unless another is positive)"
-        if moving and model.body_gravcomp[i] and _actgravcomp(model, i):
+        if model.body_gravcomp[i] and i in acting:
             yield f"actuatorgravcomp on body {model.body(i).name!r}"
-
-
-def _actgravcomp(model: mujoco.MjModel, body: int) -> bool:
-    """Whether any joint above a body applies its gravity compensation through actuators."""
-    while body:
-        first, count = model.body_jntadr[body], model.body_jntnum[body]
-        if count and model.jnt_actgravcomp[first : first + count].any():
-            return True
-        body = int(model.body_parentid[body])
-    return False
 
 
 def _joints(model: mujoco.MjModel) -> Iterator[str]:
@@ -185,9 +178,7 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
     if column >= _KEPT.get(field, width):
         return f"{field}[{column}] does not act, only " + ", ".join(f"{field}[{i}]" for i in range(_KEPT[field]))
     if field == "qpos_spring":
-        for j in range(model.njnt):
-            start = model.jnt_qposadr[j]
-            quaternion = {_FREE: range(start + 3, start + 7), _BALL: range(start, start + 4)}
-            if index in quaternion.get(int(model.jnt_type[j]), ()):
-                return "qpos_spring of a quaternion has no gradient here"
+        kinds, _joints, _dofs, starts = link_table(model)
+        if ((kinds == BALL) & (starts <= index) & (index < starts + 4)).any():
+            return "qpos_spring of a quaternion has no gradient here"
     return ""

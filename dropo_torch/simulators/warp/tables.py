@@ -10,9 +10,9 @@ import warp as wp
 
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp import collide
-from dropo_torch.simulators.warp.layout import FIELDS, Layout
+from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.pairs import condim, joins_branches
-from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables
+from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
 
 _JNT, _GEOM, _DISABLE = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit
 _INTEGRATOR = {
@@ -42,22 +42,16 @@ KINDS = {
 
 
 def build_tables(
-    model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]], layout: Layout, device: str
+    model: mujoco.MjModel,
+    space: ParameterSpace,
+    pairs: list[tuple[int, int, int]],
+    sections: dict[str, tuple[int, int]],
+    device: str,
 ) -> Tables:
     """Return the tables of a supported model on a device."""
-    columns: dict[str, Any] = {}
-    columns |= _bodies(model)
-    columns |= _links(model)
-    columns |= _actuators(model)
-    columns |= _constraints(model, space)
-    columns |= _pairs(model, pairs)
-    columns |= _switches(model, space)
-    tables = Tables()
-    for name, value in columns.items():
-        setattr(tables, name, _to_warp(value, device) if isinstance(value, np.ndarray) else value)
-    for name, (offset, _size) in layout.sections.items():
-        setattr(tables, f"o_{name}", offset)
-    return tables
+    columns = _bodies(model) | _links(model) | _actuators(model) | _constraints(model, space) | _pairs(model, pairs)
+    columns |= _switches(model, space) | {f"o_{name}": offset for name, (offset, _size) in sections.items()}
+    return fill(Tables(), {k: _to_warp(x, device) if isinstance(x, np.ndarray) else x for k, x in columns.items()})
 
 
 def _to_warp(array: np.ndarray, device: str) -> Any:
@@ -100,7 +94,7 @@ def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _link_table(model: mujoco.MjModel) -> np.ndarray:
+def link_table(model: mujoco.MjModel) -> np.ndarray:
     """Kind, joint, dof and position of each link, ``(4, n)``."""
     rows = [
         (kind, j, model.jnt_dofadr[j] + offset, model.jnt_qposadr[j] + offset)
@@ -111,7 +105,7 @@ def _link_table(model: mujoco.MjModel) -> np.ndarray:
 
 
 def _links(model: mujoco.MjModel) -> dict[str, Any]:
-    kinds, joints, dofs, qs = _link_table(model)
+    kinds, joints, dofs, qs = link_table(model)
     bodies = model.jnt_bodyid[joints]
     scalar, free = kinds <= SLIDE, model.jnt_type[joints] == _JNT.mjJNT_FREE
     table = {
@@ -129,16 +123,15 @@ def _links(model: mujoco.MjModel) -> dict[str, Any]:
 def _origin(model: mujoco.MjModel, links: dict[str, Any]) -> dict[str, Any]:
     """Where the origin of the sweep is: it travels with the translations of the first body that moves."""
     origin: list[tuple[int, np.ndarray]] = []
-    base = np.zeros(3)
     body = int(np.argmax(model.body_weldid != 0))  # 0 where none moves
-    if body and model.body_parentid[body] == 0:
-        base = model.body_pos[body].copy()
+    rooted = body and model.body_parentid[body] == 0
+    base = model.body_pos[body].copy() if rooted else np.zeros(3)
     turned = _matrices(model.body_quat[body : body + 1])[0]
     for k in np.flatnonzero(links["link_body"] == body) if body else ():
         q, axis = int(links["link_qpos"][k]), turned @ links["link_axis"][k]
         if links["link_kind"][k] == TRANSLATION:
             origin, base = [(q + i, np.eye(3)[i]) for i in range(3)], np.zeros(3)
-        elif links["link_kind"][k] == SLIDE and model.body_parentid[body] == 0:
+        elif links["link_kind"][k] == SLIDE and rooted:
             origin.append((q, axis))
             base = base - axis * links["link_ref"][k]
         else:
@@ -156,8 +149,8 @@ def _actuators(model: mujoco.MjModel) -> dict[str, Any]:
         "nu": model.nu if acting else 0, "act_dof": model.jnt_dofadr[joints], "act_qpos": model.jnt_qposadr[joints],
         "act_affine_gain": model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE,
         "act_affine_bias": model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
-        "act_ctrllimited": model.actuator_ctrllimited, "act_frclimited": model.actuator_forcelimited,
-        "clampctrl": int(not _disabled(model, _DISABLE.mjDSBL_CLAMPCTRL)),
+        "act_ctrllimited": model.actuator_ctrllimited * (not _disabled(model, _DISABLE.mjDSBL_CLAMPCTRL)),
+        "act_frclimited": model.actuator_forcelimited,
         "has_frclimit": int(acting and bool(model.jnt_actfrclimited.any())),
     }  # fmt: skip
 
@@ -184,7 +177,7 @@ def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]
     qs = np.where(pairs >= 0, model.jnt_qposadr[pairs], 0)
     return {
         "nfriction": len(friction), "friction_dof": friction, "nlimit": len(limited),
-        "limit_link": np.searchsorted(_link_table(model)[1], limited), "neq": len(ids), "eq_id": ids,
+        "limit_link": np.searchsorted(link_table(model)[1], limited), "neq": len(ids), "eq_id": ids,
         "eq_dof": np.where(pairs >= 0, model.jnt_dofadr[pairs], -1), "eq_qpos": qs, "eq_ref": model.qpos0[qs],
         "always_dense": int(any(coupled)), "maxrow": len(ids) + len(friction) + 2 * len(limited),
     }  # fmt: skip

@@ -12,28 +12,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.collide import (
-    CAPSULE_BOX,
-    PLANE_BOX,
-    PLANE_CAPSULE,
-    PLANE_CYLINDER,
-    PLANE_ELLIPSOID,
-    PLANE_SPHERE,
-    ROUND,
-    are_parallel,
-    capsule_box_codes,
-    capsule_box_contact,
-    capsule_box_dual,
-    corner,
-    overlap_end,
-    plane_point,
-    round_contact,
-    round_dual,
-    support_dual,
-    support_point,
-    vec7,
-)
-from dropo_torch.simulators.warp.spatial import join, wrench
+from dropo_torch.simulators.warp import collide
+from dropo_torch.simulators.warp.spatial import pull, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 
@@ -63,7 +43,7 @@ def half_axis(m: Tables, w: World, g: int) -> vec3:
 
 
 @wp.func(inline=True)
-def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
+def _add(w: World, n: int, k: int, which: int, x: collide.vec7, hint: vec3):
     """Write contact ``n`` with its frame; the first tangent is along the hint, or along y or z without one."""
     w.con_pair[w.t, n] = k
     w.con_which[w.t, n] = which
@@ -72,9 +52,7 @@ def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
     normal = x[4:7]
     y = hint
     if wp.dot(hint, hint) < f64(0.25):
-        y = vec3(ZERO, ONE, ZERO)
-        if normal[1] >= HALF or normal[1] <= -HALF:
-            y = vec3(ZERO, ZERO, ONE)
+        y = wp.where(wp.abs(normal[1]) >= HALF, vec3(ZERO, ZERO, ONE), vec3(ZERO, ONE, ZERO))
     w.con_hint[w.t, n] = y
     y = y - normal * wp.dot(normal, y)
     length = wp.length(y)
@@ -88,12 +66,12 @@ def _add(w: World, n: int, k: int, which: int, x: vec7, hint: vec3):
 def _towards_plane(kind: int, n: vec3, c: vec3, axis: vec3, rot: mat33, size: vec3, which: int) -> vec3:
     """The point of a geom that may touch a plane with normal ``n``; ``which`` numbers them."""
     x = c
-    if kind == PLANE_CAPSULE:
+    if kind == collide.PLANE_CAPSULE:
         x = c + axis * (size[1] * (ONE - TWO * f64(which)))
-    elif kind == PLANE_BOX:
-        x = c + rot * corner(which, size)
-    elif kind > PLANE_BOX:
-        x = support_point(kind, n, c, rot, size, which)
+    elif kind == collide.PLANE_BOX:
+        x = c + rot * collide.corner(which, size)
+    elif kind > collide.PLANE_BOX:
+        x = collide.support_point(kind, n, c, rot, size, which)
     return x
 
 
@@ -110,12 +88,10 @@ def find_contacts(m: Tables, w: World) -> int:
         c2 = geom_centre(m, w, g2)
         reach = margin + m.pair_bound[k]
         normal = vec3()
-        near = bool(False)
-        if kind <= PLANE_ELLIPSOID:
+        near = wp.length_sq(c2 - c1) < reach * reach
+        if kind <= collide.PLANE_ELLIPSOID:
             normal = geom_axis(m, w, g1)
             near = wp.dot(normal, c2 - c1) < reach
-        else:
-            near = wp.length_sq(c2 - c1) < reach * reach
         if near:
             size1 = m.geom_size[g1]
             size2 = m.geom_size[g2]
@@ -126,44 +102,42 @@ def find_contacts(m: Tables, w: World) -> int:
             parallel = bool(False)
             first = int(0)
             second = int(0)
-            if kind == ROUND:
+            if kind == collide.ROUND:
                 a1 = half_axis(m, w, g1)
-                parallel = are_parallel(a1, a2)
-            elif kind > PLANE_CAPSULE:
+                parallel = collide.are_parallel(a1, a2)
+            elif kind > collide.PLANE_CAPSULE:
                 rot = geom_rotation(m, w, g2)
-            if kind == CAPSULE_BOX and size1[1] > ZERO:  # a sphere has only the place 0
+            if kind == collide.CAPSULE_BOX and size1[1] > ZERO:  # a sphere has only the place 0
                 a1 = half_axis(m, w, g1)
                 back = wp.transpose(rot)
                 limit = margin + TWO * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
-                first, second = capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
+                first, second = collide.capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
             start = n
             for i in range(m.pair_points[k]):
                 possible = bool(True)
                 which = i
                 hint = vec3()
-                x = vec7()
-                if kind <= PLANE_ELLIPSOID:
-                    radius = ZERO
-                    if kind <= PLANE_CAPSULE:
-                        radius = size2[0]
-                    if kind == PLANE_CAPSULE:
+                x = collide.vec7()
+                if kind <= collide.PLANE_ELLIPSOID:
+                    radius = wp.where(kind <= collide.PLANE_CAPSULE, size2[0], ZERO)
+                    if kind == collide.PLANE_CAPSULE:
                         hint = axis
-                    elif kind == PLANE_BOX:  # the first four corners on the plane's side of the centre
-                        possible = wp.dot(normal, rot * corner(i, size2)) <= ZERO and n - start < 4
-                    elif kind == PLANE_CYLINDER:  # the near rim, then the far rim and two points of the near disk
+                    elif kind == collide.PLANE_BOX:  # the first four corners on the plane's side of the centre
+                        possible = wp.dot(normal, rot * collide.corner(i, size2)) <= ZERO and n - start < 4
+                    elif kind == collide.PLANE_CYLINDER:  # the near rim, then the far one and two points near
                         possible = i == 0 or n > start
-                    x = plane_point(normal, c1, _towards_plane(kind, normal, c2, axis, rot, size2, i), radius)
-                elif kind == ROUND:
+                    x = collide.plane_point(normal, c1, _towards_plane(kind, normal, c2, axis, rot, size2, i), radius)
+                elif kind == collide.ROUND:
                     which = int(0)
                     possible = i == 0 or parallel
                     if parallel:
-                        which = overlap_end(c1, a1, c2, a2, i)
-                    x = round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
+                        which = collide.overlap_end(c1, a1, c2, a2, i)
+                    x = collide.round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
                 else:
                     which = wp.where(i == 0, first, second)
                     possible = which >= 0
                     if possible:
-                        x = capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
+                        x = collide.capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
                 if possible and x[0] < margin:
                     _add(w, n, k, which, x, hint)
                     n += 1
@@ -174,12 +148,6 @@ def find_contacts(m: Tables, w: World) -> int:
 def _turned(r: mat33, rbar: mat33) -> vec3:
     """Torque that a rotation's adjoint is: Σ columns r × r̄."""
     return wp.cross(r[:, 0], rbar[:, 0]) + wp.cross(r[:, 1], rbar[:, 1]) + wp.cross(r[:, 2], rbar[:, 2])
-
-
-@wp.func
-def _pull(f: vec3, p: vec3, torque: vec3) -> vec6:
-    """The spatial force of ``f`` at ``p`` and a torque."""
-    return wrench(f, p) + join(torque, vec3())
 
 
 @wp.func(inline=True)
@@ -206,41 +174,39 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
     c2 = geom_centre(m, w, g2)
     size = m.geom_size[g2]
     rot = mat33()
-    if kind != ROUND and kind != PLANE_SPHERE:
+    if kind != collide.ROUND and kind != collide.PLANE_SPHERE:
         rot = geom_rotation(m, w, g2)
     y1 = vec6()
     y2 = vec6()
-    if kind <= PLANE_ELLIPSOID:
+    if kind <= collide.PLANE_ELLIPSOID:
         # dist = n·(x − c1) − r, p = x − n (r + dist/2), x a point of the second geom
-        radius = ZERO
-        if kind <= PLANE_CAPSULE:
-            radius = size[0]
+        radius = wp.where(kind <= collide.PLANE_CAPSULE, size[0], ZERO)
         x = _towards_plane(kind, n, c2, hint, rot, size, which)
         slope = distbar - HALF * wp.dot(pbar, n)
         xbar = pbar + n * slope
         nbar = nbar + (x - c1) * slope - pbar * (radius + HALF * w.con_dist[w.t, c])
-        if kind >= PLANE_CYLINDER:
-            _k, nb, cb, rb, _sb, _w, _x = wp.grad(support_dual)(kind, n, c2, rot, size, which, xbar)
+        if kind >= collide.PLANE_CYLINDER:
+            _k, nb, cb, rb, _sb, _w, _x = wp.grad(collide.support_dual)(kind, n, c2, rot, size, which, xbar)
             nbar = nbar + nb
-            y2 = _pull(cb, c2, _turned(rot, rb))
-        elif kind == PLANE_CAPSULE:  # its axis is the hint
-            y2 = _pull(xbar, x, wp.cross(hint, ybar - n * wp.dot(n, ybar)))
+            y2 = pull(cb, c2, _turned(rot, rb))
+        elif kind == collide.PLANE_CAPSULE:  # its axis is the hint
+            y2 = pull(xbar, x, wp.cross(hint, ybar - n * wp.dot(n, ybar)))
         else:
             y2 = wrench(xbar, x)
-        y1 = _pull(n * -slope, c1, wp.cross(n, nbar))
-    elif kind == ROUND:
+        y1 = pull(n * -slope, c1, wp.cross(n, nbar))
+    elif kind == collide.ROUND:
         a1 = half_axis(m, w, g1)
         a2 = half_axis(m, w, g2)
-        c1b, a1b, _r1, c2b, a2b, _r2, _w, _d, _p, _n = wp.grad(round_dual)(
+        c1b, a1b, _r1, c2b, a2b, _r2, _w, _d, _p, _n = wp.grad(collide.round_dual)(
             c1, a1, m.geom_size[g1][0], c2, a2, size[0], which, distbar, pbar, nbar
         )
-        y1 = _pull(c1b, c1, wp.cross(a1, a1b))
-        y2 = _pull(c2b, c2, wp.cross(a2, a2b))
+        y1 = pull(c1b, c1, wp.cross(a1, a1b))
+        y2 = pull(c2b, c2, wp.cross(a2, a2b))
     else:
         a1 = half_axis(m, w, g1)
-        c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(capsule_box_dual)(
+        c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(collide.capsule_box_dual)(
             c1, a1, m.geom_size[g1][0], c2, rot, size, which, distbar, pbar, nbar
         )
-        y1 = _pull(c1b, c1, wp.cross(a1, a1b))
-        y2 = _pull(cb, c2, _turned(rot, rb))
+        y1 = pull(c1b, c1, wp.cross(a1, a1b))
+        y2 = pull(cb, c2, _turned(rot, rb))
     return y1, y2

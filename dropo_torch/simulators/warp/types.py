@@ -62,10 +62,17 @@ def _struct(name: str, fields: dict[str, Any]) -> Any:
     return wp.struct(type(name, (), {"__module__": __name__, "__annotations__": fields}))
 
 
+def fill(struct: Any, fields: dict[str, Any]) -> Any:
+    """A Warp struct with fields set."""
+    for name, value in fields.items():
+        setattr(struct, name, value)
+    return struct
+
+
 #: Numbers of things, switches of what a model has, and what gradients are wanted of.
 _COUNTS = (
     "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "norigin", "nh", "maxcon", "maxrow",
-    "integrator", "nstage", "elliptic", "refsafe", "clampctrl", "implicit", "implicit_actuators",
+    "integrator", "nstage", "elliptic", "refsafe", "implicit", "implicit_actuators",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense",
     "want_inertial", "want_inertia", "want_ipos", "want_soft",
 )  # fmt: skip

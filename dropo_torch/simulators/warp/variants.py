@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
 import mujoco
 import numpy as np
 import torch
@@ -15,7 +13,6 @@ from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.pairs import candidate_pairs
-from dropo_torch.simulators.warp.simulator import make_engine
 
 #: Engines that are kept.
 KEPT = 64
@@ -31,8 +28,7 @@ class Variants:
     """
 
     def __init__(self, space: ParameterSpace, *, num_threads: int = 0, device: str = "cpu") -> None:
-        self._space, self._device = space, device
-        self._threads = num_threads or os.cpu_count() or 1
+        self._space, self._device, self._threads = space, device, num_threads
         self._engines: dict[bytes, Engine | None] = {}
 
     def rollout(self, model: mujoco.MjModel, starts: np.ndarray, controls: np.ndarray) -> np.ndarray | None:
@@ -55,21 +51,17 @@ class Variants:
         if engine is None:
             return None
         theta = Fields(model, self._space, candidate_pairs(model)).constant()
-        inputs = [torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, starts, controls)]
-        flat, _ = engine.simulate(Batch(inputs[0], inputs[1], inputs[2], skip=1), keep=False)
+        values, states, inputs = (torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, starts, controls))
+        flat, _ = engine.simulate(Batch(values, states, inputs, skip=1), keep=False)
         out = flat.numpy().reshape(len(starts), controls.shape[1], starts.shape[1])
-        with np.errstate(invalid="ignore"):
-            out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
+        out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
         return out
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
         try:
-            engine, _ = make_engine(
-                model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device
-            )
+            return Engine(model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device)
         except InputError:
             return None
-        return engine
 
 
 def _structure(model: mujoco.MjModel) -> bytes:
