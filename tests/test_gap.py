@@ -394,7 +394,7 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     scene, (truth,) = scene_of(name), hidden(name).effects
     base = refit(scene.evidence, scene.begin)
     candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
-    ranked = screen(Focus(scene.evidence, base, np.ones(len(scene.evidence.windows))), candidates)
+    ranked = screen(Focus(scene.evidence, base), candidates)
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dropo_torch.effects.base import Placed
-from dropo_torch.gap.ground import FEWER, Ground
-from dropo_torch.gap.naming import State
+from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit
 from dropo_torch.gap.rules import significant, simplest
 from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
@@ -22,7 +21,7 @@ def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
 def is_done(ground: Ground, state: State) -> bool:
     """Return whether what is left is noise, or too small a part of the gap to tell anything."""
     base, current = state.base, state.current
-    if ground.strategy.clears(base, current) or not significant(current.cost, ground.rules):
+    if ground.clears(base, current) or not significant(current.cost, ground.rules):
         return True
     return current.cost.excess < ground.rules.least * base.cost.excess
 
@@ -76,7 +75,7 @@ def _rivals(ground: Ground, without: Refit, current: Refit) -> list[Candidate]:
     """Candidates that promise to explain more than the effect that was left out does, the best first."""
     alive = [c for c in ground.screened(without) if not c.dead]
     focus = ground.focus(without)
-    here = refit(focus.evidence, current.hypothesis, caps=focus.caps, iterations=0)
+    here = refit(focus.evidence, current.hypothesis, iterations=0)
     return [c for c in alive[:3] if c.chi2 < 0.8 * here.cost.chi2]
 
 

@@ -10,8 +10,8 @@ from scipy import stats
 
 from dropo_torch.data.observation import joint_name
 from dropo_torch.effects.base import Setting
+from dropo_torch.gap.ground import Screening
 from dropo_torch.gap.log import blocks_of
-from dropo_torch.gap.naming import Screening
 from dropo_torch.gap.noise import FreeForces
 from dropo_torch.gap.result import Place, Residuals
 from dropo_torch.gap.twin import Windows

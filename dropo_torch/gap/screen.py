@@ -16,7 +16,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.evidence import Evidence, cost_of
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
 
 #: Difference step of a candidate's numbers, relative to their scale.
@@ -36,17 +36,15 @@ class Focus:
     Attributes:
         evidence: the windows.
         fitted: the hypothesis there.
-        caps: factors of the windows' residuals, ``(W,)``.
     """
 
     evidence: Evidence
     fitted: Refit
-    caps: np.ndarray
 
     @cached_property
     def factor(self) -> np.ndarray:
         """Factors of the residuals under which least squares is what the fit minimised, ``(W·N,)``."""
-        return np.repeat(self.caps * self.fitted.factor, self.fitted.residual.shape[1])
+        return np.repeat(self.evidence.caps * self.fitted.factor, self.fitted.residual.shape[1])
 
     @cached_property
     def residual(self) -> np.ndarray:
@@ -61,9 +59,7 @@ class Focus:
     @property
     def excess(self) -> float:
         """Excess misfit of the fitted hypothesis."""
-        linear, evidence = self.fitted.linear, self.evidence
-        degrees = evidence.degrees(linear)
-        return cost_of(self.fitted.residual, linear, degrees, self.caps, evidence.tail(linear)).excess
+        return self.evidence.cost(self.fitted.residual, self.fitted.linear).excess
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.effects.base import Placed, Setting
-from dropo_torch.gap.ground import Ground
-from dropo_torch.gap.naming import State
+from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.rules import near
 from dropo_torch.gap.screen import Candidate
 
@@ -21,7 +20,7 @@ TIES = -1
 
 def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
     """Return candidates that tie with a named effect, the excess that it accounts for, and the state with attempts."""
-    current, clears = state.current, ground.strategy.clears
+    current = state.current
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
     ranked = ground.screened(without) if origin.placed else state.first.ranked
@@ -33,7 +32,7 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     rivals, state = ground.refits(replace(state, number=TIES), without, others, "looking for ties", origin)
     found = []
     for fitted in (*alike, *rivals):
-        as_clear = clears(state.base, fitted) or not clears(state.base, current)
+        as_clear = ground.clears(state.base, fitted) or not ground.clears(state.base, current)
         close = fitted.cost.excess - current.cost.excess < near(current.cost)
         if close and as_clear and ground.advantage(current, fitted) < ground.rules.tie:
             found.append(fitted.hypothesis.placed[-1])
