@@ -147,9 +147,7 @@ class Evidence:
 
     def project(self, residuals: np.ndarray, linear: Linearisation) -> np.ndarray:
         """Return the part ``(..., W, N)`` of residuals that no initial states explain; lost ones count as LOST."""
-        lost = ~np.isfinite(residuals)
-        shifted = residuals + (linear.shift if not lost.all() else 0.0)
-        return _beside(linear, np.where(lost, LOST, shifted))
+        return _beside(linear, np.where(np.isfinite(residuals), residuals + linear.shift, LOST))
 
     def project_slope(self, slope: np.ndarray, linear: Linearisation) -> np.ndarray:
         """Return :meth:`project` of derivatives ``(..., W, N)``."""

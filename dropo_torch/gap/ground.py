@@ -83,7 +83,7 @@ class Ground:
     evidence: Evidence
     effects: tuple[Effect, ...]
     rules: Rules
-    report: Report
+    report: Report = lambda stage, share: None
     caps: np.ndarray | float = 1.0
 
     def at(self, state: State) -> Ground:

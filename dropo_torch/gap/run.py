@@ -21,10 +21,6 @@ from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
 
 
-def _quiet(stage: str, share: float) -> None:
-    """Report nothing."""
-
-
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
     """Return where simulation and log disagree, the largest share first; nothing if what remains is noise.
 
@@ -73,7 +69,7 @@ def find_gap(
     rules: Rules | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
-    report: Report = _quiet,
+    report: Report = lambda stage, share: None,
     scene: Scene | None = None,
 ) -> Gap:
     """Find where simulation and log disagree, name the missing effects, and verify them on held-out data.
@@ -93,7 +89,7 @@ def find_gap(
     started = time.perf_counter()
     report("preparing", 0.0)
     scene = scene or prepare(problem)
-    naming = _name(scene, _ground(scene, effects, rules, report), checkpoint, resume)
+    naming = _name(scene, replace(_ground(scene, effects, rules), report=report), checkpoint, resume)
     report("verifying", 0.0)
     return make_result(scene, naming, started)
 
@@ -110,7 +106,6 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
     return found[-1] if found[-1].named else found[0]
 
 
-def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None, report: Report = _quiet) -> Ground:
+def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None) -> Ground:
     """What a search stands on, by default with the whole vocabulary and the package's thresholds."""
-    known = tuple(effects or VOCABULARY.values())
-    return Ground(scene.evidence, known, rules or Rules(), report)
+    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or Rules())
