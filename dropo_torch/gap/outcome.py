@@ -11,10 +11,9 @@ import numpy as np
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.intervals import Z90, standard_errors, step_errors
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.refit import Z90, Hypothesis, Refit, refit, standard_errors, step_errors
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Score, Strength
 from dropo_torch.gap.rules import WRONG
 from dropo_torch.gap.scene import Scene, short_windows
