@@ -223,14 +223,18 @@ class ParameterSpace:
         for column, target in self.targets:
             fields[target.field].reshape(len(values), -1)[:, target.index] = target.factor * values[:, column]
 
+    def write_into(self, model: mujoco.MjModel, vector: Sequence[float] | np.ndarray) -> None:
+        """Write values ``(d,)`` into a model, but not yet what is derived from them."""
+        for column, target in self.targets:
+            write_field(model, target.field, target.index, target.factor * vector[column])
+
     def apply(self, values: np.ndarray | Mapping[str, float]) -> mujoco.MjModel:
         """Return a copy of the model with the given values and everything derived from them."""
         if self.model is None:
             raise InputError("parameters: these belong to no MuJoCo model")
         vector = self.vector(values) if isinstance(values, Mapping) else np.asarray(values, dtype=np.float64)
         model = copy.copy(self.model)
-        for column, target in self.targets:
-            write_field(model, target.field, target.index, target.factor * vector[column])
+        self.write_into(model, vector)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
 

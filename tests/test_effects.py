@@ -30,7 +30,7 @@ from dropo_torch.effects.sensor import SensorScale
 from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
-from dropo_torch.gap.config import search_box, write_config
+from dropo_torch.gap.add import search_box, write_config
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import ParameterSpace

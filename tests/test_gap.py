@@ -29,11 +29,10 @@ from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
 from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Linearisation, cost_of, robust_factors
-from dropo_torch.gap.intervals import standard_errors
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit
+from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit, standard_errors
 from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
@@ -394,7 +393,7 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     scene, (truth,) = scene_of(name), hidden(name).effects
     base = refit(scene.evidence, scene.begin)
     candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
-    ranked = screen(Focus(scene.evidence, base, np.ones(len(scene.evidence.windows))), candidates)
+    ranked = screen(Focus(scene.evidence, base), candidates)
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
 

@@ -84,9 +84,7 @@ class Observation:
 
     def states(self, observations: np.ndarray) -> np.ndarray:
         """Return full states ``(T, nq + nv)`` of logged observations ``(T, log_width)``."""
-        observations = np.asarray(observations, dtype=np.float64)
-        states = np.tile(np.asarray(self.default_state), (len(observations), 1))
-        states[:, self.index] = observations[:, list(self.log_columns)]
+        states = self.full(self.observed(observations))
         for quaternion in self.quaternions:
             block = self.index[list(quaternion)]
             norm = np.linalg.norm(states[:, block], axis=1, keepdims=True)
@@ -97,6 +95,12 @@ class Observation:
                     "a unit quaternion (w, x, y, z) is expected"
                 )
             states[:, block] = states[:, block] / norm
+        return states
+
+    def full(self, columns: np.ndarray) -> np.ndarray:
+        """Return full states ``(T, nq + nv)`` of observed columns ``(T, n)``; what is not observed has its default."""
+        states = np.tile(np.asarray(self.default_state), (len(columns), 1))
+        states[:, self.index] = columns
         return states
 
     def observed(self, log: np.ndarray) -> np.ndarray:

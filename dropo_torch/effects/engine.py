@@ -13,7 +13,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Method, Placed, Setting
 from dropo_torch.models.load import quiet_mujoco
-from dropo_torch.parameters import ParameterSpace, write_field
+from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.mujoco import control_range, default_row, filter_activations
 
@@ -112,9 +112,7 @@ class VariantEngine:
             ModelRefused: values that MuJoCo refuses.
         """
         model = copy.copy(self._base)
-        for column, parameter in enumerate(self._space.parameters):
-            for target in parameter.targets:
-                write_field(model, target.field, target.index, target.factor * variant.declared[column])
+        self._space.write_into(model, variant.declared)
         for placed in variant.placed:
             placed.effect.apply(model, placed.target, np.asarray(placed.values))
         if (model.body_mass < 0).any() or (model.body_inertia < 0).any() or (model.dof_armature < 0).any():

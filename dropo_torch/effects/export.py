@@ -12,7 +12,7 @@ from dropo_torch.effects.base import Placed, applied
 from dropo_torch.errors import InputError
 from dropo_torch.models.export import read_spec, write_inertials
 from dropo_torch.models.load import quiet_mujoco, unsimplify
-from dropo_torch.parameters import ParameterSpace, write_field
+from dropo_torch.parameters import ParameterSpace
 from dropo_torch.support.files import write_atomically
 
 #: MJCF is written with six digits; accelerations may differ by so much of the largest.
@@ -47,9 +47,7 @@ def write_model(
     write_inertials(spec)
     model = spec.compile()
     if space is not None and values is not None:
-        for column, parameter in enumerate(space.parameters):
-            for target in parameter.targets:
-                write_field(model, target.field, target.index, target.factor * values[column])
+        space.write_into(model, values)
     model = applied(model, [p for p in placed if p.effect.native])
     try:
         with quiet_mujoco():

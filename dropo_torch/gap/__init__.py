@@ -1,12 +1,12 @@
 """What is the model missing? Locate it, name it, add it, verify that the gap shrinks."""
 
 from dropo_torch.gap.add import add
-from dropo_torch.gap.naming import Naming
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, NamedEffect, Place, Score, Strength
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.run import find_gap, locate, name, verify
 from dropo_torch.gap.scene import Scene, prepare
+from dropo_torch.gap.search import Naming
 
 __all__ = [
     "Gap",

@@ -1,16 +1,22 @@
-"""Accepting effects: the one or two that remove the most, and better ones in the place of those accepted before."""
+"""Accepting effects: the one or two that remove the most, better ones in the place of others, and which do as well."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
 
-from dropo_torch.effects.base import Placed
-from dropo_torch.gap.ground import FEWER, Ground
-from dropo_torch.gap.naming import State
+import numpy as np
+
+from dropo_torch.effects.base import Placed, Setting
+from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit
-from dropo_torch.gap.rules import significant, simplest
+from dropo_torch.gap.rules import near, significant, simplest
 from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
+
+#: Cosine of two candidates' derivatives from which on they are the same thing on this log.
+SAME = 0.9999
+#: The round of attempts that only look for ties.
+TIES = -1
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
@@ -22,7 +28,7 @@ def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
 def is_done(ground: Ground, state: State) -> bool:
     """Return whether what is left is noise, or too small a part of the gap to tell anything."""
     base, current = state.base, state.current
-    if ground.strategy.clears(base, current) or not significant(current.cost, ground.rules):
+    if ground.clears(base, current) or not significant(current.cost, ground.rules):
         return True
     return current.cost.excess < ground.rules.least * base.cost.excess
 
@@ -37,9 +43,10 @@ def add(ground: Ground, state: State) -> State:
         return replace(state, done=True)
     best = simplest(singles)
     if best.cost.excess / current.cost.excess > 1 - rules.most:
+        focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
+        pairs = promising_pairs(focus, screen(focus, [c.placed for c in alive[:16]]))
         families = promising_families(ground.focus(current), alive)
-        several = {"pairs": _pairs(ground, current, alive), "families": families}
-        for words, groups in several.items():
+        for words, groups in (("pairs", pairs), ("families", families)):
             tried, state = ground.refits(state, current, groups, f"refitting {words}")
             if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
                 best = tried[0]
@@ -50,19 +57,16 @@ def add(ground: Ground, state: State) -> State:
     return replace(state, current=best)
 
 
-def _pairs(ground: Ground, current: Refit, alive: Sequence[Candidate]) -> list[list[Placed]]:
-    """Pairs of promising candidates, screened again from where they promise the most, on more windows."""
-    focus = ground.focus(current, 2 * FEWER)
-    return promising_pairs(focus, screen(focus, [c.placed for c in alive[:16]]), 5)
-
-
 def swap(ground: Ground, state: State) -> State:
     """Try to put another effect in the place of each accepted one."""
     for _ in range(2):
         before = state.current
         for index in range(len(before.hypothesis.placed)):
             without = ground.refit(state.current.hypothesis.without(index))
-            rivals = [(c.placed,) for c in _rivals(ground, without, state.current)]
+            focus = ground.focus(without)
+            here = refit(focus.evidence, state.current.hypothesis, iterations=0).cost.chi2
+            alive = [c for c in ground.screened(without) if not c.dead]
+            rivals = [(c.placed,) for c in alive[:3] if c.chi2 < 0.8 * here]  # that promise to explain more
             found, state = ground.refits(state, without, rivals, "swapping")
             better = [r for r in found[:1] if r.cost.excess < state.current.cost.excess]
             if better and beats(ground, better[0], state.current):
@@ -72,20 +76,11 @@ def swap(ground: Ground, state: State) -> State:
     return state
 
 
-def _rivals(ground: Ground, without: Refit, current: Refit) -> list[Candidate]:
-    """Candidates that promise to explain more than the effect that was left out does, the best first."""
-    alive = [c for c in ground.screened(without) if not c.dead]
-    focus = ground.focus(without)
-    here = refit(focus.evidence, current.hypothesis, caps=focus.caps, iterations=0)
-    return [c for c in alive[:3] if c.chi2 < 0.8 * here.cost.chi2]
-
-
 def extend(ground: Ground, state: State) -> State:
     """Put effects that contain an accepted one in its place, where that explains more."""
     rules = ground.rules
     for index, own in enumerate(state.current.hypothesis.placed):
-        starts = ((e, values) for e in ground.effects for values in e.extends(ground.setting, own))
-        groups = [(Placed(effect, own.target).at(values),) for effect, values in starts]
+        groups = [(Placed(e, own.target).at(v),) for e in ground.effects for v in e.extends(ground.setting, own)]
         if not groups:
             continue
         origin = state.current.hypothesis.without(index)
@@ -126,3 +121,64 @@ def prune(ground: Ground, state: State) -> State:
             break
         current = least
     return replace(state, current=current)
+
+
+def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
+    """Return candidates that tie with a named effect, the excess that it accounts for, and the state with attempts."""
+    current = state.current
+    own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
+    without = ground.refit(origin) if origin.placed else state.base
+    ranked = ground.screened(without) if origin.placed else state.first.ranked
+    same = equivalents(ground.setting, own, ranked)
+    known = {own.key, *(p.key for p in same)}
+    fits = [c for c in ranked if not c.dead and len(c.placed.values) <= len(own.values)]
+    others = [(c.placed,) for c in fits if c.key not in known][: max(5 - len(same), 2)]
+    alike = [ground.refit(origin.with_effects([p]), iterations=3) for p in same]
+    rivals, state = ground.refits(replace(state, number=TIES), without, others, "looking for ties", origin)
+    found = []
+    for fitted in (*alike, *rivals):
+        as_clear = ground.clears(state.base, fitted) or not ground.clears(state.base, current)
+        close = fitted.cost.excess - current.cost.excess < near(current.cost)
+        if close and as_clear and ground.advantage(current, fitted) < ground.rules.tie:
+            found.append(fitted.hypothesis.placed[-1])
+    return tuple(found), without.cost.excess - current.cost.excess, state
+
+
+def equivalents(setting: Setting, own: Placed, ranked: Sequence[Candidate]) -> list[Placed]:
+    """Return candidates of one number whose derivatives point the same way, with the values that do the same.
+
+    Args:
+        setting: the model and its columns.
+        own: the effect, with its value.
+        ranked: a screening beside the hypothesis without it.
+    """
+    single = [c for c in ranked if len(c.slope) == len(c.placed.values) == 1]
+    mine = next((c.slope[0] for c in single if c.key == own.key), None)
+    if mine is None:
+        return []
+    found = []
+    for other in single:
+        slope = other.slope[0]
+        cosine = float(mine @ slope / max(np.linalg.norm(mine) * np.linalg.norm(slope), 1e-300))
+        if other.key == own.key or other.dead or abs(cosine) < SAME:
+            continue
+        here, there = (p.effect.quantities(setting, p.target)[0] for p in (own, other.placed))
+        ratio = float(mine @ slope / (slope @ slope)) / here.scale * there.scale
+        value = there.neutral + ratio * (own.values[0] - here.neutral)
+        found.append(other.placed.at([float(np.clip(value, there.low, there.high))]))
+    return found
+
+
+def canonical(
+    ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]
+) -> tuple[State, tuple[tuple[Placed, ...], ...]]:
+    """Among exact ties name the one with the fewest numbers that the vocabulary lists first."""
+    order = {effect.name: i for i, effect in enumerate(ground.effects)}
+    told = list(tied)
+    for index, rivals in enumerate(told):
+        own = state.current.hypothesis.placed[index]
+        first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name]))
+        if first is not own:
+            state = replace(state, current=ground.refit(state.current.hypothesis.instead(index, first)))
+            told[index] = tuple(own if p is first else p for p in rivals)
+    return state, tuple(told)

@@ -1,20 +1,43 @@
-"""Putting named effects into the model and the config."""
+"""Putting named effects into the model, and into the config that fits their numbers."""
 
 from __future__ import annotations
 
+import itertools
+import math
+import os
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
+import mujoco
+import mujoco.batch
 import numpy as np
+import yaml
 
+from dropo_torch.config import Config
 from dropo_torch.data.features import Features
 from dropo_torch.effects import find_effect
-from dropo_torch.effects.base import Placed, Setting
+from dropo_torch.effects.base import Placed, Quantity, Setting, applied
 from dropo_torch.effects.export import write_model
+from dropo_torch.effects.placing import EffectSet, Entry
+from dropo_torch.effects.simulator import overlap
 from dropo_torch.errors import InputError
-from dropo_torch.gap.config import write_config
 from dropo_torch.gap.log import make_setting
 from dropo_torch.gap.result import FAMILY, Gap
+from dropo_torch.models.bundled import bundled_sim
+from dropo_torch.parameters import ParameterSpace, Target, object_names, read_field
 from dropo_torch.problem import Problem
+from dropo_torch.support.files import write_atomically
+
+#: Intervals of an effect's numbers, by its key and the number's name.
+Intervals = Mapping[tuple[str, str | None], Mapping[str, tuple[float, float]]]
+#: Of an effect's numbers, by their names: their search boxes, and what a config says of each as a parameter.
+_Boxes = dict[str, tuple[float, float]]
+_Specifications = dict[str, dict[str, Any]]
+
+#: Half widths of a number's interval that its search box reaches, and the box's least half width, relative.
+REACH, LEAST = 4.0, 0.2
 
 
 def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, float]]]:
@@ -73,3 +96,150 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     ranges = {placed.key: intervals for placed, intervals in found.items()}
     write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml")
     return notes
+
+
+def write_config(
+    config: Config, space: ParameterSpace, setting: Setting, placed: Sequence[Placed], intervals: Intervals,
+    model_path: Path, path: Path,
+) -> None:  # fmt: skip
+    """Write the config of a fit of the effects' numbers, together with the parameters that the config had.
+
+    Numbers with an interval become parameters around their value; others stay fixed. Where fields of the model express
+    every native effect's numbers, one each, the config names ``model_path``, the model with these effects, and its
+    fields. Otherwise it names the model as it was, and its native effects stand in ``effects`` like all others.
+
+    Args:
+        config: the config by which the effects were found.
+        space: its parameters, over the model without effects.
+        setting: where the effects were found.
+        placed: the effects with values.
+        intervals: where a number lies, as ``(low, high)``, by the effect's key and the number's name.
+        model_path: the model that :func:`~dropo_torch.effects.export.write_model` wrote.
+        path: where to write.
+    """
+    document = _document(config, path.parent)
+    boxes = {p.key: _boxes(p, setting, intervals.get(p.key, {})) for p in placed}
+    native = {p.key: p for p in placed if p.effect.native}
+    # Fields are written after the model is read: what both a parameter and an effect write must stay an effect.
+    entries = tuple(Entry(p.effect, p.target, p.values, (-1,) * len(p.values)) for p in native.values())
+    fields: dict[tuple[str, str | None], _Specifications | None] = {}
+    if not (
+        config.backend == "gymnasium"
+        or config.effects
+        or overlap(EffectSet(entries, setting), space)
+        or any(spec.get("relative") for spec in document["parameters"].values())
+    ):
+        fields = {key: _fields(p, setting, boxes[key]) for key, p in native.items()}
+    plain = None not in fields.values()
+    if fields and plain:
+        document["model"] = os.path.relpath(model_path.resolve(), path.parent.resolve())
+    for p in placed:
+        found = fields.get(p.key) if plain else None
+        if found is None:
+            fixed = config.backend == "gymnasium" and p.effect.native
+            entry, found = _effect(p, setting, {} if fixed else boxes[p.key])
+            document["effects"] = [*document.get("effects", []), entry]
+        for number, specification in found.items():
+            document["parameters"][_free_name(document["parameters"], p, number)] = specification
+    inside = [p for p in placed if not p.effect.outer and not (plain and p.key in fields)]
+    if inside and config.backend == "warp":
+        document["backend"] = "mujoco"
+    if document.get("effects") and config.optimizer == "adam":
+        document["optimizer"] = "fisher"
+    text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
+    write_atomically(path, text.encode())
+
+
+def _boxes(placed: Placed, setting: Setting, intervals: Mapping[str, tuple[float, float]]) -> _Boxes:
+    """The bounds of the numbers that have an interval."""
+    quantities = zip(placed.effect.quantities(setting, placed.target), placed.values, strict=True)
+    return {q.name: search_box(v, intervals[q.name], q) for q, v in quantities if q.name in intervals}
+
+
+def search_box(value: float, interval: tuple[float, float], quantity: Quantity) -> tuple[float, float]:
+    """Return the bounds of a number that was found in an interval: several half widths to either side."""
+    half = 0.5 * abs(interval[1] - interval[0])
+    reach = max(REACH * half, LEAST * abs(value), 1e-3 * quantity.scale)
+    low, high = max(value - reach, quantity.low), min(value + reach, quantity.high)
+    return (float(f"{low:.4g}"), float(f"{high:.4g}")) if low < high else (value - reach, value + reach)
+
+
+def _document(config: Config, folder: Path) -> dict[str, Any]:
+    """The config as plain data without a bundled simulation, whose parts it names instead."""
+    document = config.portable()
+    if config.sim is not None and config.backend != "gymnasium":
+        sim = bundled_sim(config.sim)
+        own = {
+            "model": str(sim.model), "data": str(sim.log), "frame_skip": sim.frame_skip,
+            "observation": list(sim.observation), "parameters": {n: dict(s) for n, s in sim.parameters.items()},
+        }  # fmt: skip
+        document = {**own, **{k: v for k, v in document.items() if k != "sim"}}
+    document.setdefault("parameters", {})
+    return document
+
+
+def _fields(placed: Placed, setting: Setting, boxes: _Boxes) -> _Specifications | None:
+    """An effect's numbers as parameters that are fields of the model; ``None`` unless each is one number of it."""
+    found = {}
+    for i, q in enumerate(placed.effect.quantities(setting, placed.target)):
+        if q.name in boxes:
+            own, (low, high) = placed.values[i], boxes[q.name]
+            values = [(*placed.values[:i], v, *placed.values[i + 1 :]) for v in (own, own + 1e-3 * q.scale, low, high)]
+            here, there, *ends = (applied(setting.model, [placed.at(v)]) for v in values)
+            changed = _differing(here, there)
+            specification = _specification(setting.model, *changed[0]) if len(changed) == 1 else None
+            if specification is None:
+                return None
+            bounds = sorted(float(f"{Target(*changed[0]).read(end):.6g}") for end in ends)
+            found[q.name] = {**specification, "bounds": bounds, "unit": q.unit}
+    return found
+
+
+def _effect(placed: Placed, setting: Setting, boxes: _Boxes) -> tuple[dict[str, Any], _Specifications]:
+    """An effect as an entry of ``effects``, and its numbers that are parameters."""
+    name, quantities = placed.effect.name, placed.effect.quantities(setting, placed.target)
+    numbers = {q.name: float(f"{v:.6g}") for q, v in zip(quantities, placed.values, strict=True)}
+    target, place = ({} if placed.target is None else {key: placed.target} for key in ("target", "name"))
+    parameters = {
+        q.name: {"effect": name, **place, "index": q.name, "bounds": list(boxes[q.name]), "unit": q.unit}
+        for q in quantities
+        if q.name in boxes
+    }
+    return {"effect": name, **target, **numbers}, parameters
+
+
+def _differing(one: mujoco.MjModel, other: mujoco.MjModel) -> list[tuple[str, int]]:
+    """The real numbers in which two models differ."""
+    found = []
+    for field in sorted(mujoco.batch.MODEL_FIELDS):
+        a, b = (read_field(m, field).reshape(-1) for m in (one, other))
+        found += [(field, int(i)) for i in np.flatnonzero(a != b)]
+    return found
+
+
+def _specification(model: mujoco.MjModel, field: str, flat: int) -> dict[str, Any] | None:
+    """How a config names a number of the model, or ``None``."""
+    shape = read_field(model, field).shape
+    if field.startswith("opt."):
+        return {"field": field, **({"index": flat} if math.prod(shape) > 1 else {})}
+    size = math.prod(shape[1:])
+    row, component = divmod(flat, size)
+    prefix = field.split("_", 1)[0]
+    if prefix in ("dof", "qpos"):
+        at = model.jnt_dofadr if prefix == "dof" else model.jnt_qposadr
+        match = np.flatnonzero((at == row) & (model.jnt_type >= int(mujoco.mjtJoint.mjJNT_SLIDE)))
+        if not match.size:
+            return None
+        row = int(match[0])
+    elif prefix not in ("jnt", "body", "geom", "actuator"):
+        return None
+    name = object_names(model, prefix)[row]
+    return {"field": field, "name": name, **({"index": component} if size > 1 else {})}
+
+
+def _free_name(taken: Mapping[str, Any], placed: Placed, number: str) -> str:
+    """A name for a parameter, such as ``elbow_friction``."""
+    place = placed.target if placed.target is not None else placed.effect.name
+    base = re.sub("[ ./]", "_", f"{place}_{number}")
+    options = itertools.chain((base, f"{base}_{placed.effect.name}"), (f"{base}_{i}" for i in itertools.count(2)))
+    return next(name for name in options if name not in taken)

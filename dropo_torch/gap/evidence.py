@@ -59,7 +59,9 @@ class Evidence:
         noise: standard deviation of the measurement of each feature, ``(m,)``.
         rough: linearise statistically, over draws of noise on the initial states, as contacts need it.
         model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``.
-        robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost).
+        robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost): what is named
+            must then be right in most windows, and otherwise explain all of them together.
+        caps: factors of the windows' residuals in fits, ``(W,)``, or 1.
     """
 
     twin: Twin
@@ -68,11 +70,16 @@ class Evidence:
     rough: bool
     model_error: np.ndarray | float = 1.0
     robust: bool = False
+    caps: np.ndarray | float = 1.0
 
     def on(self, windows: Windows) -> Evidence:
-        """Return the same over other windows."""
+        """Return the same over other windows, none of them capped."""
         same = windows.length == self.windows.length
-        return replace(self, windows=windows, model_error=self.model_error if same else 1.0)
+        return replace(self, windows=windows, model_error=self.model_error if same else 1.0, caps=1.0)
+
+    def select(self, rows: np.ndarray) -> Evidence:
+        """Return the same over some of the windows."""
+        return replace(self.on(self.windows.select(rows)), caps=np.broadcast_to(self.caps, len(self.windows))[rows])
 
     @cached_property
     def chart(self) -> Features:
@@ -140,9 +147,7 @@ class Evidence:
 
     def project(self, residuals: np.ndarray, linear: Linearisation) -> np.ndarray:
         """Return the part ``(..., W, N)`` of residuals that no initial states explain; lost ones count as LOST."""
-        lost = ~np.isfinite(residuals)
-        shifted = residuals + (linear.shift if not lost.all() else 0.0)
-        return _beside(linear, np.where(lost, LOST, shifted))
+        return _beside(linear, np.where(np.isfinite(residuals), residuals + linear.shift, LOST))
 
     def project_slope(self, slope: np.ndarray, linear: Linearisation) -> np.ndarray:
         """Return :meth:`project` of derivatives ``(..., W, N)``."""
@@ -151,6 +156,10 @@ class Evidence:
     def degrees(self, linear: Linearisation) -> float:
         """Return the degrees of freedom that the windows have beside their initial states."""
         return float((linear.weights > 0).sum() - len(self.windows) * self.chart.size)
+
+    def cost(self, projected: np.ndarray, linear: Linearisation, numbers: int = 0) -> Cost:
+        """Return the cost of projected residuals ``(W, N)`` to which some numbers were fitted."""
+        return cost_of(projected, linear, self.degrees(linear) - numbers, self.caps, self.tail(linear))
 
 
 def _beside(linear: Linearisation, vectors: np.ndarray) -> np.ndarray:
@@ -196,7 +205,7 @@ class Cost:
 
 
 def cost_of(
-    projected: np.ndarray, linear: Linearisation, degrees: float, caps: np.ndarray | None = None,
+    projected: np.ndarray, linear: Linearisation, degrees: float, caps: np.ndarray | float = 1.0,
     tail: float | None = None,
 ) -> Cost:  # fmt: skip
     """Return the cost of projected residuals ``(W, N)``.
@@ -208,11 +217,8 @@ def cost_of(
         caps: factors of the windows' residuals, ``(W,)``.
         tail: of :meth:`Evidence.tail`; then a window with as much as noise makes still costs its degrees of freedom.
     """
-    chi2 = (projected**2).sum(-1)
-    weights = linear.weights
-    penalty = -2 * np.log(np.where(weights > 0, weights, 1.0)).sum(-1)
-    if caps is not None:
-        chi2, penalty = chi2 * caps**2, penalty * caps**2
+    weights = np.where(linear.weights > 0, linear.weights, 1.0)
+    chi2, penalty = (projected**2).sum(-1) * caps**2, -2 * np.log(weights).sum(-1) * caps**2
     if tail is not None:
         chi2 = robust_loss(chi2, tail) / (TAIL * np.log1p(1 / TAIL))
     return Cost(chi2, penalty, degrees)

@@ -1,30 +1,71 @@
-"""What every step of a search stands on, and the refits of what a step proposes."""
+"""What every step of a search stands on and hands on, and the refits of what a step proposes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import blocks_of, spread
-from dropo_torch.gap.naming import Attempt, State
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.rules import Rules, paired
+from dropo_torch.gap.result import Ranked
+from dropo_torch.gap.rules import Rules, clears, paired
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, screen
-
-if TYPE_CHECKING:
-    from dropo_torch.gap.strategy import Strategy
 
 #: Windows that refits use, and that the screening uses; all if there are fewer.
 FEW, FEWER = 40, 10
 
 #: ``report(stage, share)`` as the work goes on.
 Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Screening:
+    """What every candidate promises beside the declared parameters alone.
+
+    Attributes:
+        ranked: the candidates, the most promising first.
+        chi2: χ² of the screened windows without them.
+        degrees: its degrees of freedom.
+    """
+
+    ranked: tuple[Candidate, ...]
+    chi2: float
+    degrees: float
+
+    @property
+    def silent(self) -> tuple[Placed, ...]:
+        """Candidates that change nothing on this log, which it therefore cannot judge."""
+        return tuple(c.placed for c in self.ranked if c.dead)
+
+
+@dataclass(frozen=True)
+class State:
+    """Where a search stands; a checkpoint holds nothing else.
+
+    Attributes:
+        noise: standard deviation of each feature, ``(m,)``: lower than the scene's where a fit showed that it is.
+        caps: factors of the windows' residuals in all fits, ``(W,)``, or 1.
+        base: the declared parameters alone.
+        first: the screening beside them.
+        current: the hypothesis so far.
+        number: rounds done.
+        done: whether no round is to follow.
+        attempts: what was refitted, in order.
+    """
+
+    noise: np.ndarray
+    caps: np.ndarray | float
+    base: Refit
+    first: Screening
+    current: Refit
+    number: int = 0
+    done: bool = False
+    attempts: tuple[Ranked, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -35,17 +76,15 @@ class Ground:
         evidence: all windows of the training part.
         effects: the vocabulary.
         rules: thresholds.
-        strategy: how windows count that no effect explains.
         report: called with a stage and its share done.
-        caps: factors of the refitted windows' residuals, ``(W,)``; 1 by default.
+        caps: factors of the refitted windows' residuals, ``(W,)``, or 1.
     """
 
     evidence: Evidence
     effects: tuple[Effect, ...]
     rules: Rules
-    strategy: Strategy
-    report: Report
-    caps: np.ndarray | None = None
+    report: Report = lambda stage, share: None
+    caps: np.ndarray | float = 1.0
 
     def at(self, state: State) -> Ground:
         """Return the ground with the noise and the caps that a state has found."""
@@ -59,7 +98,7 @@ class Ground:
     @cached_property
     def part(self) -> Evidence:
         """The evidence on the windows that refits use."""
-        return self.evidence.on(spread(self.evidence.windows, FEW))
+        return replace(self.evidence.on(spread(self.evidence.windows, FEW)), caps=self.caps)
 
     @cached_property
     def candidates(self) -> list[Placed]:
@@ -68,11 +107,14 @@ class Ground:
 
     def refit(self, hypothesis: Hypothesis, iterations: int = 12) -> Refit:
         """Return a hypothesis fitted on the windows that refits use."""
-        return refit(self.part, hypothesis, caps=self.caps, iterations=iterations)
+        return refit(self.part, hypothesis, iterations=iterations)
+
+    def clears(self, base: Refit, current: Refit) -> bool:
+        """Return whether effects are right although something else remains in some windows; only if these may part."""
+        return self.evidence.robust and clears(base, current)
 
     def focus(self, fitted: Refit, count: int = FEWER) -> Focus:
         """Return a fitted hypothesis on the windows that it fits worst and on a spread of the others."""
-        assert self.caps is not None
         order = np.argsort(-fitted.cost.windows)
         half = count // 2
         others = np.linspace(0, len(order) - 1, count - half).astype(int)
@@ -81,7 +123,7 @@ class Ground:
             fitted, residual=fitted.residual[rows], slope=fitted.slope[:, rows], linear=fitted.linear.select(rows),
             factor=fitted.factor[rows],
         )  # fmt: skip
-        return Focus(self.part.on(self.part.windows.select(rows)), here, self.caps[rows])
+        return Focus(self.part.select(rows), here)
 
     def screened(self, fitted: Refit) -> list[Candidate]:
         """Return what all candidates promise beside a fitted hypothesis."""
@@ -114,7 +156,7 @@ class Ground:
 
         def rough(hypothesis: Hypothesis, iterations: int) -> Refit:
             linear = focus.fitted.linear
-            return refit(focus.evidence, hypothesis, linear=linear, caps=focus.caps, iterations=iterations)
+            return refit(focus.evidence, hypothesis, linear=linear, iterations=iterations)
 
         found = []
         for number, group in enumerate(groups):
@@ -123,7 +165,8 @@ class Ground:
         found.sort(key=lambda r: r.cost.excess)
         found[:4] = [rough(r.hypothesis, 5) for r in found[:4]]
         found.sort(key=lambda r: r.cost.excess)
-        attempts = [Attempt(p, r.cost.excess, before, state.number) for r in found for p in r.hypothesis.placed[known:]]
+        left = [(p, max(r.cost.excess, 0.0) / max(before, 1e-12)) for r in found for p in r.hypothesis.placed[known:]]
+        attempts = [Ranked(*p.key, p.summary(self.setting), share, state.number) for p, share in left]
         best = found[0].cost
         near = 3 * max(best.excess, 0.0) + self.rules.least * before + 10 * best.sigma
         full = []

@@ -9,9 +9,10 @@ import numpy as np
 from scipy import stats
 
 from dropo_torch.data.observation import joint_name
-from dropo_torch.effects.base import Setting
+from dropo_torch.effects.actuator import driven_joint
+from dropo_torch.effects.base import Setting, object_number
+from dropo_torch.gap.ground import Screening
 from dropo_torch.gap.log import blocks_of
-from dropo_torch.gap.naming import Screening
 from dropo_torch.gap.noise import FreeForces
 from dropo_torch.gap.result import Place, Residuals
 from dropo_torch.gap.twin import Windows
@@ -63,16 +64,9 @@ def force_unit(model: mujoco.MjModel, dof: int) -> str:
 def middles(setting: Setting, windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions ``(W, nq)``, velocities ``(W, nv)`` and commands ``(W, nu)`` in the middle of windows."""
     middle = windows.length // 2
-    states = _states(setting, windows.measured[:, middle])
+    states = setting.observation.full(windows.measured[:, middle])
     commands = windows.commands[windows.episodes, windows.steps + middle]
     return states[:, : setting.model.nq], states[:, setting.model.nq :], commands
-
-
-def _states(setting: Setting, columns: np.ndarray) -> np.ndarray:
-    """States ``(W, nq + nv)`` of observed columns; what is not observed has its default."""
-    states = np.tile(np.array(setting.observation.default_state), (len(columns), 1))
-    states[:, setting.observation.index] = columns
-    return states
 
 
 def regressors(setting: Setting, windows: Windows, dof: int) -> list[Regressor]:
@@ -95,7 +89,7 @@ def regressors(setting: Setting, windows: Windows, dof: int) -> list[Regressor]:
     if model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE):
         at = position[:, model.jnt_qposadr[joint]]
         plainly(f"with the position of {name}", at, f"position of {name}", "rad" if angular else "m")
-    begin, end = (_states(setting, windows.measured[:, i])[:, model.nq + dof] for i in (0, -1))
+    begin, end = (setting.observation.full(windows.measured[:, i])[:, model.nq + dof] for i in (0, -1))
     plainly(f"with the acceleration of {name}", end - begin, f"change of {speed[0]}", speed[1])
     earlier = windows.commands[windows.episodes, np.maximum(windows.steps + windows.length // 2 - 3, 0)]
     for i in range(model.nu):
@@ -170,20 +164,16 @@ def _dof_of(setting: Setting, kind: str, name: str | None) -> int | None:
     """The degree of freedom in whose force a place shows first."""
     model = setting.model
     if kind == "joint":
-        return setting.dof(str(name))
+        return setting.dof(name)
     if kind == "actuator":
-        i = setting.names("actuator").index(str(name))
-        if model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_JOINT:
-            return int(model.jnt_dofadr[model.actuator_trnid[i, 0]])
+        joint = driven_joint(model, object_number(model, "actuator", name))
+        return None if joint is None else int(model.jnt_dofadr[joint])
     if kind == "body":
-        b = setting.names("body").index(str(name))
-        while b > 0 and model.body_dofnum[b] == 0:
-            b = int(model.body_parentid[b])
-        return int(model.body_dofadr[b]) if b > 0 else None
+        moving = int(model.body_weldid[object_number(model, "body", name)])
+        return int(model.body_dofadr[moving]) if moving > 0 else None
     if kind == "sensor":
-        joint = str(name).rsplit(".", 1)[0]
-        names = [joint_name(model, j) for j in range(model.njnt)]
-        return int(model.jnt_dofadr[names.index(joint)]) if joint in names else None
+        stem, names = str(name).rsplit(".", 1)[0], [joint_name(model, j) for j in range(model.njnt)]
+        return int(model.jnt_dofadr[names.index(stem)]) if stem in names else None
     return None
 
 

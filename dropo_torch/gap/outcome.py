@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -11,14 +11,13 @@ import numpy as np
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.intervals import Z90, standard_errors, step_errors
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
-from dropo_torch.gap.naming import Naming
 from dropo_torch.gap.noise import FreeForces, free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.refit import Z90, Hypothesis, Refit, refit, standard_errors, step_errors
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Score, Strength
 from dropo_torch.gap.rules import WRONG
 from dropo_torch.gap.scene import Scene, short_windows
+from dropo_torch.gap.search import Naming
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, score
@@ -63,7 +62,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         labels=evidence.chart.labels,
         units=evidence.chart.units,
         reduced=(naming.base.cost.reduced, naming.final.cost.reduced),
-        ranking=_ranking(setting, naming),
+        ranking=_ranking(naming.attempts),
         residuals=residual_pictures(setting, before, after, 2 if naming.gap else 0),
         cannot_judge=tuple(p.key for p in naming.first.silent),
         rollout_seconds=held.seconds,
@@ -170,11 +169,10 @@ def _next_experiment(naming: Naming, final: Refit) -> str | None:
     return suggest(naming.evidence, best, best.instead(index, other), best.placed[index], other)
 
 
-def _ranking(setting: Setting, naming: Naming) -> tuple[Ranked, ...]:
-    best: dict[tuple[int, tuple[str, str | None]], Ranked] = {}
-    for t in naming.attempts:
-        entry = Ranked(*t.placed.key, t.placed.summary(setting), max(t.excess, 0.0) / max(t.before, 1e-12), t.round)
-        key = (t.round, t.placed.key)
-        if key not in best or best[key].left > entry.left:
-            best[key] = entry
+def _ranking(attempts: Iterable[Ranked]) -> tuple[Ranked, ...]:
+    """The best attempt of every candidate in every round."""
+    best: dict[tuple[int, str, str | None], Ranked] = {}
+    for tried in attempts:
+        key = (tried.round, tried.effect, tried.target)
+        best[key] = min(best.get(key, tried), tried, key=lambda r: r.left)
     return tuple(sorted(best.values(), key=lambda r: (r.round, r.left)))

@@ -1,4 +1,4 @@
-"""Fitting a hypothesis: its effects' numbers together with the declared parameters."""
+"""Fitting a hypothesis: its effects' numbers together with the declared parameters, and how certain they are."""
 
 from __future__ import annotations
 
@@ -6,10 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
+from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors, robust_loss
+from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, robust_factors, robust_loss
+from dropo_torch.gap.log import blocks_of
 from dropo_torch.gap.twin import Twin
 from dropo_torch.optimizers.least_squares import bounded_step
 
@@ -21,6 +24,12 @@ DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
 RIDGE, LONGEST = 1e-12, 5.0
 #: Move, relative to a parameter's scale, after which the initial states are linearised again.
 FAR = 0.03
+#: Half-width of a 90 % interval in standard errors.
+Z90 = 1.6449
+#: χ² per degree of freedom from which on the simulation's own step may bias a fit.
+BIASED = 1.2
+#: An error of first order at a step is twice what halving the step changes.
+FIRST_ORDER = 2.0
 
 
 @dataclass(frozen=True)
@@ -102,7 +111,8 @@ class Refit:
         slope: projected derivatives by all numbers, in units of their scale, ``(q, W, N)``.
         linear: the linearisation in the initial states.
         scale: the numbers' scales, ``(q,)``.
-        factor: factors of the windows' residuals that the fit ended with, ``(W,)``.
+        factor: factors of the windows' residuals that the robust cost ended with, ``(W,)``.
+        loss: what the fit minimised.
     """
 
     hypothesis: Hypothesis
@@ -112,6 +122,7 @@ class Refit:
     linear: Linearisation
     scale: np.ndarray
     factor: np.ndarray
+    loss: float = 0.0
 
     @property
     def typical(self) -> np.ndarray:
@@ -137,24 +148,8 @@ def beside(
     return [hypothesis.at(vector + change) for change in changes], steps
 
 
-@dataclass(frozen=True)
-class _Point:
-    """A hypothesis on the way, with its projected residuals, their slopes, loss, and least-squares factors."""
-
-    hypothesis: Hypothesis
-    residual: np.ndarray
-    slope: np.ndarray
-    loss: float
-    factor: np.ndarray
-
-
 def refit(
-    evidence: Evidence,
-    hypothesis: Hypothesis,
-    *,
-    linear: Linearisation | None = None,
-    caps: np.ndarray | None = None,
-    iterations: int = 12,
+    evidence: Evidence, hypothesis: Hypothesis, *, linear: Linearisation | None = None, iterations: int = 12
 ) -> Refit:
     """Fit all numbers of a hypothesis by Levenberg-Marquardt on projected residuals.
 
@@ -162,30 +157,33 @@ def refit(
         evidence: the windows.
         hypothesis: where to begin.
         linear: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
-        caps: factors of the windows' residuals.
         iterations: the most of them.
     """
     limits = limits_of(hypothesis, evidence.twin)
     relinearise = linear is None
     linear = evidence.linearise(hypothesis.variant) if linear is None else linear
-    caps, tail = np.ones(len(evidence.windows)) if caps is None else caps, evidence.tail(linear)
+    tail = evidence.tail(linear)
 
-    def at(vector: np.ndarray) -> _Point:
+    def at(vector: np.ndarray) -> Refit:
         there = hypothesis.at(np.clip(vector, limits.low, limits.high))
         moved, steps = beside(there, limits, np.arange(len(vector)), STEP)
         found, _ = evidence.residuals([h.variant for h in (there, *moved)])
         residual = evidence.project(found[0], linear)
         slope = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
-        chi2 = ((residual * caps[:, None]) ** 2).sum(-1)
-        loss = float(robust_loss(chi2, tail).sum())
-        return _Point(there, residual, slope, loss, caps * robust_factors(chi2, tail))
+        chi2 = ((residual * np.reshape(evidence.caps, (-1, 1))) ** 2).sum(-1)
+        loss, factor = float(robust_loss(chi2, tail).sum()), robust_factors(chi2, tail)
+        cost = evidence.cost(residual, linear, len(vector))
+        return Refit(there, cost, residual, slope, linear, limits.scale, factor, loss)
+
+    def distance(vector: np.ndarray, other: Hypothesis) -> float:
+        return float(np.abs((vector - other.vector) / limits.scale).max(initial=0.0))
 
     damping = DAMPING
     here = begin = at(hypothesis.vector)
     for _ in range(iterations):
-        trial = here.hypothesis.vector + _move(here, limits, damping) * limits.scale
+        trial = here.hypothesis.vector + _move(here, limits, evidence.caps * here.factor, damping) * limits.scale
         trial = np.clip(trial, limits.low, limits.high)
-        if np.abs((trial - here.hypothesis.vector) / limits.scale).max(initial=0.0) < LEAST_MOVE:
+        if distance(trial, here.hypothesis) < LEAST_MOVE:
             break
         there = at(trial)
         if there.loss < here.loss:
@@ -196,20 +194,68 @@ def refit(
             damping *= 6
             if damping > MOST_DAMPING:
                 break
-    moved = np.abs((here.hypothesis.vector - begin.hypothesis.vector) / limits.scale).max(initial=0.0)
-    if relinearise and moved > FAR:
+    if relinearise and distance(here.hypothesis.vector, begin.hypothesis) > FAR:
         again = evidence.linearise(here.hypothesis.variant)
-        return refit(evidence, here.hypothesis, linear=again, caps=caps, iterations=4)
-    degrees = evidence.degrees(linear) - len(limits.scale)
-    cost = cost_of(here.residual, linear, degrees, caps, tail)
-    return Refit(here.hypothesis, cost, here.residual, here.slope, linear, limits.scale, here.factor / caps)
+        return refit(evidence, here.hypothesis, linear=again, iterations=4)
+    return here
 
 
-def _move(here: _Point, limits: Limits, damping: float) -> np.ndarray:
-    """The damped step in units of the scales, ``(q,)``."""
+def _move(here: Refit, limits: Limits, factor: np.ndarray, damping: float) -> np.ndarray:
+    """The damped step in units of the scales, ``(q,)``, of residuals with factors of their windows, ``(W,)``."""
     if not len(here.slope):
         return np.zeros(0)
-    flat, residual = ((x * here.factor[:, None]).reshape(*x.shape[:-2], -1) for x in (here.slope, here.residual))
+    flat, residual = ((x * factor[:, None]).reshape(*x.shape[:-2], -1) for x in (here.slope, here.residual))
     low, high = limits.moves(here.hypothesis.vector)
     step = bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, RIDGE, np.ones(len(flat)))
     return np.clip(step, -LONGEST, LONGEST)
+
+
+def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
+    """Return standard errors of all numbers of a fit ``(q,)``, in their units; infinite for those without influence.
+
+    The larger of two: by the noise, inflated by χ² per degree of freedom; and by how much the blocks of the log
+    disagree (the sandwich of cluster-robust errors), which also counts what the model still lacks.
+
+    Args:
+        fitted: a fit with its projected residuals and derivatives.
+        episodes: trajectory of each window, ``(W,)``.
+    """
+    slope, residual = fitted.slope * fitted.factor[:, None], fitted.residual * fitted.factor[:, None]
+    size = len(slope)
+    if not size:
+        return np.zeros(0)
+    normal = np.einsum("awn,bwn->ab", slope, slope)
+    diagonal = np.diag(normal)
+    known = diagonal > 1e-12 * diagonal.max(initial=0.0)
+    length = np.where(known, np.sqrt(np.maximum(diagonal, 0.0)), 1.0)
+    unit = np.outer(length, length)
+    shown = np.where(np.outer(known, known), normal / unit, np.eye(size))
+    inverse = np.linalg.pinv(shown, rcond=1e-12, hermitian=True) / unit
+    plain = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(1.0, fitted.cost.reduced))
+    blocks = blocks_of(episodes, 4)
+    names = np.unique(blocks)
+    scores = np.einsum("awn,wn->wa", slope, residual)
+    sums = np.stack([scores[blocks == b].sum(0) for b in names])
+    middle = sums.T @ sums * len(names) / max(len(names) - 1, 1)
+    factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / Z90
+    clustered = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)) * factor
+    inflated = fitted.cost.reduced > 1.5
+    return np.where(known, np.maximum(plain, clustered) if inflated else plain, np.inf) * fitted.scale
+
+
+def step_errors(evidence: Evidence, fitted: Refit) -> np.ndarray:
+    """Return by how much the simulation's own step may bias each number ``(q,)``, in their units.
+
+    The fit is repeated with half the step, on the windows and weights of the fit. Dry friction, ripples and stops are
+    resolved by the step only so well, and with little noise that is more than the standard errors. Zero where the fit
+    leaves no more than noise.
+    """
+    vector = fitted.hypothesis.vector
+    finer = find_effect("integration")
+    as_noise = fitted.cost.reduced < BIASED and not np.any(evidence.model_error > 1)
+    if as_noise or any(p.effect is finer for p in fitted.hypothesis.placed):
+        return np.zeros(len(vector))
+    step = float(evidence.twin.setting.model.opt.timestep)
+    other = replace(evidence, twin=evidence.twin.also(Placed(finer, None, (step / 2,))))
+    again = refit(other, fitted.hypothesis, linear=fitted.linear, iterations=3)
+    return FIRST_ORDER * np.abs(again.hypothesis.vector - vector)

@@ -161,14 +161,13 @@ class Gap:
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``gap.json``."""
-        scores = {"before": self.before, "after": self.after, "noise_floor": self.noise_floor}
         return plain_numbers({
             "schema": SCHEMA,
             "where": [asdict(place) for place in self.where],
             "effects": [_effect(e) for e in self.effects],
             "gap": {
-                name: {k: getattr(found, k) for k in ("mse", "log_likelihood", "rollout_rmse")}
-                for name, found in scores.items()
+                name: {key: getattr(getattr(self, name), key) for key in ("mse", "log_likelihood", "rollout_rmse")}
+                for name in ("before", "after", "noise_floor")
             },
             "next_experiment": self.next_experiment,
             "declared": {

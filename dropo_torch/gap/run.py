@@ -3,36 +3,22 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import VOCABULARY, Effect
-from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, Report
 from dropo_torch.gap.locate import places
-from dropo_torch.gap.naming import Naming
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import make_result
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules
-from dropo_torch.gap.scene import Scene, contact_windows, prepare, short_windows, shorter_windows
-from dropo_torch.gap.search import Checkpoint, search, start
-from dropo_torch.gap.strategy import ContactWindows, Strategy
+from dropo_torch.gap.scene import Scene, prepare, searched, short_windows
+from dropo_torch.gap.search import Checkpoint, Naming, search, start
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
-
-#: The searches in their order: suffix of the checkpoint, the windows (``None`` where the log has none), the strategy.
-SEARCHES: tuple[tuple[str, Callable[[Scene], Evidence | None], Strategy], ...] = (
-    ("", lambda scene: scene.evidence, Strategy()),
-    ("-shorter", shorter_windows, Strategy()),
-    ("-contact", contact_windows, ContactWindows()),
-)
-
-
-def _quiet(stage: str, share: float) -> None:
-    """Report nothing."""
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -83,7 +69,7 @@ def find_gap(
     rules: Rules | None = None,
     checkpoint: Path | None = None,
     resume: bool = False,
-    report: Report = _quiet,
+    report: Report = lambda stage, share: None,
     scene: Scene | None = None,
 ) -> Gap:
     """Find where simulation and log disagree, name the missing effects, and verify them on held-out data.
@@ -103,7 +89,7 @@ def find_gap(
     started = time.perf_counter()
     report("preparing", 0.0)
     scene = scene or prepare(problem)
-    naming = _name(scene, _ground(scene, effects, rules, report), checkpoint, resume)
+    naming = _name(scene, replace(_ground(scene, effects, rules), report=report), checkpoint, resume)
     report("verifying", 0.0)
     return make_result(scene, naming, started)
 
@@ -112,18 +98,14 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly."""
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
     found = []
-    for suffix, make, strategy in SEARCHES:
-        evidence = make(scene)
-        if evidence is not None:
-            path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
-            here = replace(ground, evidence=evidence, strategy=strategy)
-            found.append(search(here, scene.begin, Checkpoint(path, resume, known)))
-            if found[-1].named or not found[0].gap:
-                break
+    for suffix, evidence in searched(scene):
+        path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
+        found.append(search(replace(ground, evidence=evidence), scene.begin, Checkpoint(path, resume, known)))
+        if found[-1].named or not found[0].gap:
+            break
     return found[-1] if found[-1].named else found[0]
 
 
-def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None, report: Report = _quiet) -> Ground:
+def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None) -> Ground:
     """What a search stands on, by default with the whole vocabulary and the package's thresholds."""
-    known = tuple(effects or VOCABULARY.values())
-    return Ground(scene.evidence, known, rules or Rules(), Strategy(), report)
+    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or Rules())

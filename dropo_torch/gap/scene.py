@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -88,7 +89,7 @@ def short_windows(setting: Setting, log: Trajectories) -> Windows:
     Raises:
         InputError: a log with too few of them.
     """
-    windows = _cut(setting, log, LENGTH, SHORT)
+    windows = spread(cut_windows(log, setting.observation, LENGTH), SHORT)
     if len(windows) < 5:
         raise InputError(
             f"data: {log.source} has {len(windows)} stretches of {LENGTH} steps; expected at least 5, "
@@ -97,39 +98,36 @@ def short_windows(setting: Setting, log: Trajectories) -> Windows:
     return windows
 
 
-def shorter_windows(scene: Scene) -> Evidence | None:
-    """Windows a quarter as long, in which a large gap bends the simulation less; ``None`` if they are short."""
-    length = scene.evidence.windows.length // 4
-    if length < LENGTHS[-1]:
-        return None
-    windows = _cut(scene.setting, scene.train, length, MOST)
-    return Evidence(scene.twin, windows, scene.noise, rough=scene.evidence.rough)
+def searched(scene: Scene) -> Iterator[tuple[str, Evidence]]:
+    """Yield the windows of each search in turn, with a suffix for its checkpoint.
 
-
-def contact_windows(scene: Scene) -> Evidence | None:
-    """The shortest windows with a robust cost, for logs in which contacts part the windows into right and wrong."""
-    if not scene.setting.signals.contacts.any():
-        return None
-    windows = _cut(scene.setting, scene.train, LENGTHS[-1], MOST)
-    return Evidence(scene.twin, windows, scene.noise, rough=True, robust=True)
+    After those of the scene come windows a quarter as long, in which a large gap bends the simulation less, unless they
+    are too short; and where contacts part windows into right and wrong, the shortest ones with a robust cost.
+    """
+    yield "", scene.evidence
+    length, rough = scene.evidence.windows.length // 4, scene.evidence.rough
+    if length >= LENGTHS[-1]:
+        yield "-shorter", _cut(scene.twin, scene.train, scene.noise, length, rough=rough)
+    if scene.setting.signals.contacts.any():
+        shortest = _cut(scene.twin, scene.train, scene.noise, LENGTHS[-1])
+        yield "-contact", replace(shortest, robust=True)
 
 
 def _choose_windows(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray) -> Evidence:
     """The longest windows in whose initial states the simulation is still nearly linear."""
-    setting, longest = twin.setting, longest_episode(train)
-    touches = bool(setting.signals.contacts.any())
-    length, bent = min(LENGTHS[-1], longest), True
-    for tried in (length for length in LENGTHS if length <= longest):
-        evidence = Evidence(twin, _cut(setting, train, tried, FEW), noise, rough=True)
+    longest, touches = longest_episode(train), bool(twin.setting.signals.contacts.any())
+    for length in (length for length in LENGTHS if length <= longest):
+        evidence = _cut(twin, train, noise, length, FEW)
         rough = evidence.linearise(begin.variant).roughness
         if rough < ROUGH and (not touches or _end_error(evidence, begin) < ASTRAY):
-            length, bent = tried, rough > BENT
-            break
-    return Evidence(twin, _cut(setting, train, length, MOST), noise, rough=bent)
+            return _cut(twin, train, noise, length, rough=rough > BENT)
+    return _cut(twin, train, noise, min(LENGTHS[-1], longest))
 
 
-def _cut(setting: Setting, log: Trajectories, length: int, most: int) -> Windows:
-    return spread(cut_windows(log, setting.observation, length), most)
+def _cut(
+    twin: Twin, log: Trajectories, noise: np.ndarray, length: int, most: int = MOST, *, rough: bool = True
+) -> Evidence:
+    return Evidence(twin, spread(cut_windows(log, twin.setting.observation, length), most), noise, rough=rough)
 
 
 def _end_error(evidence: Evidence, begin: Hypothesis) -> float:

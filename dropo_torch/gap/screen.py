@@ -7,7 +7,7 @@ reach. The prediction only ranks; a refit decides.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
@@ -15,8 +15,8 @@ from itertools import combinations
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
-from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.evidence import Evidence, cost_of
+from dropo_torch.effects.engine import Variant, parts
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
 
 #: Difference step of a candidate's numbers, relative to their scale.
@@ -36,17 +36,15 @@ class Focus:
     Attributes:
         evidence: the windows.
         fitted: the hypothesis there.
-        caps: factors of the windows' residuals, ``(W,)``.
     """
 
     evidence: Evidence
     fitted: Refit
-    caps: np.ndarray
 
     @cached_property
     def factor(self) -> np.ndarray:
         """Factors of the residuals under which least squares is what the fit minimised, ``(W·N,)``."""
-        return np.repeat(self.caps * self.fitted.factor, self.fitted.residual.shape[1])
+        return np.repeat(self.evidence.caps * self.fitted.factor, self.fitted.residual.shape[1])
 
     @cached_property
     def residual(self) -> np.ndarray:
@@ -61,9 +59,7 @@ class Focus:
     @property
     def excess(self) -> float:
         """Excess misfit of the fitted hypothesis."""
-        linear, evidence = self.fitted.linear, self.evidence
-        degrees = evidence.degrees(linear)
-        return cost_of(self.fitted.residual, linear, degrees, self.caps, evidence.tail(linear)).excess
+        return self.evidence.cost(self.fitted.residual, self.fitted.linear).excess
 
 
 @dataclass(frozen=True)
@@ -108,17 +104,15 @@ def screen(
         candidates: effects at their starts.
         on_progress: called with the share of candidates that is done.
     """
-    best: dict[tuple[str, str | None], Candidate] = {}
     taken = {p.key for p in focus.fitted.hypothesis.placed}
-    waiting = [c for c in candidates if c.key not in taken]
-    for first in range(0, len(waiting), BATCH):
-        part = waiting[first : first + BATCH]
-        for found in _predict(focus, part):
-            known = best.get(found.key)
-            if known is None or (known.dead, known.chi2) > (found.dead, found.chi2):
-                best[found.key] = found
-        on_progress((first + len(part)) / len(candidates))
-    return sorted(best.values(), key=lambda c: (c.dead, c.chi2))
+    waiting, found = [c for c in candidates if c.key not in taken], list[Candidate]()
+    for rows in parts(len(waiting), BATCH):
+        found += _predict(focus, waiting[rows])
+        on_progress(rows.stop / len(candidates))
+    best: dict[tuple[str, str | None], Candidate] = {}
+    for candidate in sorted(found, key=lambda c: (c.dead, c.chi2)):
+        best.setdefault(candidate.key, candidate)
+    return list(best.values())
 
 
 def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
@@ -137,9 +131,9 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
     found, _ = evidence.residuals(variants)
     before, shared = focus.residual, focus.slope
     for placed, (moving, limits, steps, rows) in zip(part, plans, strict=True):
-        begin, beside_it = found[rows][0], found[rows][1:]
+        begin = found[rows][0]
         residual = evidence.project(begin, linear).ravel() * factor
-        change = (beside_it - begin) / steps[:, None, None]
+        change = (found[rows][1:] - begin) / steps[:, None, None]
         slope = evidence.project_slope(change, linear).reshape(len(moving), -1) * factor
         lengths = np.sqrt((slope**2).sum(1))
         dead = bool(np.linalg.norm(residual - before) < DEAD and lengths.max(initial=0.0) < DEAD)
@@ -176,16 +170,20 @@ def promising_families(focus: Focus, candidates: Sequence[Candidate]) -> list[li
     for c in candidates:
         if not c.dead and len(c.placed.values) == 1:
             families.setdefault(c.placed.effect.name, []).append(c)
-    found = [(_left(focus, members), members) for members in families.values() if len(members) > 1]
-    found = [(left, members) for left, members in found if left < 0.5 * min(c.chi2 for c in members)]
-    return [[c.placed for c in members] for _, members in sorted(found, key=lambda item: item[0])[:2]]
+    best = _best(focus, [members for members in families.values() if len(members) > 1])
+    clear = (members for left, members in best if left < 0.5 * min(c.chi2 for c in members))
+    return [[c.placed for c in members] for members in clear][:2]
 
 
-def promising_pairs(focus: Focus, candidates: Sequence[Candidate], count: int) -> list[list[Placed]]:
-    """Return the pairs of candidates that together predict the least χ², the best first."""
+def promising_pairs(focus: Focus, candidates: Sequence[Candidate]) -> list[list[Placed]]:
+    """Return the five pairs of candidates that together predict the least χ², the best first."""
     pairs = combinations([c for c in candidates if not c.dead], 2)
-    found = sorted(((_left(focus, pair), pair) for pair in pairs), key=lambda item: item[0])
-    return [[c.placed for c in pair] for _, pair in found[:count]]
+    return [[c.placed for c in pair] for _, pair in _best(focus, pairs)[:5]]
+
+
+def _best(focus: Focus, groups: Iterable[Sequence[Candidate]]) -> list[tuple[float, Sequence[Candidate]]]:
+    """Groups of candidates with the χ² that they leave together, the best first."""
+    return sorted(((_left(focus, members), members) for members in groups), key=lambda item: item[0])
 
 
 def _left(focus: Focus, members: Sequence[Candidate]) -> float:

@@ -8,17 +8,47 @@ from pathlib import Path
 
 import numpy as np
 
+from dropo_torch.effects.base import Placed
 from dropo_torch.errors import InputError
-from dropo_torch.gap.accept import add, is_done, prune, swap
-from dropo_torch.gap.ground import Ground
-from dropo_torch.gap.naming import Naming, Screening, State
+from dropo_torch.gap.accept import add, canonical, everywhere, extend, is_done, prune, swap, ties
+from dropo_torch.gap.evidence import Evidence, caps_of
+from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.refit import Hypothesis, Refit
+from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import allowance, significant
-from dropo_torch.gap.ties import canonical, ties
 from dropo_torch.support.files import write_atomically
 
 #: Least ratio of a feature's residuals to the noise at which that noise stays as it is.
 QUIET = 0.97
+
+
+@dataclass(frozen=True)
+class Naming:
+    """What was found.
+
+    Attributes:
+        evidence: the windows on which it was.
+        base: the declared parameters alone.
+        first: the screening beside them.
+        final: with the named effects, or the base again.
+        gap: whether anything is missing at all.
+        named: whether the named effects account for it.
+        ties: for each named effect, the candidates that do as well in its place.
+        shares: excess that comes back when each named effect alone is left out.
+        attempts: what was refitted, in order.
+        partial: whether they leave nothing in most of the log, but something else remains in the rest.
+    """
+
+    evidence: Evidence
+    base: Refit
+    first: Screening
+    final: Refit
+    gap: bool
+    named: bool = False
+    ties: tuple[tuple[Placed, ...], ...] = ()
+    shares: tuple[float, ...] = ()
+    attempts: tuple[Ranked, ...] = ()
+    partial: bool = False
 
 
 @dataclass(frozen=True)
@@ -79,7 +109,7 @@ def start(ground: Ground, begin: Hypothesis) -> State:
     if noise is not ground.evidence.noise:
         ground = replace(ground, evidence=replace(ground.evidence, noise=noise))
         base = ground.refit(base.hypothesis, iterations=4)
-    caps = ground.strategy.caps(base)
+    caps = 1.0 if ground.evidence.robust else caps_of(base.cost.windows, base.cost.degrees)
     ground = replace(ground, caps=caps)
     base = ground.refit(base.hypothesis, iterations=4)
     ranked, focus = ground.screened(base), ground.focus(base)
@@ -105,7 +135,10 @@ def step(ground: Ground, state: State) -> State:
     found = add(ground, state)
     if found.done:
         return found
-    found = ground.strategy.refine(ground, found)
+    if ground.evidence.robust and not is_done(ground, found):
+        found = everywhere(ground, found)
+    elif significant(found.current.cost, ground.rules):
+        found = extend(ground, found)
     if not is_done(ground, found) and len(found.current.hypothesis.placed) > 1:
         found = swap(ground, found)
     number = state.number + 1
@@ -121,7 +154,7 @@ def conclude(ground: Ground, state: State) -> Naming:
     state = prune(ground, state)
     placed = state.current.hypothesis.placed
     left = max(state.current.cost.excess, 0.0) / base.cost.excess
-    partial = ground.strategy.clears(base, state.current)
+    partial = ground.clears(base, state.current)
     if not placed or not (partial or left <= allowance(state.current.hypothesis, rules)):
         return replace(unnamed, attempts=state.attempts)
     tied, shares = [], []

@@ -139,8 +139,7 @@ class Twin:
     def _states(self, variant: Variant, shown: np.ndarray, rates: np.ndarray) -> np.ndarray:
         """Return states ``(W, nq + nv)`` of which the sensors show ``shown``."""
         sensors, observation = placed_filters(variant.placed, "sense", self.setting), self.setting.observation
-        states = np.tile(np.array(observation.default_state), (len(shown), 1))
-        states[:, observation.index] = unsensed(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy()
+        states = observation.full(unsensed(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy())
         for q in observation.quaternions:
             at = observation.index[list(q)]
             states[:, at] /= np.linalg.norm(states[:, at], axis=1, keepdims=True)
