@@ -20,10 +20,8 @@ from tensordict import TensorDict
 import dropo_torch as dropo
 from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
-from dropo_torch.rl.collect import Collector
-from dropo_torch.rl.evaluate import evaluate
-from dropo_torch.rl.networks import Normalizer
-from dropo_torch.rl.policy import Policy, load_policy
+from dropo_torch.rl.collect import Collector, evaluate
+from dropo_torch.rl.policy import Normalizer, Policy, load_policy
 from dropo_torch.rl.ppo import PPO, ReturnScale
 from dropo_torch.rl.problem import TrainingProblem, make_training
 from dropo_torch.rl.sac import Memory

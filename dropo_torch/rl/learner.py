@@ -12,8 +12,7 @@ from torchrl.modules import ProbabilisticActor
 
 from dropo_torch.errors import InputError
 from dropo_torch.rl.checkpoint import Stateful
-from dropo_torch.rl.networks import Normalizer
-from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.policy import Normalizer, Policy
 from dropo_torch.rl.settings import TrainSettings
 
 #: Updates in a row whose loss is not finite, after which training gives up.

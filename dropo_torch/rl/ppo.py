@@ -13,8 +13,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from dropo_torch.rl.learner import Learner
-from dropo_torch.rl.networks import Normalizer, mlp
-from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.policy import Normalizer, Policy, mlp
 from dropo_torch.rl.settings import PPOSettings
 
 #: What an update tells → its entry in TorchRL's loss.

@@ -13,8 +13,7 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from dropo_torch.rl.learner import Learner
-from dropo_torch.rl.networks import ActionValue, mlp
-from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.policy import ActionValue, Policy, mlp
 from dropo_torch.rl.settings import SACSettings
 
 

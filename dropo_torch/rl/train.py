@@ -14,8 +14,7 @@ import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.rl.checkpoint import Stateful, load_checkpoint, save_checkpoint
-from dropo_torch.rl.collect import Collector
-from dropo_torch.rl.evaluate import Returns, evaluate
+from dropo_torch.rl.collect import Collector, Returns, evaluate
 from dropo_torch.rl.learner import Learner
 from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.ppo import PPO
