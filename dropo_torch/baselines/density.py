@@ -7,7 +7,7 @@ import functools
 import io
 import math
 import warnings
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.spatial
@@ -42,6 +42,8 @@ _PRECISION_FLOOR = 1e-4
 #: Standard deviation of a share that is uniform in [0, 1].
 _UNIFORM = 12**-0.5
 
+Bounds = tuple[np.ndarray, np.ndarray]
+
 
 class FourierFeatures(nn.Module):
     """Quasi-random Fourier features of a Gaussian kernel: cosines and sines at Halton frequencies, ``(n, 2F)``."""
@@ -62,14 +64,7 @@ class FourierFeatures(nn.Module):
 
 
 def fit_mixture(
-    inputs: np.ndarray,
-    shares: np.ndarray,
-    at: np.ndarray,
-    *,
-    settings: BayesSimSettings,
-    seed: int,
-    low: np.ndarray,
-    width: np.ndarray,
+    inputs: np.ndarray, shares: np.ndarray, at: np.ndarray, *, settings: BayesSimSettings, seed: int, bounds: Bounds
 ) -> Mixture:
     """Learn p(θ | x) from pairs and return it at one x, in coordinates.
 
@@ -79,7 +74,7 @@ def fit_mixture(
         at: the x of the log, ``(q,)``.
         settings: features, components and size.
         seed: seeds network and split.
-        low, width: the search box, in coordinates, ``(d,)`` each.
+        bounds: low and high of the search box, in coordinates, ``(d,)`` each.
 
     Raises:
         InputError: fewer than ten simulations did not diverge.
@@ -98,16 +93,13 @@ def fit_mixture(
         estimator = _train(_float(x), _float((shares - 0.5) / _UNIFORM), settings, seed)
         with torch.no_grad():
             mixture = estimator.net(_float(here)[None])
+    low, width = bounds[0], bounds[1] - bounds[0]
     factor = mixture.precision_factors[0].double().numpy()
     precision = factor.transpose(0, 2, 1) @ factor + _PRECISION_FLOOR * np.eye(len(width))
     covariance = np.linalg.inv(precision) * _UNIFORM**2 * np.outer(width, width)
-    return Mixture(
-        weights=torch.softmax(mixture.logits[0].double(), -1).numpy(),
-        means=low + (0.5 + mixture.means[0].double().numpy() * _UNIFORM) * width,
-        covariances=0.5 * (covariance + covariance.transpose(0, 2, 1)),
-        low=low,
-        high=low + width,
-    )
+    weights = torch.softmax(mixture.logits[0].double(), -1).numpy()
+    means = low + (0.5 + mixture.means[0].double().numpy() * _UNIFORM) * width
+    return Mixture(weights, means, 0.5 * (covariance + covariance.transpose(0, 2, 1)), low, low + width)
 
 
 def unlikeness(inputs: np.ndarray, at: np.ndarray) -> float:
@@ -154,8 +146,10 @@ def _train(x: torch.Tensor, theta: torch.Tensor, settings: BayesSimSettings, see
     with warnings.catch_warnings(), contextlib.redirect_stdout(io.StringIO()):
         warnings.simplefilter("ignore")  # that ``epochs`` came first, and imports of old names
         from sbi.inference import NPE
+        from sbi.sbi_types import Tracker
 
-        trainer = NPE(density_estimator=build, show_progress_bars=False, tracker=_NoTracker())
+        silent = type("NoTracker", (Tracker,), {})()  # sbi would otherwise write into the working directory
+        trainer = NPE(density_estimator=build, show_progress_bars=False, tracker=silent)
         trainer.append_simulations(theta, x)
         return trainer.train(
             training_batch_size=_BATCH,
@@ -188,19 +182,3 @@ def _estimator(theta: torch.Tensor, x: torch.Tensor, settings: BayesSimSettings,
 def _float(values: np.ndarray) -> torch.Tensor:
     """The network's single precision."""
     return torch.from_numpy(values).to(torch.float32)
-
-
-class _NoTracker:
-    """``sbi`` would otherwise write TensorBoard files into the working directory."""
-
-    log_dir: str | None = None
-
-    def log_metric(self, name: str, value: float, step: int | None = None) -> None: ...
-
-    def log_metrics(self, metrics: dict[str, float], step: int | None = None) -> None: ...
-
-    def log_params(self, params: dict[str, Any]) -> None: ...
-
-    def add_figure(self, name: str, figure: Any, step: int | None = None) -> None: ...
-
-    def flush(self) -> None: ...

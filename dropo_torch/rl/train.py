@@ -245,9 +245,7 @@ class _Run(Stateful):
             training=self._episodes(problem.training, 1),
             nominal=None if problem.nominal is None else self._episodes(problem.nominal, 2),
             target=None if problem.target is None else self._episodes(problem.target, 3),
-            steps=last.steps,
-            episodes=last.episodes,
-            diverged=last.diverged,
+            **{name: getattr(last, name) for name in ("steps", "episodes", "diverged")},
             repaired=self.env.num_repaired,
             skipped=self.learner.skipped,
             seconds=self._seconds(),
@@ -294,16 +292,9 @@ class _Run(Stateful):
             return evaluate(self.policy, self.problem.env(world, self.problem.settings.episodes, seed % 2**31))
 
     def _entry(self, scalars: dict[str, float]) -> TrainEntry:
-        returns, lengths = self.collector.returns, self.collector.lengths
-        return TrainEntry(
-            steps=self.steps,
-            seconds=self._seconds(),
-            episodes=self.collector.episodes,
-            mean_return=sum(returns) / len(returns) if returns else math.nan,
-            mean_length=sum(lengths) / len(lengths) if lengths else math.nan,
-            diverged=self.env.num_diverged,
-            scalars=scalars,
-        )
+        done = self.collector
+        mean, length = (sum(late) / len(late) if late else math.nan for late in (done.returns, done.lengths))
+        return TrainEntry(self.steps, self._seconds(), done.episodes, mean, length, self.env.num_diverged, scalars)
 
     def _seconds(self) -> float:
         return time.monotonic() - self.begun
@@ -316,7 +307,7 @@ def _fresh_policy(problem: TrainingProblem) -> Policy:
         "num_actions": len(task.action_low),
         **{name: getattr(settings, name) for name in ("hidden", "activation", "head", "initial_std")},
     }
-    policy = Policy(architecture, config=problem.config.document(), distribution=problem.distribution)
+    policy = Policy(architecture, config=problem.config.document(), distribution=problem.training.source.document())
     policy.low.copy_(torch.as_tensor(task.action_low, dtype=torch.float32))
     policy.high.copy_(torch.as_tensor(task.action_high, dtype=torch.float32))
     return policy.to(problem.device)
