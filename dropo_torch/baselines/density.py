@@ -22,12 +22,8 @@ from dropo_torch.support.threads import single_thread
 if TYPE_CHECKING:
     from sbi.neural_nets.estimators.mixture_density_estimator import MixtureDensityEstimator
 
-_LEARNING_RATE = 2e-3
-_BATCH = 100
-#: Epochs without a better loss on the pairs held out after which training stops.
-_PATIENCE = 40
-#: Share of the pairs by which training is stopped.
-_VALIDATION = 0.1
+#: Training stops after so many epochs without a better loss on the share of the pairs that is held out.
+_TRAINING = {"training_batch_size": 100, "learning_rate": 2e-3, "validation_fraction": 0.1, "stop_after_epochs": 40}
 #: Standardised inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
 FARTHEST = 5.0
 #: The neighbour to which distances are measured.
@@ -151,13 +147,7 @@ def _train(x: torch.Tensor, theta: torch.Tensor, settings: BayesSimSettings, see
         silent = type("NoTracker", (Tracker,), {})()  # sbi would otherwise write into the working directory
         trainer = NPE(density_estimator=build, show_progress_bars=False, tracker=silent)
         trainer.append_simulations(theta, x)
-        return trainer.train(
-            training_batch_size=_BATCH,
-            learning_rate=_LEARNING_RATE,
-            validation_fraction=_VALIDATION,
-            stop_after_epochs=_PATIENCE,
-            max_num_epochs=settings.epochs,
-        )
+        return trainer.train(**_TRAINING, max_num_epochs=settings.epochs)
 
 
 def _estimator(theta: torch.Tensor, x: torch.Tensor, settings: BayesSimSettings, seed: int) -> MixtureDensityEstimator:

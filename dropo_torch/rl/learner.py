@@ -34,14 +34,9 @@ class Learner(Stateful, ABC):
         self.policy = policy
         self._device = policy.low.device
         self._seen = Normalizer(num_parameters if settings.privileged_critic else 0).to(self._device)
+        self.num_features = policy.num_observations + len(self._seen.mean)  # width of the critic's input
         self.parts = {"policy": policy, "seen": self._seen}
-        self.skipped = 0
-        self.in_a_row = 0
-
-    @property
-    def num_features(self) -> int:
-        """Width of the critic's input."""
-        return self.policy.num_observations + len(self._seen.mean)
+        self.skipped, self.in_a_row = 0, 0
 
     @abstractmethod
     def act(self, observation: torch.Tensor) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:

@@ -138,6 +138,7 @@ class Policy(nn.Module):
         distribution: where the episodes' parameters came from, as plain data.
 
     Attributes:
+        num_observations: width n of an observation.
         actor: the network.
         normalizer: statistics of the observations.
         low, high: bounds of the actions, ``(m,)`` each, finite.
@@ -149,17 +150,13 @@ class Policy(nn.Module):
     def __init__(self, architecture: Plain, *, config: Plain | None = None, distribution: Plain | None = None) -> None:
         super().__init__()
         self.actor = Actor(**architecture)
-        self.normalizer = Normalizer(architecture["num_observations"])
+        self.num_observations: int = architecture["num_observations"]
+        self.normalizer = Normalizer(self.num_observations)
         self.register_buffer("low", -torch.ones(architecture["num_actions"]))
         self.register_buffer("high", torch.ones(architecture["num_actions"]))
         self.architecture = dict(architecture)
         self.config = dict(config or {})
         self.distribution = dict(distribution or {})
-
-    @property
-    def num_observations(self) -> int:
-        """Width n of an observation."""
-        return len(self.normalizer.mean)
 
     @overload
     def forward(self, observation: torch.Tensor) -> torch.Tensor: ...

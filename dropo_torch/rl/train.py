@@ -109,6 +109,7 @@ class Training:
     def document(self) -> dict[str, Any]:
         """Return the training as plain data."""
         worlds = {"distribution": self.training, "nominal": self.nominal, "target": self.target}
+        columns = {"steps": "steps", "seconds": "seconds", "mean": "mean_return", "length": "mean_length"}
         same = ("algorithm", "steps", "episodes", "seconds", "diverged", "seed", "stop_reason")
         return {
             "schema": SCHEMA,
@@ -120,10 +121,7 @@ class Training:
             "skipped_updates": self.skipped,
             "distribution": self.policy.distribution,
             "evaluations": [asdict(e) for e in self.evaluations],
-            "returns": [
-                {"steps": e.steps, "seconds": e.seconds, "mean": e.mean_return, "length": e.mean_length}
-                for e in self.history
-            ],
+            "returns": [{key: getattr(e, own) for key, own in columns.items()} for e in self.history],
         }
 
 
