@@ -18,8 +18,8 @@ from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
-from dropo_torch.baselines.density import fit_mixture, unlikeness
 from dropo_torch.baselines.laplace import LaplaceOptimizer
+from dropo_torch.baselines.mixture import fit_mixture, unlikeness
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.commands.cli import main

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import fit_mixture, unlikeness
-from dropo_torch.baselines.mixture import Mixture
+from dropo_torch.baselines.mixture import Mixture, fit_mixture, unlikeness
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import DRAWN_STD, Distribution

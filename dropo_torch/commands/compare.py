@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from dropo_torch.commands.fit import show_report
-from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, count
 from dropo_torch.commands.progress import fit_shown
 from dropo_torch.commands.sweep import only_dropo
@@ -63,5 +63,5 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         on_run=show,
     )
     write_json(out / "compare.json", comparison.document())
-    write_compare_report(out / "report.html", comparison, config=config.document(), versions=versions())
+    write_compare_report(out / "report.html", comparison, **provenance(config))
     show_report(out, console)

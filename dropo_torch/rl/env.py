@@ -12,9 +12,8 @@ from torchrl.envs import EnvBase
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.inside import no_effects
+from dropo_torch.rl.effects import Commands, Sensors, no_effects
 from dropo_torch.rl.sampling import ParameterSource, UniformSource
-from dropo_torch.rl.signals import Commands, Sensors
 from dropo_torch.rl.stepper import make_stepper
 from dropo_torch.rl.task import Task, check_model, check_task, load_task
 from dropo_torch.simulators.base import DIVERGED

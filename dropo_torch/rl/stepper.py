@@ -14,7 +14,7 @@ from dropo_torch.effects.placing import EffectSet
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, unmark_frames
-from dropo_torch.rl.inside import RowFields, RowForces, RowModels, inside_model, no_effects
+from dropo_torch.rl.effects import RowFields, RowForces, RowModels, inside_model, no_effects
 from dropo_torch.simulators.mujoco import default_row
 from dropo_torch.support.extras import extra
 
