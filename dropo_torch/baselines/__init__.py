@@ -70,12 +70,6 @@ def fit_problem(
     on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
 ) -> Fit:
     """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`."""
-    return fit(
-        problem.objective,
-        problem.config.fit_settings(),
-        search=make_search(problem),
-        checkpoint=checkpoint,
-        resume=resume,
-        fingerprint=problem.fingerprint,
-        on_progress=on_progress,
-    )
+    settings, search = problem.config.fit_settings(), make_search(problem)
+    kept: dict[str, Any] = {"checkpoint": checkpoint, "resume": resume, "fingerprint": problem.fingerprint}
+    return fit(problem.objective, settings, search=search, on_progress=on_progress, **kept)

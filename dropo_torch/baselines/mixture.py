@@ -258,14 +258,9 @@ def _estimator(theta: torch.Tensor, x: torch.Tensor, settings: BayesSimSettings,
     if settings.features == "mdrff":
         lengthscale = float(torch.pdist(x[:500]).median()) or 1.0
         body, features = FourierFeatures(x.shape[1], settings.hidden, lengthscale, seed), 2 * settings.hidden
-    network = MultivariateGaussianMDN(
-        features=theta.shape[1],
-        context_features=x.shape[1],
-        hidden_features=features,
-        num_components=settings.components,
-        hidden_net=body,
-        custom_initialization=True,
-    )
+    sizes = {"features": theta.shape[1], "context_features": x.shape[1], "hidden_features": features}
+    sizes["num_components"] = settings.components
+    network = MultivariateGaussianMDN(**sizes, hidden_net=body, custom_initialization=True)
     return MixtureDensityEstimator(network, input_shape=theta[0].shape, condition_shape=x[0].shape)
 
 

@@ -59,10 +59,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
             if curves is not None:
                 curves.add(entry, evaluation)
 
-        result = train(
-            problem, checkpoint=checkpoint, resume=given.resume, on_progress=show,
-            on_start=None if curves is None else curves.begin,
-        )  # fmt: skip
+        begin = None if curves is None else curves.begin
+        result = train(problem, checkpoint=checkpoint, resume=given.resume, on_progress=show, on_start=begin)
     _write(problem, result, out)
     _show(result, out, console)
 

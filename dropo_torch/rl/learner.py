@@ -48,13 +48,9 @@ class Learner(Stateful, ABC):
 
     def _actor(self, distribution: type) -> ProbabilisticActor:
         """The policy's network as the losses take it, with actions of the given distribution."""
-        return ProbabilisticActor(
-            TensorDictModule(self.policy.actor, in_keys=["features"], out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=distribution,
-            return_log_prob=True,
-            log_prob_key="log_prob",
-        )
+        keys, told = ["loc", "scale"], {"return_log_prob": True, "log_prob_key": "log_prob"}
+        network = TensorDictModule(self.policy.actor, in_keys=["features"], out_keys=keys)
+        return ProbabilisticActor(network, in_keys=keys, distribution_class=distribution, **told)
 
     def _take_in(self, rollout: TensorDict) -> None:
         """Let the running statistics see new experience."""

@@ -116,17 +116,13 @@ class ActionValue(nn.Sequential):
 def mlp(inputs: int, outputs: int, hidden: Sequence[int], activation: str, gain: float) -> nn.Sequential:
     """Return a multilayer perceptron with orthogonal weights; ``gain`` scales those of the last layer."""
     layers: list[nn.Module] = []
-    widths = [inputs, *hidden]
-    for before, after in itertools.pairwise(widths):
-        layers += [_linear(before, after, math.sqrt(2)), ACTIVATIONS[activation]()]
-    return nn.Sequential(*layers, _linear(widths[-1], outputs, gain))
-
-
-def _linear(inputs: int, outputs: int, gain: float) -> nn.Linear:
-    layer = nn.Linear(inputs, outputs)
-    nn.init.orthogonal_(layer.weight, gain)
-    nn.init.zeros_(layer.bias)
-    return layer
+    gains = [*[math.sqrt(2)] * len(hidden), gain]
+    for sizes, scale in zip(itertools.pairwise([inputs, *hidden, outputs]), gains, strict=True):
+        layer = nn.Linear(*sizes)
+        nn.init.orthogonal_(layer.weight, scale)
+        nn.init.zeros_(layer.bias)
+        layers += [layer, ACTIVATIONS[activation]()]
+    return nn.Sequential(*layers[:-1])
 
 
 class Policy(nn.Module):

@@ -236,7 +236,6 @@ class _Run(Stateful):
         self.policy.load_state_dict(self.best)
         self.policy.eval()
         return Training(
-            policy=self.policy,
             algorithm=problem.algorithm,
             history=tuple(self.history),
             evaluations=tuple(self.evaluations),
@@ -244,11 +243,10 @@ class _Run(Stateful):
             nominal=None if problem.nominal is None else self._episodes(problem.nominal, 2),
             target=None if problem.target is None else self._episodes(problem.target, 3),
             **{name: getattr(last, name) for name in ("steps", "episodes", "diverged")},
+            **{name: getattr(self, name) for name in ("policy", "simulating", "learning")},
             repaired=self.env.num_repaired,
             skipped=self.learner.skipped,
             seconds=self._seconds(),
-            simulating=self.simulating,
-            learning=self.learning,
             seed=problem.config.seed,
         )
 
