@@ -18,8 +18,8 @@ from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
-from dropo_torch.baselines.density import fit_mixture, unlikeness
 from dropo_torch.baselines.laplace import LaplaceOptimizer
+from dropo_torch.baselines.mixture import fit_mixture, unlikeness
 from dropo_torch.baselines.settings import BayesSimSettings, method_settings
 from dropo_torch.baselines.simopt import reps_weights
 from dropo_torch.commands.cli import main
@@ -271,7 +271,7 @@ def test_a_mixture_density_network_learns_a_gaussian_posterior(features: str) ->
     shares = rng.uniform(size=(1500, 1))
     x = shares + 0.1 * rng.standard_normal((1500, 1))
     settings = BayesSimSettings(features=features, components=2, hidden=32, epochs=400)
-    found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
+    found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, bounds=(np.zeros(1), np.ones(1)))
     mean, covariance = moments(found)
     assert mean[0] == pytest.approx(0.5, abs=0.04)
     assert np.sqrt(covariance[0, 0]) == pytest.approx(0.1, rel=0.25)
@@ -281,9 +281,12 @@ def test_a_posterior_outside_the_box_ends_at_its_side_and_says_so(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A log that is unlike every simulation: the network extrapolates."""
-    away = lambda *_, low, width, **__: Mixture(  # noqa: E731
-        np.ones(1), (low + np.array([0.5, 30.0]) * width)[None], np.diag(width**2)[None] * 1e-4, low, low + width
-    )
+
+    def away(*_: object, bounds: tuple[np.ndarray, np.ndarray], **__: object) -> Mixture:
+        low, width = bounds[0], bounds[1] - bounds[0]
+        means, covariances = (low + np.array([0.5, 30.0]) * width)[None], np.diag(width**2)[None] * 1e-4
+        return Mixture(np.ones(1), means, covariances, *bounds)
+
     monkeypatch.setattr("dropo_torch.baselines.bayessim.fit_mixture", away)
     found = fit_problem(problem(folder, "bayessim", method_options={"simulations": 20, "horizon": 10}))
     box = found.distribution
@@ -303,7 +306,7 @@ def test_training_the_network_leaves_nothing_behind(
     settings = BayesSimSettings(components=2, hidden=8, epochs=3)
     before = torch.random.get_rng_state()
     found = [
-        fit_mixture(x, x, np.array([0.5]), settings=settings, seed=seed, low=np.zeros(1), width=np.ones(1))
+        fit_mixture(x, x, np.array([0.5]), settings=settings, seed=seed, bounds=(np.zeros(1), np.ones(1)))
         for seed in (0, 0, 1)
     ]
     assert torch.equal(torch.random.get_rng_state(), before)
@@ -806,7 +809,7 @@ def test_a_few_wild_simulations_do_not_blind_the_network() -> None:
     assert unlikeness(x, np.array([0.5])) < 1
     assert unlikeness(x, np.array([9.0])) > 5
     settings = BayesSimSettings(components=2, hidden=16, epochs=60)
-    found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, low=np.zeros(1), width=np.ones(1))
+    found = fit_mixture(x, shares, np.array([0.5]), settings=settings, seed=0, bounds=(np.zeros(1), np.ones(1)))
     assert np.sqrt(found.moments_inside[1][0, 0]) < 0.12
 
 

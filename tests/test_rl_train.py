@@ -20,10 +20,8 @@ from tensordict import TensorDict
 import dropo_torch as dropo
 from dropo_torch.commands.cli import main
 from dropo_torch.errors import InputError
-from dropo_torch.rl.collect import Collector
-from dropo_torch.rl.evaluate import evaluate
-from dropo_torch.rl.networks import Normalizer
-from dropo_torch.rl.policy import Policy, load_policy
+from dropo_torch.rl.collect import Collector, evaluate
+from dropo_torch.rl.policy import Normalizer, Policy, load_policy
 from dropo_torch.rl.ppo import PPO, ReturnScale
 from dropo_torch.rl.problem import TrainingProblem, make_training
 from dropo_torch.rl.sac import Memory
@@ -323,14 +321,14 @@ def test_a_distribution_of_other_parameters_is_refused_and_the_one_beside_the_co
     entry = {"mean": 2.5, "std": 0.1, "low": 1.0, "high": 4.0, "unit": "kg"}
     (tmp_path / "fit.json").write_text(json.dumps({"parameters": {"mass": entry}}))
     given = problem(tmp_path)
-    assert given.distribution["kind"] == "fitted"
+    assert given.training.source.document()["kind"] == "fitted"
     values = given.env(given.training, 200, seed=0)
     values.reset()
     assert values.values.mean() == pytest.approx(2.5, abs=0.03)
     (tmp_path / "fit.json").write_text(json.dumps({"parameters": {"weight": entry}}))
     with pytest.raises(dropo.InputError, match="'weight' is not in the model"):
         problem(tmp_path)
-    assert problem(folder).distribution["kind"] == "uniform"
+    assert problem(folder).training.source.document()["kind"] == "uniform"
 
 
 def test_a_target_may_differ_in_what_does_not_vary_in_training(folder: Path) -> None:
@@ -489,7 +487,7 @@ def test_a_correlation_is_part_of_the_training(folder: Path, tmp_path: Path) -> 
         drags = {"field": "dof_damping", "name": "rail", "bounds": [0.1, 1.0]}
         found.append(problem(folder, parameters={"mass": MASS, "drag": drags}, distribution=str(path)))
     assert found[0].fingerprint != found[1].fingerprint
-    assert found[1].distribution["correlation"][0][1] == 0.9
+    assert found[1].training.source.document()["correlation"][0][1] == 0.9
 
 
 def test_a_seed_of_any_size_trains(folder: Path) -> None:

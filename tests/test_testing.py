@@ -22,7 +22,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FisherOptimizer, FitSettings, Progress, Request
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.inside import RowForces
+from dropo_torch.rl.effects import RowForces
 from dropo_torch.testing import (
     ConformanceError,
     LinearSimulator,

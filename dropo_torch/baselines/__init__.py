@@ -7,20 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from dropo_torch.baselines.bayessim import BayesSimOptimizer
 from dropo_torch.baselines.droid import DroidOptimizer
 from dropo_torch.baselines.laplace import LaplaceOptimizer
 from dropo_torch.baselines.mixture import Mixture
-from dropo_torch.baselines.settings import (
-    METHODS,
-    BayesSimSettings,
-    DroidSettings,
-    SimOptSettings,
-    UdrSettings,
-    method_options,
-    method_settings,
-)
+from dropo_torch.baselines.settings import METHODS, method_options, method_settings
 from dropo_torch.baselines.simopt import SimOptOptimizer
 from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.config import Config
@@ -31,6 +24,11 @@ from dropo_torch.optimizers import Optimizer, Progress
 from dropo_torch.problem import Problem
 
 __all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
+
+#: The searches with settings of their own.
+_SEARCHES = {kind.method: kind for kind in (BayesSimOptimizer, DroidOptimizer, SimOptOptimizer, UdrOptimizer)}
+#: Those that replay the log, and whether replays are compared with the log about each window's start.
+_REPLAYED = {"bayessim": True, "simopt": False}
 
 
 def make_search(problem: Problem) -> Optimizer | None:
@@ -43,22 +41,13 @@ def make_search(problem: Problem) -> Optimizer | None:
     if config.method != "dropo":
         _refuse_options_of_dropo(config)
     settings = method_settings(config.method, config.method_options)
-    if isinstance(settings, UdrSettings):
-        return UdrOptimizer(objective, settings=settings, seed=config.seed)
-    if isinstance(settings, DroidSettings):
-        return DroidOptimizer(objective, settings=settings, seed=config.seed)
-    if isinstance(settings, SimOptSettings | BayesSimSettings):
-        replay = make_replay(
-            problem.trajectories,
-            problem.observation,
-            settings.horizon,
-            history=objective.transitions.history,
-            about_start=isinstance(settings, BayesSimSettings),
-        )
-        if isinstance(settings, SimOptSettings):
-            return SimOptOptimizer(objective, replay, settings=settings, seed=config.seed)
-        return BayesSimOptimizer(objective, replay, settings=settings, seed=config.seed)
-    return LaplaceOptimizer(objective) if config.method == "laplace" else None
+    if config.method not in _SEARCHES:
+        return LaplaceOptimizer(objective) if config.method == "laplace" else None
+    given: dict[str, Any] = {"settings": settings, "seed": config.seed}
+    if config.method in _REPLAYED:
+        cut: dict[str, Any] = {"history": objective.transitions.history, "about_start": _REPLAYED[config.method]}
+        given["replay"] = make_replay(problem.trajectories, problem.observation, given["settings"].horizon, **cut)
+    return _SEARCHES[config.method](objective, **given)
 
 
 def _refuse_options_of_dropo(config: Config) -> None:
@@ -81,12 +70,6 @@ def fit_problem(
     on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
 ) -> Fit:
     """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`."""
-    return fit(
-        problem.objective,
-        problem.config.fit_settings(),
-        search=make_search(problem),
-        checkpoint=checkpoint,
-        resume=resume,
-        fingerprint=problem.fingerprint,
-        on_progress=on_progress,
-    )
+    settings, search = problem.config.fit_settings(), make_search(problem)
+    kept: dict[str, Any] = {"checkpoint": checkpoint, "resume": resume, "fingerprint": problem.fingerprint}
+    return fit(problem.objective, settings, search=search, on_progress=on_progress, **kept)

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.baselines.density import fit_mixture, unlikeness
-from dropo_torch.baselines.mixture import Mixture
+from dropo_torch.baselines.mixture import Mixture, fit_mixture, unlikeness
 from dropo_torch.baselines.settings import BayesSimSettings
 from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import DRAWN_STD, Distribution
@@ -184,13 +183,6 @@ class BayesSimOptimizer(Optimizer):
         shares = np.concatenate([self._shares(i) for i in range(len(self._sums))])
         count = len(self._replay.states) * (self._replay.horizon - 1)
         found = summaries(np.concatenate([*self._sums, self._logged[None]]), self._num_columns, count)
-        mixture = fit_mixture(
-            found[:-1],
-            shares,
-            found[-1],
-            settings=self._settings,
-            seed=derived_seed(self._seed, 29),
-            low=self._box.low,
-            width=self._box.width,
-        )
+        seed, bounds = derived_seed(self._seed, 29), (self._box.low, self._box.high)
+        mixture = fit_mixture(found[:-1], shares, found[-1], settings=self._settings, seed=seed, bounds=bounds)
         return mixture, unlikeness(found[:-1], found[-1])

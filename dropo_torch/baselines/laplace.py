@@ -41,13 +41,8 @@ class LaplaceOptimizer(Optimizer):
 
     def ask(self) -> Request:
         """Return the stencil of the means."""
-        return Request(
-            values=self._box.values(self._means.points()),
-            reduce=self._means.reduction(),
-            evaluations=1,
-            linearise_at=self._linearised,
-            is_stencil=True,
-        )
+        values, reduce = self._box.values(self._means.points()), self._means.reduction()
+        return Request(values, reduce, evaluations=1, linearise_at=self._linearised, is_stencil=True)
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Hand the sums to the means; start anew around noise propagated at them until convergence."""

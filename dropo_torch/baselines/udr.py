@@ -28,6 +28,8 @@ class UdrOptimizer(Optimizer):
 
     name = "udr"
     method = "udr"
+    stop_reason = "the boxes are random: nothing is searched"
+    progress = Progress("drawing boxes", float("nan"), 1.0)
 
     def __init__(self, objective: Objective, *, settings: UdrSettings, seed: int) -> None:
         self._space, self._box, self._chosen = objective.simulator.parameters, objective.box, settings.box
@@ -41,16 +43,6 @@ class UdrOptimizer(Optimizer):
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Nothing is told."""
         raise RuntimeError("uniform domain randomization simulates nothing")
-
-    @property
-    def stop_reason(self) -> str | None:
-        """It is done before it begins."""
-        return "the boxes are random: nothing is searched"
-
-    @property
-    def progress(self) -> Progress:
-        """All is done."""
-        return Progress("drawing boxes", float("nan"), 1.0)
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return mean and standard deviation of the chosen box."""

@@ -90,11 +90,8 @@ def _dispatch(given: list[str]) -> None:
 
 def _parser(called: str) -> argparse.ArgumentParser:
     """The parser of the command that is called; of the others it knows the names."""
-    parser = Parser(
-        prog="dropo",
-        description="Fit a distribution over a simulator's parameters to a log of the real robot.",
-        allow_abbrev=False,
-    )
+    purpose = "Fit a distribution over a simulator's parameters to a log of the real robot."
+    parser = Parser(prog="dropo", description=purpose, allow_abbrev=False)
     parser.add_argument("--version", action="store_true", help="show the version and exit")
     commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
     for name, (module, summary) in COMMANDS.items():

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 
 from dropo_torch.commands.fit import show_report
-from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, count
 from dropo_torch.commands.progress import fit_shown
 from dropo_torch.commands.sweep import only_dropo
@@ -53,15 +53,11 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         )
 
     truth = bundled_sim(config.sim).truth if config.sim and config.data is None else {}
-    comparison = compare(
-        fit_with,
-        methods=METHODS if given.methods is None else [m.strip() for m in given.methods.split(",")],
-        seeds=range(config.seed, config.seed + given.seeds),
-        reference={n: truth[n] for n in problem.space.names} if truth else None,
-        store=store,
-        fingerprint=problem.fingerprint,
-        on_run=show,
-    )
+    methods = METHODS if given.methods is None else [m.strip() for m in given.methods.split(",")]
+    seeds = range(config.seed, config.seed + given.seeds)
+    reference = {n: truth[n] for n in problem.space.names} if truth else None
+    kept: dict[str, Any] = {"store": store, "fingerprint": problem.fingerprint}
+    comparison = compare(fit_with, methods=methods, seeds=seeds, reference=reference, on_run=show, **kept)
     write_json(out / "compare.json", comparison.document())
-    write_compare_report(out / "report.html", comparison, config=config.document(), versions=versions())
+    write_compare_report(out / "report.html", comparison, **provenance(config))
     show_report(out, console)

@@ -11,7 +11,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
-from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, add_log
 from dropo_torch.commands.progress import fit_shown
 from dropo_torch.config import Config, load_config
@@ -80,26 +80,20 @@ def _write(problem: Problem, result: Fit, out: Path) -> None:
     result.distribution.save(out / "distribution.yaml")
     portable = yaml.safe_dump(config.portable(), sort_keys=False, allow_unicode=True)
     write_atomically(out / "fitted_config.yaml", portable.encode())
-    write_fit_report(
-        out / "report.html",
-        fit=result,
-        diagnostics=diagnose(problem.objective, result.distribution, seed=config.seed),
-        config=config.document(),
-        title=f"Fit of {config.sim or config.model or config.environment}",
-        notes=_write_model(problem, result, out / "model.xml"),
-        versions=versions(),
-        space=problem.space,
-    )
+    found = diagnose(problem.objective, result.distribution, seed=config.seed)
+    title, notes = f"Fit of {config.sim or config.model or config.environment}", _write_model(problem, result, out)
+    about = {"title": title, "notes": notes, **provenance(config)}
+    write_fit_report(out / "report.html", fit=result, diagnostics=found, space=problem.space, **about)
 
 
-def _write_model(problem: Problem, result: Fit, path: Path) -> list[str]:
-    """Write the model with the fitted values and effects; return what it lacks, in words."""
+def _write_model(problem: Problem, result: Fit, out: Path) -> list[str]:
+    """Write ``model.xml`` with the fitted values and effects; return what it lacks, in words."""
     from dropo_torch.effects.export import write_model
     from dropo_torch.models.export import export_model
 
     if problem.model_path is None:
         return []
-    values, rest = result.distribution.center, []
+    values, path, rest = result.distribution.center, out / "model.xml", []
     try:
         if problem.effects is None:
             export_model(problem.model_path, problem.space, values, path)

@@ -10,7 +10,9 @@ import tempfile
 from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
+from dropo_torch.config import Config
 from dropo_torch.errors import InputError
 
 #: Files by which a folder is known to hold a run.
@@ -89,6 +91,11 @@ def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:
     aside.mkdir()
     for name in reversed(present):  # the marks last: what is cut short here is still known as a run
         shutil.move(str(out / name), aside / name)
+
+
+def provenance(config: Config) -> dict[str, Any]:
+    """Return what every report says of where it comes from: the config, and the versions of what it depends on."""
+    return {"config": config.document(), "versions": versions()}
 
 
 def versions() -> dict[str, str]:

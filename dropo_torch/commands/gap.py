@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config as add_arguments
 from dropo_torch.commands.progress import StageProgress
 from dropo_torch.config import load_config
@@ -48,11 +48,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
     write_json(out / "gap.json", gap.document())
-    write_gap_report(
-        out / "report.html", gap, config=config.document(), versions=versions(),
-        title=f"What {config.sim or config.model or 'model'} lacks", model_note=" ".join(notes),
-        has_config=written.exists(),
-    )  # fmt: skip
+    about = {"title": f"What {config.sim or config.model or 'model'} lacks", **provenance(config)}
+    write_gap_report(out / "report.html", gap, model_note=" ".join(notes), has_config=written.exists(), **about)
     _show(gap, out, console)
 
 

@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dropo_torch.commands.fit import show_report
-from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config
 from dropo_torch.commands.progress import fit_shown
 from dropo_torch.config import Config, load_config
@@ -73,7 +73,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     chosen = keys_of(sweep.chosen) | ({"scaling": True} if config.scaling else {})  # which ε is in units of
     _show(sweep, chosen, problem.space.names, console)
     write_json(out / "sweep.json", {**sweep.document(), "use": chosen})
-    write_sweep_report(out / "report.html", sweep, use=chosen, config=config.document(), versions=versions())
+    write_sweep_report(out / "report.html", sweep, use=chosen, **provenance(config))
     show_report(out, console)
 
 

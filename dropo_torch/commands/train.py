@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from dropo_torch.commands.folder import prepare_folder, versions
+from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, add_log
 from dropo_torch.commands.progress import TrainProgress
 from dropo_torch.config import load_config
@@ -59,10 +59,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
             if curves is not None:
                 curves.add(entry, evaluation)
 
-        result = train(
-            problem, checkpoint=checkpoint, resume=given.resume, on_progress=show,
-            on_start=None if curves is None else curves.begin,
-        )  # fmt: skip
+        begin = None if curves is None else curves.begin
+        result = train(problem, checkpoint=checkpoint, resume=given.resume, on_progress=show, on_start=begin)
     _write(problem, result, out)
     _show(result, out, console)
 
@@ -79,10 +77,8 @@ def _write(problem: TrainingProblem, result: Training, out: Path) -> None:
     notes = [note] if note else []
     if problem.nominal is None:
         notes.append("Not evaluated in a nominal model: a number of an effect has no value of its own in the model.")
-    write_train_report(
-        out / "report.html", result, config=problem.config.document(), versions=versions(),
-        title=f"Policy for {env.task.name}", strip=strip, notes=notes,
-    )  # fmt: skip
+    about = {"title": f"Policy for {env.task.name}", "notes": notes, **provenance(problem.config)}
+    write_train_report(out / "report.html", result, strip=strip, **about)
     write_json(out / "train.json", result.document())
 
 

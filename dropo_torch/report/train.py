@@ -12,7 +12,7 @@ from dropo_torch.report.figures.train import episodes_panel, learning_curve
 from dropo_torch.report.formatting import duration, number, plain, thousands, whole
 from dropo_torch.report.page import Config, Versions, write_page
 from dropo_torch.report.words import Finding, attention, note
-from dropo_torch.rl.evaluate import Returns
+from dropo_torch.rl.collect import Returns
 from dropo_torch.rl.train import Training
 
 WORLDS = {

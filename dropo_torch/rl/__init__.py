@@ -4,9 +4,8 @@ from dropo_torch.support.extras import extra
 
 with extra("rl", "a policy"):
     from dropo_torch.rl.env import RandomizedEnv
-    from dropo_torch.rl.mujoco_stepper import MujocoStepper
     from dropo_torch.rl.sampling import DistributionSource, ParameterSource, PointSource, UniformSource, load_source
-    from dropo_torch.rl.stepper import BatchStepper
+    from dropo_torch.rl.stepper import BatchStepper, MujocoStepper
     from dropo_torch.rl.task import Task, load_task
     from dropo_torch.rl.vector import RandomizedVectorEnv
 

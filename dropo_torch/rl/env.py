@@ -12,9 +12,8 @@ from torchrl.envs import EnvBase
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.inside import no_effects
+from dropo_torch.rl.effects import Commands, Sensors, no_effects
 from dropo_torch.rl.sampling import ParameterSource, UniformSource
-from dropo_torch.rl.signals import Commands, Sensors
 from dropo_torch.rl.stepper import make_stepper
 from dropo_torch.rl.task import Task, check_model, check_task, load_task
 from dropo_torch.simulators.base import DIVERGED
@@ -99,11 +98,8 @@ class RandomizedEnv(EnvBase):
     def _make_specs(self) -> None:
         batch, column = (self.num_envs,), (self.num_envs, 1)
         flag = Binary(1, shape=column, dtype=torch.bool)
-        entries = {
-            "observation": Unbounded((*batch, self.task.num_observations)),
-            "step_count": Unbounded(column, dtype=torch.int64),
-            "diverged": flag,
-        }
+        entries = {"observation": Unbounded((*batch, self.task.num_observations)), "diverged": flag}
+        entries["step_count"] = Unbounded(column, dtype=torch.int64)
         if self._exposed:
             entries["parameters"] = Unbounded((*batch, len(self.space)))
         self.observation_spec = Composite(entries, shape=batch).to(self.device)
@@ -144,7 +140,7 @@ class RandomizedEnv(EnvBase):
         before, self._states = self._states, path[:, -1]
         if self._sensors:
             self._sensors.record(path)
-        observation = self._observed(slice(None))
+        observation = self._observed()
         reward = self.task.reward(before, actions, self._states).to(torch.float32)
         terminated = self.task.terminated(self._states)
         sound = good & torch.isfinite(reward) & torch.isfinite(observation).all(1)
@@ -170,7 +166,7 @@ class RandomizedEnv(EnvBase):
             entries["parameters"] = self._values.to(torch.float32)
         return TensorDict(entries, batch_size=self.batch_size, device=self.device)
 
-    def _observed(self, rows: torch.Tensor | slice) -> torch.Tensor:
+    def _observed(self, rows: torch.Tensor | slice = slice(None)) -> torch.Tensor:
         """What the task observes of some environments, ``(k, n)`` float32."""
         shown = self._sensors.show(self._states) if self._sensors else self._states
         return self.task.observe(shown[rows]).to(torch.float32)

@@ -12,8 +12,7 @@ from torchrl.modules import ProbabilisticActor
 
 from dropo_torch.errors import InputError
 from dropo_torch.rl.checkpoint import Stateful
-from dropo_torch.rl.networks import Normalizer
-from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.policy import Normalizer, Policy
 from dropo_torch.rl.settings import TrainSettings
 
 #: Updates in a row whose loss is not finite, after which training gives up.
@@ -35,14 +34,9 @@ class Learner(Stateful, ABC):
         self.policy = policy
         self._device = policy.low.device
         self._seen = Normalizer(num_parameters if settings.privileged_critic else 0).to(self._device)
+        self.num_features = policy.num_observations + len(self._seen.mean)  # width of the critic's input
         self.parts = {"policy": policy, "seen": self._seen}
-        self.skipped = 0
-        self.in_a_row = 0
-
-    @property
-    def num_features(self) -> int:
-        """Width of the critic's input."""
-        return self.policy.num_observations + len(self._seen.mean)
+        self.skipped, self.in_a_row = 0, 0
 
     @abstractmethod
     def act(self, observation: torch.Tensor) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
@@ -54,13 +48,9 @@ class Learner(Stateful, ABC):
 
     def _actor(self, distribution: type) -> ProbabilisticActor:
         """The policy's network as the losses take it, with actions of the given distribution."""
-        return ProbabilisticActor(
-            TensorDictModule(self.policy.actor, in_keys=["features"], out_keys=["loc", "scale"]),
-            in_keys=["loc", "scale"],
-            distribution_class=distribution,
-            return_log_prob=True,
-            log_prob_key="log_prob",
-        )
+        keys, told = ["loc", "scale"], {"return_log_prob": True, "log_prob_key": "log_prob"}
+        network = TensorDictModule(self.policy.actor, in_keys=["features"], out_keys=keys)
+        return ProbabilisticActor(network, in_keys=keys, distribution_class=distribution, **told)
 
     def _take_in(self, rollout: TensorDict) -> None:
         """Let the running statistics see new experience."""

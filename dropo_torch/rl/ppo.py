@@ -13,8 +13,7 @@ from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
 from dropo_torch.rl.learner import Learner
-from dropo_torch.rl.networks import Normalizer, mlp
-from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.policy import Normalizer, Policy, mlp
 from dropo_torch.rl.settings import PPOSettings
 
 #: What an update tells → its entry in TorchRL's loss.
@@ -24,6 +23,8 @@ _SCALARS = {
     "kl": "kl_approx",
     "clip_fraction": "clip_fraction",
 }
+#: How TorchRL's loss is used, whatever the settings.
+_LOSS = {"loss_critic_type": "l2", "normalize_advantage": True, "functional": False, "log_explained_variance": False}
 
 
 class PPO(Learner):
@@ -43,17 +44,9 @@ class PPO(Learner):
         self.settings = settings
         network = mlp(self.num_features, 1, settings.hidden, settings.activation, 1.0).to(self._device)
         self._critic = TensorDictModule(network, in_keys=["critic_features"], out_keys=["state_value"])
-        self._loss = ClipPPOLoss(
-            self._actor(IndependentNormal),
-            self._critic,
-            clip_epsilon=settings.clip,
-            entropy_bonus=settings.entropy > 0,
-            entropy_coeff=settings.entropy,
-            loss_critic_type="l2",
-            normalize_advantage=True,
-            functional=False,
-            log_explained_variance=False,
-        )
+        entropy = {"entropy_bonus": settings.entropy > 0, "entropy_coeff": settings.entropy}
+        actor = self._actor(IndependentNormal)
+        self._loss = ClipPPOLoss(actor, self._critic, clip_epsilon=settings.clip, **entropy, **_LOSS)
         self._loss.set_keys(sample_log_prob="log_prob")
         self._advantage = GAE(gamma=settings.gamma, lmbda=settings.lambda_, value_network=None, vectorized=True)
         self._optimizer = torch.optim.Adam(

@@ -79,19 +79,9 @@ class TrainingProblem:
 
     def env(self, world: World, num_envs: int, seed: int) -> RandomizedEnv:
         """Return environments of one of the worlds, on the config's backend."""
-        return RandomizedEnv(
-            **vars(world),
-            num_envs=num_envs,
-            backend=self.config.backend,
-            seed=seed,
-            num_threads=self.config.threads,
-            device=self.device,
-        )
-
-    @property
-    def distribution(self) -> dict[str, Any]:
-        """Where the parameters of a training's episodes come from, as plain data."""
-        return self.training.source.document()
+        config, where = self.config, self.device
+        engine: dict[str, Any] = {"backend": config.backend, "num_threads": config.threads, "device": where}
+        return RandomizedEnv(**vars(world), num_envs=num_envs, seed=seed, **engine)
 
     @property
     def device(self) -> str:
@@ -116,17 +106,10 @@ def make_training(config: Config) -> TrainingProblem:
     given = _given_distribution(full)
     space, effects = _space_and_effects(full, task)
     training = World(task, space, load_source(given, space), effects)
-    return TrainingProblem(
-        config=config,
-        algorithm=algorithm,
-        settings=settings,
-        model_path=model_path,
-        training=training,
-        nominal=replace(training, source=PointSource.nominal(space)) if np.isfinite(space.nominal).all() else None,
-        target=_target_world(full, {} if sim is None else sim.parameters, task) if config.target else None,
-        distribution_path=given if isinstance(given, Path) else None,
-        fingerprint=_fingerprint(config, algorithm, settings, training),
-    )
+    nominal = replace(training, source=PointSource.nominal(space)) if np.isfinite(space.nominal).all() else None
+    target = _target_world(full, {} if sim is None else sim.parameters, task) if config.target else None
+    path, digest = given if isinstance(given, Path) else None, _fingerprint(config, algorithm, settings, training)
+    return TrainingProblem(config, algorithm, settings, model_path, training, nominal, target, path, digest)
 
 
 def _completed(config: Config, sim: BundledSim | None) -> Config:

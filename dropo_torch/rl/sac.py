@@ -13,8 +13,7 @@ from torchrl.modules import TanhNormal
 from torchrl.objectives import SACLoss, SoftUpdate
 
 from dropo_torch.rl.learner import Learner
-from dropo_torch.rl.networks import ActionValue, mlp
-from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.policy import ActionValue, Policy, mlp
 from dropo_torch.rl.settings import SACSettings
 
 
@@ -36,21 +35,16 @@ class SAC(Learner):
         entropy = -float(self._num_actions) if settings.target_entropy is None else settings.target_entropy
         shape = self.num_features + self._num_actions, 1, settings.hidden, settings.activation, 1.0
         in_keys, out_keys = ["critic_features", "action"], ["state_action_value"]
-        self._loss = SACLoss(
-            self._actor(TanhNormal),
-            [TensorDictModule(ActionValue(*mlp(*shape)), in_keys, out_keys) for _ in range(2)],
-            loss_function="l2",
-            target_entropy=entropy,
-            alpha_init=0.2,
-        )
+        actor = self._actor(TanhNormal)
+        critics = [TensorDictModule(ActionValue(*mlp(*shape)), in_keys, out_keys) for _ in range(2)]
+        self._loss = SACLoss(actor, critics, loss_function="l2", target_entropy=entropy, alpha_init=0.2)
         self._loss.make_value_estimator(gamma=settings.gamma)
         self._loss.to(self._device)
         self._targets = SoftUpdate(self._loss, tau=settings.tau)
         self._optimizer = torch.optim.Adam(self._loss.parameters(), lr=settings.learning_rate, fused=True)
         self._memory = Memory(min(settings.buffer, max(settings.steps, 1)), settings.minibatch)
         self.parts |= {"loss": self._loss, "optimizer": self._optimizer, "memory": self._memory}
-        self.seen_steps = 0
-        self.owed = 0.0
+        self.seen_steps, self.owed = 0, 0.0
 
     def act(self, observation: torch.Tensor) -> tuple[torch.Tensor, Mapping[str, torch.Tensor]]:
         """Return sampled actions; uniform ones during the warm-up."""

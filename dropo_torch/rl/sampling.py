@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from dropo_torch.distribution import Distribution, to_coordinates, to_values
+from dropo_torch.distribution import Distribution, SearchBox, to_values
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.random import base_uniforms
 
 
 class ParameterSource(abc.ABC):
@@ -107,13 +108,12 @@ class UniformSource(ParameterSource):
 
     def __init__(self, space: ParameterSpace) -> None:
         self.names, self._space = space.names, space
-        self._low, high = (to_coordinates(x, space.is_log) for x in (space.low, space.high))
-        self._width = high - self._low
+        self._box = SearchBox.of(space)
 
     def sample(self, count: int, generator: torch.Generator) -> torch.Tensor:
         """Return values ``(count, d)`` inside the bounds."""
-        uniforms = torch.rand(count, len(self.names), generator=generator, dtype=torch.float64).numpy()
-        return torch.from_numpy(to_values(self._low + uniforms * self._width, self._space.is_log))
+        uniforms = base_uniforms(count, len(self.names), generator).numpy()
+        return torch.from_numpy(self._box.values(self._box.low + uniforms * self._box.width))
 
     def document(self) -> dict[str, Any]:
         """Return each parameter's bounds, unit and scale."""

@@ -105,13 +105,8 @@ def load_task(task: str | Task, *, base: Path | None = None) -> Task:
     name = task if ":" in task else bundled_sim(task, key="task").task
     if name is None:
         raise InputError(f"task: the bundled simulation {task!r} has none; expected file.py:Class of a Task")
-    maker = load_callable(
-        "task",
-        name,
-        path=lambda p: (base or Path()) / p,
-        what="class {} that is a Task",
-        example="a bundled simulation such as hopper, or file.py:Class of a Task",
-    )
+    what, example = "class {} that is a Task", "a bundled simulation such as hopper, or file.py:Class of a Task"
+    maker = load_callable("task", name, path=(base or Path()).joinpath, what=what, example=example)
     with user_code("task", name):
         made = maker()
     if not isinstance(made, Task):

@@ -14,8 +14,7 @@ import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.rl.checkpoint import Stateful, load_checkpoint, save_checkpoint
-from dropo_torch.rl.collect import Collector
-from dropo_torch.rl.evaluate import Returns, evaluate
+from dropo_torch.rl.collect import Collector, Returns, evaluate
 from dropo_torch.rl.learner import Learner
 from dropo_torch.rl.policy import Policy
 from dropo_torch.rl.ppo import PPO
@@ -110,6 +109,7 @@ class Training:
     def document(self) -> dict[str, Any]:
         """Return the training as plain data."""
         worlds = {"distribution": self.training, "nominal": self.nominal, "target": self.target}
+        columns = {"steps": "steps", "seconds": "seconds", "mean": "mean_return", "length": "mean_length"}
         same = ("algorithm", "steps", "episodes", "seconds", "diverged", "seed", "stop_reason")
         return {
             "schema": SCHEMA,
@@ -121,10 +121,7 @@ class Training:
             "skipped_updates": self.skipped,
             "distribution": self.policy.distribution,
             "evaluations": [asdict(e) for e in self.evaluations],
-            "returns": [
-                {"steps": e.steps, "seconds": e.seconds, "mean": e.mean_return, "length": e.mean_length}
-                for e in self.history
-            ],
+            "returns": [{key: getattr(e, own) for key, own in columns.items()} for e in self.history],
         }
 
 
@@ -239,21 +236,17 @@ class _Run(Stateful):
         self.policy.load_state_dict(self.best)
         self.policy.eval()
         return Training(
-            policy=self.policy,
             algorithm=problem.algorithm,
             history=tuple(self.history),
             evaluations=tuple(self.evaluations),
             training=self._episodes(problem.training, 1),
             nominal=None if problem.nominal is None else self._episodes(problem.nominal, 2),
             target=None if problem.target is None else self._episodes(problem.target, 3),
-            steps=last.steps,
-            episodes=last.episodes,
-            diverged=last.diverged,
+            **{name: getattr(last, name) for name in ("steps", "episodes", "diverged")},
+            **{name: getattr(self, name) for name in ("policy", "simulating", "learning")},
             repaired=self.env.num_repaired,
             skipped=self.learner.skipped,
             seconds=self._seconds(),
-            simulating=self.simulating,
-            learning=self.learning,
             seed=problem.config.seed,
         )
 
@@ -295,16 +288,9 @@ class _Run(Stateful):
             return evaluate(self.policy, self.problem.env(world, self.problem.settings.episodes, seed % 2**31))
 
     def _entry(self, scalars: dict[str, float]) -> TrainEntry:
-        returns, lengths = self.collector.returns, self.collector.lengths
-        return TrainEntry(
-            steps=self.steps,
-            seconds=self._seconds(),
-            episodes=self.collector.episodes,
-            mean_return=sum(returns) / len(returns) if returns else math.nan,
-            mean_length=sum(lengths) / len(lengths) if lengths else math.nan,
-            diverged=self.env.num_diverged,
-            scalars=scalars,
-        )
+        done = self.collector
+        mean, length = (sum(late) / len(late) if late else math.nan for late in (done.returns, done.lengths))
+        return TrainEntry(self.steps, self._seconds(), done.episodes, mean, length, self.env.num_diverged, scalars)
 
     def _seconds(self) -> float:
         return time.monotonic() - self.begun
@@ -317,7 +303,7 @@ def _fresh_policy(problem: TrainingProblem) -> Policy:
         "num_actions": len(task.action_low),
         **{name: getattr(settings, name) for name in ("hidden", "activation", "head", "initial_std")},
     }
-    policy = Policy(architecture, config=problem.config.document(), distribution=problem.distribution)
+    policy = Policy(architecture, config=problem.config.document(), distribution=problem.training.source.document())
     policy.low.copy_(torch.as_tensor(task.action_low, dtype=torch.float32))
     policy.high.copy_(torch.as_tensor(task.action_high, dtype=torch.float32))
     return policy.to(problem.device)

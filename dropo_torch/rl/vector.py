@@ -57,11 +57,9 @@ class RandomizedVectorEnv(gymnasium.vector.VectorEnv):
         """Make a step in every environment, and begin new episodes where one ends."""
         given = torch.as_tensor(np.asarray(actions, dtype=np.float32), device=self.env.device)
         after = self.env.step(self.env.now().set("action", given)).get("next")
-        observations = _array(after.get("observation"))
-        rewards = _array(after.get("reward"))[:, 0].astype(np.float64)
-        terminated, truncated, diverged = (
-            _array(after.get(key))[:, 0] for key in ("terminated", "truncated", "diverged")
-        )
+        keys = ("observation", "reward", "terminated", "truncated", "diverged")
+        observations, *columns = (_array(after.get(key)) for key in keys)
+        rewards, terminated, truncated, diverged = (column[:, 0] for column in columns)
         done = terminated | truncated
         infos: dict[str, Any] = {}
         if done.any():
@@ -70,7 +68,7 @@ class RandomizedVectorEnv(gymnasium.vector.VectorEnv):
                 final[row] = observations[row].copy()
             infos |= {"final_obs": final, "_final_obs": done.copy()}
             observations = self._reset(done)
-        return observations, rewards, terminated, truncated, infos | self._infos(diverged)
+        return observations, rewards.astype(np.float64), terminated, truncated, infos | self._infos(diverged)
 
     def _infos(self, diverged: np.ndarray) -> dict[str, Any]:
         every = np.ones(self.num_envs, dtype=bool)

@@ -11,7 +11,7 @@ import warp as wp
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.effects.simulator import check_backend
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.rl.inside import inside_model, no_effects
+from dropo_torch.rl.effects import inside_model, no_effects
 from dropo_torch.rl.stepper import BatchStepper
 from dropo_torch.simulators.warp.engine import Batch, Engine
 

@@ -114,7 +114,6 @@ def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: in
     columns, index = list(observation.log_columns), observation.index
     starts = observation.states(log.observations)
     before, after = log.observations.copy(), log.next_observations.copy()
-    state = torch.from_numpy(starts[:1].copy())
     for t in range(len(log)):
         if t == 0 or log.terminals[t - 1]:
             state = torch.from_numpy(starts[t : t + 1].copy())

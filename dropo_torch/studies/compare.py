@@ -13,7 +13,7 @@ import numpy as np
 from dropo_torch.errors import InputError, choices
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
-from dropo_torch.studies.store import Store
+from dropo_torch.studies.study import Store
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/compare/1"

@@ -1,4 +1,4 @@
-"""A large study: cells that are computed side by side, each kept in a file of its own, and what they say together."""
+"""Studies: what an interrupted one does not compute again, cells that are computed side by side, and what they say."""
 
 from __future__ import annotations
 
@@ -7,16 +7,18 @@ import json
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
 from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
+from dropo_torch.support.given import reading
 from dropo_torch.support.parallel import in_parallel
 
 SCHEMA = "dropo-torch/study/1"
 
 Item = TypeVar("Item")
 Key = TypeVar("Key", bound=Hashable)
+Result = TypeVar("Result")
 
 
 class Cell(Protocol):
@@ -62,6 +64,43 @@ def run_cells(
     for number, (cell, _) in enumerate(in_parallel(work, waiting, workers), done + 1):
         report(f"{number} of {len(cells)}: {cell.name}", number / len(cells))
     return [{**json.loads(files[cell.name].read_text()), "cell": asdict(cell)} for cell in cells]
+
+
+class Store(Generic[Result]):
+    """Results by key: dataclasses of plain data, or mappings.
+
+    Args:
+        path: the file, written whole after each result; ``None`` to keep nothing.
+        fingerprint: identifies config, log and options.
+        what: the study, for messages.
+        kind: makes a result of what the file holds, from keyword arguments.
+
+    Raises:
+        InputError: a file of something else, or of a study with another fingerprint.
+    """
+
+    def __init__(self, path: Path | None, fingerprint: str, what: str, kind: Callable[..., Result]) -> None:
+        self._path, self._fingerprint = path, fingerprint
+        self._results: dict[str, Result] = {}
+        if path is None or not path.is_file():
+            return
+        with reading(f"resume: {path}", f"the record of a {what}", "start again without --resume"):
+            content = json.loads(path.read_text())
+            owner = content["fingerprint"]
+            self._results = {key: kind(**result) for key, result in content["results"].items()}
+        if owner != fingerprint:
+            raise InputError(
+                f"resume: {path} belongs to another config or log, or to other options; start again without --resume"
+            )
+
+    def get(self, key: str, compute: Callable[[], Result]) -> Result:
+        """Return the result of a key, computed and kept where there is none yet."""
+        if key not in self._results:
+            self._results[key] = compute()
+            if self._path is not None:
+                content = {"fingerprint": self._fingerprint, "results": self._results}
+                write_atomically(self._path, json.dumps(content, default=asdict).encode())
+        return self._results[key]
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:

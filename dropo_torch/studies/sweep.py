@@ -18,7 +18,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
 from dropo_torch.objective import robust_log_likelihood as student_log_likelihood
-from dropo_torch.studies.store import Store
+from dropo_torch.studies.study import Store
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/sweep/1"

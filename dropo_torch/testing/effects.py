@@ -209,8 +209,8 @@ class EffectCase:
     def trained(self, target: str | None, values: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
         """What the environments of a training show at first ``(W, nq + nv)``, and then ``(W, T, nq + nv)``."""
         try:
-            from dropo_torch.rl.mujoco_stepper import MujocoStepper
-            from dropo_torch.rl.signals import Commands, Sensors
+            from dropo_torch.rl.effects import Commands, Sensors
+            from dropo_torch.rl.stepper import MujocoStepper
         except MissingExtra as error:
             raise NotApplicable(str(error)) from None
         effects, space, rows = self.placed(target, values), ParameterSpace.empty(self.setting.model), torch.arange(3)

@@ -9,7 +9,7 @@ import numpy as np
 
 from dropo_torch.report.figures import drawing
 from dropo_torch.report.figures.drawing import BLUE, GREY, INK, ORANGE
-from dropo_torch.rl.evaluate import Returns
+from dropo_torch.rl.collect import Returns
 from dropo_torch.rl.train import Training
 
 _COLOURS = {"distribution": GREY, "nominal": BLUE, "target": ORANGE}
