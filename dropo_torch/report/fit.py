@@ -11,7 +11,7 @@ import numpy as np
 
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
-from dropo_torch.distribution import Distribution, to_values
+from dropo_torch.distribution import Distribution, SearchBox, to_values
 from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report import words
@@ -220,7 +220,7 @@ def _convergence(fit: Fit) -> dict[str, Any]:
         return {"stages": [], "progress": [], "legend": [], "others": 0}
     begins = [i for i, entry in enumerate(history) if i == 0 or entry.stage != history[i - 1].stage]
     spans = list(zip(begins, [*begins[1:], len(history)], strict=True))
-    box, names = words.search_box(fit.distribution), fit.distribution.names
+    box, names = SearchBox.of(fit.distribution), fit.distribution.names
     means = (np.array([entry.mean for entry in history]) - box.low) / box.width
     stds = np.array([entry.std for entry in history]) / box.width
     shortfall = _shortfall(history, spans)

@@ -11,7 +11,7 @@ import numpy as np
 from dropo_torch.report.figures.train import episodes_panel, learning_curve
 from dropo_torch.report.formatting import duration, number, plain, thousands, whole
 from dropo_torch.report.page import Config, Versions, write_page
-from dropo_torch.report.words import Finding, attention, note
+from dropo_torch.report.words import Finding
 from dropo_torch.rl.evaluate import Returns
 from dropo_torch.rl.train import Training
 
@@ -99,23 +99,23 @@ def _findings(training: Training) -> Iterator[Finding]:
         error = float(np.hypot(nominal.standard_error, target.standard_error))
         lost = nominal.mean - target.mean
         if lost > 3 * error and lost > 0.1 * abs(nominal.mean):
-            yield attention(
-                "Lower return in the target",
+            text = (
                 f"The target's return is {number(lost, error)} below the nominal model's. A distribution "
-                "fitted to a log of the target, or a wider one, may close the gap.",
+                "fitted to a log of the target, or a wider one, may close the gap."
             )
+            yield Finding("attention", "Lower return in the target", text)
     if training.diverged:
-        yield note(
-            "Diverged simulations",
+        text = (
             f"{training.diverged:,} simulations diverged, which ended their episodes. If this is frequent, the "
-            "bounds or the distribution include values at which the model is unstable.",
+            "bounds or the distribution include values at which the model is unstable."
         )
+        yield Finding("note", "Diverged simulations", text)
     if training.repaired or training.skipped:
-        yield attention(
-            "Non-finite numbers",
+        text = (
             f"{training.repaired:,} steps with non-finite numbers were excluded from the losses, and "
-            f"{training.skipped:,} updates were skipped.",
+            f"{training.skipped:,} updates were skipped."
         )
+        yield Finding("attention", "Non-finite numbers", text)
 
 
 def _facts(training: Training) -> list[tuple[str, str]]:
