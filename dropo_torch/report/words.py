@@ -243,9 +243,9 @@ def box_shares(distribution: Distribution, values: np.ndarray) -> np.ndarray:
         return np.clip((to_coordinates(values, distribution.is_log) - box.low) / box.width, 0, 1)
 
 
-def place(spec: Any) -> str:
+def place(spec: Mapping[str, Any]) -> str:
     """Return where a parameter of a config sits in the model, such as ``body_mass of thigh``."""
-    if not isinstance(spec, Mapping) or not spec.get("field"):
+    if not spec.get("field"):
         return ""
     names = spec.get("name") or []
     names = [names] if isinstance(names, str) else [str(n) for n in names]
