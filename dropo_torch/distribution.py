@@ -144,10 +144,9 @@ class Distribution:
     @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest value that occurs, in coordinates, ``(d,)`` each."""
-        if self.is_uniform:
-            return self.mean - math.sqrt(3) * self.std, self.mean + math.sqrt(3) * self.std
-        a, b = truncated_interval(*self._normals)
-        return self.mean + self.std * a.numpy(), self.mean + self.std * b.numpy()
+        half = math.sqrt(3)
+        a, b = (-half, half) if self.is_uniform else (x.numpy() for x in truncated_interval(*self._normals))
+        return self.mean + self.std * a, self.mean + self.std * b
 
     @property
     def _normals(self) -> tuple[torch.Tensor, ...]:
@@ -183,15 +182,11 @@ class Distribution:
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return name → mean, std, low, high, unit, limits (and ``log_mean``, ``log_std`` where log-scaled)."""
         entries: dict[str, dict[str, Any]] = {}
+        columns = {"mean": self.center, "std": self.spread, "low": self.low, "high": self.high}
         for i, name in enumerate(self.names):
-            entries[name] = {
-                "mean": float(self.center[i]),
-                "std": float(self.spread[i]),
-                "low": float(self.low[i]),
-                "high": float(self.high[i]),
-                "unit": self.units[i],
-                "limits": [None if math.isinf(x) else float(x) for x in self.limits[i]],
-            }
+            limits = [None if math.isinf(x) else float(x) for x in self.limits[i]]
+            numbers = {key: float(column[i]) for key, column in columns.items()}
+            entries[name] = numbers | {"unit": self.units[i], "limits": limits}
             if self.is_uniform:
                 entries[name]["law"] = "uniform"
             if self.is_log[i]:

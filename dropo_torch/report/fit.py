@@ -166,10 +166,8 @@ def _columns(diagnostics: Diagnostics) -> dict[str, Any]:
     """Table, traces and residual panels of the compared columns."""
     z, size = words.standardised_residual(diagnostics), words.column_rms(diagnostics)
     limit = words.unexplained_above(diagnostics)
-    residual, expected = (
-        words.root_mean_square(np.where(np.isfinite(z), v, np.nan))
-        for v in (diagnostics.residual, diagnostics.expected)
-    )
+    both = (np.where(np.isfinite(z), v, np.nan) for v in (diagnostics.residual, diagnostics.expected))
+    residual, expected = map(words.root_mean_square, both)
     stretch = worst_stretch(z)
     rows = diagnostics.rows[stretch]
     breaks = _breaks(diagnostics)[stretch]
