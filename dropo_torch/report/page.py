@@ -42,12 +42,9 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], fram
         content: what the template names; ``facts`` are pairs for the table of how the result was computed.
         frame: title, config and versions.
     """
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
     environment.filters |= {f.__name__: f for f in FILTERS} | {"svg": to_svg, "yaml": config_yaml}
     page = environment.get_template(template).render(
