@@ -25,73 +25,67 @@ if TYPE_CHECKING:
 Entries = dict[str, Any]
 
 
+def _key(default: Any, description: str, **limits: Any) -> Any:
+    """A key's default, what it is, and which numbers it takes."""
+    return Field(default, description=description, **limits)
+
+
 class Config(pydantic.BaseModel):
     """What a run is made of. Paths are relative to the config file."""
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    model: str | None = Field(None, description="path of the MJCF, URDF or .mjb model")
-    sim: str | None = Field(None, description="a bundled simulation instead of a model")
-    environment: str | None = Field(
+    model: str | None = _key(None, "path of the MJCF, URDF or .mjb model")
+    sim: str | None = _key(None, "a bundled simulation instead of a model")
+    environment: str | None = _key(
+        None, "with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter"
+    )
+    data: Any = _key(None, "path of the log, a list of paths, or path and reading options")
+    trajectories: int | Annotated[list[int], Field(min_length=1)] | None = _key(
+        None, "how many of the log's episodes to use (the first ones), or which, counted from 0"
+    )
+    frame_skip: int | None = _key(None, "physics steps per logged transition", ge=1, le=1_000_000)
+    observation: list[str] | None = _key(None, "what the log's columns are, such as [qpos[1:], qvel]")
+    parameters: dict[str, Entries] | None = _key(
+        None, "name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
+    )
+    effects: list[Entries] = _key([], "physical effects that the model lacks: effect, target and its numbers")
+    own_effects: list[str] = _key([], "file.py:Class (module:Class) of effects of one's own, which join the vocabulary")
+    backend: Literal["mujoco", "warp", "gymnasium"] = _key("mujoco", "the simulator")
+    method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = _key(
+        "dropo", "what finds the distribution"
+    )
+    method_options: Entries = _key({}, "options of a method other than dropo; see docs/methods.md")
+    optimizer: Literal["fisher", "cma", "adam"] = _key("fisher", "how φ is searched")
+    entropy: float = _key(0.0, "weight of the entropy of the distribution in the fit", ge=0)
+    covariance: Literal["diagonal", "full"] = _key("diagonal", "whether parameters vary together")
+    epsilon: float | list[float] = _key(1e-5, "ε, variance added to every column, or one each")
+    noise: float | list[float] | None = _key(
+        None, "standard deviation of the measurement, or one per column; initial states are then uncertain"
+    )
+    samples: int = _key(100, "K, parameter vectors per transition", ge=2, le=1_000_000)
+    lag: int = _key(1, "λ, logged steps per window", ge=1)
+    seed: int = _key(0, "seed of everything that is random", ge=0, lt=2**63)
+    mask: list[str | int] = _key([], "observed columns which the likelihood leaves out")
+    scaling: bool = _key(False, "divide each column by its standard deviation over the log")
+    budget: int = _key(1000, "with cma: evaluations of the objective", ge=1)
+    population: int | None = _key(None, "with cma: φ per generation", ge=2)
+    common_random_numbers: bool = _key(False, "with cma: the same samples in every generation")
+    adam: Entries = _key({}, "with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers")
+    device: str = _key("cpu", "with warp: cpu, or a GPU such as cuda:0")
+    task: str | None = _key(
+        None, "what a policy learns: a bundled task, or file.py:Class (module:Class); the sim's by default"
+    )
+    algorithm: Literal["ppo", "sac"] | None = _key(None, "how a policy is trained: ppo (the default) or sac")
+    distribution: str | Entries | None = _key(
         None,
-        description="with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter",
-    )
-    data: Any = Field(None, description="path of the log, a list of paths, or path and reading options")
-    trajectories: int | Annotated[list[int], Field(min_length=1)] | None = Field(
-        None, description="how many of the log's episodes to use (the first ones), or which, counted from 0"
-    )
-    frame_skip: int | None = Field(None, ge=1, le=1_000_000, description="physics steps per logged transition")
-    observation: list[str] | None = Field(None, description="what the log's columns are, such as [qpos[1:], qvel]")
-    parameters: dict[str, Entries] | None = Field(
-        None, description="name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
-    )
-    effects: list[Entries] = Field(
-        [], description="physical effects that the model lacks: effect, target and its numbers"
-    )
-    own_effects: list[str] = Field(
-        [], description="file.py:Class (module:Class) of effects of one's own, which join the vocabulary"
-    )
-    backend: Literal["mujoco", "warp", "gymnasium"] = Field("mujoco", description="the simulator")
-    method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = Field(
-        "dropo", description="what finds the distribution"
-    )
-    method_options: Entries = Field({}, description="options of a method other than dropo; see docs/methods.md")
-    optimizer: Literal["fisher", "cma", "adam"] = Field("fisher", description="how φ is searched")
-    entropy: float = Field(0.0, ge=0, description="weight of the entropy of the distribution in the fit")
-    covariance: Literal["diagonal", "full"] = Field("diagonal", description="whether parameters vary together")
-    epsilon: float | list[float] = Field(1e-5, description="ε, variance added to every column, or one each")
-    noise: float | list[float] | None = Field(
-        None, description="standard deviation of the measurement, or one per column; initial states are then uncertain"
-    )
-    samples: int = Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
-    lag: int = Field(1, ge=1, description="λ, logged steps per window")
-    seed: int = Field(0, ge=0, lt=2**63, description="seed of everything that is random")
-    mask: list[str | int] = Field([], description="observed columns which the likelihood leaves out")
-    scaling: bool = Field(False, description="divide each column by its standard deviation over the log")
-    budget: int = Field(1000, ge=1, description="with cma: evaluations of the objective")
-    population: int | None = Field(None, ge=2, description="with cma: φ per generation")
-    common_random_numbers: bool = Field(False, description="with cma: the same samples in every generation")
-    adam: Entries = Field(
-        {}, description="with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers"
-    )
-    device: str = Field("cpu", description="with warp: cpu, or a GPU such as cuda:0")
-    task: str | None = Field(
-        None, description="what a policy learns: a bundled task, or file.py:Class (module:Class); the sim's by default"
-    )
-    algorithm: Literal["ppo", "sac"] | None = Field(
-        None, description="how a policy is trained: ppo (the default) or sac"
-    )
-    distribution: str | Entries | None = Field(
-        None,
-        description="of the parameters in training: path of a fit.json, uniform, nominal, or name: value; "
+        "of the parameters in training: path of a fit.json, uniform, nominal, or name: value; "
         "fit.json beside the config by default, uniform where there is none",
     )
-    train: Entries = Field({}, description="how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md")
-    target: Entries = Field(
-        {}, description="name: value, the model on which a trained policy is evaluated beside the nominal one"
-    )
-    threads: int = Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")
-    chunk_size: int = Field(10_000, ge=1, description="simulations held in memory at once")
+    train: Entries = _key({}, "how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md")
+    target: Entries = _key({}, "name: value, the model on which a trained policy is evaluated beside the nominal one")
+    threads: int = _key(0, "threads of the simulator, 0 for all processors", ge=0, le=4096)
+    chunk_size: int = _key(10_000, "simulations held in memory at once", ge=1)
 
     #: Folder that relative paths start from; not a key of the file.
     base: Path = Field(Path(), exclude=True)
@@ -272,20 +266,16 @@ class _Loader(yaml.SafeLoader):
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
                 if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"key {key.value!r} stands there twice", key.start_mark
-                    )
+                    twice = f"key {key.value!r} stands there twice"
+                    raise yaml.constructor.ConstructorError(None, None, twice, key.start_mark)
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
 
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)$|^[-+]?(\d+\.\d*|\.\d+)$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
-    ),
-    list("-+0123456789."),
+_FLOAT = re.compile(
+    r"^[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)$|^[-+]?(\d+\.\d*|\.\d+)$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
 )
+_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
 
 
 def _override(document: dict[str, Any], dotted: str, value: Any) -> None:

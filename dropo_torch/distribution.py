@@ -27,6 +27,7 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.support.given import reading
 from dropo_torch.support.random import base_uniforms
 
+_YAML = (".yaml", ".yml")
 SCHEMA = "dropo-torch/distribution/1"
 #: A truncated normal reaches this many σ from its mean.
 TRUNCATION = 2.0
@@ -115,18 +116,11 @@ class Distribution:
         is_uniform: bool = False,
     ) -> Distribution:
         """Return the distribution over ``space`` with μ and σ in coordinates, ``(d,)`` each."""
-        return cls(
-            names=space.names,
-            mean=np.array(mean, dtype=np.float64),
-            std=np.array(std, dtype=np.float64),
-            low=space.low,
-            high=space.high,
-            limits=space.limits,
-            is_log=space.is_log,
-            units=tuple(p.unit for p in space.parameters),
-            correlation=None if correlation is None else np.array(correlation, dtype=np.float64),
-            is_uniform=is_uniform,
-        )
+        mean, std = np.array(mean, dtype=np.float64), np.array(std, dtype=np.float64)
+        correlation = None if correlation is None else np.array(correlation, dtype=np.float64)
+        units = tuple(p.unit for p in space.parameters)
+        box = space.low, space.high, space.limits, space.is_log
+        return cls(space.names, mean, std, *box, units, correlation, is_uniform)
 
     @property
     def center(self) -> np.ndarray:
@@ -150,10 +144,9 @@ class Distribution:
     @property
     def ends(self) -> tuple[np.ndarray, np.ndarray]:
         """Lowest and highest value that occurs, in coordinates, ``(d,)`` each."""
-        if self.is_uniform:
-            return self.mean - math.sqrt(3) * self.std, self.mean + math.sqrt(3) * self.std
-        a, b = truncated_interval(*self._normals)
-        return self.mean + self.std * a.numpy(), self.mean + self.std * b.numpy()
+        half = math.sqrt(3)
+        a, b = (-half, half) if self.is_uniform else (x.numpy() for x in truncated_interval(*self._normals))
+        return self.mean + self.std * a, self.mean + self.std * b
 
     @property
     def _normals(self) -> tuple[torch.Tensor, ...]:
@@ -189,15 +182,11 @@ class Distribution:
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return name → mean, std, low, high, unit, limits (and ``log_mean``, ``log_std`` where log-scaled)."""
         entries: dict[str, dict[str, Any]] = {}
+        columns = {"mean": self.center, "std": self.spread, "low": self.low, "high": self.high}
         for i, name in enumerate(self.names):
-            entries[name] = {
-                "mean": float(self.center[i]),
-                "std": float(self.spread[i]),
-                "low": float(self.low[i]),
-                "high": float(self.high[i]),
-                "unit": self.units[i],
-                "limits": [None if math.isinf(x) else float(x) for x in self.limits[i]],
-            }
+            limits = [None if math.isinf(x) else float(x) for x in self.limits[i]]
+            numbers = {key: float(column[i]) for key, column in columns.items()}
+            entries[name] = numbers | {"unit": self.units[i], "limits": limits}
             if self.is_uniform:
                 entries[name]["law"] = "uniform"
             if self.is_log[i]:
@@ -209,11 +198,11 @@ class Distribution:
         document: dict[str, Any] = {"schema": SCHEMA, "parameters": self.summary()}
         if self.correlation is not None:
             document["correlation"] = self.correlation.tolist()
-        path = Path(path)
-        if path.suffix in (".yaml", ".yml"):
-            path.write_text(yaml.safe_dump(document, sort_keys=False, allow_unicode=True), encoding="utf-8")
+        if Path(path).suffix in _YAML:
+            text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
         else:
-            path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+            text = json.dumps(document, indent=2) + "\n"
+        Path(path).write_text(text, encoding="utf-8")
 
     @classmethod
     def load(cls, path: str | Path) -> Distribution:
@@ -225,37 +214,24 @@ class Distribution:
         path = Path(path)
         if not path.is_file():
             raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
-        is_yaml = path.suffix in (".yaml", ".yml")  # JSON is not quite YAML 1.1, which reads 1e-05 as text
+        is_yaml = path.suffix in _YAML  # JSON is not quite YAML 1.1, which reads 1e-05 as text
         with reading(f"distribution: {path}", "YAML" if is_yaml else "JSON"):
             text = path.read_text(encoding="utf-8")
             document = yaml.safe_load(text) if is_yaml else json.loads(text)
         entries = document.get("parameters") if isinstance(document, Mapping) else None
         if not isinstance(entries, Mapping) or not entries:
             raise InputError(f"distribution: {path} has no 'parameters'; expected name → mean, std, low, high, unit")
-        return cls._from_entries(entries, path, _correlation(document.get("correlation"), len(entries), path))
-
-    @classmethod
-    def _from_entries(
-        cls, entries: Mapping[str, Mapping[str, Any]], path: Path, correlation: np.ndarray | None
-    ) -> Distribution:
+        correlation = _correlation(document.get("correlation"), len(entries), path)
         laws = {str(entry.get("law", "normal")) for entry in entries.values() if isinstance(entry, Mapping)}
         rows = [_numbers(path, name, entry) for name, entry in entries.items()]
         if laws not in ({"normal"}, {"uniform"}):
             raise InputError(f"distribution: {path}: law {', '.join(sorted(laws))}; expected all normal or all uniform")
         mean, std, low, high = np.array(rows).T
         limits = np.array([entry.get("limits") or [None, None] for entry in entries.values()], dtype=np.float64)
-        return cls(
-            names=tuple(entries),
-            mean=mean,
-            std=std,
-            low=low,
-            high=high,
-            limits=np.where(np.isnan(limits), [-np.inf, np.inf], limits),
-            is_log=np.array([entry.get("scale") == "log" for entry in entries.values()]),
-            units=tuple(str(e.get("unit", "")) for e in entries.values()),
-            correlation=correlation,
-            is_uniform=laws == {"uniform"},
-        )
+        limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
+        is_log = np.array([entry.get("scale") == "log" for entry in entries.values()])
+        units = tuple(str(entry.get("unit", "")) for entry in entries.values())
+        return cls(tuple(entries), mean, std, low, high, limits, is_log, units, correlation, laws == {"uniform"})
 
 
 def _numbers(path: Path, name: str, entry: Any) -> list[float]:

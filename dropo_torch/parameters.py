@@ -346,7 +346,9 @@ def _at_field(model: mujoco.MjModel | None, where: str, name: str, spec: Mapping
         raise InputError(f"{where}: no field given; expected one of MjModel's, such as field: body_mass")
     targets, objects, index = _targets(model, where, field, index, spec)
     if spec.get("relative"):
-        targets = tuple(_scaled(model, where, t) for t in targets)
+        if none := [t.field for t in targets if t.read(model) == 0]:
+            raise InputError(f"{where}: relative, but the model's {none[0]} is 0 there; give absolute bounds")
+        targets = tuple(replace(t, factor=t.read(model)) for t in targets)  # they multiply the model's own
     if spec.get("scale_inertia"):
         targets = _with_inertia(model, where, field, targets, bool(spec.get("relative")))
     return Parameter(name, field=field, objects=objects, index=index, targets=targets)
@@ -452,14 +454,6 @@ def _component(where: str, field: str, index: int | None, size: int) -> int:
     if index >= size:
         raise InputError(f"{where}: index {index} is outside {field}, which has {size} component{'s' * (size > 1)}")
     return index
-
-
-def _scaled(model: mujoco.MjModel, where: str, target: Target) -> Target:
-    """The target of a relative parameter: its factor is the model's own value."""
-    own = target.read(model)
-    if own == 0:
-        raise InputError(f"{where}: relative, but the model's {target.field} is 0 there; give absolute bounds")
-    return Target(target.field, target.index, own)
 
 
 def _with_inertia(

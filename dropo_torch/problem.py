@@ -85,22 +85,20 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     effects, history = None, 0
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
-        effects = _effects(config, space, _observation(config, space.model, num_states, width), frame_skip)
+        observation = _observation(config, space.model, num_states, width)
+        if space.model is None or len(observation.default_state) != space.model.nq + space.model.nv:
+            raise InputError("effects: they need a MuJoCo model; this simulator has none")
+        setting = plain_setting(space.model, observation, frame_skip)
+        effects = place_effects(config.effects, space, setting, find_effect)
         space = space.with_limits(lowest(effects, space))
         simulator, history = _with_effects(config, source, effects, space, trajectories)
     else:
         simulator = _backend(config, source, frame_skip, space)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
-    objective = Objective(
-        simulator,
-        make_transitions(trajectories, observation, lag=config.lag, history=history),
-        observation,
-        epsilon=config.epsilon,
-        noise=config.noise,
-        mask=config.mask,
-        scaling=config.scaling,
-    )
+    transitions = make_transitions(trajectories, observation, lag=config.lag, history=history)
+    likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling")}
+    objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
     return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)
 
@@ -134,22 +132,8 @@ def _is_registered(environment: str | None) -> bool:
 
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
     """The simulator of the config's backend."""
-    return make_simulator(
-        config.backend,
-        source,
-        parameters=space,
-        frame_skip=frame_skip,
-        num_threads=config.threads,
-        chunk_size=config.chunk_size,
-        device=config.device,
-    )
-
-
-def _effects(config: Config, space: ParameterSpace, observation: Observation, frame_skip: int) -> EffectSet:
-    """The effects of a config."""
-    if space.model is None or len(observation.default_state) != space.model.nq + space.model.nv:
-        raise InputError("effects: they need a MuJoCo model; this simulator has none")
-    return place_effects(config.effects, space, plain_setting(space.model, observation, frame_skip), find_effect)
+    means: dict[str, Any] = {"num_threads": config.threads, "chunk_size": config.chunk_size, "device": config.device}
+    return make_simulator(config.backend, source, parameters=space, frame_skip=frame_skip, **means)
 
 
 def _with_effects(

@@ -10,10 +10,4 @@ from dropo_torch.report.gap import write_gap_report
 from dropo_torch.report.study import write_study_report
 from dropo_torch.report.sweep import write_sweep_report
 
-__all__ = [
-    "write_compare_report",
-    "write_fit_report",
-    "write_gap_report",
-    "write_study_report",
-    "write_sweep_report",
-]
+__all__ = ["write_compare_report", "write_fit_report", "write_gap_report", "write_study_report", "write_sweep_report"]

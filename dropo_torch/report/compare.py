@@ -3,35 +3,28 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Unpack
 
 from dropo_torch.report.figures.compare import cost_panel
-from dropo_torch.report.page import Config, Versions, write_page
+from dropo_torch.report.page import Frame, write_page
 from dropo_torch.studies.compare import Comparison
 
 _COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#d55e00", "#e69f00", "#cc79a7")
 
 
-def write_compare_report(
-    path: str | Path,
-    comparison: Comparison,
-    *,
-    config: Config,
-    versions: Versions = None,
-    title: str = "Comparison of optimizers",
-) -> None:
+def write_compare_report(path: str | Path, comparison: Comparison, **frame: Unpack[Frame]) -> None:
     """Write the report of a comparison as one self-contained file, whole or not at all.
 
     Args:
         path: the HTML file.
         comparison: the runs.
-        config: the runs' config, printed as YAML.
-        versions: name → version of what the result depends on.
-        title: of the page.
+        frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`.
     """
     runs = comparison.runs
     colours = dict(zip(dict.fromkeys(run.method for run in runs), _COLOURS, strict=False))
     best = max(run.log_likelihood for run in runs)
     content = {
+        "title": "Comparison of optimizers",
         "colours": colours,
         "panels": [
             cost_panel(runs, colours, best, cost=cost, shown=shown)
@@ -41,4 +34,4 @@ def write_compare_report(
         "comparison": comparison,
         "best": best,
     }
-    write_page(path, "compare.html", title, content, config=config, versions=versions)
+    write_page(path, "compare.html", content, frame)

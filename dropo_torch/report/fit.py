@@ -5,20 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
 from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
-from dropo_torch.distribution import Distribution, to_values
+from dropo_torch.distribution import Distribution, SearchBox, to_values
 from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report import words
 from dropo_torch.report.figures import fit as figures
 from dropo_torch.report.figures.drawing import BLUE, FAINT, PALETTE, Axis
 from dropo_torch.report.formatting import duration, nats, number, plain, plural, rms
-from dropo_torch.report.page import Config, Versions, write_page
+from dropo_torch.report.page import Frame, write_page
 
 #: Columns with figures of their own; of more, the worst explained are shown.
 MAX_COLUMNS = 24
@@ -36,11 +36,9 @@ def write_fit_report(
     *,
     fit: Fit,
     diagnostics: Diagnostics,
-    config: Config,
-    title: str,
     notes: Sequence[str] = (),
-    versions: Versions = None,
     space: ParameterSpace | None = None,
+    **frame: Unpack[Frame],
 ) -> None:
     """Write the report of a fit.
 
@@ -48,15 +46,15 @@ def write_fit_report(
         path: the HTML file; written whole or not at all.
         fit: the result.
         diagnostics: what :func:`~dropo_torch.diagnostics.diagnose` says about it.
-        config: the run's config, printed as YAML; its ``parameters`` tell where they sit in the model.
-        title: of the page.
         notes: further sentences for the reader.
-        versions: name → version of what the result depends on.
         space: the parameters, for their place in the model and the model's own values.
+        frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`; the
+            config's ``parameters`` tell where they sit in the model.
     """
     ok, verdict = words.verdict(fit, diagnostics)
     nominal = np.full(len(fit.distribution), np.nan) if space is None else space.nominal
     content = {
+        "title": "Fit",
         "fit": fit,
         "diagnostics": diagnostics,
         "words": words,
@@ -66,7 +64,7 @@ def write_fit_report(
         "findings": words.findings(fit, diagnostics),
         "notes": notes,
         "tiles": _tiles(fit, diagnostics),
-        "parameters": _parameters(fit, diagnostics, config, space, nominal),
+        "parameters": _parameters(fit, diagnostics, frame.get("config") or {}, space, nominal),
         "has_nominal": bool(np.isfinite(nominal).any()),
         **_posterior(fit),
         **_columns(diagnostics),
@@ -74,7 +72,7 @@ def write_fit_report(
         **_identifiability(fit, diagnostics),
         "facts": _facts(fit, diagnostics),
     }
-    write_page(path, "fit.html", title, content, config=config, versions=versions)
+    write_page(path, "fit.html", content, frame)
 
 
 def shown_columns(diagnostics: Diagnostics, most: int = MAX_COLUMNS) -> list[int]:
@@ -108,12 +106,11 @@ def _tiles(fit: Fit, diagnostics: Diagnostics) -> list[tuple[str, str]]:
 
 
 def _parameters(
-    fit: Fit, diagnostics: Diagnostics, config: Config, space: ParameterSpace | None, nominal: np.ndarray
+    fit: Fit, diagnostics: Diagnostics, config: Mapping[str, Any], space: ParameterSpace | None, nominal: np.ndarray
 ) -> list[dict[str, Any]]:
     """Table and densities of the parameters, one dictionary each."""
     distribution = fit.distribution
-    specs = (config or {}).get("parameters")
-    specs = specs if isinstance(specs, Mapping) else {}
+    specs = config.get("parameters") or {}
     places = {} if space is None else {p.name: p.where for p in space.parameters if p.field or p.effect}
     error = diagnostics.standard_error * np.where(distribution.is_log, distribution.center, 1.0)
     curves = [words.density_curve(distribution, i) for i in range(len(distribution))]
@@ -122,7 +119,7 @@ def _parameters(
     return [
         {
             "name": name,
-            "where": words.place(specs.get(name)) or places.get(name, ""),
+            "where": words.place(specs.get(name, {})) or places.get(name, ""),
             "mean": distribution.center[i],
             "std": distribution.spread[i],
             "error": error[i],
@@ -169,10 +166,8 @@ def _columns(diagnostics: Diagnostics) -> dict[str, Any]:
     """Table, traces and residual panels of the compared columns."""
     z, size = words.standardised_residual(diagnostics), words.column_rms(diagnostics)
     limit = words.unexplained_above(diagnostics)
-    residual, expected = (
-        words.root_mean_square(np.where(np.isfinite(z), v, np.nan))
-        for v in (diagnostics.residual, diagnostics.expected)
-    )
+    both = (np.where(np.isfinite(z), v, np.nan) for v in (diagnostics.residual, diagnostics.expected))
+    residual, expected = map(words.root_mean_square, both)
     stretch = worst_stretch(z)
     rows = diagnostics.rows[stretch]
     breaks = _breaks(diagnostics)[stretch]
@@ -220,7 +215,7 @@ def _convergence(fit: Fit) -> dict[str, Any]:
         return {"stages": [], "progress": [], "legend": [], "others": 0}
     begins = [i for i, entry in enumerate(history) if i == 0 or entry.stage != history[i - 1].stage]
     spans = list(zip(begins, [*begins[1:], len(history)], strict=True))
-    box, names = words.search_box(fit.distribution), fit.distribution.names
+    box, names = SearchBox.of(fit.distribution), fit.distribution.names
     means = (np.array([entry.mean for entry in history]) - box.low) / box.width
     stds = np.array([entry.std for entry in history]) / box.width
     shortfall = _shortfall(history, spans)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -13,7 +13,7 @@ from dropo_torch.report import gap_words as words
 from dropo_torch.report.figures.drawing import BLUE, ORANGE
 from dropo_torch.report.figures.gap import force_frame, force_panel, score_panel
 from dropo_torch.report.formatting import duration, nats, percent, whole
-from dropo_torch.report.page import Config, Versions, write_page
+from dropo_torch.report.page import Frame, write_page
 
 #: Rounds of the search that the ranking shows, and candidates in each.
 MAX_ROUNDS = 3
@@ -27,30 +27,22 @@ LEAST_LEFT = 1e-4
 
 
 def write_gap_report(
-    path: str | Path,
-    gap: Gap,
-    *,
-    config: Config,
-    versions: Versions,
-    title: str,
-    model_note: str = "",
-    has_config: bool = True,
+    path: str | Path, gap: Gap, *, model_note: str = "", has_config: bool = True, **frame: Unpack[Frame]
 ) -> None:
     """Write the report of a search for a gap as one self-contained file, whole or not at all.
 
     Args:
         path: the HTML file.
         gap: the result.
-        config: the run's config, printed as YAML.
-        versions: name → version of what the result depends on.
-        title: of the page.
         model_note: what was written besides, such as a model that has the effects; a sentence.
         has_config: whether a config with the effects stands beside the report.
+        frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`.
     """
     named = [e for e in gap.effects if words.is_named(e)]
     headline, items = words.answer(gap)
     folder = Path(path).parent  # as a command takes it; of one elsewhere on the machine, but its name
     content = {
+        "title": "What the model lacks",
         "gap": gap,
         "words": words,
         "headline": headline,
@@ -69,7 +61,7 @@ def write_gap_report(
         "folder": folder.name if folder.is_absolute() else folder.as_posix(),
         "facts": _facts(gap, bool(named)),
     }
-    write_page(path, "gap.html", title, content, config=config, versions=versions)
+    write_page(path, "gap.html", content, frame)
 
 
 def _scores(gap: Gap, named: bool) -> list[tuple[str, str, Any]]:

@@ -121,11 +121,6 @@ def places(values: Iterable[tuple[str, str | None]]) -> list[tuple[str, str]]:
     return [(title(e), joined(list(targets), 12)) for e, targets in groups.items()]
 
 
-def either(items: list[str]) -> str:
-    """Return alternatives in words, cut where they are many."""
-    return joined(items, last="or", rest="one of {} more")
-
-
 def strength(given: Strength) -> tuple[str, str, str]:
     """Return value, interval and unit of a number in words, with as many digits as the interval supports."""
     values, unit = [given.value, given.low, given.high], "" if given.unit in ("-", "1") else given.unit

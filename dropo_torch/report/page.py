@@ -9,63 +9,55 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypedDict
 
 import jinja2
-import numpy as np
 import yaml
-from markupsafe import Markup
 
 from dropo_torch.report.figures import to_svg
 from dropo_torch.report.formatting import FILTERS
 from dropo_torch.support.files import write_atomically
 
-Versions = Mapping[str, str] | None
-Config = Mapping[str, Any] | None
+
+class Frame(TypedDict, total=False):
+    """What every page can be given.
+
+    Attributes:
+        title: of the page; each kind has one of its own.
+        config: the run's config, printed as YAML.
+        versions: name → version of what the result depends on.
+    """
+
+    title: str
+    config: Mapping[str, Any] | None
+    versions: Mapping[str, str] | None
 
 
-def write_page(
-    path: str | Path, template: str, title: str, content: Mapping[str, Any], *, config: Config, versions: Versions
-) -> None:
+def write_page(path: str | Path, template: str, content: Mapping[str, Any], frame: Frame) -> None:
     """Write a page as one self-contained file, whole or not at all.
 
     Args:
         path: the HTML file.
         template: the file of its template.
-        title: of the page.
         content: what the template names; ``facts`` are pairs for the table of how the result was computed.
-        config: the run's config, printed as YAML.
-        versions: name → version of what the result depends on.
+        frame: title, config and versions.
     """
+    loader = jinja2.FileSystemLoader(Path(__file__).parent)
     environment = jinja2.Environment(
-        loader=jinja2.FileSystemLoader(Path(__file__).parent),
-        autoescape=True,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        undefined=jinja2.StrictUndefined,
+        loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
-    environment.filters |= {f.__name__: f for f in FILTERS} | {"svg": _svg}
-    frame = {"title": title, "facts": (), "config": config_yaml(config), "versions": dict(versions or {})}
-    page = environment.get_template(template).render({**frame, **content})
+    environment.filters |= {f.__name__: f for f in FILTERS} | {"svg": to_svg, "yaml": config_yaml}
+    page = environment.get_template(template).render(
+        {"facts": (), "config": None, "versions": None, **content, **frame}
+    )
     write_atomically(Path(path), page.encode())
 
 
-def config_yaml(config: Config) -> str:
-    """Return a config as YAML; empty for ``None``."""
-    if config is None:
-        return ""
-    document = json.loads(json.dumps(dict(config), default=_plain_data))
+def config_yaml(config: Mapping[str, Any]) -> str:
+    """Return a config as YAML."""
+    document = json.loads(json.dumps(dict(config), default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v)))
     options: dict[str, Any] = {"sort_keys": False, "allow_unicode": True, "width": 100}
     return "".join(
         yaml.safe_dump({key: value}, default_flow_style=None if isinstance(value, (dict, list)) else False, **options)
         for key, value in document.items()
     )
-
-
-def _svg(figure: Any, grow: bool = True) -> Markup:
-    return Markup(to_svg(figure, grow=grow))
-
-
-def _plain_data(value: Any) -> Any:
-    """JSON for what JSON does not know."""
-    return value.tolist() if isinstance(value, (np.ndarray, np.generic)) else str(value)

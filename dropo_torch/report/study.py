@@ -4,30 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Unpack
 
-from markupsafe import Markup
-
-from dropo_torch.report.page import Versions, write_page
+from dropo_torch.report.page import Frame, write_page
 
 
 def write_study_report(
     path: str | Path,
     *,
-    title: str,
     lead: str,
     tables: Sequence[tuple[str, Sequence[str], Sequence[Sequence[str]]]],
     figures: Mapping[str, str],
-    versions: Versions = None,
+    **frame: Unpack[Frame],
 ) -> None:
     """Write the report of a study as one self-contained file, whole or not at all.
 
     Args:
         path: the HTML file.
-        title: of the page.
         lead: what the study is.
         tables: each a heading, the columns' names and the rows.
         figures: heading of the table that a figure stands above → SVG.
-        versions: name → version of what the results depend on.
+        frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`.
     """
-    content = {"lead": lead, "tables": tables, "figures": {heading: Markup(svg) for heading, svg in figures.items()}}
-    write_page(path, "study.html", title, content, config=None, versions=versions)
+    write_page(path, "study.html", {"lead": lead, "tables": tables, "figures": figures}, frame)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 
 from dropo_torch.report.figures.train import episodes_panel, learning_curve
 from dropo_torch.report.formatting import duration, number, plain, thousands, whole
-from dropo_torch.report.page import Config, Versions, write_page
-from dropo_torch.report.words import Finding, attention, note
+from dropo_torch.report.page import Frame, write_page
+from dropo_torch.report.words import Finding
 from dropo_torch.rl.collect import Returns
 from dropo_torch.rl.train import Training
 
@@ -26,25 +27,22 @@ def write_train_report(
     path: str | Path,
     training: Training,
     *,
-    config: Config,
-    versions: Versions = None,
-    title: str = "Trained policy",
     strip: bytes | None = None,
     notes: Sequence[str] = (),
+    **frame: Unpack[Frame],
 ) -> None:
     """Write the report of a training as one self-contained file, whole or not at all.
 
     Args:
         path: the HTML file.
         training: the result.
-        config: the run's config, printed as YAML.
-        versions: name → version of what the result depends on.
-        title: of the page.
         strip: a PNG of an episode, or ``None``.
         notes: further sentences for the reader.
+        frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`.
     """
     found = evaluations(training)
     content = {
+        "title": "Trained policy",
         "headline": headline(training),
         "tiles": _tiles(training),
         "findings": list(_findings(training)),
@@ -58,7 +56,7 @@ def write_train_report(
         "strip": "" if strip is None else base64.b64encode(strip).decode(),
         "facts": _facts(training),
     }
-    write_page(path, "train.html", title, content, config=config, versions=versions)
+    write_page(path, "train.html", content, frame)
 
 
 def evaluations(training: Training) -> dict[str, Returns]:
@@ -99,23 +97,23 @@ def _findings(training: Training) -> Iterator[Finding]:
         error = float(np.hypot(nominal.standard_error, target.standard_error))
         lost = nominal.mean - target.mean
         if lost > 3 * error and lost > 0.1 * abs(nominal.mean):
-            yield attention(
-                "Lower return in the target",
+            text = (
                 f"The target's return is {number(lost, error)} below the nominal model's. A distribution "
-                "fitted to a log of the target, or a wider one, may close the gap.",
+                "fitted to a log of the target, or a wider one, may close the gap."
             )
+            yield Finding("attention", "Lower return in the target", text)
     if training.diverged:
-        yield note(
-            "Diverged simulations",
+        text = (
             f"{training.diverged:,} simulations diverged, which ended their episodes. If this is frequent, the "
-            "bounds or the distribution include values at which the model is unstable.",
+            "bounds or the distribution include values at which the model is unstable."
         )
+        yield Finding("note", "Diverged simulations", text)
     if training.repaired or training.skipped:
-        yield attention(
-            "Non-finite numbers",
+        text = (
             f"{training.repaired:,} steps with non-finite numbers were excluded from the losses, and "
-            f"{training.skipped:,} updates were skipped.",
+            f"{training.skipped:,} updates were skipped."
         )
+        yield Finding("attention", "Non-finite numbers", text)
 
 
 def _facts(training: Training) -> list[tuple[str, str]]:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from itertools import compress
-from typing import Any, Literal, cast
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +14,6 @@ from dropo_torch.baselines.mixture import Mixture
 from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, SearchBox, to_coordinates, to_values
 from dropo_torch.fit import Fit
-from dropo_torch.parameters import ParameterSpace
 from dropo_torch.report.formatting import MOST_NAMED, joined, number, plain, rms, signed, whole, with_unit
 
 #: A mean nearer to its bound than this share of the box is at its bound.
@@ -48,20 +46,88 @@ class Finding:
     text: str
 
 
-#: A finding that asks for a decision, and one that is good to know.
-attention, note = partial(Finding, "attention"), partial(Finding, "note")
+_OF_METHOD = "What the standard deviations are"
+#: What a finding means and what to do, by its title; {} is what it is about.
+_TEXTS = {
+    "Velocities missing from the log": "{}: every simulated window starts with these joints at rest, but the robot "
+    "was moving. Use data: preprocess to derive velocities from the positions, and list them in observation.",
+    "Mean at its physical limit": "{}. The log shows no sign of this effect. Drop it, or log a motion that excites it.",
+    **dict.fromkeys(
+        ("Mean at its lower search bound", "Mean at its upper search bound"),
+        "{}. The optimum may lie outside. Widen the bounds if that is physically plausible, "
+        "or look for something else in the model that would cause the same motion.",
+    ),
+    "Standard deviation at its upper bound": "{}. The log calls for more variation than the largest σ allowed, a "
+    "quarter of the search box. Usually the model lacks something (a delay, friction, an offset) and this parameter "
+    "compensates for it. Do not read σ as the spread of the real quantity.",
+    "Standard deviation as large as the mean": "{}. Such a spread is rarely real. It usually compensates for a model "
+    "error: a mass whose inertia was not scaled along (scale_inertia), one value shared by joints that differ, a "
+    "missing friction or delay, or sensor noise that was not declared.",
+    "Standard deviation at its floor": "{}. A single fixed value explains the log as well as any distribution: "
+    "this is a point estimate. To train a policy, you may want to widen it.",
+    _OF_METHOD: "{}",
+    "Several values explain the log": "{}. The normal distribution above also covers the values in between, which the "
+    "log rules out: do not train on it. Narrow the bounds to one of the peaks, or log a motion that distinguishes "
+    "them.",
+    "Hardly narrower than the search box": "{}. Either the log barely constrains the parameter on its own, or the "
+    "network has not learned it. If the posterior samples form a line, only a combination with another parameter is "
+    "identified; if not, more simulations or a longer horizon may help.",
+    "The model does not explain every column": "{}: measured next states are farther from the simulated ones than the "
+    "fit expects (rms of standardized residuals; 1 is ideal). Either the model is missing or misrepresents something "
+    "that acts on these columns, or their noise is larger than ε allows.",
+    "Columns that barely count": "{}. Their residuals are far smaller than expected: the ε (or noise) given for them "
+    "exceeds the simulation error, so the fit barely uses them. Set ε per column, or lower it.",
+    "Columns without a finite residual": "{}.",
+    "Parameters that are not identifiable separately": "{}. A change in one is compensated by a change in the other, "
+    "so only their combination is identified. Fix one of them, or log a motion that separates them.",
+    "Poorly identified means": "{}: the standard error of the mean is not small compared to the search box. Log a "
+    "motion that excites the parameter, or drop it.",
+    "Diverged simulations": "{} diverged under the fitted distribution. Narrow the bounds or limits of the parameters "
+    "that destabilize the model, or shorten its time step.",
+    "No finite likelihood": "{} did not produce a usable result.",
+}
+#: Findings that are good to know; the others ask for a decision.
+_NOTES = ("Mean at its physical limit", "Standard deviation at its floor", "Columns that barely count")
+#: What a method's standard deviations tell, and what to know about them; DROPO's need no more.
+_MEANINGS = {
+    "droid": "how far the search had contracted when it stopped, which says nothing about the log",
+    "simopt": "how far the search had contracted when it stopped",
+    "bayessim": "how uncertain the network is about a single fixed value",
+    "laplace": "how uncertain a single fixed value is, not how much the parameter varies",
+    "udr": "how wide a box drawn at random is",
+}
+_CAUTIONS = {
+    "droid": "They shrink with every generation, whatever the noise. Use the means, and choose σ yourself.",
+    "simopt": "They depend on the number of iterations and on the step bound. Use the means, and choose σ yourself.",
+    "bayessim": "They come from simulations that resemble the log; see the posterior below.",
+    "laplace": "A longer log makes them smaller; a missing effect does not make them larger.",
+    "udr": "The log does not affect them.",
+}
 
 
 def findings(fit: Fit, diagnostics: Diagnostics) -> list[Finding]:
     """Return what needs attention first, then what is good to know."""
+    distribution, lost = fit.distribution, max(fit.diverged, diagnostics.diverged)
+    usable = np.isfinite(fit.log_likelihood) and np.isfinite(distribution.mean).all()
+    vague = ~(diagnostics.standard_error < VAGUE * SearchBox.of(distribution).width)
+    about: dict[str, Sequence[str]] = {
+        "Velocities missing from the log": diagnostics.at_rest,
+        **_at_bounds(distribution),
+        **(_standard_deviations(distribution) if fit.method == "dropo" else _of_method(fit)),
+        **({} if fit.method == "udr" else _residuals(diagnostics)),
+        "Parameters that are not identifiable separately": [
+            f"{a} and {b} ({signed(correlation)})" for a, b, correlation in strongest(diagnostics)
+        ],
+        "Poorly identified means": _chosen(distribution, vague),
+        "Diverged simulations": [whole(lost, "simulation")] if lost else [],
+        "No finite likelihood": [] if usable else ["The fit"],
+    }
+    is_alarming = fit.method in ("droid", "simopt") or fit.extras.get("extrapolates")
+    notes = _NOTES if is_alarming else (*_NOTES, _OF_METHOD)
     found = [
-        *_unobserved(diagnostics),
-        *_at_bounds(fit.distribution),
-        *(_standard_deviations(fit.distribution) if fit.method == "dropo" else _of_method(fit)),
-        *([] if fit.method == "udr" else _residuals(diagnostics)),
-        *_confounded(diagnostics),
-        *_vague(fit.distribution, diagnostics),
-        *_failures(fit, diagnostics),
+        Finding("note" if title in notes else "attention", title, _TEXTS[title].format(joined(items)))
+        for title, items in about.items()
+        if items
     ]
     return sorted(found, key=lambda finding: finding.level != "attention")
 
@@ -140,14 +206,9 @@ def has_standard_errors(fit: Fit) -> bool:
     return fit.method not in ("bayessim", "simopt", "udr")
 
 
-def search_box(distribution: Distribution) -> SearchBox:
-    """Return the search box of a fitted distribution."""
-    return SearchBox.of(cast(ParameterSpace, distribution))  # it has the same low, high and is_log
-
-
 def at_largest_std(distribution: Distribution) -> np.ndarray:
     """Return which standard deviations lie at their upper bound, ``(d,)`` bool."""
-    return np.asarray(distribution.std >= search_box(distribution).max_std / AT_STD_BOUND)
+    return np.asarray(distribution.std >= SearchBox.of(distribution).max_std / AT_STD_BOUND)
 
 
 def shape(distribution: Distribution) -> str:
@@ -160,13 +221,7 @@ def shape(distribution: Distribution) -> str:
 
 def meaning_of_std(fit: Fit) -> str:
     """Return what the standard deviations say, by the method that found them."""
-    meaning = {
-        "droid": "how far the search had contracted when it stopped, which says nothing about the log",
-        "simopt": "how far the search had contracted when it stopped",
-        "bayessim": "how uncertain the network is about a single fixed value",
-        "laplace": "how uncertain a single fixed value is, not how much the parameter varies",
-        "udr": "how wide a box drawn at random is",
-    }.get(fit.method, "how much the parameter must vary for the simulator to cover the log")
+    meaning = _MEANINGS.get(fit.method, "how much the parameter must vary for the simulator to cover the log")
     return f"The standard deviation tells {meaning}"
 
 
@@ -183,14 +238,14 @@ def density_curve(distribution: Distribution, index: int, points: int = 121) -> 
 
 def box_shares(distribution: Distribution, values: np.ndarray) -> np.ndarray:
     """Return where values, in units, lie between the ends of the search box, as shares in [0, 1]; NaN kept."""
-    box = search_box(distribution)
+    box = SearchBox.of(distribution)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.clip((to_coordinates(values, distribution.is_log) - box.low) / box.width, 0, 1)
 
 
-def place(spec: Any) -> str:
+def place(spec: Mapping[str, Any]) -> str:
     """Return where a parameter of a config sits in the model, such as ``body_mass of thigh``."""
-    if not isinstance(spec, Mapping) or not spec.get("field"):
+    if not spec.get("field"):
         return ""
     names = spec.get("name") or []
     names = [names] if isinstance(names, str) else [str(n) for n in names]
@@ -206,92 +261,40 @@ def strongest(diagnostics: Diagnostics) -> list[tuple[str, str, float]]:
     return sorted(diagnostics.confounded, key=lambda pair: -np.nan_to_num(abs(pair[2])))
 
 
-def _unobserved(diagnostics: Diagnostics) -> Iterator[Finding]:
-    if diagnostics.at_rest:
-        yield attention(
-            "Velocities missing from the log",
-            f"{joined(diagnostics.at_rest)}: every simulated window starts with these joints at rest, but the robot "
-            "was moving. Use data: preprocess to derive velocities from the positions, and list them in observation.",
-        )
-
-
-def _at_bounds(distribution: Distribution) -> Iterator[Finding]:
-    box = search_box(distribution)
+def _at_bounds(distribution: Distribution) -> dict[str, list[str]]:
+    """Means at the ends of the search box, with the ends' values."""
+    box, (physical, _) = SearchBox.of(distribution), distribution.limits.T
     share = (distribution.mean - box.low) / box.width
-    lower, upper = share < AT_BOUND, share > 1 - AT_BOUND
-    physical = distribution.low <= distribution.limits[:, 0]
-    if none := _with_values(distribution, lower & physical, distribution.low):
-        yield note(
-            "Mean at its physical limit",
-            f"{joined(none)}. The log shows no sign of this effect. Drop it, or log a motion that excites it.",
-        )
-    for side, at, bound in (("lower", lower & ~physical, distribution.low), ("upper", upper, distribution.high)):
-        if names := _with_values(distribution, at, bound):
-            yield attention(
-                f"Mean at its {side} search bound",
-                f"{joined(names)}. The optimum may lie outside. Widen the bounds if that is physically plausible, "
-                "or look for something else in the model that would cause the same motion.",
-            )
-
-
-def _standard_deviations(distribution: Distribution) -> Iterator[Finding]:
-    box = search_box(distribution)
-    top = at_largest_std(distribution)
-    floor = distribution.std <= box.min_std * AT_STD_BOUND
-    wide = ~top & (distribution.spread >= WIDE * np.abs(distribution.center)) & (distribution.mean > box.low)
-    if top.any():
-        yield attention(
-            "Standard deviation at its upper bound",
-            f"{_chosen(distribution, top)}. The log calls for more variation than the largest σ allowed, a quarter of "
-            "the search box. Usually the model lacks something (a delay, friction, an offset) and this parameter "
-            "compensates for it. Do not read σ as the spread of the real quantity.",
-        )
-    if wide.any():
-        yield attention(
-            "Standard deviation as large as the mean",
-            f"{_chosen(distribution, wide)}. Such a spread is rarely real. It usually compensates for a model error: "
-            "a mass whose inertia was not scaled along (scale_inertia), one value shared by joints that differ, a "
-            "missing friction or delay, or sensor noise that was not declared.",
-        )
-    if floor.any():
-        yield note(
-            "Standard deviation at its floor",
-            f"{_chosen(distribution, floor)}. A single fixed value explains the log as well as any distribution: "
-            "this is a point estimate. To train a policy, you may want to widen it.",
-        )
-
-
-def _of_method(fit: Fit) -> Iterator[Finding]:
-    """What to know about the standard deviations of a method other than DROPO."""
-    instead = "Use the means, and choose σ yourself."
-    texts = {
-        "droid": (attention, f"They shrink with every generation, whatever the noise. {instead}"),
-        "simopt": (attention, f"They depend on the number of iterations and on the step bound. {instead}"),
-        "laplace": (note, "A longer log makes them smaller; a missing effect does not make them larger."),
-        "udr": (note, "The log does not affect them."),
-        "bayessim": (note, "They come from simulations that resemble the log; see the posterior below."),
+    lower, upper, at_limit = share < AT_BOUND, share > 1 - AT_BOUND, distribution.low <= physical
+    return {
+        "Mean at its physical limit": _with_values(distribution, lower & at_limit, distribution.low),
+        "Mean at its lower search bound": _with_values(distribution, lower & ~at_limit, distribution.low),
+        "Mean at its upper search bound": _with_values(distribution, upper, distribution.high),
     }
-    if fit.extras.get("extrapolates"):
-        texts["bayessim"] = (attention, f"But the posterior is a guess: {fit.caveat}.")
-    finding, text = texts.get(fit.method, (note, ""))
-    yield finding("What the standard deviations are", f"{meaning_of_std(fit)}. {text}")
-    if fit.method != "bayessim":
-        return
-    if several := _several_peaks(fit):
-        yield attention(
-            "Several values explain the log",
-            f"{joined([f'{name}: {joined(values)}' for name, values in several.items()])}. The normal distribution "
-            "above also covers the values in between, which the log rules out: do not train on it. Narrow the "
-            "bounds to one of the peaks, or log a motion that distinguishes them.",
-        )
-    share = zip(fit.distribution.names, fit.distribution.std / search_box(fit.distribution).width, strict=True)
-    if vague := [name for name, s in share if s > 0.8 / math.sqrt(12) and name not in several]:
-        yield attention(
-            "Hardly narrower than the search box",
-            f"{joined(vague)}. Either the log barely constrains the parameter on its own, or the network has "
-            "not learned it. If the posterior samples form a line, only a combination with another parameter is "
-            "identified; if not, more simulations or a longer horizon may help.",
-        )
+
+
+def _standard_deviations(distribution: Distribution) -> dict[str, list[str]]:
+    """Standard deviations of DROPO that say more of the model or the log than of the parameter."""
+    box, top = SearchBox.of(distribution), at_largest_std(distribution)
+    wide = ~top & (distribution.spread >= WIDE * np.abs(distribution.center)) & (distribution.mean > box.low)
+    return {
+        "Standard deviation at its upper bound": _chosen(distribution, top),
+        "Standard deviation as large as the mean": _chosen(distribution, wide),
+        "Standard deviation at its floor": _chosen(distribution, distribution.std <= box.min_std * AT_STD_BOUND),
+    }
+
+
+def _of_method(fit: Fit) -> dict[str, list[str]]:
+    """What to know about the standard deviations of a method other than DROPO."""
+    guessed = fit.extras.get("extrapolates")
+    caution = f"But the posterior is a guess: {fit.caveat}." if guessed else _CAUTIONS.get(fit.method, "")
+    about = {_OF_METHOD: [f"{meaning_of_std(fit)}. {caution}"]}
+    if fit.method == "bayessim":
+        peaks, shares = _several_peaks(fit), fit.distribution.std / SearchBox.of(fit.distribution).width
+        vague = [n for n in _chosen(fit.distribution, shares > 0.8 / math.sqrt(12)) if n not in peaks]
+        about["Several values explain the log"] = [f"{name}: {joined(values)}" for name, values in peaks.items()]
+        about["Hardly narrower than the search box"] = vague
+    return about
 
 
 def _several_peaks(fit: Fit) -> dict[str, list[str]]:
@@ -302,25 +305,18 @@ def _several_peaks(fit: Fit) -> dict[str, list[str]]:
     return {name: [number(v, 0.01 * abs(v)) for v in values] for name, values in found if len(values) > 1}
 
 
-def _residuals(diagnostics: Diagnostics) -> Iterator[Finding]:
+def _residuals(diagnostics: Diagnostics) -> dict[str, list[str]]:
+    """Columns whose residuals are too large, too small or not there."""
     standardised, labels, limit = column_rms(diagnostics), diagnostics.labels, unexplained_above(diagnostics)
     order = np.argsort(-np.nan_to_num(standardised, nan=-1))
-    if bad := [f"{labels[i]} ({rms(standardised[i])})" for i in order if standardised[i] > limit]:
-        yield attention(
-            "The model does not explain every column",
-            f"{joined(bad)}: measured next states are farther from the simulated ones than the fit expects "
-            "(rms of standardized residuals; 1 is ideal). Either the model is missing or misrepresents something "
-            "that acts on these columns, or their noise is larger than ε allows.",
-        )
-    if drowned := [label for i, label in enumerate(labels) if _is_drowned(diagnostics, i)]:
-        yield note(
-            "Columns that barely count",
-            f"{len(drowned)} of {len(labels)} columns: {joined(drowned)}. Their residuals are far smaller "
-            "than expected: the ε (or noise) given for them exceeds the simulation error, so the fit barely uses "
-            "them. Set ε per column, or lower it.",
-        )
-    if lost := list(compress(labels, ~np.isfinite(standardised))):
-        yield attention("Columns without a finite residual", f"{joined(lost)}.")
+    drowned = [label for i, label in enumerate(labels) if _is_drowned(diagnostics, i)]
+    return {
+        "The model does not explain every column": [
+            f"{labels[i]} ({rms(standardised[i])})" for i in order if standardised[i] > limit
+        ],
+        "Columns that barely count": [f"{len(drowned)} of {len(labels)} columns: {joined(drowned)}"] if drowned else [],
+        "Columns without a finite residual": list(compress(labels, ~np.isfinite(standardised))),
+    }
 
 
 def _is_drowned(diagnostics: Diagnostics, column: int) -> bool:
@@ -330,38 +326,8 @@ def _is_drowned(diagnostics: Diagnostics, column: int) -> bool:
     return bool(finite.any() and root_mean_square(residual[finite]) < DROWNED * np.median(given[finite]))
 
 
-def _confounded(diagnostics: Diagnostics) -> Iterator[Finding]:
-    if pairs := [f"{a} and {b} ({signed(correlation)})" for a, b, correlation in strongest(diagnostics)]:
-        yield attention(
-            "Parameters that are not identifiable separately",
-            f"{joined(pairs)}. A change in one is compensated by a change in the other, so only their "
-            "combination is identified. Fix one of them, or log a motion that separates them.",
-        )
-
-
-def _vague(distribution: Distribution, diagnostics: Diagnostics) -> Iterator[Finding]:
-    vague = ~(diagnostics.standard_error < VAGUE * search_box(distribution).width)
-    if vague.any():
-        yield attention(
-            "Poorly identified means",
-            f"{_chosen(distribution, vague)}: the standard error of the mean is not small compared to the search "
-            "box. Log a motion that excites the parameter, or drop it.",
-        )
-
-
-def _failures(fit: Fit, diagnostics: Diagnostics) -> Iterator[Finding]:
-    if lost := max(fit.diverged, diagnostics.diverged):
-        yield attention(
-            "Diverged simulations",
-            f"{whole(lost, 'simulation')} diverged under the fitted distribution. Narrow the bounds or limits of "
-            "the parameters that destabilize the model, or shorten its time step.",
-        )
-    if not (np.isfinite(fit.log_likelihood) and np.isfinite(fit.distribution.mean).all()):
-        yield attention("No finite likelihood", "The fit did not produce a usable result.")
-
-
-def _chosen(distribution: Distribution, mask: np.ndarray) -> str:
-    return joined(list(compress(distribution.names, mask)))
+def _chosen(distribution: Distribution, mask: np.ndarray) -> list[str]:
+    return list(compress(distribution.names, mask))
 
 
 def _with_values(distribution: Distribution, mask: np.ndarray, values: np.ndarray) -> list[str]:

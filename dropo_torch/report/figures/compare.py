@@ -26,8 +26,7 @@ def cost_panel(runs: Sequence[Run], colours: Mapping[str, str], best: float, *, 
         shown: nats below the best, plus one, or the largest relative error of a mean.
     """
     name = cost.replace("_", " ")
-    figure = drawing.new_figure(460, 290, f"{_LABELS[shown]} against {name}")
-    axes = drawing.new_axes(figure, (62, 42, 14, 12), grid="both")
+    figure, axes = drawing.new_panel(460, 290, f"{_LABELS[shown]} against {name}", (62, 42, 14, 12), grid="both")
     drawing.log_scale(axes, "x")
     drawing.log_scale(axes, "y")
     for run in runs:

@@ -67,6 +67,14 @@ def new_axes(figure: Any, margins: Margins, *, grid: Literal["x", "y", "both"] |
     return axes
 
 
+def new_panel(
+    width: float, height: float, label: str, margins: Margins, grid: Literal["x", "y", "both"] | None = None
+) -> tuple[Any, Any]:
+    """Return a figure of one pair of axes, and these."""
+    figure = new_figure(width, height, label)
+    return figure, new_axes(figure, margins, grid=grid)
+
+
 def log_scale(axes: Any, which: Which) -> None:
     """Make an axis logarithmic."""
     axes.set(**{f"{which}scale": "log"})

@@ -20,8 +20,7 @@ def distribution_row(axis: Axis, values: np.ndarray, density: np.ndarray, center
         center: the mean.
         nominal: the model's own value; NaN where there is none.
     """
-    figure = drawing.new_figure(320, 64, "density over the search box")
-    axes = drawing.new_axes(figure, (12, 20, 12, 4))
+    figure, axes = drawing.new_panel(320, 64, "density over the search box", (12, 20, 12, 4))
     axes.spines["left"].set_visible(False)
     drawing.show_axis(axes, "x", axis, 6)
     _tick_the_ends(axes, axis)
@@ -44,8 +43,7 @@ def pair_panel(x_axis: Axis, y_axis: Axis, x: np.ndarray, y: np.ndarray) -> Any:
         x_axis, y_axis: the search boxes, in the parameters' units.
         x, y: the draws, ``(n,)`` each.
     """
-    figure = drawing.new_figure(300, 240, "draws of two parameters")
-    axes = drawing.new_axes(figure, (46, 26, 12, 8))
+    figure, axes = drawing.new_panel(300, 240, "draws of two parameters", (46, 26, 12, 8))
     drawing.dots(axes, x, y, BLUE)
     drawing.show_axis(axes, "x", x_axis, 5)
     drawing.show_axis(axes, "y", y_axis, 5)
@@ -141,8 +139,7 @@ def progress_panel(
         limits: of the vertical axis.
         marks: horizontal guides.
     """
-    figure = drawing.new_figure(340, 225, label)
-    axes = drawing.new_axes(figure, (58, 36, 12, 34))
+    figure, axes = drawing.new_panel(340, 225, label, (58, 36, 12, 34))
     keep = np.unique(np.linspace(0, max(len(cost) - 1, 0), min(len(cost), MAX_POINTS)).astype(int))
     lines = np.where(np.isfinite(lines) & ((lines > 0) | (not log)), lines, np.nan)
     for column, colour in sorted(enumerate(colours), key=lambda pair: pair[1] != FAINT):
@@ -191,8 +188,9 @@ def heat_map(
     cell, right = ((40, 24), 70) if roomy else ((small, small), 8)
     rows, columns = [drawing.shorten(r) for r in rows], [drawing.shorten(c) for c in columns]
     left, top = (12 + 5.6 * max(map(len, names), default=1) for names in (rows, columns))
-    figure = drawing.new_figure(left + cell[0] * width + right, top + cell[1] * count + 6, "heat map")
-    axes = drawing.new_axes(figure, (left, 6, right, top))
+    figure, axes = drawing.new_panel(
+        left + cell[0] * width + right, top + cell[1] * count + 6, "heat map", (left, 6, right, top)
+    )
     shown = np.where(np.tri(count, width, dtype=bool) | (not lower), matrix, np.nan)
     colours = heat_colours(shown, diverging)
     axes.imshow(colours, aspect="auto", interpolation="none")

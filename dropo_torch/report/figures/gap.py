@@ -30,8 +30,7 @@ def score_panel(scores: Mapping[str, float], label: str, *, log: bool) -> Any:
         log: whether the axis is logarithmic, for errors; it is not if one is not positive. Otherwise it is at least
             :data:`LEAST_NATS` wide.
     """
-    figure = drawing.new_figure(300, 56 + 26 * len(scores), label)
-    axes = drawing.new_axes(figure, (80, 40, 62, 8), grid="x")
+    figure, axes = drawing.new_panel(300, 56 + 26 * len(scores), label, (80, 40, 62, 8), grid="x")
     drawn = np.array([v for v in scores.values() if np.isfinite(v)])
     least = 0.0 if log else LEAST_NATS
     log = log and len(drawn) > 0 and bool((drawn > 0).all())
@@ -66,8 +65,7 @@ def force_panel(
         x_label, y_label: of the axes.
         colour: of the median.
     """
-    figure = drawing.new_figure(420, 250, f"{y_label} against {x_label}")
-    axes = drawing.new_axes(figure, (62, 42, 14, 10))
+    figure, axes = drawing.new_panel(420, 250, f"{y_label} against {x_label}", (62, 42, 14, 10))
     left, right, low, high = frame
     axes.set(xlabel=drawing.shorten(x_label, 56), ylabel=drawing.shorten(y_label, 36))
     axes.yaxis.set_label_coords(-48 / 344, 0.5)
@@ -75,7 +73,8 @@ def force_panel(
     x, y = variable[finite], force[finite]
     if len(x):
         axes.axhline(0, color=GREY, linewidth=0.8)
-        keep = _spread(x, MAX_DOTS)
+        few = len(x) <= MAX_DOTS  # of more, some at random, but always the same
+        keep = np.arange(len(x)) if few else np.sort(np.random.default_rng(0).choice(len(x), MAX_DOTS, replace=False))
         cloud = np.clip(y[keep], low, high)
         drawing.strokes(axes, np.clip(x[keep], left, right), cloud, cloud, CLOUD, 2.6)
         middle, median = running_median(x, y)
@@ -101,13 +100,6 @@ def running_median(x: np.ndarray, y: np.ndarray, most: int = 40) -> tuple[np.nda
     count = int(np.clip(len(x) // LEAST_POINTS, 1, most))
     groups = [g for g in np.array_split(order, count) if len(g)]
     return np.array([np.median(x[g]) for g in groups]), np.array([np.median(y[g]) for g in groups])
-
-
-def _spread(x: np.ndarray, most: int) -> np.ndarray:
-    """Which points to draw: all, or as many as may be, at random but always the same."""
-    if len(x) <= most:
-        return np.arange(len(x))
-    return np.sort(np.random.default_rng(0).choice(len(x), most, replace=False))
 
 
 def _range(values: np.ndarray, share: float) -> tuple[float, float]:

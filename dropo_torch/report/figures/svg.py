@@ -9,8 +9,10 @@ import warnings
 import zlib
 from typing import Any
 
+from markupsafe import Markup
 
-def to_svg(figure: Any, label: str = "", *, grow: bool = True) -> str:
+
+def to_svg(figure: Any, label: str = "", *, grow: bool = True) -> Markup:
     """Return a figure as an ``<svg>`` element.
 
     Args:
@@ -25,7 +27,7 @@ def to_svg(figure: Any, label: str = "", *, grow: bool = True) -> str:
     with matplotlib.rc_context(settings), warnings.catch_warnings():
         warnings.filterwarnings("ignore", message="Glyph .* missing")  # the reader's fonts draw the text
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Format": None, "Type": None})
-    return _inline(stream.getvalue(), label or figure.get_label(), grow)
+    return Markup(_inline(stream.getvalue(), label or figure.get_label(), grow))
 
 
 def _inline(document: str, label: str, grow: bool) -> str:

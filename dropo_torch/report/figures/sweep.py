@@ -19,8 +19,7 @@ def epsilon_panel(epsilon: np.ndarray, y: np.ndarray, chosen: float, label: str,
         label: of the vertical axis.
         log: whether the vertical axis is logarithmic, too.
     """
-    figure = drawing.new_figure(460, 300, f"{label} against ε")
-    axes = drawing.new_axes(figure, (62, 42, 14, 12), grid="both")
+    figure, axes = drawing.new_panel(460, 300, f"{label} against ε", (62, 42, 14, 12), grid="both")
     usable = np.isfinite(epsilon) & (epsilon > 0) & np.isfinite(y) & ((y > 0) | (not log))
     axes.plot(epsilon[usable], y[usable], color=BLUE, linewidth=1.5, marker="o", markersize=4.5)
     if np.isfinite(chosen) and chosen > 0:

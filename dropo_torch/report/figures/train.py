@@ -17,8 +17,7 @@ _COLOURS = {"distribution": GREY, "nominal": BLUE, "target": ORANGE}
 
 def learning_curve(training: Training) -> Any:
     """Draw the return of training episodes and of evaluations against environment steps."""
-    figure = drawing.new_figure(760, 300, "return against environment steps")
-    axes = drawing.new_axes(figure, (64, 42, 14, 26), grid="both")
+    figure, axes = drawing.new_panel(760, 300, "return against environment steps", (64, 42, 14, 26), grid="both")
     steps = np.array([e.steps for e in training.history], dtype=float)
     returns = np.array([e.mean_return for e in training.history])
     keep = np.isfinite(returns)
@@ -36,8 +35,9 @@ def learning_curve(training: Training) -> Any:
 
 def episodes_panel(evaluations: Mapping[str, Returns]) -> Any:
     """Draw the return of every episode of each evaluation as a dot, and the mean as a stroke."""
-    figure = drawing.new_figure(760, 58 + 34 * len(evaluations), "returns of the evaluation episodes")
-    axes = drawing.new_axes(figure, (120, 42, 14, 8), grid="x")
+    figure, axes = drawing.new_panel(
+        760, 58 + 34 * len(evaluations), "returns of the evaluation episodes", (120, 42, 14, 8), grid="x"
+    )
     for row, (name, e) in enumerate(evaluations.items()):
         axes.plot(e.returns, np.full(len(e.returns), row), "o", color=_COLOURS[name], alpha=0.45, markersize=6)
         axes.plot([e.mean, e.mean], [row - 0.32, row + 0.32], color=_COLOURS[name], linewidth=2.2)
