@@ -142,14 +142,16 @@ def reductions(gap: Mapping[str, Any]) -> dict[str, float]:
 
 def attempt(spec: CaseSpec, backend: str, threads: int = 0) -> dict[str, Any]:
     """Make a case, run it and judge the answer; what fails is recorded with its traceback."""
-    result: dict[str, Any] = {"name": spec.name, "kind": spec.kind, "system": spec.system, "seed": spec.seed[0]}
+    result: dict[str, Any] = {
+        "name": spec.name, "kind": spec.kind, "trait": spec.trait, "system": spec.system, "seed": spec.seed[0],
+    }  # fmt: skip
     try:
         case = spec.make()
         result["hidden"] = [[e.name, e.target, dict(e.parameters)] for e in case.effects]
         result["equivalents"], result["gap_ratio"] = case.equivalents, case.gap_ratio
-        started = time.perf_counter()
+        started, used = time.perf_counter(), time.process_time()
         document = run_case(case, backend, threads)
-        result["seconds"] = time.perf_counter() - started
+        result["seconds"], result["cpu_seconds"] = time.perf_counter() - started, time.process_time() - used
         result.update(judge(case, document), document=document)
     except Exception:  # a case that fails must not stop the others
         result["failure"] = traceback.format_exc()
