@@ -17,6 +17,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.hidden.systems import CORE, SYSTEMS, System, fine, load
+from benchmarks.hidden.ties import exact_ties
 from benchmarks.hidden.truths import Before, Case, Effect, Recording, make_case, make_recording, observed
 from dropo_torch.parameters import ParameterSpace
 
@@ -210,8 +211,11 @@ class CaseSpec:
         system, rng = SYSTEMS[self.system], np.random.default_rng([*self.seed, 1])
         effects = tuple(_drawn(system, e, rng, self.seed, self.unusual) for e in self.effects)
         recording = make_recording(system, effects, self.seed, noise=self.unusual.noise, before=self.unusual.before)
-        ratio = gap_ratio(system, recording)
-        return make_case(system, effects, recording, name=self.name, kind=self.kind, gap_ratio=ratio, trait=self.trait)
+        ratio, same = gap_ratio(system, recording), exact_ties(system, effects, recording)
+        return make_case(
+            system, effects, recording,
+            name=self.name, kind=self.kind, gap_ratio=ratio, trait=self.trait, ties=same,
+        )  # fmt: skip
 
 
 def cases(seed: int, which: str = "all") -> list[CaseSpec]:

@@ -66,7 +66,8 @@ class Case:
         config: the project's config of it.
         trajectories: the log.
         effects: what is hidden.
-        equivalents: for each effect, the (effect, target) pairs that are the same thing on this system.
+        equivalents: for each effect, the (effect, target) pairs that are as right an answer.
+        ties: for each effect, those of them that are exactly the same thing on this log, each of which is to be told.
         declared: the true values of the declared parameters.
         noise: standard deviation of each column of the log.
         gap_ratio: the gap beside the noise, once the declared parameters are at their best; see ``cases.py``.
@@ -81,6 +82,7 @@ class Case:
     trajectories: Trajectories
     effects: tuple[Effect, ...] = ()
     equivalents: tuple[tuple[tuple[str, str | None], ...], ...] = ()
+    ties: tuple[tuple[tuple[str, str | None], ...], ...] = ()
     declared: Mapping[str, float] = field(default_factory=dict)
     noise: tuple[float, ...] = ()
     gap_ratio: float = 0.0
@@ -949,8 +951,10 @@ def make_case(
     noise: float = 1.0,
     gap_ratio: float = 0.0,
     trait: str = "",
+    ties: Sequence[tuple[tuple[str, str | None], ...]] = (),
 ) -> Case:
     """Return the case of a recording; its generator advances."""
+    same = [*ties] or [()] * len(effects)
     levels = noise * recording.noise
     return Case(
         name=name or system.name,
@@ -960,7 +964,10 @@ def make_case(
         config=config_of(system),
         trajectories=measured(system, recording.log, levels, recording.rng),
         effects=tuple(effects),
-        equivalents=tuple(equivalents(system, e) for e in effects),
+        equivalents=tuple(
+            tuple(sorted({*equivalents(system, e), *found}, key=str)) for e, found in zip(effects, same, strict=True)
+        ),
+        ties=tuple(same),
         declared=recording.declared,
         noise=tuple(levels.tolist()),
         gap_ratio=gap_ratio,
