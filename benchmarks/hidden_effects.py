@@ -26,7 +26,8 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from benchmarks.hidden.cases import CaseSpec, cases, select
-from benchmarks.hidden.truths import Case
+from benchmarks.hidden.systems import SYSTEMS
+from benchmarks.hidden.truths import Case, Effect, observed
 from dropo_torch.support.parallel import in_parallel
 
 KINDS = ("null", "single", "double", "outside")
@@ -38,6 +39,8 @@ STRENGTH = {
 NEUTRAL = {"gain": 1.0, "factor": 1.0}
 #: Parameters that need not be told: structure, or angles that are equal modulo a turn.
 UNSCORED = {"poles", "phase", "reference", "velocity", "damping_ratio"}
+#: What the told noise of a column may be off, relative to the true one.
+NOISE_WITHIN = 0.15
 
 
 def run_case(case: Case, backend: str, threads: int = 0) -> dict[str, Any]:
@@ -69,6 +72,7 @@ def judge(case: Case, document: Mapping[str, Any]) -> dict[str, Any]:
     scored = [_strength(case, h, entries[m]) for h, m in matches.items()]
     scored = [s for s in scored if s is not None]
     complete = len(matches) == len(case.effects) and len(entries) == len(case.effects)
+    noise = noise_ratios(case, document)
     return {
         "named": [[e["effect"], e.get("target")] for e in entries],
         "unnamed": unnamed,
@@ -76,8 +80,38 @@ def judge(case: Case, document: Mapping[str, Any]) -> dict[str, Any]:
         "found": len(matches),
         "errors": [s["error"] for s in scored],
         "covered": [c for s in scored for c in s["covered"]],
+        "deviations": {k: v for s in scored for k, v in s["deviations"].items()},
+        "noise": noise,
+        "noise_right": all(abs(r - 1) <= NOISE_WITHIN for r in noise.values()) if noise else None,
+        "ties_missing": [
+            sorted({*case.ties[h], (case.effects[h].name, case.effects[h].target)} - _names(entries[m]), key=str)
+            for h, m in matches.items()
+            if case.ties[h]
+        ],
+        "chi2": (document.get("chi2_per_degree") or {}).get("after"),
+        "left": _left(document.get("gap") or {}),
         "reduction": reductions(document.get("gap") or {}),
     }
+
+
+def noise_ratios(case: Case, document: Mapping[str, Any]) -> dict[str, float]:
+    """Told noise by true noise, feature by feature; a rotation's is twice that of its quaternion's numbers."""
+    labels = observed(SYSTEMS[case.system]).labels
+    true = dict(zip(labels, case.noise, strict=True))
+    found = {}
+    for label, told in (document.get("noise") or {}).items():
+        stem, _, part = label.partition(".rotation[")
+        level = 2 * true[f"{stem}.position[q{part}"] if part else true[label]
+        found[label] = float(told) / level
+    return found
+
+
+def _left(gap: Mapping[str, Any]) -> float | None:
+    """The held-out one-step mean square after, by that of noise alone."""
+    try:
+        return float(gap["after"]["mse"]) / float(gap["noise_floor"]["mse"])
+    except (KeyError, TypeError, ZeroDivisionError):
+        return None
 
 
 def _names(entry: Mapping[str, Any]) -> set[Pair]:
@@ -100,28 +134,42 @@ def _matches(case: Case, entries: Sequence[Mapping[str, Any]]) -> dict[int, int]
 
 
 def _strength(case: Case, hidden: int, entry: Mapping[str, Any]) -> dict[str, Any] | None:
-    """Relative error and coverage of an effect's parameters, where it is called by its own name."""
+    """Relative error, coverage of all numbers, and their deviations in half widths of the 90 % intervals.
+
+    Only where an effect is called by its own name: the numbers of another one mean something else.
+    """
     effect = case.effects[hidden]
-    if entry["effect"] != effect.name or entry.get("target") != effect.target:
+    if entry["effect"] != effect.name or entry.get("target") != effect.target or effect.name == "integration":
         return None
-    told, true = _positive(entry.get("parameters") or {}), effect.parameters
-    hidden_by_plane = {k for k in ("y", "roll") if true.get(k) == 0.0}
-    keys = [k for k in STRENGTH.get(effect.name, tuple(true)) if k in told and k not in UNSCORED | hidden_by_plane]
-    if not keys or effect.name == "integration":
+    told = _aligned(entry.get("parameters") or {}, effect)
+    hidden_by_plane = {k for k in ("y", "roll") if effect.parameters.get(k) == 0.0}
+    known = {k: v for k, v in effect.parameters.items() if k in told and k not in hidden_by_plane}
+    keys = [k for k in STRENGTH.get(effect.name, tuple(known)) if k in known and k not in UNSCORED]
+    if not keys:
         return None
-    off = np.array([told[k]["value"] - true[k] for k in keys])
-    size = np.array([true[k] - NEUTRAL.get(k, 0.0) for k in keys])
-    inside = [bool(told[k]["low"] <= true[k] <= told[k]["high"]) for k in keys]
-    return {"error": float(np.linalg.norm(off) / np.linalg.norm(size)), "covered": inside}
+    off = np.array([told[k]["value"] - known[k] for k in keys])
+    size = np.array([known[k] - NEUTRAL.get(k, 0.0) for k in keys])
+    halves = {k: max(0.5 * (told[k]["high"] - told[k]["low"]), 1e-300) for k in known}
+    return {
+        "error": float(np.linalg.norm(off) / np.linalg.norm(size)),
+        "covered": [bool(told[k]["low"] <= v <= told[k]["high"]) for k, v in known.items()],
+        "deviations": {f"{effect.name}.{k}": (told[k]["value"] - v) / halves[k] for k, v in known.items()},
+    }
 
 
-def _positive(told: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Parameters with an amplitude above 0: below, it is the same wave half a turn on."""
-    amplitude = told.get("amplitude")
-    if amplitude is None or amplitude["value"] >= 0:
-        return told
-    flipped = {"value": -amplitude["value"], "low": -amplitude["high"], "high": -amplitude["low"]}
-    return {**told, "amplitude": flipped}
+def _aligned(told: Mapping[str, Any], effect: Effect) -> dict[str, Any]:
+    """Told numbers with an amplitude above 0 and a phase within half a turn of the true one: it is the same wave."""
+    told = {k: dict(v) for k, v in told.items()}
+    flipped = "amplitude" in told and told["amplitude"]["value"] < 0
+    if flipped:
+        a = told["amplitude"]
+        told["amplitude"] = {"value": -a["value"], "low": -a["high"], "high": -a["low"]}
+    if "phase" in told and "phase" in effect.parameters:
+        shift = math.pi if flipped else 0.0
+        turns = round((told["phase"]["value"] + shift - effect.parameters["phase"]) / (2 * math.pi))
+        shift -= 2 * math.pi * turns
+        told["phase"] = {k: told["phase"][k] + shift for k in ("value", "low", "high")}
+    return told
 
 
 def reductions(gap: Mapping[str, Any]) -> dict[str, float]:
@@ -142,14 +190,16 @@ def reductions(gap: Mapping[str, Any]) -> dict[str, float]:
 
 def attempt(spec: CaseSpec, backend: str, threads: int = 0) -> dict[str, Any]:
     """Make a case, run it and judge the answer; what fails is recorded with its traceback."""
-    result: dict[str, Any] = {"name": spec.name, "kind": spec.kind, "system": spec.system, "seed": spec.seed[0]}
+    result: dict[str, Any] = {
+        "name": spec.name, "kind": spec.kind, "trait": spec.trait, "system": spec.system, "seed": spec.seed[0],
+    }  # fmt: skip
     try:
         case = spec.make()
         result["hidden"] = [[e.name, e.target, dict(e.parameters)] for e in case.effects]
-        result["equivalents"], result["gap_ratio"] = case.equivalents, case.gap_ratio
-        started = time.perf_counter()
+        result["equivalents"], result["ties"], result["gap_ratio"] = case.equivalents, case.ties, case.gap_ratio
+        started, used = time.perf_counter(), time.process_time()
         document = run_case(case, backend, threads)
-        result["seconds"] = time.perf_counter() - started
+        result["seconds"], result["cpu_seconds"] = time.perf_counter() - started, time.process_time() - used
         result.update(judge(case, document), document=document)
     except Exception:  # a case that fails must not stop the others
         result["failure"] = traceback.format_exc()
@@ -166,6 +216,22 @@ def _plain(value: Any) -> Any:
 def share(flags: Sequence[bool]) -> str:
     """A share as text, with its counts."""
     return f"{100 * sum(flags) / len(flags):5.1f} %  ({sum(flags)} of {len(flags)})" if flags else "-"
+
+
+def interval(count: int, total: int, z: float = 1.645) -> tuple[float, float]:
+    """The 90 % interval of a share (Wilson's), of ``count`` among ``total``."""
+    share, spread = count / total, z * z / total
+    middle = (share + 0.5 * spread) / (1 + spread)
+    half = z / (1 + spread) * math.sqrt(share * (1 - share) / total + 0.25 * spread / total)
+    return middle - half, middle + half
+
+
+def with_interval(flags: Sequence[bool]) -> str:
+    """A share with the 90 % interval of what many more cases would give."""
+    if not flags:
+        return "-"
+    low, high = interval(sum(flags), len(flags))
+    return f"{share(flags)}, {100 * low:.0f} to {100 * high:.0f} %"
 
 
 def confusion(results: Sequence[Mapping[str, Any]]) -> str:
@@ -199,14 +265,69 @@ def scores(results: Sequence[Mapping[str, Any]]) -> dict[str, str]:
         "names claimed for outsiders": share([bool(r["named"]) for r in of["outside"]]),
         "outsiders reported as unnamed": share([r["unnamed"] for r in of["outside"]]),
         "strength within 5 %": share([e <= 0.05 for e in errors]),
-        "true value in the 90 % interval": share([c for r in hidden for c in r["covered"]]),
+        "true value in the 90 % interval": with_interval([c for r in hidden for c in r["covered"]]),
+        "noise within 15 %, effects named right": share(_known([r["noise_right"] for r in hidden if r["right"]])),
+        "noise within 15 %, nothing missing": share(_known([r["noise_right"] for r in of["null"]])),
+        "exact ties all told": share([not missing for r in hidden for missing in r["ties_missing"]]),
+        "χ²/ν left after the right name": spread_of([r["chi2"] for r in hidden if r["right"]]),
+        "held-out mse by noise alone, right name": spread_of([r["left"] for r in hidden if r["right"]]),
     }
     for key, what in (("mse", "mean square"), ("rollout_rmse", "rollout")):
         gone = [r["reduction"][key] >= 0.95 for r in hidden if key in r["reduction"]]
         table[f"held-out gap reduced by 95 %, {what}"] = share(gone)
     table["median seconds of a single-effect case"] = f"{np.median(seconds):.1f}" if seconds else "-"
+    table["CPU seconds of a case"] = spread_of([r.get("cpu_seconds") for r in done], "{:.0f}")
     table["failed cases"] = str(len(results) - len(done))
     return table
+
+
+def told_ties(r: Mapping[str, Any]) -> str:
+    """The ties that an answer keeps to itself."""
+    return ", ".join(f"{e} {t or ''}".strip() for missing in r["ties_missing"] for e, t in missing)
+
+
+def _known(flags: Sequence[bool | None]) -> list[bool]:
+    return [f for f in flags if f is not None]
+
+
+def spread_of(values: Sequence[float | None], form: str = "{:.2f}") -> str:
+    """Least, median and largest of some numbers."""
+    known = [v for v in values if v is not None]
+    if not known:
+        return "-"
+    return " ".join(f"{n} {form.format(v)}" for n, v in zip(("least", "median", "largest"), _ends(known), strict=True))
+
+
+def _ends(values: Sequence[float]) -> tuple[float, float, float]:
+    return min(values), float(np.median(values)), max(values)
+
+
+#: Heads of the table of traits.
+TRAITS = ("trait", "right", "false names", "noise", "intervals", "ties", "χ²/ν largest", "CPU s median, max")
+
+
+def by_trait(results: Sequence[Mapping[str, Any]]) -> str:
+    """A line for each trait: counts of cases named right, of false names, of noises, intervals and ties."""
+    rows = [TRAITS]
+    for trait in dict.fromkeys(r.get("trait", "") for r in results):
+        own = [r for r in results if r.get("trait", "") == trait]
+        done = [r for r in own if "failure" not in r]
+        right = [r for r in done if r["right"] and r["kind"] != "outside"]
+        flags = {
+            "right": [r in done and r["right"] for r in own],
+            "false": [len(r["named"]) > r["found"] for r in done],
+            "noise": _known([r["noise_right"] for r in right]),
+            "covered": [c for r in done for c in r["covered"]],
+            "ties": [not missing for r in done for missing in r["ties_missing"]],
+        }
+        chi2 = [r["chi2"] for r in right if r["chi2"] is not None]
+        seconds = [r["cpu_seconds"] for r in done if "cpu_seconds" in r]
+        rows.append((
+            trait or "plain", *(f"{sum(f)} of {len(f)}" for f in flags.values()),
+            f"{max(chi2):.2f}" if chi2 else "-", f"{np.median(seconds):.0f}, {max(seconds):.0f}" if seconds else "-",
+        ))  # fmt: skip
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(f"{c:{w}s}" for c, w in zip(row, widths, strict=True)).rstrip() for row in rows)
 
 
 def one_line(r: Mapping[str, Any]) -> str:
@@ -216,6 +337,10 @@ def one_line(r: Mapping[str, Any]) -> str:
     named = ", ".join(f"{e} {t or ''}".strip() for e, t in r["named"]) + (" unnamed" if r["unnamed"] else "")
     hidden = ", ".join(f"{e} {t or ''}".strip() for e, t, _ in r["hidden"])
     error = f", strength {100 * max(r['errors']):.1f} % off" if r["errors"] else ""
+    error += f", χ²/ν {r['chi2']:.2f}" if r["chi2"] is not None else ""
+    ratios = r["noise"].values()
+    error += f", noise × {min(ratios):.2f} to {max(ratios):.2f}" if ratios else ""
+    error += f", ties not told: {told_ties(r)}" if any(r["ties_missing"]) else ""
     gap = f", gap {r['gap_ratio']:.0f} × noise" if math.isfinite(r["gap_ratio"]) and r["hidden"] else ""
     verdict = "right" if r["right"] else "WRONG"
     asked, told = f"[{hidden or 'nothing'}{gap}]", named.strip() or "nothing"
@@ -264,6 +389,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         missing = [s.name for s in specs if s.name not in {r["name"] for r in results}]
         print(f"a process died, of the first of these: {', '.join(missing)}", flush=True)
     print("\n" + confusion(results) + "\n")
+    print(by_trait(results) + "\n")
     for name, value in scores(results).items():
         print(f"{name:45s} {value}")
 

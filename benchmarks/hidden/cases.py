@@ -11,13 +11,14 @@ import fnmatch
 import math
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import numpy as np
 
-from benchmarks.hidden.systems import SYSTEMS, System, load
-from benchmarks.hidden.truths import Case, Effect, Recording, make_case, make_recording, observed
+from benchmarks.hidden.systems import CORE, SYSTEMS, System, fine, load
+from benchmarks.hidden.ties import exact_ties
+from benchmarks.hidden.truths import Before, Case, Effect, Recording, make_case, make_recording, observed
 from dropo_torch.parameters import ParameterSpace
 
 #: The gap that a single effect is given, in units of the noise; and the least with which a case is kept.
@@ -83,7 +84,7 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     },
     "gravity_tilt": dict.fromkeys(("torque_arm", "servo_arm", "cart_pole", "furuta", "puck", "hopper"), (None,)),
     "ground_slope": {"puck": (None,), "hopper": (None,)},
-    "integration": {s: (None,) for s in SYSTEMS if SYSTEMS[s].coarse},
+    "integration": {s.name: (None,) for s in CORE if s.coarse},
     "actuator_gain": _MOTORS,
     "actuator_bias": _ACTUATORS,
     "actuator_damping": _ACTUATORS,
@@ -125,13 +126,59 @@ DOUBLES = (
     ("hopper", "joint_damping", "contact_friction"),
     ("hopper", "payload", "actuator_gain"),
 )
+_PENDULUM, _RUNNER = ("pivot", "knee"), ("back_hip", "back_knee", "front_hip", "front_knee")
+#: What can carry an effect on the systems of unusual cases, which the plain list leaves out.
+UNUSUAL_OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
+    "joint_damping": {"double_pendulum": _PENDULUM, "runner": _RUNNER},
+    "joint_friction": {"double_pendulum": _PENDULUM, "runner": _RUNNER},
+    "gravity_tilt": dict.fromkeys(("double_pendulum", "tumbler", "passive_puck"), (None,)),
+    "payload": {"double_pendulum": ("upper",), "tumbler": ("brick",), "passive_puck": ("puck",)},
+    "fluid_drag": {"double_pendulum": _PENDULUM, "tumbler": ("brick",), "passive_puck": ("puck",)},
+    "contact_friction": {"passive_puck": ("puck",)},
+    "inertia": {"runner": ("torso",)},
+    "integration": dict.fromkeys(("coarse_servo_arm", "coarse_puck"), (None,)),
+}
 #: Effects of the small list, each once.
 SMALL = (
     "joint_damping", "joint_friction", "payload", "gravity_tilt", "actuator_delay", "sensor_bias",
     "contact_friction", "torque_ripple",
 )  # fmt: skip
 #: Systems and bodies that move in the world's x-z plane only: nothing along y, no roll, shows there.
-_PLANAR = frozenset({"cart_pole", "hopper", "servo_arm"})
+_PLANAR = frozenset({"cart_pole", "hopper", "servo_arm", "double_pendulum", "runner"})
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is said of a hidden effect beforehand.
+
+    Attributes:
+        target: where it sits; drawn where not given.
+        sizes: range of its size in place of a wanted gap.
+        draw: key of :data:`DRAWS` in place of the effect's own name.
+    """
+
+    target: str | None = None
+    sizes: tuple[float, float] | None = None
+    draw: str = ""
+
+
+@dataclass(frozen=True)
+class Unusual:
+    """What is unusual about a case.
+
+    Attributes:
+        trait: what it is called; the beginning of the case's name.
+        before: for a log that begins in motion.
+        noise: for noise that differs much between columns; see :func:`~benchmarks.hidden.truths.noise_levels`.
+        wishes: for some effects, what is said of them.
+        note: an addition to the case's name.
+    """
+
+    trait: str = ""
+    before: Before | None = None
+    noise: str = ""
+    wishes: Mapping[str, Wish] = field(default_factory=dict)
+    note: str = ""
 
 
 @dataclass(frozen=True)
@@ -144,6 +191,7 @@ class CaseSpec:
         system: the system's name.
         effects: names of what is hidden.
         seed: decides targets, strengths and log.
+        unusual: what is unusual about it, if anything.
     """
 
     name: str
@@ -151,14 +199,23 @@ class CaseSpec:
     system: str
     effects: tuple[str, ...]
     seed: tuple[int, ...]
+    unusual: Unusual = Unusual()
+
+    @property
+    def trait(self) -> str:
+        """What is unusual, in a word; empty for a plain case."""
+        return self.unusual.trait
 
     def make(self) -> Case:
         """Draw the strengths and simulate the log."""
         system, rng = SYSTEMS[self.system], np.random.default_rng([*self.seed, 1])
-        effects = tuple(_drawn(system, e, rng, self.seed) for e in self.effects)
-        recording = make_recording(system, effects, self.seed)
-        ratio = gap_ratio(system, recording)
-        return make_case(system, effects, recording, name=self.name, kind=self.kind, gap_ratio=ratio)
+        effects = tuple(_drawn(system, e, rng, self.seed, self.unusual) for e in self.effects)
+        recording = make_recording(system, effects, self.seed, noise=self.unusual.noise, before=self.unusual.before)
+        ratio, same = gap_ratio(system, recording), exact_ties(system, effects, recording)
+        return make_case(
+            system, effects, recording,
+            name=self.name, kind=self.kind, gap_ratio=ratio, trait=self.trait, ties=same,
+        )  # fmt: skip
 
 
 def cases(seed: int, which: str = "all") -> list[CaseSpec]:
@@ -169,11 +226,12 @@ def cases(seed: int, which: str = "all") -> list[CaseSpec]:
         return [*chosen, _spec("double", *_pair(DOUBLES[0]), seed)]
     if which != "all":
         raise ValueError(f"which is {which!r}; expected all or small")
-    systems = [s for s in SYSTEMS if not SYSTEMS[s].coarse]
+    systems = [s.name for s in CORE if not s.coarse]
     found = [_spec("null", s, (), seed, n) for s in systems for n in range(2)]
     found += [s for e in VOCABULARY for s in _spread(e, seed, 2)]
     found += [_spec("double", *_pair(d), seed) for d in DOUBLES]
-    return found + [s for e in OUTSIDE for s in _spread(e, seed, 1)]
+    found += [s for e in OUTSIDE for s in _spread(e, seed, 1)]
+    return found + [_unusual(u, system, effects, seed) for u, system, effects in UNUSUAL_CASES]
 
 
 def select(specs: Sequence[CaseSpec], pattern: str = "*", kind: str | None = None) -> list[CaseSpec]:
@@ -188,6 +246,13 @@ def _pair(double: tuple[str, str, str]) -> tuple[str, tuple[str, ...]]:
 def _spec(kind: str, system: str, effects: tuple[str, ...], seed: int, number: int = 0) -> CaseSpec:
     name = f"{kind}-{system}" + "".join(f"-{e}" for e in effects) + (f"-{number}" if number else "")
     return CaseSpec(name, kind, system, effects, (seed, zlib.crc32(name.encode())))
+
+
+def _unusual(unusual: Unusual, system: str, effects: tuple[str, ...], seed: int) -> CaseSpec:
+    words = (unusual.trait, system, *(effects or ("null",)), *filter(None, [unusual.note]))
+    name = "-".join(words)
+    kind = ("null", "single", "double")[len(effects)]
+    return CaseSpec(name, kind, system, effects, (seed, zlib.crc32(name.encode())), unusual)
 
 
 def _spread(effect: str, seed: int, count: int) -> list[CaseSpec]:
@@ -205,15 +270,22 @@ def _spread(effect: str, seed: int, count: int) -> list[CaseSpec]:
 Draw = Callable[[float], dict[str, float]]
 
 
-def _drawn(system: System, effect: str, rng: np.random.Generator, seed: Sequence[int]) -> Effect:
+def _drawn(
+    system: System, effect: str, rng: np.random.Generator, seed: Sequence[int], unusual: Unusual = Unusual()
+) -> Effect:
     """An effect on a target that shows it, of a strength that makes the wanted gap."""
+    wish = unusual.wishes.get(effect, Wish())
+    if effect == "integration":
+        return Effect(effect, None, {"timestep": load(system.xml).opt.timestep})
+    system = fine(system)  # what a careless step does besides is no strength of this effect
     best: tuple[float, Effect] | None = None
     for _ in range(4):
-        options = OPTIONS[effect][system.name]
+        options = (wish.target,) if wish.target else _targets(effect, system)
         target = options[int(rng.integers(len(options)))]
-        if effect == "integration":
-            return Effect(effect, target, {"timestep": load(system.xml).opt.timestep})
-        found = _sized(system, effect, target, rng, seed)
+        if wish.sizes is not None:
+            draw = DRAWS[wish.draw or effect](system, target, rng)
+            return Effect(effect, target, draw(rng.uniform(*wish.sizes)))
+        found = _sized(system, effect, target, rng, seed, unusual)
         if best is None or found[0] > best[0]:
             best = found
         if best[0] >= LEAST_GAP:
@@ -222,16 +294,25 @@ def _drawn(system: System, effect: str, rng: np.random.Generator, seed: Sequence
     return best[1]
 
 
+def _targets(effect: str, system: System) -> tuple[str | None, ...]:
+    """What can carry an effect on a system."""
+    return OPTIONS[effect].get(system.name) or UNUSUAL_OPTIONS[effect][system.name]
+
+
 def _sized(
-    system: System, effect: str, target: str | None, rng: np.random.Generator, seed: Sequence[int]
-) -> tuple[float, Effect]:
+    system: System, effect: str, target: str | None, rng: np.random.Generator, seed: Sequence[int],
+    unusual: Unusual = Unusual(),
+) -> tuple[float, Effect]:  # fmt: skip
     """The effect whose gap is closest to a random one, and its gap."""
-    draw, wanted = DRAWS[effect](system, target, rng), math.exp(rng.uniform(*np.log(GAP)))
+    draw = DRAWS[unusual.wishes.get(effect, Wish()).draw or effect](system, target, rng)
+    wanted = math.exp(rng.uniform(*np.log(GAP)))
     least, tried = LEAST_SIZE.get(effect, SIZES[0]), []
     size = max(0.1, least)
+    short = {"episodes": 2, "transitions": 150, "substeps": 20}
     for _ in range(5):
         hidden = Effect(effect, target, draw(size))
-        ratio = gap_ratio(system, make_recording(system, [hidden], seed, episodes=2, transitions=150, substeps=20))
+        recording = make_recording(system, [hidden], seed, noise=unusual.noise, before=unusual.before, **short)
+        ratio = gap_ratio(system, recording)
         tried.append((abs(math.log(max(ratio, 1e-9) / wanted)), ratio, hidden))
         step = min(max(wanted / max(ratio, 1e-9), 0.02), 5.0)
         following = min(max(size * step, least), SIZES[1])
@@ -374,6 +455,13 @@ def _payload(system: System, target: str | None, rng: np.random.Generator) -> Dr
     return lambda s: {"mass": 0.8 * s * mass, **dict(zip("xyz", map(float, place), strict=True))}
 
 
+def _payload_on_roll_axis(system: System, target: str | None, rng: np.random.Generator) -> Draw:
+    """A payload on the axis of the servo arm's wrist, where it is one of the hand and of the forearm as well."""
+    start, mass = {"hand": 0.0, "fore": 0.3}[str(target)], _body_mass(system, target)
+    along = start + rng.uniform(0.08, 0.15)
+    return lambda s: {"mass": 0.8 * s * mass, "x": along, "y": 0.0, "z": 0.0}
+
+
 def _shift(system: System, target: str | None, rng: np.random.Generator) -> Draw:
     way = _direction(system, target, rng) * max(float(np.linalg.norm(load(system.xml).body(target).ipos)), 0.1)
     return lambda s: dict(zip("xyz", (0.5 * s * way).tolist(), strict=True))
@@ -479,6 +567,7 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "joint_limit": _joint_draw(_limit),
     "joint_coupling": _joint_draw(lambda t, v, i, r: lambda s: {"stiffness": s * t}),
     "payload": _payload,
+    "payload_on_roll_axis": _payload_on_roll_axis,
     "center_of_mass": _shift,
     "inertia": _inertia,
     "external_force": _external_force,
@@ -507,3 +596,55 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "dropout": _actuator_draw(_dropout),
     "gain_drift": _actuator_draw(_gain_drift),
 }
+
+# --- unusual cases --------------------------------------------------------------------------------------------
+
+_BUSY, _QUIET = Before(), Before(quiet=True)
+_LATE = {"actuator_delay": Wish(sizes=(0.4, 0.6))}  # 20 to 30 ms
+_ON_AXIS = "payload_on_roll_axis"
+
+
+def _motion(before: Before, wishes: Mapping[str, Wish] | None = None) -> Unusual:
+    return Unusual("motion", before=before, wishes=wishes or {}, note="quiet" if before.quiet else "")
+
+
+def _at(trait: str, effect: str, target: str, draw: str = "") -> Unusual:
+    return Unusual(trait, wishes={effect: Wish(target, draw=draw)}, note=target)
+
+
+def _noise(noise: str) -> Unusual:
+    return Unusual("unequal", noise=noise, note=noise)
+
+
+_PASSIVE, _COARSE = Unusual("passive"), Unusual("coarse")
+#: What is unusual, the system, and what is hidden.
+UNUSUAL_CASES: tuple[tuple[Unusual, str, tuple[str, ...]], ...] = (
+    (_motion(_QUIET, _LATE), "cart_pole", ("actuator_delay",)),
+    (_motion(_QUIET, _LATE), "torque_arm", ("actuator_delay",)),
+    (_motion(_BUSY), "furuta", ("actuator_delay",)),
+    (_motion(_BUSY), "servo_arm", ("actuator_lag",)),
+    (_motion(_QUIET), "cart_pole", ("actuator_backlash",)),
+    (_motion(_BUSY), "torque_arm", ("joint_friction",)),
+    (_motion(_QUIET, _LATE), "servo_arm", ("joint_damping", "actuator_delay")),
+    (_motion(_QUIET), "furuta", ()),
+    (_PASSIVE, "passive_puck", ()),
+    (_PASSIVE, "passive_puck", ("contact_friction",)),
+    (_PASSIVE, "double_pendulum", ("joint_friction",)),
+    (_PASSIVE, "double_pendulum", ("gravity_tilt",)),
+    (_PASSIVE, "double_pendulum", ("joint_damping", "payload")),
+    (_PASSIVE, "tumbler", ("fluid_drag",)),
+    (_COARSE, "coarse_torque_arm", ("integration", "joint_friction")),
+    (_COARSE, "coarse_cart_pole", ("integration", "actuator_delay")),
+    (_COARSE, "coarse_servo_arm", ("integration", "payload")),
+    (_COARSE, "coarse_puck", ("integration", "contact_friction")),
+    (_noise("fine_positions"), "torque_arm", ("joint_stribeck",)),
+    (_noise("rough_positions"), "servo_arm", ("joint_damping",)),
+    (_noise("coarse_velocities"), "servo_arm", ()),
+    (_noise("one_rough"), "furuta", ("joint_quadratic_damping",)),
+    (_noise("fine_positions"), "runner", ("joint_damping",)),
+    (_at("tie", "external_force", "cart"), "cart_pole", ("external_force",)),
+    (_at("tie", "actuator_bias", "push"), "cart_pole", ("actuator_bias",)),
+    (_at("tie", "external_force", "cart"), "coarse_cart_pole", ("integration", "external_force")),
+    (_at("tie", "actuator_damping", "shoulder_motor"), "torque_arm", ("actuator_damping",)),
+    (_at("tie", "payload", "hand", _ON_AXIS), "servo_arm", ("payload",)),
+)

@@ -61,7 +61,8 @@ class System:
         equivalents: groups of (effect, target) that are the same thing here, by construction of the mechanism.
         observation: what the log's columns are.
         episodes, transitions: size of the log; the length of an episode is drawn from a range.
-        free: the name of a free joint which starts with random velocities on a table.
+        free: the name of a free joint which starts with random velocities, on a table or in the air.
+        airborne: whether it starts in the air.
         substeps: steps of the truth in one logged transition.
         coarse: whether the user's model takes steps too large to be right.
     """
@@ -78,6 +79,7 @@ class System:
     episodes: int = 8
     transitions: tuple[int, int] = (300, 450)
     free: str = ""
+    airborne: bool = False
     substeps: int = 40
     coarse: bool = False
 
@@ -346,10 +348,152 @@ HOPPER = System(
     substeps=60,
 )  # fmt: skip
 
-SYSTEMS = {
-    s.name: s
-    for s in (
-        TORQUE_ARM, SERVO_ARM, CART_POLE, FURUTA, PUCK, HOPPER,
-        coarse(TORQUE_ARM, 0.005), coarse(FURUTA, 0.01), coarse(CART_POLE, 0.01),
-    )
-}  # fmt: skip
+# --- passive systems: no actuator, only what they were given at the start ------------------------------------
+
+
+def _released(system: System, **changes: object) -> System:
+    """A system without its actuators."""
+    xml = re.sub(r"<actuator>.*?</actuator>", "", system.xml, flags=re.S)
+    return replace(system, xml=xml, commands=(), **changes)  # type: ignore[arg-type]
+
+
+PASSIVE_PUCK = _released(
+    replace(PUCK, xml=PUCK.xml.replace('friction="0.25 ', 'friction="0.12 ')),
+    name="passive_puck",
+    declared={
+        "puck_inertia": {
+            "field": "body_inertia", "name": "puck", "index": 2, "bounds": [0.006, 0.02], "unit": "kg m²",
+        },
+    },
+    episodes=16,
+    transitions=(100, 140),
+    equivalents=(),
+)  # fmt: skip
+
+DOUBLE_PENDULUM = System(
+    name="double_pendulum",
+    xml="""
+<mujoco model="double_pendulum">
+  <option integrator="RK4" timestep="0.0025"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="pivot" type="hinge" axis="0 1 0" damping="0.02"/>
+      <geom name="upper" type="capsule" size=".02" fromto="0 0 0 0 0 -.4" mass=".8"/>
+      <body name="lower" pos="0 0 -.4">
+        <joint name="knee" type="hinge" axis="0 1 0" damping="0.01"/>
+        <geom name="lower" type="capsule" size=".015" fromto="0 0 0 0 0 -.3" mass=".4"/>
+      </body>
+    </body>
+  </worldbody>
+</mujoco>""",
+    declared={"lower_mass": mass("lower", 0.4)},
+    commands=(),
+    start={"pivot": (1.5, 2.0), "knee": (1.5, 3.0)},
+    scales={"pivot": Scale(2.5, 4.0, 0.15), "knee": Scale(0.6, 6.0, 0.015)},
+    substeps=30,
+)
+
+TUMBLER = System(
+    name="tumbler",
+    xml="""
+<mujoco model="tumbler">
+  <option integrator="RK4" timestep="0.002"/>
+  <worldbody>
+    <body name="brick">
+      <freejoint name="root"/>
+      <geom name="brick" type="box" size=".15 .1 .04" mass=".6"/>
+    </body>
+  </worldbody>
+</mujoco>""",
+    declared={
+        "brick_inertia": {
+            "field": "body_inertia", "name": "brick", "index": 0, "bounds": [0.001, 0.01], "unit": "kg m²",
+        },
+    },
+    commands=(),
+    start={"root": (0.5, 4.0)},
+    scales={"root": Scale(6.0, 4.0, 0.6)},
+    free="root",
+    airborne=True,
+    episodes=12,
+    transitions=(100, 140),
+    substeps=30,
+)  # fmt: skip
+
+# --- a fast legged system -------------------------------------------------------------------------------------
+
+
+def _leg(side: str, x: float) -> str:
+    return f"""
+      <body name="{side}_thigh" pos="{x} 0 0">
+        <joint name="{side}_hip" type="hinge" axis="0 1 0" range="-1.2 1.2"/>
+        <geom name="{side}_thigh" type="capsule" size=".045" fromto="0 0 0 .05 0 -.28" mass="1.4"/>
+        <body name="{side}_shin" pos=".05 0 -.28">
+          <joint name="{side}_knee" type="hinge" axis="0 1 0" range="-1.2 1.2"/>
+          <geom name="{side}_shin" type="capsule" size=".04" fromto="0 0 0 -.05 0 -.26" mass=".9"/>
+        </body>
+      </body>"""
+
+
+RUNNER = System(
+    name="runner",
+    xml=f"""
+<mujoco model="runner">
+  <compiler angle="radian"/>
+  <option integrator="RK4" timestep="0.001"/>
+  <default>
+    <joint armature="0.05" damping="2" limited="true" solreflimit="0.08 1" solimplimit="0 0.9 0.1 0.5 2"/>
+    <geom contype="1" conaffinity="0" friction="0.7 0.005 0.0001" solref="0.05 1" solimp="0 0.9 0.03 0.5 2"/>
+  </default>
+  <worldbody>
+    <geom name="floor" type="plane" size="40 40 .1" contype="0" conaffinity="1" friction="0.1 0.005 0.0001"/>
+    <body name="torso" pos="0 0 0.6">
+      <joint name="rootx" type="slide" axis="1 0 0" limited="false" damping="0" armature="0"/>
+      <joint name="rootz" type="slide" axis="0 0 1" limited="false" damping="0" armature="0"/>
+      <joint name="rooty" type="hinge" axis="0 1 0" limited="false" damping="0" armature="0"/>
+      <geom name="torso" type="capsule" size=".06" fromto="-.45 0 0 .45 0 0" mass="6"/>
+      {_leg("back", -0.45)}
+      {_leg("front", 0.45)}
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="back_hip_motor" joint="back_hip" gear="60"/>
+    <motor name="back_knee_motor" joint="back_knee" gear="40"/>
+    <motor name="front_hip_motor" joint="front_hip" gear="60"/>
+    <motor name="front_knee_motor" joint="front_knee" gear="40"/>
+  </actuator>
+</mujoco>""",
+    declared={"torso_mass": mass("torso", 6.0)},
+    commands=tuple(
+        Command(0.8, 0.0, (2.0, 4.0), (0.8, 0.03), joint, 1.5)
+        for joint in ("back_hip", "back_knee", "front_hip", "front_knee")
+    ),
+    start={
+        "rootz": (0.04, 0.3), "rooty": (0.05, 0.5), "rootx": (0.0, 2.0),
+        **dict.fromkeys(("back_hip", "back_knee", "front_hip", "front_knee"), (0.3, 3.0)),
+    },
+    scales={
+        j: Scale(t, 8.0, i)
+        for j, t, i in (
+            ("back_hip", 50.0, 0.3), ("back_knee", 30.0, 0.1), ("front_hip", 50.0, 0.3), ("front_knee", 30.0, 0.1),
+        )
+    },
+    observation=("qpos[1:]", "qvel"),
+    episodes=16,
+    transitions=(100, 130),
+    substeps=60,
+)  # fmt: skip
+
+#: The systems of the plain list; those of the unusual cases besides.
+CORE = (
+    TORQUE_ARM, SERVO_ARM, CART_POLE, FURUTA, PUCK, HOPPER,
+    coarse(TORQUE_ARM, 0.005), coarse(FURUTA, 0.01), coarse(CART_POLE, 0.01),
+)  # fmt: skip
+UNUSUAL = (PASSIVE_PUCK, DOUBLE_PENDULUM, TUMBLER, RUNNER, coarse(SERVO_ARM, 0.005), coarse(PUCK, 0.01))
+SYSTEMS = {s.name: s for s in (*CORE, *UNUSUAL)}
+
+
+def fine(system: System) -> System:
+    """Return the system whose model a coarse one was made from; itself, where it is not coarse."""
+    return SYSTEMS[system.name.removeprefix("coarse_")]

@@ -27,6 +27,9 @@ from dropo_torch.parameters import ParameterSpace
 PREROLL = 5
 #: Typical standard deviations of the measurement: positions, velocities.
 POSITION_NOISE, VELOCITY_NOISE = 2e-5, 5e-4
+#: Noises that differ much: standard deviations of positions and velocities; and by how much one sensor is worse.
+UNEQUAL = {"fine_positions": (2e-5, 5e-4), "rough_positions": (1e-3, 1e-4), "coarse_velocities": (5e-6, 3e-3)}
+ONE_ROUGH, ROUGHER = "one_rough", 20.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,19 @@ class Effect:
     name: str
     target: str | None
     parameters: Mapping[str, float] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Before:
+    """What was before a log that begins in motion, and is not in it.
+
+    Attributes:
+        seconds: range of how long it was.
+        quiet: whether the commands of that time were zero; otherwise they were like those of the log.
+    """
+
+    seconds: tuple[float, float] = (0.3, 1.0)
+    quiet: bool = False
 
 
 @dataclass(frozen=True)
@@ -50,10 +66,12 @@ class Case:
         config: the project's config of it.
         trajectories: the log.
         effects: what is hidden.
-        equivalents: for each effect, the (effect, target) pairs that are the same thing on this system.
+        equivalents: for each effect, the (effect, target) pairs that are as right an answer.
+        ties: for each effect, those of them that are exactly the same thing on this log, each of which is to be told.
         declared: the true values of the declared parameters.
         noise: standard deviation of each column of the log.
         gap_ratio: the gap beside the noise, once the declared parameters are at their best; see ``cases.py``.
+        trait: what is unusual about the case; empty for the plain ones.
     """
 
     name: str
@@ -64,9 +82,11 @@ class Case:
     trajectories: Trajectories
     effects: tuple[Effect, ...] = ()
     equivalents: tuple[tuple[tuple[str, str | None], ...], ...] = ()
+    ties: tuple[tuple[tuple[str, str | None], ...], ...] = ()
     declared: Mapping[str, float] = field(default_factory=dict)
     noise: tuple[float, ...] = ()
     gap_ratio: float = 0.0
+    trait: str = ""
 
     def write(self, folder: str | Path) -> Path:
         """Write model, log and config into a folder; return the config's path."""
@@ -595,10 +615,18 @@ def make_plant(system: System, declared: Mapping[str, float], effects: Sequence[
 
 @dataclass(frozen=True)
 class Log:
-    """Episodes as they were sensed without noise: per episode ``(steps + 1, n)`` states and ``(steps, m)`` commands."""
+    """Episodes as they were sensed without noise.
+
+    Attributes:
+        states: of each episode, ``(steps + 1, nq + nv)``.
+        commands: of each episode, ``(steps, m)``.
+        unlogged: commands from before each episode's first row, the last of them last; what was before them was
+            their first.
+    """
 
     states: tuple[np.ndarray, ...]
     commands: tuple[np.ndarray, ...]
+    unlogged: tuple[np.ndarray, ...]
 
 
 def excitation(system: System, steps: int, rng: np.random.Generator) -> np.ndarray:
@@ -625,7 +653,7 @@ def start_state(system: System, rng: np.random.Generator) -> tuple[np.ndarray, n
     for joint, (position, velocity) in system.start.items():
         j = model.joint(joint)
         if joint == system.free:
-            _slide_off(model, q, v, velocity, rng)
+            (_throw if system.airborne else _slide_off)(model, q, v, velocity, rng)
             continue
         q[j.qposadr[0]] = system.start_mean.get(joint, q[j.qposadr[0]]) + rng.uniform(-position, position)
         v[j.dofadr[0]] = rng.uniform(-velocity, velocity)
@@ -644,6 +672,13 @@ def _slide_off(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, velocity: fl
     v[5] = rng.uniform(-4, 4)
 
 
+def _throw(_model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, velocity: float, rng: np.random.Generator) -> None:
+    """A body in the air that flies and tumbles."""
+    turn = rng.standard_normal(4)
+    q[:3], q[3:7] = rng.uniform(-0.5, 0.5, 3), turn / np.linalg.norm(turn)
+    v[:3], v[3:6] = rng.uniform(-velocity, velocity, 3), rng.uniform(-6, 6, 3)
+
+
 def record(
     system: System,
     declared: Mapping[str, float],
@@ -653,17 +688,21 @@ def record(
     episodes: int | None = None,
     transitions: int | None = None,
     substeps: int | None = None,
+    before: Before | None = None,
 ) -> Log:
     """Simulate a log without noise; sensor effects are in it."""
     plant = make_plant(system, declared, effects, substeps or system.substeps)
-    states, commands = [], []
+    states, commands, unlogged = [], [], []
     for _ in range(episodes or system.episodes):
         steps = transitions or int(rng.integers(system.transitions[0], system.transitions[1] + 1))
-        wave = excitation(system, steps, rng)
-        sensed, given = _episode(system, plant, effects, wave, *start_state(system, rng))
+        lead = 0 if before is None else round(rng.uniform(*before.seconds) / DT)
+        wave = excitation(system, lead + steps, rng)
+        quiet = before is not None and before.quiet
+        sensed, given = _episode(system, plant, effects, wave, *start_state(system, rng), lead=lead, quiet=quiet)
         states.append(sensed)
         commands.append(given)
-    return Log(tuple(states), tuple(commands))
+        unlogged.append(np.array(plant.commands[: len(plant.commands) - steps]))
+    return Log(tuple(states), tuple(commands), tuple(unlogged))
 
 
 def _episode(
@@ -673,25 +712,36 @@ def _episode(
     wave: np.ndarray,
     qpos: np.ndarray,
     qvel: np.ndarray,
+    *,
+    lead: int = 0,
+    quiet: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """States as sensed ``(steps + 1, nq + nv)`` and commands ``(steps, m)`` of one episode."""
+    """States as sensed ``(steps + 1, nq + nv)`` and commands ``(steps, m)`` of one episode.
+
+    Of the wave the first ``lead`` steps are not logged, and zero if they are ``quiet``. Without them the first
+    command was held for long.
+    """
     user = load(system.xml)
     q_index, v_index = _indices(user, plant.model)
     q, v = plant.model.qpos0.copy(), np.zeros(plant.model.nv)
     q[q_index], v[v_index] = qpos, qvel
     constant = constant_forces(plant.model, effects)
     hold = _hold(system, user)
-    first = hold(wave[0], qpos, qvel)
+    first = np.zeros(wave.shape[1]) if quiet else hold(wave[0], qpos, qvel)
     plant.reset(q, v, first)
     sensors = Sensors(system, effects, q_index, v_index)
     plant.watch = sensors.see if sensors.delays else None
     sensors.start(plant)
-    for _ in range(PREROLL):
-        plant.advance(first, constant)
-    plant.commands, plant.t = [first], 0.0  # the log sets in
-    states, commands = [sensors.read(plant)], []
-    for step, excited in enumerate(wave):
-        command = first if step == 0 else hold(excited, plant.q[q_index], plant.v[v_index])
+    if lead:
+        for excited in wave[:lead]:
+            plant.advance(first if quiet else hold(excited, plant.q[q_index], plant.v[v_index]), constant)
+    else:
+        for _ in range(PREROLL):
+            plant.advance(first, constant)
+        plant.commands, plant.t = [first], 0.0
+    states, commands = [sensors.read(plant)], []  # the log sets in
+    for step, excited in enumerate(wave[lead:]):
+        command = first if step == lead == 0 else hold(excited, plant.q[q_index], plant.v[v_index])
         plant.advance(command, constant)
         commands.append(command)
         states.append(sensors.read(plant))
@@ -768,11 +818,15 @@ def observed(system: System) -> Observation:
     return parse_observation(load(system.xml), system.observation)
 
 
-def noise_levels(system: System, rng: np.random.Generator) -> np.ndarray:
-    """Standard deviation of each column, of a size that no user knows beforehand."""
+def noise_levels(system: System, rng: np.random.Generator, noise: str = "") -> np.ndarray:
+    """Standard deviation of each column, of a size that no user knows beforehand; or of an unequal ``noise``."""
     model, observation = load(system.xml), observed(system)
     position, velocity = POSITION_NOISE * rng.uniform(0.5, 3.0), VELOCITY_NOISE * rng.uniform(0.5, 3.0)
-    return np.where(observation.index < model.nq, position, velocity)
+    position, velocity = UNEQUAL.get(noise, (position, velocity))
+    levels = np.where(observation.index < model.nq, position, velocity)
+    if noise == ONE_ROUGH:
+        levels[rng.integers(len(levels))] *= ROUGHER
+    return levels
 
 
 def measured(system: System, log: Log, noise: np.ndarray, rng: np.random.Generator) -> Trajectories:
@@ -849,11 +903,19 @@ class Recording:
     rng: np.random.Generator
 
 
-def make_recording(system: System, effects: Sequence[Effect], seed: int | Sequence[int], **size: int) -> Recording:
+def make_recording(
+    system: System,
+    effects: Sequence[Effect],
+    seed: int | Sequence[int],
+    *,
+    noise: str = "",
+    before: Before | None = None,
+    **size: int,
+) -> Recording:
     """Draw declared values and noise levels, and record; ``size`` is that of :func:`record`."""
     rng = np.random.default_rng(seed)
-    declared, levels = true_declared(system, rng), noise_levels(system, rng)
-    return Recording(declared, levels, record(system, declared, effects, rng, **size), rng)
+    declared, levels = true_declared(system, rng), noise_levels(system, rng, noise)
+    return Recording(declared, levels, record(system, declared, effects, rng, before=before, **size), rng)
 
 
 def simulate_truth(
@@ -888,8 +950,11 @@ def make_case(
     kind: str = "single",
     noise: float = 1.0,
     gap_ratio: float = 0.0,
+    trait: str = "",
+    ties: Sequence[tuple[tuple[str, str | None], ...]] = (),
 ) -> Case:
     """Return the case of a recording; its generator advances."""
+    same = [*ties] or [()] * len(effects)
     levels = noise * recording.noise
     return Case(
         name=name or system.name,
@@ -899,8 +964,12 @@ def make_case(
         config=config_of(system),
         trajectories=measured(system, recording.log, levels, recording.rng),
         effects=tuple(effects),
-        equivalents=tuple(equivalents(system, e) for e in effects),
+        equivalents=tuple(
+            tuple(sorted({*equivalents(system, e), *found}, key=str)) for e, found in zip(effects, same, strict=True)
+        ),
+        ties=tuple(same),
         declared=recording.declared,
         noise=tuple(levels.tolist()),
         gap_ratio=gap_ratio,
+        trait=trait,
     )
