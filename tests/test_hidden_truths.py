@@ -377,9 +377,6 @@ def _ties(system: System, *effects: Effect) -> tuple:
 def test_ties_are_those_of_the_mechanism() -> None:
     force = Effect("external_force", "cart", {"x": 1.0, "y": 0.0, "z": 0.0})
     assert _ties(CART_POLE, force) == ((("actuator_bias", "push"),),)
-    coarse = SYSTEMS["coarse_cart_pole"]
-    beside = Effect("integration", None, {"timestep": 0.01})
-    assert _ties(coarse, beside, Effect("actuator_bias", "push", {"force": 0.1})) == ((), (("external_force", "cart"),))
     assert _ties(CART_POLE, Effect("actuator_delay", "push", {"delay": 0.02})) == ((),)
 
 
@@ -417,27 +414,24 @@ SAME = [
 ]
 
 
+def test_ties_beside_an_integration_gap(monkeypatch) -> None:
+    tried = [r for r in ties.rivals(CART_POLE) if r.effect in ("external_force", "gravity_tilt", "sensor_bias")]
+    monkeypatch.setattr(ties, "rivals", lambda _: iter(tried))
+    beside, bias = Effect("integration", None, {"timestep": 0.01}), Effect("actuator_bias", "push", {"force": 0.1})
+    assert _ties(SYSTEMS["coarse_cart_pole"], beside, bias) == ((), (("external_force", "cart"),))
+
+
 @pytest.mark.parametrize(("system", "effect", "rival"), SAME, ids=lambda x: getattr(x, "name", ""))
 def test_ties_simulate_the_same_log(system: System, effect: Effect, rival: Effect, monkeypatch) -> None:
     one, other, none = (short(system, *e, noise=0.0).trajectories for e in ([effect], [rival], []))
     size = np.array(short(system, transitions=2).noise)
-
-    def apart(log) -> float:
-        # another sensor's start is another state: what counts is the motion from there
-        return float(np.abs((log.next_observations - one.next_observations) / size).max())
-
-    if not rival.name.startswith("sensor"):
-        assert apart(other) < 0.05
-    assert apart(none) > 5.0
-    own = [r for r in ties.rivals(system) if (r.effect, r.target) in ((rival.name, rival.target), ("armature", "knee"))]
-    monkeypatch.setattr(ties, "rivals", lambda _: iter([*own, *_others(system)]))
-    assert _ties(system, effect) == (((rival.name, rival.target),),)
-
-
-def _others(system: System) -> list[ties.Rival]:
-    """Some rivals that are not the same thing as any of these."""
-    scalar = ("fluid_drag", "center_of_mass", "sensor_scale")
-    return [r for r in ties.rivals(system) if r.effect in scalar][:4]
+    if not rival.name.startswith("sensor"):  # with which the same readings are another start
+        assert np.abs((other.next_observations - one.next_observations) / size).max() < 0.05
+    assert np.abs((none.next_observations - one.next_observations) / size).max() > 5.0
+    pair, others = (rival.name, rival.target), ("fluid_drag", "joint_damping", "sensor_scale")
+    tried = [r for r in ties.rivals(system) if (r.effect, r.target) == pair or r.effect in others]
+    monkeypatch.setattr(ties, "rivals", lambda _: iter(tried))
+    assert _ties(system, effect) == ((pair,),)
 
 
 def test_a_case_has_the_gap_that_was_asked_for() -> None:

@@ -513,6 +513,10 @@ OUTSIDE_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = 
 # --- what has to change the model -----------------------------------------------------------------------------
 
 
+#: Effects for which a model is compiled anew.
+BUILT = frozenset({"payload", "inertia", "slosh", "center_of_mass"})
+
+
 def _added_bodies(spec: mujoco.MjSpec, base: mujoco.MjModel, effects: Sequence[Effect]) -> None:
     """Weld or hang further bodies: payloads, rotational inertia, a mass that slides on a spring."""
     for n, e in enumerate(effects):
@@ -589,10 +593,11 @@ def _change_contact(model: mujoco.MjModel, geom: int, e: Effect) -> None:
 def true_model(system: System, declared: Mapping[str, float], effects: Sequence[Effect] = ()) -> mujoco.MjModel:
     """Return the system's model with the true declared values and whatever effects must change it."""
     space = ParameterSpace(load(system.xml), system.declared)  # type: ignore[arg-type]
-    base = space.apply(declared)
-    spec = mujoco.MjSpec.from_string(system.xml)
-    _added_bodies(spec, base, effects)
-    model = ParameterSpace(spec.compile(), system.declared).apply(declared)  # type: ignore[arg-type]
+    model = space.apply(declared)
+    if any(e.name in BUILT for e in effects):
+        spec = mujoco.MjSpec.from_string(system.xml)
+        _added_bodies(spec, model, effects)
+        model = ParameterSpace(spec.compile(), system.declared).apply(declared)  # type: ignore[arg-type]
     for e in effects:
         _change_model(model, e)
     mujoco.mj_setConst(model, mujoco.MjData(model))
