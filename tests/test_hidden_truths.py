@@ -518,7 +518,9 @@ def test_scores_of_noise_ties_and_intervals() -> None:
 def test_noise_of_rotations_is_twice_that_of_quaternions() -> None:
     case = short(PUCK, transitions=2)
     level = case.noise[4]
-    assert noise_ratios(case, {"noise": {"root.position.rotation[x]": 2 * level}}) == {"root.position.rotation[x]": pytest.approx(1.0)}
+    assert noise_ratios(case, {"noise": {"root.position.rotation[x]": 2 * level}}) == {
+        "root.position.rotation[x]": pytest.approx(1.0)
+    }
 
 
 def test_amplitudes_and_phases_are_those_of_the_same_wave() -> None:
