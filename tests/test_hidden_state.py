@@ -92,7 +92,7 @@ def test_a_search_over_effects_replays_filters_too() -> None:
 
 
 @pytest.mark.parametrize("effects", [[], [{"effect": "actuator_gain", "target": "a", "gain": 1.0}],
-                                     [{"effect": "joint_quadratic_damping", "target": "elbow", "damping": 0.0}],
+                                     [{"effect": "joint_quadratic_damping", "target": "elbow", "coefficient": 0.0}],
                                      [{"effect": "actuator_delay", "target": "a", "delay": 0.0}]])  # fmt: skip
 def test_a_fit_sees_a_log_of_filtered_actuators_as_it_was(tmp_path, effects: list) -> None:
     _, controls, path = arm("implicitfast")
