@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import re
 import warnings
 from dataclasses import dataclass
@@ -25,6 +26,7 @@ from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import CheckedAdapter, MujocoEnvAdapter, Simulator, make_simulator
+from dropo_torch.simulators.hidden import POSE, filter_memory, prescribed_bodies, prescribed_names
 from dropo_torch.support.extras import extra
 from dropo_torch.support.usercode import load_callable, user_code
 
@@ -82,7 +84,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     trajectories = _log(config, space.model)
     frame_skip = _frame_skip(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
-    effects, history = None, 0
+    effects = None
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
         observation = _observation(config, space.model, num_states, width)
@@ -91,12 +93,12 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         setting = plain_setting(space.model, observation, frame_skip)
         effects = place_effects(config.effects, space, setting, find_effect)
         space = space.with_limits(lowest(effects, space))
-        simulator, history = _with_effects(config, source, effects, space, trajectories)
+        simulator = _with_effects(config, source, effects, space, trajectories)
     else:
         simulator = _backend(config, source, frame_skip, space)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
-    transitions = make_transitions(trajectories, observation, lag=config.lag, history=history)
+    transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history)
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
@@ -133,13 +135,15 @@ def _is_registered(environment: str | None) -> bool:
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
     """The simulator of the config's backend."""
     means: dict[str, Any] = {"num_threads": config.threads, "chunk_size": config.chunk_size, "device": config.device}
+    if config.backend == "mujoco":
+        means["history"] = math.ceil(filter_memory(space) / frame_skip)
     return make_simulator(config.backend, source, parameters=space, frame_skip=frame_skip, **means)
 
 
 def _with_effects(
     config: Config, source: Any, effects: EffectSet, space: ParameterSpace, trajectories: Trajectories
-) -> tuple[Simulator, int]:
-    """The simulator with effects in it, and the logged steps before each window that it needs."""
+) -> Simulator:
+    """The simulator with effects in it."""
     other = config.backend == "gymnasium"
     step = source.timestep if other else float(source.opt.timestep)
     if step is None:
@@ -241,8 +245,17 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
     """The log's actions and time stamps must be the simulator's."""
     width = trajectories.actions.shape[1]
     if width != simulator.num_controls:
+        model = simulator.parameters.model
+        poses = 0 if model is None else POSE * len(prescribed_bodies(model))
+        also = ""
+        if poses and model is not None:
+            also = (
+                f" and {poses} numbers of mocap poses ({prescribed_names(model)}: position and quaternion w, x, y, z, "
+                "after the actions)"
+            )
         raise InputError(
-            f"data: {width} action column{'s' * (width != 1)}, but the simulator has {simulator.num_controls} actuators"
+            f"data: {width} action column{'s' * (width != 1)}, but the simulator has "
+            f"{simulator.num_controls - poses} actuators{also}"
         )
     ours, theirs = simulator.timestep, trajectories.dt
     if ours is None or theirs is None or abs(ours - theirs) <= TIME_TOLERANCE * theirs:

@@ -157,5 +157,5 @@ class Twin:
             filters = placed_filters(variant.placed, "command", self.setting)
             step = float(self.setting.model.opt.timestep)
             self._filtered[key] = filtered(np.repeat(windows.commands, skip, axis=1), filters, step)
-        at = windows.steps[:, None] * skip + np.arange(length * skip)
+        at = np.maximum(windows.steps[:, None] * skip + np.arange(-self._engine.lead, length * skip), 0)
         return self._filtered[key][windows.episodes[:, None], at]

@@ -199,11 +199,11 @@ class EffectCase:
         def make(model: mujoco.MjModel, skip: int, space: ParameterSpace) -> MujocoSimulator:
             return MujocoSimulator(model, parameters=space, frame_skip=skip, num_threads=1)
 
-        simulator, history = effect_simulator(
+        simulator = effect_simulator(
             "mujoco", self.placed(target, values), ParameterSpace.empty(self.setting.model), make,
             timestep=self.step * self.setting.frame_skip, longest=1000, num_threads=1,
         )  # fmt: skip
-        before = self.controls[:, :1].expand(-1, history, -1)
+        before = self.controls[:, :1].expand(-1, simulator.history, -1)
         return simulator.rollout(states, torch.cat([before, self.controls], 1), _NO_VALUES)[:, 0]
 
     def trained(self, target: str | None, values: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
