@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from dropo_torch.distribution import Distribution
+from dropo_torch.distribution import Distribution, coordinate_limits, truncated_interval, truncated_moments
 from dropo_torch.initial_noise import InitialStateNoise
+from dropo_torch.likelihood import robust_cholesky
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.support.random import draw_uniforms
 
+#: Windows that follow on each other in what is judged of a log that is too long to be judged whole.
+RUN = 20
 #: Two parameters whose estimates are correlated more than this cannot be told apart on the log.
 CONFOUNDED = 0.95
 
@@ -30,10 +34,16 @@ class Diagnostics:
         spread: their standard deviation, ``(T, m)``.
         expected: square root of the diagonal of Σ: spread, ε and noise together, ``(T, m)``.
         given: what ε and the noise alone let expect, ``(T, m)``.
+        change: by how much each column changed over the window, measured, ``(T, m)``.
+        follows: whether the next window begins where this one ends, ``(T,)``; not the last.
         at_center: the simulated next state at μ, ``(T, m)``.
         sensitivity: root mean square change of each column when a parameter moves by 1 % of its
             search width, ``(d, m)``.
-        standard_error: of each mean, in coordinates, from the likelihood's curvature, ``(d,)``.
+        standard_error: of each mean, in coordinates, ``(d,)``, by the Fisher information of the whole covariance: that
+            of parameters that vary, ε and noise.
+        std_error: of each σ, likewise; NaN where it is at its floor, or parameters are correlated.
+        local: χ² over degrees of freedom of the windows' residuals, by ε and noise alone, where each short stretch of
+            the log may have parameters of its own: median over stretches; NaN where there are none.
         correlation: of the estimates of the means, ``(d, d)``.
         confounded: pairs of parameters that this log cannot tell apart, with their correlation.
         diverged: simulations that diverged.
@@ -49,9 +59,13 @@ class Diagnostics:
     spread: np.ndarray
     expected: np.ndarray
     given: np.ndarray
+    change: np.ndarray
+    follows: np.ndarray
     at_center: np.ndarray
     sensitivity: np.ndarray
     standard_error: np.ndarray
+    std_error: np.ndarray
+    local: float
     correlation: np.ndarray
     confounded: tuple[tuple[str, str, float], ...]
     diverged: int
@@ -68,19 +82,24 @@ def diagnose(
 ) -> Diagnostics:
     """Simulate the log under a distribution, and around its center.
 
-    A log of more than ``max_transitions`` windows is judged on that many, spread evenly over it.
+    A log of more than ``max_transitions`` windows is judged on about that many, in runs spread evenly over it.
     """
     if len(objective) > max_transitions:
-        chosen = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
+        begins = np.linspace(0, len(objective) - RUN, max(1, max_transitions // RUN)).astype(int)
+        chosen = np.unique(begins[:, None] + np.arange(RUN))
         objective = objective.on(objective.transitions.select(chosen))
     initial = objective.initial_noise_of(distribution)
     values = distribution.rsample(draw_uniforms(samples, len(distribution), seed, 3))
     mean, variance, center, jacobian, lost = _simulate(objective, distribution, values, initial)
-    covariance = torch.cat([objective.base_covariance(slice(i, i + 1), initial) for i in range(len(objective))])
-    information = torch.einsum("tdm,tmn,ten->de", jacobian, torch.linalg.inv(covariance), jacobian).numpy()
-    error, correlation = estimates(information)
+    covariance = objective.base_covariance(slice(None), initial)
+    error, correlation, std_error = _standard_errors(objective, distribution, covariance, jacobian)
     base = torch.diagonal(covariance, dim1=-2, dim2=-1)
-    widened = torch.ones(1) if initial is None else initial.widening[:, None]
+    widened = torch.ones(1, dtype=torch.float64) if initial is None else initial.widening[:, None]
+    log = objective.transitions
+    follows = np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
+    residual = objective.target(slice(None), initial) - center
+    started = objective.evaluator.columns_at_start
+    columns = objective.evaluator.columns
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
     return Diagnostics(
@@ -93,14 +112,77 @@ def diagnose(
         spread=variance.sqrt().numpy(),
         expected=(variance + base).sqrt().numpy(),
         given=(base / widened).sqrt().numpy(),
+        change=(objective.measured - objective.features.values(started, columns)).numpy(),
+        follows=follows,
         at_center=center.numpy(),
         sensitivity=0.01 * objective.box.width[:, None] * jacobian.square().mean(0).sqrt().numpy(),
         standard_error=error,
+        std_error=std_error,
+        local=_local_chi2(residual, jacobian, covariance / widened[..., None], follows),
         correlation=correlation,
         confounded=tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs),
         diverged=lost,
         at_rest=objective.observation.at_rest,
     )
+
+
+def _standard_errors(
+    objective: Objective, distribution: Distribution, covariance: torch.Tensor, jacobian: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Standard errors of μ and their correlations, and standard errors of σ, in coordinates.
+
+    They are the Fisher information's of N(s̄(μ), A Σ_ξ Aᵀ + C), with C of ε and noise: AᵀΣ⁻¹A for μ, and
+    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ.
+
+    Args:
+        objective: gives the floor of σ.
+        distribution: the fit.
+        covariance: C, ``(T, m, m)``.
+        jacobian: A, ``(T, d, m)``.
+    """
+    limits = coordinate_limits(distribution.limits, distribution.is_log)
+    a, b = truncated_interval(*map(torch.as_tensor, (distribution.mean, distribution.std, *limits)))
+    first, second, _ = truncated_moments(a, b)
+    drawn = torch.as_tensor(distribution.std) * (second - first**2).clamp(min=0).sqrt()
+    shared = torch.eye(len(drawn)) if distribution.correlation is None else torch.as_tensor(distribution.correlation)
+    spread = shared * torch.outer(drawn, drawn)
+    total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
+    gram = jacobian @ torch.linalg.solve(total, jacobian.mT)
+    error, correlation = estimates(gram.sum(0).numpy())
+    std_error = np.full(len(drawn), np.nan)
+    free = distribution.std > 2 * objective.box.min_std
+    if distribution.correlation is None and free.any():
+        information = (2 * torch.outer(drawn, drawn).square() * gram.square().sum(0)).numpy()[np.ix_(free, free)]
+        std_error[free] = distribution.std[free] * estimates(information)[0]
+    return error, correlation, std_error
+
+
+def _local_chi2(
+    residual: torch.Tensor, jacobian: torch.Tensor, covariance: torch.Tensor, follows: np.ndarray
+) -> float:
+    """χ² over degrees of freedom where every stretch of the log has parameters of its own, median over stretches.
+
+    Args:
+        residual: at μ, ``(T, m)``.
+        jacobian: ``(T, d, m)``.
+        covariance: of ε and noise, ``(T, m, m)``.
+        follows: whether the next window begins where this one ends, ``(T,)``.
+    """
+    factor = robust_cholesky(covariance)
+    both = torch.cat([residual[..., None], jacobian.mT], -1)
+    white = torch.linalg.solve_triangular(factor, both, upper=False)  # (t, m, 1 + d)
+    d, m = jacobian.shape[1:]
+    length = max(4, math.ceil(3 * d / m))
+    run = np.concatenate([[0], np.cumsum(~follows[:-1])])  # which stretch without gaps each window is in
+    found = []
+    for number in np.unique(run):
+        own = white[torch.from_numpy(np.flatnonzero(run == number))]
+        for part in own[: len(own) // length * length].unflatten(0, (-1, length)):
+            flat = part.flatten(0, 1)
+            if bool(flat.isfinite().all()):
+                left = flat[:, 0] - flat[:, 1:] @ torch.linalg.lstsq(flat[:, 1:], flat[:, :1], driver="gelsd").solution[:, 0]
+                found.append(float(left.square().sum()) / (length * m - d))
+    return float(np.median(found)) if found else math.nan
 
 
 def _simulate(

@@ -100,6 +100,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         noise=config.noise,
         mask=config.mask,
         scaling=config.scaling,
+        orientation=config.orientation,
     )
     digest = _fingerprint(given, space.model, trajectories)
     return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)
