@@ -69,7 +69,8 @@ class Config(pydantic.BaseModel):
     mask: list[str | int] = Field([], description="observed columns which the likelihood leaves out")
     scaling: bool = Field(False, description="divide each column by its standard deviation over the log")
     orientation: Literal["rotation_vector", "angle"] = Field(
-        "rotation_vector", description="how orientations are compared: as rotation vectors, or by the angle as in the paper"
+        "rotation_vector",
+        description="how orientations are compared: as rotation vectors, or by the angle as in the paper",
     )
     budget: int = Field(1000, ge=1, description="with cma: evaluations of the objective")
     population: int | None = Field(None, ge=2, description="with cma: φ per generation")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,6 @@ import torch
 
 from dropo_torch.distribution import Distribution, coordinate_limits, truncated_interval, truncated_moments
 from dropo_torch.initial_noise import InitialStateNoise
-from dropo_torch.likelihood import robust_cholesky
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.support.random import draw_uniforms
@@ -42,12 +40,11 @@ class Diagnostics:
         standard_error: of each mean, in coordinates, ``(d,)``, by the Fisher information of the whole covariance: that
             of parameters that vary, ε and noise.
         std_error: of each σ, likewise; NaN where it is at its floor, or parameters are correlated.
-        local: χ² over degrees of freedom of the windows' residuals, by ε and noise alone, where each short stretch of
-            the log may have parameters of its own: median over stretches; NaN where there are none.
         correlation: of the estimates of the means, ``(d, d)``.
         confounded: pairs of parameters that this log cannot tell apart, with their correlation.
         diverged: simulations that diverged.
         at_rest: joints at rest in every initial state, because the log has their position alone.
+        noisy_starts: whether initial states are noisy, so that windows that follow on each other share a measurement.
     """
 
     labels: tuple[str, ...]
@@ -65,11 +62,11 @@ class Diagnostics:
     sensitivity: np.ndarray
     standard_error: np.ndarray
     std_error: np.ndarray
-    local: float
     correlation: np.ndarray
     confounded: tuple[tuple[str, str, float], ...]
     diverged: int
     at_rest: tuple[str, ...] = ()
+    noisy_starts: bool = False
 
     @property
     def residual(self) -> np.ndarray:
@@ -97,9 +94,7 @@ def diagnose(
     widened = torch.ones(1, dtype=torch.float64) if initial is None else initial.widening[:, None]
     log = objective.transitions
     follows = np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
-    residual = objective.target(slice(None), initial) - center
-    started = objective.evaluator.columns_at_start
-    columns = objective.evaluator.columns
+    started, columns = objective.evaluator.columns_at_start, objective.evaluator.columns
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
     return Diagnostics(
@@ -118,11 +113,11 @@ def diagnose(
         sensitivity=0.01 * objective.box.width[:, None] * jacobian.square().mean(0).sqrt().numpy(),
         standard_error=error,
         std_error=std_error,
-        local=_local_chi2(residual, jacobian, covariance / widened[..., None], follows),
         correlation=correlation,
         confounded=tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs),
         diverged=lost,
         at_rest=objective.observation.at_rest,
+        noisy_starts=objective.noise is not None,
     )
 
 
@@ -157,34 +152,6 @@ def _standard_errors(
     return error, correlation, std_error
 
 
-def _local_chi2(
-    residual: torch.Tensor, jacobian: torch.Tensor, covariance: torch.Tensor, follows: np.ndarray
-) -> float:
-    """χ² over degrees of freedom where every stretch of the log has parameters of its own, median over stretches.
-
-    Args:
-        residual: at μ, ``(T, m)``.
-        jacobian: ``(T, d, m)``.
-        covariance: of ε and noise, ``(T, m, m)``.
-        follows: whether the next window begins where this one ends, ``(T,)``.
-    """
-    factor = robust_cholesky(covariance)
-    both = torch.cat([residual[..., None], jacobian.mT], -1)
-    white = torch.linalg.solve_triangular(factor, both, upper=False)  # (t, m, 1 + d)
-    d, m = jacobian.shape[1:]
-    length = max(4, math.ceil(3 * d / m))
-    run = np.concatenate([[0], np.cumsum(~follows[:-1])])  # which stretch without gaps each window is in
-    found = []
-    for number in np.unique(run):
-        own = white[torch.from_numpy(np.flatnonzero(run == number))]
-        for part in own[: len(own) // length * length].unflatten(0, (-1, length)):
-            flat = part.flatten(0, 1)
-            if bool(flat.isfinite().all()):
-                left = flat[:, 0] - flat[:, 1:] @ torch.linalg.lstsq(flat[:, 1:], flat[:, :1], driver="gelsd").solution[:, 0]
-                found.append(float(left.square().sum()) / (length * m - d))
-    return float(np.median(found)) if found else math.nan
-
-
 def _simulate(
     objective: Objective, distribution: Distribution, values: torch.Tensor, initial: InitialStateNoise | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, int]:
@@ -216,6 +183,6 @@ def estimates(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    inverse = (vectors / np.maximum(values, 1e-12 * max(float(values.max()), 1e-300))) @ vectors.T
+    inverse = (vectors / np.maximum(values, 1e-12 * max(float(values.max()), 1e-6))) @ vectors.T
     error = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
     return error / scale, np.clip(inverse / np.outer(error, error), -1, 1)

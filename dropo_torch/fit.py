@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import pickle
 import time
 from collections.abc import Callable, Mapping
@@ -23,9 +24,11 @@ from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FitSettings, Optimizer, Progress, Request, make_optimizer
 from dropo_torch.support.files import write_atomically, write_json
 from dropo_torch.support.random import draw_uniforms
-from dropo_torch.verdict import Judgment
+from dropo_torch.verdict import Judgment, hopeless_at
 
 SCHEMA = "dropo-torch/fit/1"
+#: Share of a search after which it is asked once whether it is hopeless to go on.
+LOOK_AT = 0.4
 #: Distributions that are judged in the end, at most, where simulations diverge under all those before.
 RETREATS = 12
 #: Keys of ``fit.json``, before what a method adds; ``correlation`` only where parameters vary together.
@@ -69,7 +72,6 @@ class Fit:
     Attributes:
         distribution: p_φ.
         log_likelihood: the sampled objective at φ, in nats, on draws that no optimizer has seen.
-        log_likelihood_eq3: the same by eq. 3, which it is on a log without noise.
         mse: mean squared difference between measured and simulated mean next states, in (scaled) units.
         epsilon: ε, one per compared column.
         backend, optimizer: names.
@@ -84,11 +86,11 @@ class Fit:
         method: how the distribution was found.
         extras: what that method found beside it, as plain data.
         judgment: whether the model explains the log, once that was judged.
+        log_likelihood_eq3: the log-likelihood by eq. 3, which it is on a log without noise.
     """
 
     distribution: Distribution
     log_likelihood: float
-    log_likelihood_eq3: float
     mse: float
     epsilon: tuple[float, ...]
     backend: str
@@ -105,6 +107,7 @@ class Fit:
     method: str = "dropo"
     extras: Mapping[str, Any] = field(default_factory=dict)
     judgment: Judgment | None = None
+    log_likelihood_eq3: float = math.nan
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
@@ -177,6 +180,7 @@ class _State:
     simulated_transitions: int
     history: list[HistoryEntry] = field(default_factory=list)
     initial: InitialStateNoise | None = None
+    hopeless: str | None = None  # why, empty where it is not; None before that was looked at
 
     @property
     def spent(self) -> tuple[int, float]:
@@ -190,10 +194,10 @@ def _run(
     """Ask and tell until the optimizer stops; keep the state after every batch."""
     evaluations, seconds = state.spent
     begun = time.monotonic() - seconds
-    while search.stop_reason is None:
+    while search.stop_reason is None and not state.hopeless:
         request = search.ask()
-        at = request.linearise_at, request.linearise_std, request.widen
-        if at[0] is not None and (state.initial is None or not state.initial.is_at(*at)):
+        at, rest = request.linearise_at, (request.linearise_std, request.widen)
+        if at is not None and (state.initial is None or not state.initial.is_at(at, *rest)):
             state.initial = noise_of(objective, request)
             state.simulated_transitions += state.initial.simulated_transitions if state.initial else 0
         sums = answer(objective, request, state.initial)
@@ -201,6 +205,8 @@ def _run(
         evaluations += request.evaluations
         state.simulated_transitions += sums.simulated_transitions
         progress = search.progress
+        if state.hopeless is None and search.improves and progress.fraction >= LOOK_AT:
+            state.hopeless = hopeless_at(objective, search.candidates()[0][0])
         cost = (evaluations, state.simulated_transitions, time.monotonic() - begun)
         entry = HistoryEntry(*cost, progress.log_likelihood, progress.stage, *map(np.array, search.candidates()[0]))
         state.history.append(entry)
@@ -262,7 +268,8 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
         simulated_transitions=state.simulated_transitions,
         diverged=best.diverged,
         seconds=seconds + time.monotonic() - begun,
-        stop_reason=(search.stop_reason or "") + (f", but {remark}" if remark else ""),
+        stop_reason=("it is hopeless" if state.hopeless else search.stop_reason or "")
+        + (f", but {remark}" if remark else ""),
         history=tuple(state.history),
         caveat=f"a full covariance {remark}" if remark else search.caveat,
         method=search.method,
@@ -300,6 +307,7 @@ class _Checkpoint:
             "optimizer": search.state(),
             "history": [vars(entry) for entry in state.history],
             "simulated_transitions": state.simulated_transitions,
+            "hopeless": state.hopeless,
             "linearised": state.initial and (state.initial.mean, state.initial.std, state.initial.is_widened),
         }
         write_atomically(self.path, pickle.dumps(content))
@@ -312,7 +320,7 @@ class _Checkpoint:
             content = pickle.loads(self.path.read_bytes())
             is_own, linearised = content["owner"] == self.owner, content["linearised"]
             history = [HistoryEntry(**entry) for entry in content["history"]]
-            state = _State(content["simulated_transitions"], history)
+            state = _State(content["simulated_transitions"], history, hopeless=content["hopeless"])
             if is_own:
                 search.restore(content["optimizer"])
         except Exception as error:

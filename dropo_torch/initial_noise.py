@@ -63,8 +63,8 @@ def propagate_noise(
     Each initial state is simulated from antithetic draws of its noise. The mean of the outcomes shifts the prediction.
     The regression of the outcomes on the draws gives G and with it the covariance G diag(ν²) Gᵀ, to which the variance
     that the regression leaves is added: a contact that some draws make and others do not. An orientation is turned in
-    its body's frame, so that the world's does not matter. Windows that the result still does not explain, nor parameters
-    that vary with σ around μ, have their covariance widened.
+    its body's frame, so that the world's does not matter. Windows that the result still does not explain, nor do
+    parameters that vary with σ around μ, have their covariance widened.
 
     Args:
         evaluator: simulates the log.
@@ -93,7 +93,7 @@ def propagate_noise(
             outcomes = evaluator.after(block, values, states).reshape(-1, len(draws), evaluator.features.size)
             shift, covariance = propagate(outcomes, draws)
             total = covariance + fixed
-            spread = 0.0 if std is None else _parameter_covariance(evaluator, box, block, mean, std)
+            spread = 0.0 if std is None else parameter_covariance(evaluator, box, block, mean, std)
             residual = evaluator.measured[block] - torch.nan_to_num(outcomes[:, 0]) - shift
             factor = widening(residual, total + spread) if widen else torch.ones_like(residual[:, 0])
             parts.append((shift, total * factor[:, None, None] - torch.diag(epsilon), factor))
@@ -107,14 +107,16 @@ def _perturbed(evaluator: Evaluator, block: slice, every: Features, moves: torch
     """Initial states of which all features are moved by ``(M, features)``, ``(t, M, num_states)``."""
     moved = evaluator.states[block][:, None].repeat(1, len(moves), 1)
     index = evaluator.observation.index
-    moved[..., index] = torch.from_numpy(every.move(moved[..., index].numpy(), moves.expand(*moved.shape[:2], -1).numpy()))
+    moved[..., index] = torch.from_numpy(
+        every.move(moved[..., index].numpy(), moves.expand(*moved.shape[:2], -1).numpy())
+    )
     return moved
 
 
-def _parameter_covariance(
+def parameter_covariance(
     evaluator: Evaluator, box: SearchBox, block: slice, mean: np.ndarray, std: np.ndarray
 ) -> torch.Tensor:
-    """Covariance of features by parameters that vary with σ around μ, to first order, ``(t, m, m)``."""
+    """Return the covariance of features by parameters that vary with σ around μ, to first order, ``(t, m, m)``."""
     ends = np.clip(mean + np.concatenate([np.diag(std), -np.diag(std)]), box.low, box.high)
     features = evaluator.after(block, torch.from_numpy(box.values(ends)))
     reach = torch.from_numpy(2 * std / np.maximum(np.diag(ends[: len(std)] - ends[len(std) :]), 1e-300))

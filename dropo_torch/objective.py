@@ -233,8 +233,8 @@ class Objective:
         for value, gaussian, squared, kept, lost in sums.total.reshape(5, len(values)).T.tolist():
             whole = kept == len(self)
             mse = squared / (kept * self.features.size) if kept else math.nan
-            likelihoods = (value, gaussian) if whole else (-math.inf, -math.inf)
-            found.append(Evaluation(*likelihoods, value, mse, int(lost), cost))
+            likelihood, eq3 = (value, gaussian) if whole else (-math.inf, -math.inf)
+            found.append(Evaluation(likelihood, eq3, value, mse, int(lost), cost))
         return found
 
 

@@ -263,7 +263,9 @@ def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 FLYING_XML = """
 <mujoco>
   <option timestep="0.004"/>
-  <worldbody><body name="top"><freejoint/><inertial mass="1.5" pos="0 0 0" diaginertia=".005 .006 .009"/></body></worldbody>
+  <worldbody>
+    <body name="top"><freejoint/><inertial mass="1.5" pos="0 0 0" diaginertia=".005 .006 .009"/></body>
+  </worldbody>
 </mujoco>"""
 SPINNING = {
     "x": {"field": "body_inertia[0]", "name": "top", "bounds": [0.003, 0.008]},
@@ -283,7 +285,9 @@ def flying_objective(seed: int, **options) -> tuple[Objective, mujoco.MjModel]:
     measured[:, :3] += generator.normal(0, 0.02, (12, 3))
     for row, noise in zip(measured, generator.normal(0, 0.05, (12, 3)), strict=True):
         mujoco.mju_quatIntegrate(row[3:], noise, 1.0)
-    return Objective(simulator, windows(states, controls, measured), parse_observation(model, ["qpos"]), **options), model
+    return Objective(
+        simulator, windows(states, controls, measured), parse_observation(model, ["qpos"]), **options
+    ), model
 
 
 @pytest.mark.parametrize("orientation", ["rotation_vector", "angle"])
@@ -296,7 +300,8 @@ def test_in_a_turned_world_the_likelihood_is_the_same(orientation, noise, seed, 
     other = turned_world(objective, model, np.array(turn) / np.linalg.norm(turn), **options)
     mean, std, uniforms = *middle(objective), draw_uniforms(15, 2, seed)
     ours, theirs = (
-        o.evaluate(mean[None], 2 * std[None], uniforms, o.initial_noise(mean, widen=False))[0] for o in (objective, other)
+        o.evaluate(mean[None], 2 * std[None], uniforms, o.initial_noise(mean, widen=False))[0]
+        for o in (objective, other)
     )
     assert ours.log_likelihood == pytest.approx(theirs.log_likelihood, rel=1e-8, abs=1e-6)
     assert ours.gaussian == pytest.approx(theirs.gaussian, rel=1e-8, abs=1e-6)

@@ -354,7 +354,7 @@ def test_lost_transitions_are_counted_and_left_out_by_every_likelihood():
 
 
 def unstable_objective(cut: float, truth: float, epsilon: float, number: int = 8) -> Objective:
-    """Two parameters in [0, 1]; every simulation diverges where the first exceeds ``cut``, towards which the log pulls."""
+    """Two parameters in [0, 1]; all simulations diverge where one exceeds ``cut``, towards which the log pulls."""
 
     def unstable(values: torch.Tensor) -> torch.Tensor:
         return torch.where(values[..., :1] > cut, torch.nan, values)
@@ -400,7 +400,10 @@ def test_a_search_that_begins_where_everything_diverges_looks_elsewhere(cut, tru
     assert found.distribution.mean[0] <= cut
 
 
-@given(costs=st.lists(st.floats(-1e300, 1e300), min_size=6, max_size=6), lost=st.lists(st.integers(0, 3), min_size=6, max_size=6))
+@given(
+    costs=st.lists(st.floats(-1e300, 1e300), min_size=6, max_size=6),
+    lost=st.lists(st.integers(0, 3), min_size=6, max_size=6),
+)
 def test_cma_is_told_of_divergence_before_all_costs(costs, lost):
     objective = unstable_objective(0.9, 0.5, 1e-2)
     search = DroidOptimizer(objective, settings=DroidSettings(population=6), seed=0)

@@ -46,8 +46,8 @@ class AdamOptimizer(LikelihoodOptimizer):
     σ moves by its logarithm, but Adam sees the gradient of its square, which does not vanish
     towards the floor, so that σ can leave it and reach it again.
 
-    What diverges has no gradient: where a larger share of a minibatch does than where the least did so far, half the way
-    back there is the step.
+    What diverges has no gradient: where a larger share of a minibatch does than where the least did so far, the step is
+    half the way back there.
 
     Args:
         objective: its reduction and its simulator's gradients are used; it is not evaluated here.

@@ -82,6 +82,8 @@ class Optimizer(abc.ABC):
     name: ClassVar[str]
     #: What stands as ``method`` in ``fit.json``.
     method: ClassVar[str] = "dropo"
+    #: Whether candidates are meant to simulate the log well long before the search ends.
+    improves: ClassVar[bool] = False
     #: Names of the attributes that change.
     STATE: ClassVar[tuple[str, ...]] = ()
 
@@ -141,6 +143,8 @@ class LikelihoodOptimizer(Optimizer):
         objective: gives the reduction, the parameters and the size of the log; it is not evaluated here.
         settings: what the fit was told.
     """
+
+    improves = True
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         self._objective, self._settings = objective, settings

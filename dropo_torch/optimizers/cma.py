@@ -15,7 +15,6 @@ from dropo_torch.optimizers.base import LikelihoodOptimizer, Optimizer, Progress
 from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.support.random import draw_uniforms
 
-
 #: Cost that pycma is told of what diverges, times its rank: beyond every finite one.
 DIVERGED = 1e100
 
