@@ -68,6 +68,9 @@ class Config(pydantic.BaseModel):
     seed: int = _key(0, "seed of everything that is random", ge=0, lt=2**63)
     mask: list[str | int] = _key([], "observed columns which the likelihood leaves out")
     scaling: bool = _key(False, "divide each column by its standard deviation over the log")
+    orientation: Literal["rotation_vector", "angle"] = _key(
+        "rotation_vector", "how orientations are compared: as rotation vectors, or by the angle as in the paper"
+    )
     budget: int = _key(1000, "with cma: evaluations of the objective", ge=1)
     population: int | None = _key(None, "with cma: φ per generation", ge=2)
     common_random_numbers: bool = _key(False, "with cma: the same samples in every generation")

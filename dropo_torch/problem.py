@@ -99,7 +99,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
     transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history)
-    likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling")}
+    likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
     return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)

@@ -108,10 +108,6 @@ WRONG_CONFIGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "data of no known kind": ({"data": "arm.xml"}, ("unknown kind of log", ".npz")),
     "option of data": ({"data": {"path": "log.npz", "epsiode": 1}}, ("'epsiode'", "did you mean 'episode'")),
     "environment without backend": ({"environment": "adapter.py:make"}, ("backend: gymnasium",)),
-    "everything diverges": (
-        {"parameters": {"gear": {"field": "actuator_gear", "name": "lift", "bounds": [1e16, 1e17]}}},
-        ("every simulation of this log diverges", "bounds"),
-    ),
 }  # fmt: skip
 
 

@@ -99,9 +99,7 @@ def test_a_fit_sees_a_log_of_filtered_actuators_as_it_was(tmp_path, effects: lis
     (tmp_path / "arm.xml").write_text(ARM.format(integrator="implicitfast"))
     ends = np.zeros(ROWS, bool)
     ends[-1] = True
-    np.savez(
-        tmp_path / "log.npz", observations=path[:-1], next_observations=path[1:], actions=controls, terminals=ends
-    )
+    np.savez(tmp_path / "log.npz", observations=path[:-1], next_observations=path[1:], actions=controls, terminals=ends)
     text = (
         "model: arm.xml\ndata: log.npz\nframe_skip: 4\n"
         "parameters: {mass: {field: body_mass, name: fore, bounds: [0.1, 1.0]}}\n"

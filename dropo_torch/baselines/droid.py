@@ -14,14 +14,12 @@ from dropo_torch.optimizers.base import Progress, Request
 from dropo_torch.optimizers.cma import Evolution, evolution, why_stopped
 from dropo_torch.parameters import ParameterSpace
 
-#: Squared error that a diverged transition counts as, per column.
-_LOST = 1e6
-
 
 def squared_errors(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-    """Return Σ‖s − s'‖² of each parameter vector, ``(P,)``; a diverged column counts a million."""
-    error = (features - measured[:, None]).square()
-    return torch.nan_to_num(error, nan=_LOST).sum((0, 2))
+    """Return Σ‖s − s'‖² of each parameter vector and how many transitions diverge under it, which it leaves out."""
+    error = (features - measured[:, None]).square().sum(-1)
+    alive = error.isfinite()
+    return torch.cat([torch.where(alive, error, 0.0).sum(0), (~alive).sum(0).double()])
 
 
 class DroidOptimizer(Evolution):
@@ -56,10 +54,11 @@ class DroidOptimizer(Evolution):
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its errors."""
-        assert self._asked is not None
-        self._best = min(self._best, float(sums.min()))
-        self._search.tell(self._asked, sums.tolist())
-        self._asked = None
+        costs, lost = sums.reshape(2, -1).numpy()
+        best = int(np.lexsort((costs, lost))[0])
+        if (lost[best], costs[best]) < (self._least, self._best):
+            self._best = float(costs[best])
+        self._tell(costs, lost)
 
     @property
     def stop_reason(self) -> str | None:

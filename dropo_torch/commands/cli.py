@@ -1,7 +1,8 @@
 """The command line: ``dropo fit``, ``gap``, ``train``, ``sweep-epsilon``, ``compare``, ``reproduce`` and others.
 
 A command is a module of this folder, imported when it is called. It has ``add_arguments(parser)``, among them ``out``,
-and ``run(given, overrides, console)``: the arguments, the config's keys that were given as options, where to print.
+and ``run(given, overrides, console)``: the arguments, the config's keys that were given as options, where to print. It
+may return an exit code.
 """
 
 from __future__ import annotations
@@ -30,13 +31,13 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return 0 on success, 2 on bad input, 130 when interrupted."""
+    """Run a command; return 0 on success, 2 on bad input, 3 after a hopeless fit, 130 when interrupted."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters is no reason to stop
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        _dispatch(given)
+        return _dispatch(given)
     except InputError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:
@@ -63,8 +64,8 @@ def _silence() -> None:
     os.close(nowhere)
 
 
-def _dispatch(given: list[str]) -> None:
-    """Run the command that was given; what it does not know are overrides of its config."""
+def _dispatch(given: list[str]) -> int:
+    """Run the command that was given, and return its exit code; what it does not know are overrides of its config."""
     command = given[0] if given else ""
     if command not in (*COMMANDS, "", "-h", "--help", "--version"):
         if command.startswith("-"):
@@ -85,7 +86,8 @@ def _dispatch(given: list[str]) -> None:
         console = Console(highlight=False)
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
         with claimed(parsed.out):
-            parsed.run(parsed, parse_overrides(rest), console)
+            return parsed.run(parsed, parse_overrides(rest), console) or 0
+    return 0
 
 
 def _parser(called: str) -> argparse.ArgumentParser:

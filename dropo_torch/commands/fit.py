@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,7 @@ from dropo_torch.support.extras import require
 from dropo_torch.support.files import write_atomically
 
 if TYPE_CHECKING:
+    from dropo_torch.diagnostics import Diagnostics
     from dropo_torch.fit import Fit
     from dropo_torch.problem import Problem
 
@@ -30,10 +32,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_log(parser, "the history")
 
 
-def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
-    """Run ``dropo fit``."""
+#: Exit code of a fit that is hopeless.
+HOPELESS = 3
 
-    run_fit(load_config(given.config, overrides), given.out, console=console, resume=given.resume, log=given.log)
+
+def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> int:
+    """Run ``dropo fit``."""
+    config = load_config(given.config, overrides)
+    result = run_fit(config, given.out, console=console, resume=given.resume, log=given.log)
+    return HOPELESS if result.judgment and result.judgment.verdict == "hopeless" else 0
 
 
 def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None) -> Fit:
@@ -47,8 +54,10 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         log: ``"tensorboard"`` writes the history as TensorBoard events too.
     """
     from dropo_torch.baselines import make_search
+    from dropo_torch.diagnostics import diagnose
     from dropo_torch.excitation import refuse_dead_parameters
     from dropo_torch.problem import make_problem
+    from dropo_torch.verdict import judge
 
     if log is not None:
         require("tensorboard", f"--log {log}")
@@ -59,20 +68,17 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
     result = fit_shown(problem, console, checkpoint=out / "checkpoint.pkl", resume=resume)
-    if result.diverged == len(problem.objective) * result.samples:
-        raise InputError(
-            "parameters: every simulation of this log diverges, wherever in the bounds; "
-            "check the log's units, the order of its columns (observation), frame_skip and the bounds"
-        )
-    _write(problem, result, out)
+    diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed)
+    lost = result.diverged / (len(problem.objective) * result.samples)
+    result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))
+    _write(problem, result, diagnostics, out)
     if log is not None:
         _write_events(result, out / "tensorboard")
     _show(problem, result, out, console)
     return result
 
 
-def _write(problem: Problem, result: Fit, out: Path) -> None:
-    from dropo_torch.diagnostics import diagnose
+def _write(problem: Problem, result: Fit, diagnostics: Diagnostics, out: Path) -> None:
     from dropo_torch.report import write_fit_report
 
     config = problem.config
@@ -80,10 +86,9 @@ def _write(problem: Problem, result: Fit, out: Path) -> None:
     result.distribution.save(out / "distribution.yaml")
     portable = yaml.safe_dump(config.portable(), sort_keys=False, allow_unicode=True)
     write_atomically(out / "fitted_config.yaml", portable.encode())
-    found = diagnose(problem.objective, result.distribution, seed=config.seed)
     title, notes = f"Fit of {config.sim or config.model or config.environment}", _write_model(problem, result, out)
     about = {"title": title, "notes": notes, **provenance(config)}
-    write_fit_report(out / "report.html", fit=result, diagnostics=found, space=problem.space, **about)
+    write_fit_report(out / "report.html", fit=result, diagnostics=diagnostics, space=problem.space, **about)
 
 
 def _write_model(problem: Problem, result: Fit, out: Path) -> list[str]:
@@ -124,6 +129,9 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
         box = f"\\[{entry['low']:g}, {entry['high']:g}]"
         table.add_row(name, f"{entry['mean']:.5g}", f"{entry['std']:.2g}", entry["unit"], box)
     console.print(table)
+    if result.judgment is not None:
+        verdict = result.judgment.verdict.replace("_", " ")
+        console.print(f"verdict: {verdict}: {result.judgment.reason}", soft_wrap=True, markup=False)
     console.print(
         f"log-likelihood {result.log_likelihood:.2f}, mean squared error {result.mse:.3g}, "
         f"{len(problem.objective)} windows, {result.simulated_transitions} simulated transitions, "

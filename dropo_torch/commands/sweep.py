@@ -64,8 +64,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     def point_at(epsilon: float) -> SweepPoint:
         part = make_problem(config.model_copy(update=keys_of(epsilon)))
         fit = fit_shown(part, console, f"ε = {epsilon:g}")
-        robust = study.robust_log_likelihood(part.objective, fit) if noisy_starts else None
-        return study.SweepPoint.of(epsilon, fit, robust)
+        return study.SweepPoint.of(epsilon, fit, noisy_starts=noisy_starts)
 
     sweep = study.sweep_epsilon(
         point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store

@@ -15,6 +15,9 @@ from dropo_torch.optimizers.base import LikelihoodOptimizer, Optimizer, Progress
 from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.support.random import draw_uniforms
 
+#: Cost that pycma is told of what diverges, times its rank: beyond every finite one.
+DIVERGED = 1e100
+
 
 class Normals:
     """Standard normals for pycma from a generator of their own, which travels with a checkpoint."""
@@ -59,11 +62,16 @@ def why_stopped(search: cma.CMAEvolutionStrategy, budget: str, value: str) -> st
 
 
 class Evolution(Optimizer):
-    """A search by pycma: a generation stands until it was told, and the state holds pycma's own pickle."""
+    """A search by pycma: a generation stands until it was told, and the state holds pycma's own pickle.
 
-    STATE: ClassVar[tuple[str, ...]] = ("_asked", "_best")
+    Nothing outweighs a divergence: whatever diverges more often than the least of all generations ranks behind all
+    that does not, whatever it costs.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("_asked", "_best", "_least")
     _search: cma.CMAEvolutionStrategy
     _asked: list[np.ndarray] | None = None
+    _least: float = np.inf
 
     def state(self) -> dict[str, Any]:
         """Return pycma's own pickle and what stands beside it."""
@@ -79,6 +87,15 @@ class Evolution(Optimizer):
             self._asked = self._search.ask()
         return np.array(self._asked)
 
+    def _tell(self, costs: np.ndarray, lost: np.ndarray) -> None:
+        """Rank the generation by how often each point diverged, then by its costs, ``(population,)`` each."""
+        assert self._asked is not None
+        self._least = min(self._least, float(lost.min()))
+        costs = np.minimum(np.nan_to_num(costs, nan=DIVERGED), DIVERGED)
+        rank = np.argsort(np.lexsort((costs, lost)))
+        self._search.tell(self._asked, np.where(lost > self._least, DIVERGED * (1.0 + rank), costs).tolist())
+        self._asked = None
+
 
 class CMAOptimizer(Evolution, LikelihoodOptimizer):
     """CMA-ES on the sampled objective: μ linear, σ logarithmic, all in [0, 4], step 1.
@@ -90,6 +107,7 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
 
     name = "cma"
     STATE = (*Evolution.STATE, "_best_phi")
+    _best: tuple[float, float] = (-np.inf, -np.inf)
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
@@ -97,32 +115,39 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
             2 * len(self._space), seed=settings.seed, budget=settings.budget, population=settings.population,
             tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
         )  # fmt: skip
-        self._best = -np.inf
         self._best_phi: np.ndarray | None = None
 
     def ask(self) -> Request:
-        """Return the samples of a generation, ``(population · K, d)``."""
-        mean, std = self._box.denormalise(self._generation())
+        """Return the samples of a generation, ``(population · K, d)``.
+
+        Where initial states are noisy, the best so far is among them: under the noise as it is propagated here.
+        """
+        generation = self._generation()
+        if self._noisy and self._best_phi is not None:
+            generation = np.concatenate([generation, self._best_phi[None]])
+        mean, std = self._box.denormalise(generation)
         settings = self._settings
-        generation = 0 if settings.common_random_numbers else self._search.countiter
-        uniforms = draw_uniforms(settings.samples, len(self._space), settings.seed, 1, generation)
+        draw = 0 if settings.common_random_numbers else self._search.countiter
+        uniforms = draw_uniforms(settings.samples, len(self._space), settings.seed, 1, draw)
         return Request(
             values=self._objective.values(mean, std, uniforms).flatten(0, 1).numpy(),
-            reduce=self._likelihood(len(mean)),
+            reduce=self._objective.likelihood(len(mean)),
             evaluations=len(mean),
             linearise_at=self._center() if self._noisy else None,
+            widen=False,
         )
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its log-likelihoods."""
-        assert self._asked is not None
-        std = self._box.denormalise(np.array(self._asked))[1]
-        values = sums[: len(self._asked)].numpy() + self._settings.entropy * np.log(std).sum(-1)
-        best = int(np.argmax(values))
-        if values[best] > self._best:
-            self._best, self._best_phi = float(values[best]), np.array(self._asked[best])
-        self._search.tell(self._asked, list(-values))
-        self._asked = None
+        every, count = sums.reshape(5, -1).numpy(), len(self._generation())
+        points = np.array([*self._generation(), self._best_phi][: every.shape[1]])
+        values = every[0] + self._settings.entropy * np.log(self._box.denormalise(points)[1]).sum(-1)
+        if len(points) > count:  # the best so far, under the noise of this generation
+            self._best = (-every[4, -1], values[-1])
+        best = int(np.lexsort((values, -every[4]))[-1])
+        if (-every[4, best], values[best]) > self._best:
+            self._best, self._best_phi = (-float(every[4, best]), float(values[best])), points[best]
+        self._tell(-values[:count], every[4, :count])
 
     @property
     def stop_reason(self) -> str | None:
@@ -132,7 +157,7 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
     @property
     def progress(self) -> Progress:
         """Best sampled log-likelihood and the share of the budget that is spent."""
-        best = self._best if np.isfinite(self._best) else float("nan")
+        best = self._best[1] if np.isfinite(self._best[1]) else float("nan")
         return Progress("CMA-ES", best, min(1.0, self._search.countevals / self._settings.budget))
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -14,7 +14,7 @@ import torch
 
 from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox
 from dropo_torch.errors import InputError
-from dropo_torch.fit import answer
+from dropo_torch.fit import answer, noise_of
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
@@ -151,8 +151,7 @@ class OptimizerCase:
 
 def told(objective: Objective, request: Request) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Return what ``tell`` takes for a request."""
-    at = request.linearise_at
-    sums = answer(objective, request, None if at is None else objective.initial_noise(at, request.linearise_std))
+    sums = answer(objective, request, noise_of(objective, request))
     return sums.total, sums.gradient
 
 
@@ -352,7 +351,7 @@ def _it_finds_the_standard_deviations(case: OptimizerCase) -> None:
 
 def _require_same_request(found: Request, expected: Request, what: str, like: str) -> None:
     require_same(torch.from_numpy(found.values), torch.from_numpy(expected.values), f"{what}, values,", like)
-    for name in ("linearise_at", "linearise_std", "rows"):
+    for name in ("linearise_at", "linearise_std", "widen", "rows"):
         one, other = getattr(found, name), getattr(expected, name)
         require(np.array_equal(one, other), f"{what}: {name} {one}", f"{other}, as in {like}")
     for name in ("evaluations", "gradient", "is_stencil"):
