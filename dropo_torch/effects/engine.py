@@ -121,8 +121,11 @@ class VariantEngine:
         """
         model = copy.copy(self._base)
         self._space.write_into(model, variant.declared)
+        step = model.opt.timestep
         for placed in variant.placed:
             placed.effect.apply(model, placed.target, np.asarray(placed.values))
+        if model.opt.timestep != step and whole_ratio(self._base.opt.timestep, model.opt.timestep) is None:
+            raise ModelRefused(f"no whole number of its steps of {model.opt.timestep:g} s is the model's")
         if (model.body_mass < 0).any() or (model.body_inertia < 0).any() or (model.dof_armature < 0).any():
             raise ModelRefused("a mass or an inertia is negative")
         try:
@@ -263,6 +266,12 @@ class VariantEngine:
         return self._batches[rows]
 
 
+def whole_ratio(longer: float, shorter: float) -> int | None:
+    """Return how many of the shorter steps make the longer one; ``None`` if that is no whole number."""
+    ratio = longer / shorter if shorter > 0 else 0.0
+    return round(ratio) if round(ratio) >= 1 and abs(ratio - round(ratio)) <= 1e-6 * ratio else None
+
+
 def parts(total: int, size: int) -> list[slice]:
     """Return slices of at most ``size`` that make up ``total``."""
     return [slice(a, min(a + size, total)) for a in range(0, total, size)]
@@ -270,7 +279,8 @@ def parts(total: int, size: int) -> list[slice]:
 
 def _varies(control: np.ndarray, every: int) -> bool:
     """Whether commands change within a logged step."""
-    if every == 1:
+    rows, steps, width = control.shape
+    if every == 1 or width == 0:
         return False
-    blocks = control.reshape(control.shape[0], -1, every, control.shape[2])
+    blocks = control.reshape(rows, steps // every, every, width)
     return bool((blocks != blocks[:, :, :1]).any())

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.effects.base import Placed, applied
-from dropo_torch.effects.engine import Variant, VariantEngine, parts
+from dropo_torch.effects.engine import Variant, VariantEngine, parts, whole_ratio
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -332,11 +332,11 @@ def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSe
     Raises:
         InputError: no whole number.
     """
-    ratio = model.opt.timestep / changed.opt.timestep
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+    ratio = whole_ratio(model.opt.timestep, changed.opt.timestep)
+    if ratio is None:
         entry = next((e for e in native.entries if e.effect.name == "integration"), native.entries[0])
         raise InputError(
             f"effects: {entry.place} makes steps of {changed.opt.timestep:g} s, of which no whole number is the "
             f"model's {model.opt.timestep:g} s"
         )
-    return round(ratio)
+    return ratio

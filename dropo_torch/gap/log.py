@@ -74,8 +74,9 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     """Return where effects are looked for: the model, its columns, and the sizes of the log."""
     model, observation = copy.copy(problem.space.model), problem.observation
     assert model is not None
-    frame_skip, nq, nv = problem.simulator.frame_skip, model.nq, model.nv
-    step = frame_skip * float(model.opt.timestep)
+    nq, nv, physics, step = model.nq, model.nv, float(model.opt.timestep), problem.simulator.timestep
+    step = problem.simulator.frame_skip * physics if step is None else step
+    frame_skip = round(step / physics)  # steps of the given model, whatever the simulator makes of them
     states, after = observation.states(log.observations), observation.states(log.next_observations)
     rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
     inertia, force, speed, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.nbody), np.zeros(model.ngeom, bool)

@@ -82,6 +82,11 @@ class Limits:
     high: np.ndarray
     scale: np.ndarray
 
+    @property
+    def free(self) -> np.ndarray:
+        """Which numbers move, ``(q,)`` bool."""
+        return self.low < self.high
+
     def moves(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and the largest move from values within the bounds, in units of the scale."""
         return (self.low - values) / self.scale, (self.high - values) / self.scale
@@ -92,11 +97,12 @@ class Limits:
 
 
 def limits_of(hypothesis: Hypothesis, twin: Twin) -> Limits:
-    """Return the bounds and sizes of a hypothesis' numbers."""
+    """Return the bounds and sizes of a hypothesis' numbers; both bounds of a discrete one are its value."""
     space = twin.space
     numbers = [(low, high, 0.25 * (high - low)) for low, high in zip(space.low, space.high, strict=True)]
     for p in hypothesis.placed:
-        numbers += [(q.low, q.high, q.scale) for q in p.effect.quantities(twin.setting, p.target)]
+        quantities = zip(p.effect.quantities(twin.setting, p.target), p.values, strict=True)
+        numbers += [(v if q.discrete else q.low, v if q.discrete else q.high, q.scale) for q, v in quantities]
     return Limits(*np.array(numbers).reshape(-1, 3).T)
 
 
@@ -166,10 +172,11 @@ def refit(
 
     def at(vector: np.ndarray) -> Refit:
         there = hypothesis.at(np.clip(vector, limits.low, limits.high))
-        moved, steps = beside(there, limits, np.arange(len(vector)), STEP)
+        moved, steps = beside(there, limits, np.flatnonzero(limits.free), STEP)
         found, _ = evidence.residuals([h.variant for h in (there, *moved)])
         residual = evidence.project(found[0], linear)
-        slope = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
+        slope = np.zeros((len(vector), *residual.shape))  # none by discrete numbers
+        slope[limits.free] = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
         chi2 = ((residual * np.reshape(evidence.caps, (-1, 1))) ** 2).sum(-1)
         loss, factor = float(robust_loss(chi2, tail).sum()), robust_factors(chi2, tail)
         cost = evidence.cost(residual, linear, len(vector))

@@ -124,7 +124,9 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         hypothesis = focus.fitted.hypothesis.with_effects([placed])
         chosen, size = placed.effect.screened(), len(placed.values)
         moving = np.arange(size) if chosen is None else np.array(chosen, dtype=int)
-        limits, columns = limits_of(hypothesis, evidence.twin), len(hypothesis.vector) - size + moving
+        limits = limits_of(hypothesis, evidence.twin)
+        moving = moving[limits.free[len(hypothesis.vector) - size + moving]]
+        columns = len(hypothesis.vector) - size + moving
         moved, steps = beside(hypothesis, limits, columns, STEP)
         plans.append((moving, limits.of(columns), steps, slice(len(variants), len(variants) + 1 + len(moved))))
         variants += [h.variant for h in (hypothesis, *moved)]
