@@ -14,7 +14,9 @@ import numpy as np
 
 from dropo_torch.config import TRAINING_KEYS, Config
 from dropo_torch.data.observation import Observation, generic_observation, parse_observation
+from dropo_torch.data.examination import Finding, examine
 from dropo_torch.data.readers import read_trajectories
+from dropo_torch.data.recording import TOLERANCE
 from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
@@ -30,6 +32,8 @@ from dropo_torch.support.usercode import load_callable, user_code
 
 #: Relative difference between the log's time step and the simulator's that is still called equal.
 TIME_TOLERANCE = 1e-3
+#: Relative deviation of time stamps that an examination reads, so as to tell it.
+UNEVEN = 1e9
 #: Seconds between rows beyond which stamps are rather in another unit.
 SLOWEST = 1.0
 
@@ -59,6 +63,66 @@ class Problem:
     objective: Objective
     fingerprint: str
     effects: EffectSet | None = None
+
+
+@dataclass(frozen=True)
+class LoggedData:
+    """A log and what its columns are: what is examined before anything is fitted.
+
+    Attributes:
+        model_path: path of the model, where there is one.
+        model: the model, or ``None`` for another simulator.
+        trajectories: the log, or the part of it that is used.
+        observation: what its columns are.
+        frame_skip: physics steps of one logged transition.
+        tolerance: relative deviation of time stamps that the reader refuses.
+    """
+
+    model_path: Path | None
+    model: mujoco.MjModel | None
+    trajectories: Trajectories
+    observation: Observation
+    frame_skip: int
+    tolerance: float = np.inf
+
+    def examined(self) -> tuple[Finding, ...]:
+        """Return what is wrong with the log, the sure findings first."""
+        return examine(
+            self.trajectories, self.observation, self.model, self.frame_skip, tolerance=self.tolerance
+        )  # fmt: skip
+
+
+def logged_data(problem: Problem) -> LoggedData:
+    """Return the log of a problem."""
+    model = problem.space.model if problem.config.backend != "gymnasium" else None
+    return LoggedData(
+        problem.model_path, model, problem.trajectories, problem.observation, problem.simulator.frame_skip
+    )  # fmt: skip
+
+
+def read_log(config: Config, *, uneven: bool = False) -> LoggedData:
+    """Read the log that a config names, and its model; no parameters are needed.
+
+    Args:
+        config: the config.
+        uneven: read uneven time stamps, too, which the examination then tells.
+
+    Raises:
+        InputError: anything that does not fit, by key.
+    """
+    config, tolerance = _completed(config), np.inf
+    if config.backend == "gymnasium":
+        trajectories = _log(config, None)
+        width = trajectories.observations.shape[1]
+        return LoggedData(None, None, trajectories, generic_observation(width), config.frame_skip or 1)
+    path = config.path(str(config.model))
+    model = load_model(path)
+    if uneven and not (isinstance(config.data, dict) and "tolerance" in config.data):
+        tolerance = TOLERANCE
+    trajectories = _log(config, model, UNEVEN if np.isfinite(tolerance) else TOLERANCE)
+    frame_skip = _frame_skip(config, model, trajectories)
+    observation = parse_observation(model, config.observation, trajectories.observations.shape[1])
+    return LoggedData(path, model, trajectories, observation, frame_skip, tolerance)
 
 
 def make_problem(config: Config, *, general: bool = False) -> Problem:
@@ -209,7 +273,7 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
     return path, space, CheckedAdapter(adapter, name)
 
 
-def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:
+def _log(config: Config, model: mujoco.MjModel | None, tolerance: float = TOLERANCE) -> Trajectories:
     source = config.data
     if source is None:
         raise InputError("config: no data given; expected the path of a log, such as data: log.npz")
@@ -218,7 +282,7 @@ def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:
             raise InputError("data: preprocess needs dt, the seconds of one transition (or frame_skip, and a model)")
         step = float(model.opt.timestep) * config.frame_skip
         source = {**source, "preprocess": {"dt": step, **source["preprocess"]}}
-    log, wanted = read_trajectories(source, base=config.base), config.trajectories
+    log, wanted = read_trajectories(source, base=config.base, tolerance=tolerance), config.trajectories
     if isinstance(wanted, int):
         if not 1 <= wanted <= log.num_episodes:
             raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")

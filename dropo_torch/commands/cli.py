@@ -7,6 +7,7 @@ and ``run(given, overrides, console)``: the arguments, the config's keys that we
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import io
 import os
@@ -19,6 +20,7 @@ from dropo_torch.errors import InputError, choices
 #: Commands, each with its module and what it does.
 COMMANDS = {
     "fit": ("fit", "fit the distribution to the log"),
+    "check": ("check", "examine the log before anything is fitted to it"),
     "gap": ("gap", "find where simulation and log disagree, and name the physical effect that is missing"),
     "train": ("train", "train a policy over the distribution"),
     "sweep-epsilon": ("sweep", "fit at several ε and choose one by the elbow"),
@@ -84,7 +86,7 @@ def _dispatch(given: list[str]) -> None:
 
         console = Console(highlight=False)
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
-        with claimed(parsed.out):
+        with claimed(parsed.out) if parsed.out is not None else contextlib.nullcontext():
             parsed.run(parsed, parse_overrides(rest), console)
 
 

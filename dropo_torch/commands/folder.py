@@ -15,7 +15,7 @@ from dropo_torch.errors import InputError
 
 #: Files by which a folder is known to hold a run.
 _MARKS = (
-    "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.pkl",
+    "fit.json", "check.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.pkl",
     "gap-progress.pkl", "sweep-progress.json", "compare-progress.json", "train-progress.pt",
 )  # fmt: skip
 #: What runs write; an earlier run's are moved aside together.

@@ -22,7 +22,7 @@ from scipy.interpolate import Akima1DInterpolator
 from scipy.signal import butter, sosfiltfilt
 
 from dropo_torch.data.recording import Recording, resolve_names
-from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
+from dropo_torch.data.trajectory import Origin, Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.given import check_keys, number
 
@@ -296,7 +296,8 @@ class _Episode:
             actions = {name: self._commands(name, grid[:-1]) for name in self.part.action_names}
         observations = np.stack([*position.values(), *velocity.values()], axis=1)
         commands = np.stack(list(actions.values()), axis=1) if actions else np.empty((len(grid) - 1, 0))
-        return Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
+        log = Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
+        return replace(log, origin=Origin((*position, *velocity), tuple(actions)))
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
         return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")

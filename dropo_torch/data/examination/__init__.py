@@ -1,0 +1,62 @@
+"""The examination of a log before anything is fitted: what is wrong with it, where, how surely, and what cures it.
+
+A check is a function of a :class:`~dropo_torch.data.examination.record.Record` and the
+:class:`~dropo_torch.data.examination.rules.Rules`; it returns findings. Those of :data:`CHECKS` need nothing but the
+columns, those of :data:`MODEL_CHECKS` simulate, and run only where the others find nothing sure: they would see the
+same fault again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import mujoco
+import numpy as np
+
+from dropo_torch.data.examination.columns import commanded_range, quantised, ranges, stuck, units
+from dropo_torch.data.examination.commands import commands
+from dropo_torch.data.examination.continuity import continuous
+from dropo_torch.data.examination.finding import Finding
+from dropo_torch.data.examination.kinematics import velocities
+from dropo_torch.data.examination.quaternions import quaternions
+from dropo_torch.data.examination.record import Record
+from dropo_torch.data.examination.rules import Rules
+from dropo_torch.data.examination.stamps import stamps
+from dropo_torch.data.observation import Observation
+from dropo_torch.data.trajectory import Trajectories
+
+__all__ = ["CHECKS", "MODEL_CHECKS", "Finding", "Rules", "examine"]
+
+Check = Callable[[Record, Rules], list[Finding]]
+
+CHECKS: tuple[Check, ...] = (stamps, quaternions, stuck, velocities, units, quantised, commanded_range)
+MODEL_CHECKS: tuple[Check, ...] = (ranges, commands)
+
+
+def examine(
+    log: Trajectories,
+    observation: Observation,
+    model: mujoco.MjModel | None,
+    frame_skip: int,
+    *,
+    tolerance: float = np.inf,
+    rules: Rules | None = None,
+) -> tuple[Finding, ...]:
+    """Return what is wrong with a log, the sure findings first.
+
+    Args:
+        log: the log.
+        observation: what its columns are.
+        model: the model, or ``None`` where there is none: only what needs none is examined.
+        frame_skip: physics steps of one logged transition.
+        tolerance: relative deviation of time stamps above which they are refused by the reader.
+        rules: the thresholds.
+    """
+    rules = rules or Rules()
+    record, found = continuous(Record.of(log, observation, model, frame_skip, tolerance), rules)
+    for check in CHECKS:
+        found += check(record, rules)
+    for check in MODEL_CHECKS:
+        if not any(finding.sure for finding in found):
+            found += check(record, rules)
+    return tuple(sorted(found, key=lambda finding: not finding.sure))
