@@ -104,11 +104,12 @@ def _unwrapped(
 
 
 def _continuous(angles: np.ndarray) -> np.ndarray:
-    """Angles ``(N, k)`` without jumps by a turn; NaN, which is no sample, stays."""
+    """Angles ``(N, k)`` without jumps by a turn, the first within half a turn of 0; NaN, which is no sample, stays."""
     angles = np.array(angles)
     for column in angles.T:
         present = ~np.isnan(column)
-        column[present] = np.unwrap(column[present])
+        unwrapped = np.unwrap(column[present])
+        column[present] = unwrapped - TURN * np.round(unwrapped[:1] / TURN)
     return angles
 
 

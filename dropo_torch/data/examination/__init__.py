@@ -2,13 +2,13 @@
 
 A check is a function of a :class:`~dropo_torch.data.examination.record.Record` and the
 :class:`~dropo_torch.data.examination.rules.Rules`; it returns findings. Those of :data:`CHECKS` need nothing but the
-columns, those of :data:`MODEL_CHECKS` simulate, and run only where the others find nothing sure: they would see the
-same fault again.
+columns; those of :data:`LATER_CHECKS`, some of which simulate, run in turn while nothing sure is found: they would see
+the same fault again.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -25,12 +25,12 @@ from dropo_torch.data.examination.stamps import stamps
 from dropo_torch.data.observation import Observation
 from dropo_torch.data.trajectory import Trajectories
 
-__all__ = ["CHECKS", "MODEL_CHECKS", "Finding", "Rules", "examine"]
+__all__ = ["CHECKS", "LATER_CHECKS", "Finding", "Rules", "examine"]
 
 Check = Callable[[Record, Rules], list[Finding]]
 
-CHECKS: tuple[Check, ...] = (stamps, quaternions, stuck, velocities, units, quantised, commanded_range)
-MODEL_CHECKS: tuple[Check, ...] = (ranges, commands)
+CHECKS: tuple[Check, ...] = (stamps, quaternions, stuck, velocities, quantised, commanded_range)
+LATER_CHECKS: tuple[Check, ...] = (units, ranges, commands)
 
 
 def examine(
@@ -54,9 +54,20 @@ def examine(
     """
     rules = rules or Rules()
     record, found = continuous(Record.of(log, observation, model, frame_skip, tolerance), rules)
-    for check in CHECKS:
+    for check in () if any(finding.name == "next_observations" for finding in found) else CHECKS:
         found += check(record, rules)
-    for check in MODEL_CHECKS:
+    for check in LATER_CHECKS:
         if not any(finding.sure for finding in found):
             found += check(record, rules)
-    return tuple(sorted(found, key=lambda finding: not finding.sure))
+    return tuple(sorted(_causes(found), key=lambda finding: not finding.sure))
+
+
+def _causes(found: Sequence[Finding]) -> list[Finding]:
+    """Return the findings without those that another one explains: the same again, or doubts about the same columns."""
+    sure = {column for finding in found if finding.sure for column in finding.where}
+    kept: list[Finding] = []
+    for finding in found:
+        again = not finding.where and any(finding.name == other.name for other in kept)
+        if not again and (finding.sure or not sure.intersection(finding.where)):
+            kept.append(finding)
+    return kept

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
-
 import mujoco
 import numpy as np
 
@@ -51,11 +49,13 @@ def _frozen(record: Record, c: Coordinate, step: float, rules: Rules) -> list[Fi
     still = (record.steps[:, c.position] == 0) & ~record.cut
     travel = 0.5 * step * (record.before[:, c.velocity] + record.after[:, c.velocity])
     spread = float(np.ptp(record.before[:, c.position]))
-    best, rows = 0.0, np.empty(0, dtype=int)
+    size = np.abs(record.steps[:, c.position])
+    quantum = float(size[size > 0].min()) if size.any() else 0.0
+    best, rows = max(rules.frozen_travel * spread, 5 * quantum), np.empty(0, dtype=int)
     for a, b in _stretches(still & ~record.parted):
-        size = abs(float(travel[a:b].sum()))
-        if b - a >= rules.frozen and size > max(rules.frozen_travel * spread, best):
-            best, rows = size, np.arange(a, b)
+        moved = abs(float(travel[a:b].sum()))
+        if b - a >= rules.frozen and moved > best:
+            best, rows = moved, np.arange(a, b)
     if rows.size == 0:
         return []
     what = (
@@ -72,9 +72,7 @@ def _frozen(record: Record, c: Coordinate, step: float, rules: Rules) -> list[Fi
 def _stretches(flags: np.ndarray) -> list[tuple[int, int]]:
     """First and last-plus-one row of each stretch of true flags."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return list(itertools.batched(edges.tolist(), 2)) if hasattr(itertools, "batched") else [
-        (int(a), int(b)) for a, b in edges.reshape(-1, 2)
-    ]  # fmt: skip
+    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
 
 
 def _repeated(record: Record, step: float, rules: Rules) -> list[Finding]:
@@ -204,31 +202,39 @@ def _outside(record: Record, c: Coordinate, factor: float = 1.0) -> float:
 
 def commanded_range(record: Record, rules: Rules) -> list[Finding]:
     """Return commands beyond the actuators' range, which the simulation cuts off."""
-    model = record.model
-    if model is None or model.nu != record.log.actions.shape[1] or model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+    model, actions = record.model, record.log.actions
+    if model is None or model.nu != actions.shape[1]:
         return []
+    if model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL:
+        return []
+    limited = np.flatnonzero(model.actuator_ctrllimited)
+    low, high = model.actuator_ctrlrange[limited].T
+    margin = 0.01 * (high - low)
+    share = ((actions[:, limited] < low - margin) | (actions[:, limited] > high + margin)).mean(axis=0)
+    reach = np.abs(actions[:, limited]).max(axis=0) / np.maximum(np.abs(low), np.abs(high))
     found = []
-    for j in range(model.nu):
-        low, high = (float(x) for x in model.actuator_ctrlrange[j])
-        if not model.actuator_ctrllimited[j]:
-            continue
-        values, width = record.log.actions[:, j], high - low
-        share = float(((values < low - 0.01 * width) | (values > high + 0.01 * width)).mean())
-        reach = float(np.abs(values).max() / max(abs(low), abs(high)))
-        if share <= rules.beyond:
-            continue
-        sure = share > 0.5 and reach > rules.far_beyond
-        what = (
-            f"{share:.0%} of the commands {record.command(j)} lie beyond the range {low:.4g} to {high:.4g} of actuator "
-            f"{model.actuator(j).name or j}, and the simulation cuts them off there; they reach {reach:.3g} times as far"
-        )
-        typical = 1 / reach
-        named = min((DEGREE, 1e-3, 1e-2), key=lambda f: abs(np.log(f / typical)))
-        factor = named if abs(np.log(named / typical)) < 1.2 else float(f"{typical:.3g}")
-        found.append(Finding(
-            "ctrlrange", (record.command(j),), what, confidence(sure), evidence={"share": share, "reach": reach},
-            cure={"data": {"scale": {record.command(j): factor}}} if sure else {},
-            advice="the factor is a guess by the range; or a wider ctrlrange in the model" if sure
-            else "nothing where the robot cuts them off, too; otherwise a wider ctrlrange in the model",
-        ))  # fmt: skip
+    far = (share > 0.5) & (reach > rules.far_beyond)
+    for wanted, sure in ((far, True), ((share > rules.beyond) & ~far, False)):
+        if wanted.any():
+            found.append(_beyond(record, limited[wanted], share[wanted], reach[wanted], sure))
     return found
+
+
+def _beyond(record: Record, columns: np.ndarray, share: np.ndarray, reach: np.ndarray, sure: bool) -> Finding:
+    """The finding of commands beyond their ranges."""
+    names = [record.command(int(j)) for j in columns]
+    what = (
+        f"commands lie beyond their actuators' ctrlrange, where the simulation cuts them off: "
+        f"{', '.join(f'{n} in {s:.0%} of the rows' for n, s in zip(names, share, strict=True))}, up to {reach.max():.3g} "
+        "times as far"
+    )
+    typical = 1 / float(reach.max())
+    unit = min((DEGREE, 1e-3, 1e-2), key=lambda f: abs(np.log(f / typical)))
+    factor = unit if abs(np.log(unit / typical)) < 1.2 else float(f"{typical:.3g}")
+    guess = "the factor is a guess by the range; or a wider ctrlrange in the model"
+    usual = "nothing where the robot cuts them off, too; otherwise a wider ctrlrange in the model"
+    return Finding(
+        "ctrlrange", tuple(names), what, confidence(sure),
+        evidence={"share": float(share.max()), "reach": float(reach.max())},
+        cure={"data": {"scale": dict.fromkeys(names, factor)}} if sure else {}, advice=guess if sure else usual,
+    )  # fmt: skip

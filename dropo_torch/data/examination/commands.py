@@ -113,15 +113,15 @@ class _Effects:
         if len(rows) < 100:
             return None
         predicted, response = _responses(record, rows, seen)
-        change = (record.after - record.before)[rows][:, seen]
-        change = change - predicted + np.einsum("tvu,tu->tv", response, log.actions[rows])
+        predicted = predicted - np.einsum("tvu,tu->tv", response, log.actions[rows])
+        change = (record.after - record.before)[rows][:, seen] - predicted
         good = np.isfinite(change).all(axis=1) & np.isfinite(response).all(axis=(1, 2))
         rows, change, response = rows[good], change[good], response[good]
         moved = np.abs(response).max(axis=(0, 2)) > 0
         if len(rows) < 100 or not moved.any():
             return None
         logged = {s: log.actions[rows + s] for s in range(-REACH, REACH + 1)}
-        terms = _terms(record, rows)
+        terms = _terms(record, rows, predicted[good])
         change, response = change[:, moved], response[:, moved]
         rest = change - terms @ (terms.T @ change)
         scale = np.maximum(1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0), 1e-9)
@@ -217,17 +217,24 @@ def _responses(record: Record, rows: np.ndarray, seen: np.ndarray) -> tuple[np.n
     return ends - states[:, columns], response
 
 
-def _terms(record: Record, rows: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of constant, positions, velocities and their signs in some rows, ``(T, p)``."""
+def _terms(record: Record, rows: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what may explain changes besides commands in some rows, ``(T, p)``.
+
+    That is a constant, positions, velocities and their signs, as springs and friction need them, sines and cosines of
+    angles, as weights do, and the changes that the model predicts without commands, as wrong masses do.
+    """
     model = record.model
     assert model is not None
     columns = np.asarray(record.observation.columns)
     positions = np.flatnonzero(columns < model.nq)[:TERMS]
     speeds = np.flatnonzero(columns >= model.nq)[:TERMS]
     values = record.before[rows]
-    parts = [np.ones((len(rows), 1)), values[:, positions], values[:, speeds], np.tanh(
-        values[:, speeds] / np.maximum(0.1 * values[:, speeds].std(axis=0), 1e-12)
-    )]  # fmt: skip
+    angles = [c.position for c in record.coordinates if c.angle and c.position is not None][:TERMS]
+    fast = np.maximum(0.1 * values[:, speeds].std(axis=0), 1e-12)
+    parts = [
+        np.ones((len(rows), 1)), values[:, positions], values[:, speeds], np.tanh(values[:, speeds] / fast),
+        np.sin(values[:, angles]), np.cos(values[:, angles]), predicted[:, :TERMS],
+    ]  # fmt: skip
     table = np.concatenate(parts, axis=1)
     table = table / np.maximum(np.abs(table).max(axis=0), 1e-12)
     basis, size, _ = np.linalg.svd(table, full_matrices=False)

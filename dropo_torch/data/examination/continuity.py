@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence, first_rows
-from dropo_torch.data.examination.record import Record
+from dropo_torch.data.examination.record import Coordinate, Record
 from dropo_torch.data.examination.rules import Rules
 
 TURN = 2 * np.pi
@@ -26,6 +26,9 @@ def _misplaced(record: Record, rules: Rules) -> tuple[Record, list[Finding]]:
     """Where the next row is not what was observed after a transition."""
     if len(record.log) < 3:
         return record, []
+    other = _other_row(record)
+    if other is not None:
+        return record, [other]
     off = _unlike(record.before[1:], record.after[:-1], rules) & ~record.log.terminals[:-1]
     inside = int((~record.log.terminals[:-1]).sum())
     if not off.any():
@@ -35,20 +38,33 @@ def _misplaced(record: Record, rules: Rules) -> tuple[Record, list[Finding]]:
     share = len(rows) / max(inside, 1)
     if share < 0.5:
         return record, [_breaks(record, rows, rows + 1, True, "what was observed after a row is not the next row")]
-    moving = np.any(record.before[1:] != record.before[:-1], axis=1)
-    for other, words in ((0, "the observations of the same row"), (2, "the observations two rows further on")):
-        count = len(record.log) - other
-        same = ~_unlike(record.before[other:][:count], record.after[:count], rules)
-        if same[:-1][moving[: count - 1]].mean() > 0.9:
-            what = f"next_observations are {words}; they must be those of the next row"
-            cure = {"data": {"observations": "observations"}}  # next observations are then the next row's
-            return record, [Finding("next_observations", (), what, "sure", evidence={"share": share}, cure=cure)]
     what = (
         f"in {share:.0%} of the rows the next row does not follow: the rows are in no order. A fit of single "
         "transitions takes them; whatever looks at longer stretches does not"
     )
     advice = "terminals that are true in every row say so"
     return record, [Finding("unordered", (), what, "doubtful", evidence={"share": share}, advice=advice)]
+
+
+def _other_row(record: Record) -> Finding | None:
+    """The finding of next observations that are those of the same row, or of one too far on."""
+    rows = np.flatnonzero(~record.log.terminals[:-2] & ~record.log.terminals[1:-1])
+    scale = np.maximum(np.ptp(record.before, axis=0), 1e-12)
+    off = {
+        s: float(np.mean(np.abs(record.before[rows + s] - record.after[rows]) / scale)) if len(rows) else 0.0
+        for s in (0, 1, 2)
+    }  # fmt: skip
+    best = min(off, key=lambda s: off[s])
+    if best == 1 or off[best] > 0.1 * off[1]:
+        return None
+    words = {0: "the observations of the same row", 2: "the observations two rows further on"}[best]
+    what = f"next_observations are {words}; they must be those of the next row"
+    names = [record.signal(i) for i in range(record.observation.size)]
+    cure = {"data": {"observations": names}} if record.observation.log_width == len(names) else {}
+    return Finding(
+        "next_observations", (), what, "sure", evidence={"off": off[best], "off_next_row": off[1]}, cure=cure,
+        advice="without the array the next row's observations are taken",
+    )  # fmt: skip
 
 
 def _unlike(first: np.ndarray, second: np.ndarray, rules: Rules) -> np.ndarray:
@@ -66,27 +82,35 @@ def _jumps(record: Record, rules: Rules) -> np.ndarray:
     for c in record.coordinates:
         if c.position is None or len(size) < 5:
             continue
-        own, column = size[:, c.position], record.before[:, c.position]
-        beside = np.maximum(np.append(own[1:], 0.0), np.append(0.0, own[:-1]))
-        spread = float(np.ptp(column))
-        usual = rules.jump * (beside + float(np.median(own))) + 0.03 * spread
-        excess[:, c.position] = own / usual if spread > 0 else 0.0
+        own, spread = size[:, c.position], float(np.ptp(record.before[:, c.position]))
+        if not own.any():
+            continue
+        beside = np.max([np.roll(own, s) for s in (-2, -1, 1, 2)], axis=0)
+        usual = rules.jump * (beside + float(np.median(own[own > 0]))) + 0.03 * spread
+        excess[:, c.position] = np.where(_released(record, c, own), 0.0, own / usual)
     return excess
+
+
+def _released(record: Record, c: Coordinate, size: np.ndarray) -> np.ndarray:
+    """Rows ``(T,)`` before which a position stood still although its velocity was not zero: it catches up."""
+    if c.velocity is None:
+        return np.zeros(len(size), dtype=bool)
+    stood = (size == 0) & (np.abs(record.before[:, c.velocity]) > 1e-6 * np.abs(record.before[:, c.velocity]).max())
+    return np.asarray(np.roll(stood, 1) & np.roll(stood, 2))
 
 
 def _turned(record: Record, jumps: np.ndarray, rules: Rules) -> tuple[Record, list[Finding]]:
     """Angles that jump by a turn while nothing else jumps."""
     turns = np.zeros_like(jumps)
     columns = [c for c in record.coordinates if c.angle and c.position is not None]
-    alone = (jumps > 1).sum(axis=1) <= len(columns)
     for c in columns:
         assert c.position is not None
         step, column = record.steps[:, c.position], record.before[:, c.position]
         whole = np.round(step / TURN)
-        near = np.abs(step - TURN * whole) < rules.turn_tolerance * TURN
-        others = np.delete(jumps, c.position, axis=1).max(axis=1, initial=0.0) > 1
-        inside = np.ptp(column) < TURN * (1 + 1e-3)
-        turns[:, c.position] = np.where(near & alone & ~others & inside & (np.abs(whole) == 1), whole, 0.0)
+        near = (np.abs(step - TURN * whole) < rules.turn_tolerance * TURN) & (np.abs(whole) == 1)
+        turns[:, c.position] = np.where(near & (np.ptp(column) < TURN * (1 + 1e-3)), whole, 0.0)
+    others = (np.where(turns != 0, 0.0, jumps) > 1).any(axis=1)
+    turns[others] = 0.0  # what jumps together with something else is another episode
     wrapped = np.flatnonzero(np.any(turns != 0, axis=0))
     if wrapped.size == 0:
         return record, []

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dropo_torch.data.examination.finding import Finding, confidence
-from dropo_torch.data.examination.record import Coordinate, Record, windows
+from dropo_torch.data.examination.record import Coordinate, Record, entry, resampled, windows
 from dropo_torch.data.examination.rules import Rules
 
 #: Rows over which changes are summed: noise drowns the change of one row, never that of many.
@@ -192,13 +192,6 @@ def _exchanged(
     return [finding], {c for c, _, _ in columns}
 
 
-def entry(label: str, place: int, nq: int) -> str:
-    """Return an entry of ``observation`` for a single state column: its joint's, or its number where a joint has more."""
-    if "[" not in label:
-        return label
-    return f"qpos[{place}]" if place < nq else f"qvel[{place - nq}]"
-
-
 def _slopes(
     record: Record, pairs: Sequence[Coordinate], own: dict[Coordinate, Likeness], rules: Rules
 ) -> list[Finding]:
@@ -323,23 +316,9 @@ def _delays(record: Record, pairs: Sequence[Coordinate], rules: Rules) -> list[F
     return [Finding(
         "delay", tuple(record.label(i) for i in columns), what, confidence(sure),
         evidence={c.name: share for c, (_, share) in clear.items()},
-        cure=_delay_cure(record, columns, seconds),
+        cure=resampled(record, delays={record.signal(i): seconds for i in columns}),
         advice="" if sure else "a filter of the velocity looks like this, too",
     )]  # fmt: skip
-
-
-def _delay_cure(record: Record, columns: Sequence[int], seconds: float) -> dict[str, object]:
-    """Keys that resample the log with the velocities in time; none where its columns are not positions and velocities."""
-    observation = record.observation
-    names = [record.signal(i) for i in range(observation.size)]
-    moving = [names[i] for i, place in enumerate(observation.columns) if record.model and place >= record.model.nq]
-    settings: dict[str, object] = {
-        "dt": record.step, "velocities": moving, "delays": {names[i]: seconds for i in columns},
-    }  # fmt: skip
-    if record.orientations:
-        settings["quaternions"] = [[names[i] for i in o.quaternion] for o in record.orientations]
-    timed = record.log.origin is not None and record.log.origin.durations is not None
-    return {"data": ({} if timed else {"dt": record.step}) | {"preprocess": settings}}
 
 
 def _shares(late: dict[Coordinate, tuple[int, float]]) -> str:

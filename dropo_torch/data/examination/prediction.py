@@ -12,7 +12,7 @@ from dropo_torch.data.examination.record import Record
 from dropo_torch.models.load import quiet_mujoco
 
 #: Microseconds of simulation that one prediction may take, about, and the most rows that are simulated.
-BUDGET, MOST_ROWS = 3e5, 2000
+BUDGET, MOST_ROWS = 1.5e5, 1200
 
 
 def chosen_rows(record: Record, runs: int, block: int = 40, reach: int = 0) -> np.ndarray:
@@ -22,7 +22,7 @@ def chosen_rows(record: Record, runs: int, block: int = 40, reach: int = 0) -> n
     """
     model = record.model
     assert model is not None
-    cost = (3 + 0.15 * model.nv**2) * record.frame_skip * max(runs, 1)
+    cost = (3 + 0.15 * model.nv**2) * (2 if model.npair or _touching(model) else 1) * record.frame_skip * max(runs, 1)
     most = int(np.clip(BUDGET / cost, 80, MOST_ROWS))
     usable = ~record.cut
     number = record.runs
@@ -36,6 +36,11 @@ def chosen_rows(record: Record, runs: int, block: int = 40, reach: int = 0) -> n
     blocks = np.array_split(rows, max(1, len(rows) // block))
     picked = np.unique(np.linspace(0, len(blocks) - 1, max(1, most // block)).astype(int))
     return np.concatenate([blocks[i] for i in picked])
+
+
+def _touching(model: mujoco.MjModel) -> bool:
+    """Whether geoms may touch."""
+    return bool((model.geom_contype[:, None] & model.geom_conaffinity[None]).any())
 
 
 def simulate(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray, steps: int) -> np.ndarray:

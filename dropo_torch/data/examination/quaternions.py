@@ -8,8 +8,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence, first_rows
-from dropo_torch.data.examination.kinematics import entry
-from dropo_torch.data.examination.record import Orientation, Record
+from dropo_torch.data.examination.record import Orientation, Record, entry
 from dropo_torch.data.examination.rules import Rules
 
 #: How a log may order (w, x, y, z): for each, where w, x, y and z stand.

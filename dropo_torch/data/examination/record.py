@@ -149,6 +149,34 @@ class Record:
         )
 
 
+def resampled(record: Record, **settings: object) -> dict[str, object]:
+    """Return the keys of a config that resample the log onto the simulation's steps: its positions, its velocities."""
+    nq = 0 if record.model is None else record.model.nq
+    columns = list(enumerate(record.observation.columns))
+    positions, speeds = ([i for i, place in columns if (place >= nq) == moving] for moving in (False, True))
+    options: dict[str, object] = {"dt": record.step}
+    if record.orientations:
+        options["quaternions"] = [[record.signal(i) for i in o.quaternion] for o in record.orientations]
+    if speeds:
+        options["velocities"] = [record.signal(i) for i in speeds]
+    timed = record.log.origin is not None and record.log.origin.durations is not None
+    data: dict[str, object] = {} if timed else {"dt": record.step}
+    if record.observation.log_width > len(columns):  # columns that are no state are left out
+        data["observations"] = [record.signal(i) for i in positions + speeds]
+    cure: dict[str, object] = {"data": data | {"preprocess": options | settings}}
+    if [i for i, _ in columns] != positions + speeds or "observations" in data:
+        places = [record.observation.columns[i] for i in positions + speeds]
+        cure["observation"] = [entry(record.label(i), p, nq) for i, p in zip(positions + speeds, places, strict=True)]
+    return cure
+
+
+def entry(label: str, place: int, nq: int) -> str:
+    """Return an entry of ``observation`` for a single state column: its joint's, or its number where a joint has more."""
+    if "[" not in label:
+        return label
+    return f"qpos[{place}]" if place < nq else f"qvel[{place - nq}]"
+
+
 def windows(record: Record, values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
     """Return sums of ``length`` rows of ``values (T, k)`` that follow one another, ``(W, k)``, and first rows ``(W,)``."""
     count = len(values) - length + 1

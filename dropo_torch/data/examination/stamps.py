@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence, first_rows
-from dropo_torch.data.examination.record import Record
+from dropo_torch.data.examination.record import Record, resampled
 from dropo_torch.data.examination.rules import Rules
 
 #: Units of time stamps, by how many of them make a second.
@@ -26,8 +26,9 @@ def stamps(record: Record, rules: Rules) -> list[Finding]:
     wide = rows[lengths > rules.gap * median]
     uneven = rows[off > rules.jitter]
     refused = bool((off > record.tolerance).any())
-    step = record.step or median
-    cure = {"data": {"preprocess": {"dt": round(step, 9)}}}
+    longest = float(lengths.max())
+    bridged = {"max_gap": float(f"{1.01 * longest:.4g}")} if longest > 2.4 * median else {}
+    cure = resampled(record, **bridged)
     if wide.size:
         what = (
             f"the time stamps leave samples out at {len(wide)} rows: up to {lengths.max():.4g} s lie between rows that "
@@ -36,7 +37,7 @@ def stamps(record: Record, rules: Rules) -> list[Finding]:
         found.append(Finding(
             "dropouts", (), what, confidence(refused), rows=first_rows(wide),
             evidence={"longest": float(lengths.max()), "median": median, "rows": float(len(wide))}, cure=cure,
-            advice="max_gap bounds what is interpolated",
+            advice="data: breaks makes two episodes of a gap too long to be interpolated" if bridged else "",
         ))  # fmt: skip
     if uneven.size > len(wide) + 0.01 * len(rows):
         what = (
@@ -47,15 +48,16 @@ def stamps(record: Record, rules: Rules) -> list[Finding]:
             "jitter", (), what, confidence(refused), rows=first_rows(uneven),
             evidence={"share": len(uneven) / len(rows), "median": median, "deviation": float(lengths.std())}, cure=cure,
         ))  # fmt: skip
-    return found + _step(record, median if found else record.log.dt)
+    typical = float(lengths[lengths <= rules.gap * median].mean())
+    return found + _step(record, typical if found else record.log.dt, 0.03 if found else 1e-3)
 
 
-def _step(record: Record, seconds: float | None) -> list[Finding]:
+def _step(record: Record, seconds: float | None, tolerance: float = 1e-3) -> list[Finding]:
     """Whether the time between rows is that of the simulated transition."""
     if record.model is None or seconds is None or record.step is None:
         return []
     ratio = seconds / record.step
-    if abs(ratio - 1) <= 1e-3 or (abs(ratio - 1) <= 0.02 and record.tolerance == np.inf):
+    if abs(ratio - 1) <= tolerance:
         return []
     steps = seconds / float(record.model.opt.timestep)
     evidence = {"stamps": seconds, "simulated": record.step, "ratio": ratio}
@@ -67,5 +69,4 @@ def _step(record: Record, seconds: float | None) -> list[Finding]:
     what = f"rows are {seconds:.6g} s apart by their stamps, and frame_skip {record.frame_skip} makes {record.step:g} s"
     if round(steps) >= 1 and abs(steps - round(steps)) < 0.02 * steps:
         return [Finding("frame_skip", (), what, "sure", evidence=evidence, cure={"frame_skip": round(steps)})]
-    cure = {"data": {"preprocess": {"dt": record.step}}}
-    return [Finding("frame_skip", (), what, "sure", evidence=evidence, cure=cure)]
+    return [Finding("frame_skip", (), what, "sure", evidence=evidence, cure=resampled(record))]
