@@ -123,16 +123,17 @@ def _chirps(data: Path, folder: Path) -> Iterator[Named]:
             continue
         arrays = torch.load(log, weights_only=False)
         kp, kd = np.asarray(arrays["kp"]), np.asarray(arrays["kd"])
-        names = _bare(model.read_text(), folder / f"{robot}.xml", kp, kd)
-        q, dq, target = (np.asarray(arrays[k])[:, : len(names)] for k in ("dof_pos", "dof_vel", "des_dof_pos"))
+        count = 12 if robot == "go2" else 6  # the gripper's velocity was not measured
+        _bare(model.read_text(), folder / f"{robot}.xml", kp[:count], kd[:count])
+        q, dq, target = (np.asarray(arrays[k])[:, :count] for k in ("dof_pos", "dof_vel", "des_dof_pos"))
         ends = np.arange(len(q)) == len(q) - 1
         np.savez(folder / f"{robot}.npz", observations=np.hstack([q, dq]), actions=target, terminals=ends)
-        source = {"path": f"{robot}.npz", "dt": 0.005}
-        yield f"chirps {robot}", {"model": f"{robot}.xml", "data": source}, folder
+        source, columns = {"path": f"{robot}.npz", "dt": 0.005}, [f"qpos[:{count}]", f"qvel[:{count}]"]
+        yield f"chirps {robot}", {"model": f"{robot}.xml", "data": source, "observation": columns}, folder
 
 
-def _bare(xml: str, path: Path, kp: np.ndarray, kd: np.ndarray) -> list[str]:
-    """Write a robot's model without meshes, on a fixed base, with servos; return its joints."""
+def _bare(xml: str, path: Path, kp: np.ndarray, kd: np.ndarray) -> None:
+    """Write a robot's model without meshes, on a fixed base, with servos at its first joints."""
     import mujoco
 
     for tag in ("mesh", "material", "texture"):
@@ -149,7 +150,6 @@ def _bare(xml: str, path: Path, kp: np.ndarray, kd: np.ndarray) -> list[str]:
     )
     text = spec.to_xml().replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>")
     path.write_text(text)
-    return names
 
 
 def _panda(data: Path, folder: Path) -> Iterator[Named]:

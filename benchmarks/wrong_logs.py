@@ -1,4 +1,4 @@
-"""Score `dropo check`: wrong logs made of good ones, whether it tells what is wrong with them, and what it says of good ones.
+"""Score `dropo check`: whether it tells what is wrong with wrong logs, and leaves good ones in peace.
 
 python benchmarks/wrong_logs.py --seed 11                    # 40 wrong logs of ten kinds, 30 good ones
 python benchmarks/wrong_logs.py --seed 11 --out out/wrong    # and the table as JSON
@@ -32,7 +32,7 @@ from benchmarks.hidden.systems import DT, SYSTEMS, load
 from benchmarks.hidden.truths import make_recording, measured
 from dropo_torch.config import make_config
 from dropo_torch.data.examination import Finding
-from dropo_torch.problem import read_log
+from dropo_torch.logged import read_log
 
 #: A box with three thrusters, thrown: every column of a free joint, and a quaternion that turns about all axes.
 THROWN = """
@@ -245,7 +245,9 @@ def _sign(log: Log, rng: np.random.Generator) -> Log:
 
 
 def _swapped(log: Log, rng: np.random.Generator) -> Log:
-    first, second = rng.choice(hinges(log, True) if len(hinges(log, True)) > 1 else scalars(log, True), 2, replace=False)
+    first, second = rng.choice(
+        hinges(log, True) if len(hinges(log, True)) > 1 else scalars(log, True), 2, replace=False
+    )
 
     def change(values: np.ndarray) -> np.ndarray:
         values[:, [first, second]] = values[:, [second, first]]

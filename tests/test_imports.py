@@ -90,6 +90,7 @@ LAYERS = (
     "optimizers",
     "certify", "fit",
     "config",
+    "logged",
     "effects",
     "problem",
     "diagnostics", "baselines", "gap", "rl",

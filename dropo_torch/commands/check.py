@@ -20,7 +20,7 @@ from dropo_torch.support.files import write_json
 
 if TYPE_CHECKING:
     from dropo_torch.data.examination import Finding
-    from dropo_torch.problem import LoggedData
+    from dropo_torch.logged import LoggedData
 
 SCHEMA = "dropo-torch/check/1"
 
@@ -41,8 +41,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     Raises:
         InputError: something is surely wrong with the log; the files are written all the same.
     """
-    from dropo_torch.problem import read_log
-    from dropo_torch.report.check import verdict
+    from dropo_torch.data.examination.finding import verdict
+    from dropo_torch.logged import read_log
 
     config = load_config(given.config, overrides)
     logged = read_log(config, uneven=True)
@@ -88,7 +88,9 @@ def refuse(findings: Sequence[Finding], hint: str = "") -> None:
 def told(finding: Finding) -> str:
     """Return a finding in one line, with what cures it."""
     cure = finding.cure_line or finding.advice
-    return f"{finding.name}: {finding.what}" + (f"; cured by {cure}" if finding.cure_line else f"; {cure}" if cure else "")
+    return f"{finding.name}: {finding.what}" + (
+        f"; cured by {cure}" if finding.cure_line else f"; {cure}" if cure else ""
+    )
 
 
 def _table(findings: Sequence[Finding]) -> Table:

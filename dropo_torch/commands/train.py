@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo train``, which writes ``policy.pt``, ``train.json`` and ``report.html``."""
-    from dropo_torch.problem import read_log
+    from dropo_torch.logged import read_log
     from dropo_torch.rl.problem import make_training
     from dropo_torch.rl.train import check_training, train
 

@@ -95,7 +95,8 @@ def _unwrapped(
     values = np.array(recording.observations)
     bounds = np.flatnonzero(np.diff(recording.episodes)) + 1
     for part in np.split(np.arange(len(values)), bounds):
-        values[np.ix_(part, columns)] = _continuous(values[np.ix_(part, columns)])
+        for column in columns:
+            values[part, column] = _continuous(values[part, column])
     if following is not None:
         following = np.array(following)
         turns = np.round((values[:, columns] - following[:, columns]) / TURN)
@@ -103,19 +104,15 @@ def _unwrapped(
     return replace(recording, observations=values), following
 
 
-def _continuous(angles: np.ndarray) -> np.ndarray:
-    """Angles ``(N, k)`` without jumps by a turn, the first within half a turn of 0; NaN, which is no sample, stays."""
-    angles = np.array(angles)
-    for column in angles.T:
-        present = ~np.isnan(column)
-        unwrapped = np.unwrap(column[present])
-        column[present] = unwrapped - TURN * np.round(unwrapped[:1] / TURN)
-    return angles
+def _continuous(angle: np.ndarray) -> np.ndarray:
+    """An angle ``(N,)`` without jumps by a turn, the first within half a turn of 0; NaN, which is no sample, stays."""
+    angle, present = np.array(angle), ~np.isnan(angle)
+    unwrapped = np.unwrap(angle[present])
+    angle[present] = unwrapped - TURN * np.round(unwrapped[:1] / TURN)
+    return angle
 
 
-def _shifted(
-    recording: Recording, following: np.ndarray | None, shift: int
-) -> tuple[Recording, np.ndarray | None]:
+def _shifted(recording: Recording, following: np.ndarray | None, shift: int) -> tuple[Recording, np.ndarray | None]:
     """The recording with the commands of other rows; rows without one are left out."""
     if not shift:
         return recording, following

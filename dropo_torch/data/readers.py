@@ -308,7 +308,19 @@ def _are_dates(stamps: np.ndarray) -> bool:
 
 
 def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
-    for name in ("next_observations", "time", "episode", "terminals", "group", "separator", "preprocess", "scale", "unwrap", "shift", "breaks"):
+    for name in (
+        "next_observations",
+        "time",
+        "episode",
+        "terminals",
+        "group",
+        "separator",
+        "preprocess",
+        "scale",
+        "unwrap",
+        "shift",
+        "breaks",
+    ):
         if getattr(options, name):
             source = f"{PREFIX}{dataset}" if isinstance(dataset, str) else dataset
             raise InputError(

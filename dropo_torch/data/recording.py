@@ -80,7 +80,9 @@ class Recording:
     def split(self) -> tuple[Recording, ...]:
         """Return each episode as a recording of its own."""
         bounds = np.flatnonzero(np.diff(self.episodes)) + 1
-        names = [name for name in ("observations", "actions", "time", "episodes", "rows") if getattr(self, name) is not None]
+        names = [
+            name for name in ("observations", "actions", "time", "episodes", "rows") if getattr(self, name) is not None
+        ]
         parts = zip(*(np.split(getattr(self, name), bounds) for name in names), strict=True)
         return tuple(replace(self, **dict(zip(names, part, strict=True))) for part in parts)
 

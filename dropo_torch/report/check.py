@@ -6,22 +6,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dropo_torch.data.examination import Finding
-from dropo_torch.data.examination.finding import MOST_ROWS
-from dropo_torch.report.formatting import whole
+from dropo_torch.data.examination.finding import MOST_ROWS, verdict
 from dropo_torch.report.page import Config, Versions, write_page
-
-
-def verdict(findings: Sequence[Finding]) -> str:
-    """Return in a sentence what an examination found."""
-    sure = sum(finding.sure for finding in findings)
-    doubtful = len(findings) - sure
-    if not findings:
-        return "Nothing is wrong with the log."
-    if not sure:
-        return f"Nothing is surely wrong with the log; {whole(doubtful, 'thing')} to look at."
-    return f"{whole(sure, 'thing')} {'is' if sure == 1 else 'are'} wrong with the log" + (
-        f", and {doubtful} more to look at." if doubtful else "."
-    )
 
 
 def write_check_report(

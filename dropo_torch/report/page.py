@@ -16,7 +16,6 @@ import numpy as np
 import yaml
 from markupsafe import Markup
 
-from dropo_torch.report.figures import to_svg
 from dropo_torch.report.formatting import FILTERS
 from dropo_torch.support.files import write_atomically
 
@@ -63,6 +62,8 @@ def config_yaml(config: Config) -> str:
 
 
 def _svg(figure: Any, grow: bool = True) -> Markup:
+    from dropo_torch.report.figures import to_svg  # heavy, and not every page has a figure
+
     return Markup(to_svg(figure, grow=grow))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence, first_rows
 from dropo_torch.data.examination.prediction import skills
-from dropo_torch.data.examination.record import Coordinate, Record
+from dropo_torch.data.examination.record import Coordinate, Pair, Record
 from dropo_torch.data.examination.rules import Rules
 
 DEGREE = float(np.pi / 180)
@@ -18,8 +18,6 @@ def stuck(record: Record, rules: Rules) -> list[Finding]:
     found = []
     step = record.step or 1.0
     for c in record.pairs:
-        assert c.position is not None
-        assert c.velocity is not None
         position, speed = record.before[:, c.position], record.before[:, c.velocity]
         moved, told = float(np.ptp(position)), float(np.abs(speed).max() * step)
         if np.ptp(speed) == 0 and moved > 0 and np.median(np.abs(record.steps[:, c.position])) > 0:
@@ -31,9 +29,8 @@ def stuck(record: Record, rules: Rules) -> list[Finding]:
     return found + _repeated(record, step, rules)
 
 
-def _constant(record: Record, c: Coordinate, column: int, moved: float) -> Finding:
+def _constant(record: Record, c: Pair, column: int, moved: float) -> Finding:
     other = c.position if column == c.velocity else c.velocity
-    assert other is not None
     what = f"{record.named([column])} is constant while {record.named([other])} changes: it was not measured"
     advice = "" if column == c.position else (
         "leave the velocities out and let them be derived: data: {observations: [the positions], preprocess: {dt: "
@@ -42,10 +39,8 @@ def _constant(record: Record, c: Coordinate, column: int, moved: float) -> Findi
     return Finding("frozen", (record.label(column),), what, "sure", evidence={"moved": moved}, advice=advice)
 
 
-def _frozen(record: Record, c: Coordinate, step: float, rules: Rules) -> list[Finding]:
+def _frozen(record: Record, c: Pair, step: float, rules: Rules) -> list[Finding]:
     """A stretch in which a position stands still although its velocity is not zero."""
-    assert c.position is not None
-    assert c.velocity is not None
     still = (record.steps[:, c.position] == 0) & ~record.cut
     travel = 0.5 * step * (record.before[:, c.velocity] + record.after[:, c.velocity])
     spread = float(np.ptp(record.before[:, c.position]))
@@ -80,8 +75,6 @@ def _repeated(record: Record, step: float, rules: Rules) -> list[Finding]:
     found = []
     held: list[np.ndarray] = []
     for c in record.pairs:
-        assert c.position is not None
-        assert c.velocity is not None
         size = np.abs(record.steps[:, c.position])
         moving = size > 0
         if moving.sum() < 20:
@@ -111,11 +104,9 @@ def _repeated(record: Record, step: float, rules: Rules) -> list[Finding]:
 def quantised(record: Record, rules: Rules) -> list[Finding]:
     """Return positions whose resolution is as coarse as their motion."""
     columns, quanta = [], []
-    for c in record.coordinates:
-        if c.position is None:
-            continue
-        values = np.unique(record.before[:, c.position])
-        size = np.abs(record.steps[:, c.position])
+    for _, column in record.positions:
+        values = np.unique(record.before[:, column])
+        size = np.abs(record.steps[:, column])
         if len(values) < 3 or len(values) > len(size) / 4:
             continue
         gaps = np.diff(values)
@@ -123,13 +114,12 @@ def quantised(record: Record, rules: Rules) -> list[Finding]:
         whole = np.abs(gaps / quantum - np.round(gaps / quantum)) < 0.02
         typical = float(np.median(size[size > 0])) if (size > 0).any() else 0.0
         if whole.mean() > 0.95 and quantum >= rules.quantum * typical > 0:
-            columns.append(c.position)
+            columns.append(column)
             quanta.append(quantum)
     if not columns:
         return []
-    what = (
-        f"{record.named(columns)}: a row's motion is as small as the resolution, "
-        + ", ".join(f"{q:.3g}" for q in quanta)
+    what = f"{record.named(columns)}: a row's motion is as small as the resolution, " + ", ".join(
+        f"{q:.3g}" for q in quanta
     )
     return [Finding(
         "quantised", tuple(record.label(c) for c in columns), what, "doubtful",
@@ -141,20 +131,21 @@ def quantised(record: Record, rules: Rules) -> list[Finding]:
 
 def units(record: Record, rules: Rules) -> list[Finding]:
     """Return joints whose positions and velocities together are in another unit than the model's."""
-    angles = [c for c in record.coordinates if c.angle and c.position is not None]
+    angles = [c for c, _ in record.positions if c.angle]
+    places = [column for c, column in record.positions if c.angle]
     if not angles:
         return []
     outside = [c for c in angles if c.limits is not None and _outside(record, c) > rules.out_of_range]
-    reach = max(float(np.abs(record.before[:, c.position]).max()) for c in angles) / (2 * np.pi)
+    reach = float(np.abs(record.before[:, places]).max()) / (2 * np.pi)
     if not outside and reach < rules.turns:
         return []
     fits = [c for c in outside if _outside(record, c, DEGREE) < 0.05]
     columns = [i for c in angles for i in (c.position, c.velocity) if i is not None]
-    as_is, degrees = skills(record, {i: DEGREE for i in columns})
+    as_is, degrees = skills(record, dict.fromkeys(columns, DEGREE))
     evidence = {"turns": reach, "outside": float(len(outside)), "skill": as_is, "skill_in_degrees": degrees}
     decided = degrees - as_is > rules.skill
     scale = {record.signal(i): DEGREE for i in columns}
-    if len(fits) > 0 and len(fits) == len(outside) or decided or reach > rules.many_turns:
+    if (len(fits) > 0 and len(fits) == len(outside)) or decided or reach > rules.many_turns:
         named = [c.position for c in (outside or angles) if c.position is not None]
         sure = decided or (len(fits) > 0 and len(fits) == len(outside) and as_is < rules.skill)
         what = f"{record.named(named)} reach {reach:.3g} turns if they are radians: the angles are in degrees"
@@ -170,20 +161,20 @@ def units(record: Record, rules: Rules) -> list[Finding]:
 def ranges(record: Record, rules: Rules) -> list[Finding]:
     """Return joints whose positions lie far outside their ranges."""
     found = []
-    for c in record.coordinates:
-        if c.position is None or c.limits is None:
+    for c, column in record.positions:
+        if c.limits is None:
             continue
         share = _outside(record, c)
         if share > rules.out_of_range:
-            low, high = (float(f(record.before[:, c.position])) for f in (np.min, np.max))
+            low, high = (float(f(record.before[:, column])) for f in (np.min, np.max))
             what = (
-                f"{record.named([c.position])} goes from {low:.3g} to {high:.3g}, and the joint's range is "
+                f"{record.named([column])} goes from {low:.3g} to {high:.3g}, and the joint's range is "
                 f"{c.limits[0]:.3g} to {c.limits[1]:.3g}: another unit, zero, sign or joint"
             )
             far = low > c.limits[1] + _width(c) or high < c.limits[0] - _width(c)
             found.append(Finding(
-                "range", (record.label(c.position),), what, confidence(far), evidence={"share": share},
-                advice=f"data: {{scale: {{{record.signal(c.position)}: FACTOR}}}}, an offset, or observation",
+                "range", (record.label(column),), what, confidence(far), evidence={"share": share},
+                advice=f"data: {{scale: {{{record.signal(column)}: FACTOR}}}}, an offset, or observation",
             ))  # fmt: skip
     return found
 
@@ -223,10 +214,10 @@ def commanded_range(record: Record, rules: Rules) -> list[Finding]:
 def _beyond(record: Record, columns: np.ndarray, share: np.ndarray, reach: np.ndarray, sure: bool) -> Finding:
     """The finding of commands beyond their ranges."""
     names = [record.command(int(j)) for j in columns]
+    shares = ", ".join(f"{n} in {s:.0%} of the rows" for n, s in zip(names, share, strict=True))
     what = (
-        f"commands lie beyond their actuators' ctrlrange, where the simulation cuts them off: "
-        f"{', '.join(f'{n} in {s:.0%} of the rows' for n, s in zip(names, share, strict=True))}, up to {reach.max():.3g} "
-        "times as far"
+        "commands lie beyond their actuators' ctrlrange, where the simulation cuts them off: "
+        f"{shares}, up to {reach.max():.3g} times as far"
     )
     typical = 1 / float(reach.max())
     unit = min((DEGREE, 1e-3, 1e-2), key=lambda f: abs(np.log(f / typical)))

@@ -316,14 +316,20 @@ def _units(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
     model = record.model
     assert model is not None
     for j, (gain, error, share) in enumerate(zip(plain.gains, plain.errors, plain.shares, strict=True)):
-        if gain < rules.sure_significance * error or share < rules.command_share or abs(np.log(gain)) < np.log(rules.gain):
+        if (
+            gain < rules.sure_significance * error
+            or share < rules.command_share
+            or abs(np.log(gain)) < np.log(rules.gain)
+        ):
             continue
         degrees = abs(np.log(gain / DEGREE)) < 0.3
         joint = model.actuator_trntype[j] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_biasprm[j, 1] != 0
         factor = DEGREE if degrees and joint else float(f"{gain:.3g}")
         what = f"{record.command(j)} acts {gain:.3g} times as strongly as the model says: it is in another unit"
         if degrees and joint:
-            what = f"the target {record.command(j)} acts {gain:.3g} times as strongly as the model says: it is in degrees"
+            what = (
+                f"the target {record.command(j)} acts {gain:.3g} times as strongly as the model says: it is in degrees"
+            )
         found.append(Finding(
             "action_unit", (record.command(j),), what, confidence(bool(degrees and joint)),
             evidence={"gain": float(gain), "error": float(error), "share": float(share)},
@@ -364,4 +370,3 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
     )
     advice = "leave a true delay to the model: dropo gap names it (actuator_delay, actuator_lag)"
     return [Finding("action_shift", names, what, "doubtful", evidence=evidence, cure=cure, advice=advice)]
-

@@ -79,15 +79,13 @@ def _jumps(record: Record, rules: Rules) -> np.ndarray:
     """How far the step of each row and position column is beyond what its neighbours allow, ``(T, n)``; 1 is a jump."""
     size = np.abs(record.steps)
     excess = np.zeros_like(size)
-    for c in record.coordinates:
-        if c.position is None or len(size) < 5:
-            continue
-        own, spread = size[:, c.position], float(np.ptp(record.before[:, c.position]))
+    for c, column in record.positions if len(size) >= 5 else ():
+        own, spread = size[:, column], float(np.ptp(record.before[:, column]))
         if not own.any():
             continue
         beside = np.max([np.roll(own, s) for s in (-2, -1, 1, 2)], axis=0)
         usual = rules.jump * (beside + float(np.median(own[own > 0]))) + 0.03 * spread
-        excess[:, c.position] = np.where(_released(record, c, own), 0.0, own / usual)
+        excess[:, column] = np.where(_released(record, c, own), 0.0, own / usual)
     return excess
 
 
@@ -102,13 +100,11 @@ def _released(record: Record, c: Coordinate, size: np.ndarray) -> np.ndarray:
 def _turned(record: Record, jumps: np.ndarray, rules: Rules) -> tuple[Record, list[Finding]]:
     """Angles that jump by a turn while nothing else jumps."""
     turns = np.zeros_like(jumps)
-    columns = [c for c in record.coordinates if c.angle and c.position is not None]
-    for c in columns:
-        assert c.position is not None
-        step, column = record.steps[:, c.position], record.before[:, c.position]
+    for column in [column for c, column in record.positions if c.angle]:
+        step, angle = record.steps[:, column], record.before[:, column]
         whole = np.round(step / TURN)
         near = (np.abs(step - TURN * whole) < rules.turn_tolerance * TURN) & (np.abs(whole) == 1)
-        turns[:, c.position] = np.where(near & (np.ptp(column) < TURN * (1 + 1e-3)), whole, 0.0)
+        turns[:, column] = np.where(near & (np.ptp(angle) < TURN * (1 + 1e-3)), whole, 0.0)
     others = (np.where(turns != 0, 0.0, jumps) > 1).any(axis=1)
     turns[others] = 0.0  # what jumps together with something else is another episode
     wrapped = np.flatnonzero(np.any(turns != 0, axis=0))
@@ -143,9 +139,7 @@ def _joined(record: Record, jumps: np.ndarray, rules: Rules) -> tuple[Record, li
     return record, [_breaks(record, rows, rows, sure, f"{record.named(columns)} jumps", float(free.max()))]
 
 
-def _breaks(
-    record: Record, rows: np.ndarray, at: np.ndarray, sure: bool, words: str, excess: float = 1.0
-) -> Finding:
+def _breaks(record: Record, rows: np.ndarray, at: np.ndarray, sure: bool, words: str, excess: float = 1.0) -> Finding:
     """The finding of episodes that were joined before some rows of the file."""
     begins = [record.file_row(int(r)) + (0 if at is not rows else 1) for r in at]
     what = (

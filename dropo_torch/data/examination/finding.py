@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+import numpy as np
 import yaml
 
 Confidence = Literal["sure", "doubtful"]
@@ -57,12 +58,25 @@ class Finding:
         }  # fmt: skip
 
 
+def verdict(findings: Sequence[Finding]) -> str:
+    """Return in a sentence what an examination found."""
+    sure = sum(finding.sure for finding in findings)
+    doubtful = len(findings) - sure
+    more = f"{doubtful} {'thing' if doubtful == 1 else 'things'} to look at"
+    if not findings:
+        return "Nothing is wrong with the log."
+    if not sure:
+        return f"Nothing is surely wrong with the log; {more}."
+    wrong = "one thing is" if sure == 1 else f"{sure} things are"
+    return f"{wrong[0].upper()}{wrong[1:]} wrong with the log" + (f"; {more}." if doubtful else ".")
+
+
 def confidence(sure: bool) -> Confidence:
     """Return the word for how sure a finding is."""
     return "sure" if sure else "doubtful"
 
 
-def first_rows(rows: Sequence[int]) -> tuple[int, ...]:
+def first_rows(rows: Sequence[int] | np.ndarray) -> tuple[int, ...]:
     """Return the first of many rows."""
     return tuple(int(row) for row in rows[:MOST_ROWS])
 

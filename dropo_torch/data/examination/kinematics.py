@@ -6,10 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from dropo_torch.data.examination.finding import Finding, confidence
-from dropo_torch.data.examination.record import Coordinate, Record, entry, resampled, windows
+from dropo_torch.data.examination.record import Pair, Record, entry, resampled, windows
 from dropo_torch.data.examination.rules import Rules
 
 #: Rows over which changes are summed: noise drowns the change of one row, never that of many.
@@ -45,8 +44,10 @@ def velocities(record: Record, rules: Rules) -> list[Finding]:
     found += _slopes(record, clear, own, rules)
     odd = [c for c in pairs if own[c].share <= 0.3 and c not in exchanged and _smooth(record, c)]
     if odd and not found:
-        columns = [i for c in odd for i in (c.position, c.velocity) if i is not None]
-        what = f"the velocities of {', '.join(c.name for c in odd)} do not follow from the positions: {_worst(odd, own)}"
+        columns = [i for c in odd for i in (c.position, c.velocity)]
+        what = (
+            f"the velocities of {', '.join(c.name for c in odd)} do not follow from the positions: {_worst(odd, own)}"
+        )
         found.append(Finding(
             "velocity", tuple(record.label(i) for i in columns), what, "doubtful",
             evidence={c.name: own[c].share for c in odd},
@@ -55,10 +56,8 @@ def velocities(record: Record, rules: Rules) -> list[Finding]:
     return found + _delays(record, clear, rules)
 
 
-def likeness(record: Record, position: int | None, velocity: int | None) -> Likeness:
+def likeness(record: Record, position: int, velocity: int) -> Likeness:
     """Return how well a column is another one's derivative, over the number of rows where it is best."""
-    assert position is not None
-    assert velocity is not None
     change = record.steps[:, position]
     mean = 0.5 * (record.before[:, velocity] + record.after[:, velocity])
     best = Likeness(0.0, 0.0, 1)
@@ -86,13 +85,11 @@ def _fit(change: np.ndarray, mean: np.ndarray) -> tuple[float, float]:
     return float((x @ y) ** 2 / (whole * part)), float((x @ y) / part)
 
 
-def _moves(record: Record, c: Coordinate) -> bool:
-    assert c.position is not None
-    assert c.velocity is not None
+def _moves(record: Record, c: Pair) -> bool:
     return bool(np.ptp(record.before[:, c.position]) > 0 and np.ptp(record.before[:, c.velocity]) > 0)
 
 
-def _smooth(record: Record, c: Coordinate) -> bool:
+def _smooth(record: Record, c: Pair) -> bool:
     """Whether a position moves by more than it scatters, and long enough to say so."""
     sums, start = windows(record, record.steps[:, [c.position]], 8)
     if len(start) < 20:
@@ -101,18 +98,18 @@ def _smooth(record: Record, c: Coordinate) -> bool:
     return bool(sums.std() > 4 * single.std())  # eight independent steps would make 2.8 of one
 
 
-def _worst(pairs: Sequence[Coordinate], own: dict[Coordinate, Likeness]) -> str:
+def _worst(pairs: Sequence[Pair], own: dict[Pair, Likeness]) -> str:
     return ", ".join(f"r² = {own[c].share:.2f}" for c in pairs)
 
 
 def _order(
-    record: Record, pairs: Sequence[Coordinate], own: dict[Coordinate, Likeness], rules: Rules
-) -> tuple[list[Finding], set[Coordinate]]:
+    record: Record, pairs: Sequence[Pair], own: dict[Pair, Likeness], rules: Rules
+) -> tuple[list[Finding], set[Pair]]:
     """Columns that stand in each other's place: others are their derivatives, and these are not."""
     wrong = [c for c in pairs if own[c].share < rules.unlike or own[c].slope < 0]
     weak = [c for c in pairs if c not in wrong and own[c].share < 0.99]
-    for group in (wrong, [*wrong, *weak], list(pairs)):
-        if len(group) < 1:
+    for group in (wrong, [*wrong, *weak]):
+        if not group:
             continue
         columns = _matched(record, group, own, rules)
         if columns is not None:
@@ -121,22 +118,22 @@ def _order(
 
 
 def _matched(
-    record: Record, group: Sequence[Coordinate], own: dict[Coordinate, Likeness], rules: Rules
-) -> list[tuple[Coordinate, int, int]] | None:
+    record: Record, group: Sequence[Pair], own: dict[Pair, Likeness], rules: Rules
+) -> list[tuple[Pair, int, int]] | None:
     """A position and a velocity column for each coordinate of a group, from among all of theirs, that fit far better."""
-    pool = [i for c in group for i in (c.position, c.velocity) if i is not None]
+    pool = [i for c in group for i in (c.position, c.velocity)]
     table = np.zeros((len(pool), len(pool)))
     slopes = np.zeros_like(table)
-    for a, first in enumerate(pool):
-        for b, second in enumerate(pool):
-            if a != b:
-                found = likeness(record, first, second)
-                slopes[a, b], table[a, b] = found.slope, found.share if found.slope > 0 else 0.0
+    for a, b in zip(*np.nonzero(_alike(record, pool) > 0.5), strict=True):
+        found = likeness(record, pool[a], pool[b])
+        slopes[a, b], table[a, b] = found.slope, found.share if found.slope > 0 else 0.0
     chosen = _pairing(table, pool, group)
     if chosen is None:
         return None
     step = record.step or 1.0
-    moved = [(c, a, b) for c, (a, b) in zip(group, chosen, strict=True) if (pool[a], pool[b]) != (c.position, c.velocity)]
+    moved = [
+        (c, a, b) for c, (a, b) in zip(group, chosen, strict=True) if (pool[a], pool[b]) != (c.position, c.velocity)
+    ]
     if not moved:
         return None
     for c, a, b in moved:
@@ -148,11 +145,29 @@ def _matched(
     return [(c, pool[a], pool[b]) for c, a, b in moved]
 
 
-def _pairing(table: np.ndarray, pool: Sequence[int], group: Sequence[Coordinate]) -> list[tuple[int, int]] | None:
+def _alike(record: Record, pool: Sequence[int]) -> np.ndarray:
+    """The largest r² of each column's changes on each other column's means, outliers among them, ``(p, p)``."""
+    columns = list(pool)
+    changes, means = record.steps[:, columns], 0.5 * (record.before[:, columns] + record.after[:, columns])
+    best = np.zeros((len(columns), len(columns)))
+    for length in LENGTHS:
+        sums, _ = windows(record, np.concatenate([changes, means], axis=1), length)
+        if len(sums) < 20:
+            break
+        change, mean = sums[:, : len(columns)], sums[:, len(columns) :]
+        sizes = np.outer((change**2).sum(axis=0), (mean**2).sum(axis=0))
+        best = np.maximum(best, np.divide((change.T @ mean) ** 2, sizes, out=np.zeros_like(best), where=sizes > 0))
+    np.fill_diagonal(best, 0.0)
+    return best
+
+
+def _pairing(table: np.ndarray, pool: Sequence[int], group: Sequence[Pair]) -> list[tuple[int, int]] | None:
     """Which columns of a pool are positions and which their velocities, in the order of the positions."""
+    from scipy.optimize import linear_sum_assignment  # heavy, and most logs need none
+
     index = {column: i for i, column in enumerate(pool)}
-    positions = [index[c.position] for c in group if c.position is not None]
-    others = [index[c.velocity] for c in group if c.velocity is not None]
+    positions = [index[c.position] for c in group]
+    others = [index[c.velocity] for c in group]
     rows, columns = linear_sum_assignment(-table[np.ix_(positions, others)])
     best = [(positions[r], others[c]) for r, c in zip(rows, columns, strict=True)]
     if all(table[a, b] > 0.9 for a, b in best):
@@ -166,9 +181,7 @@ def _pairing(table: np.ndarray, pool: Sequence[int], group: Sequence[Coordinate]
     return sorted(found, key=lambda pair: pool[pair[0]]) if len(found) == len(group) else None
 
 
-def _exchanged(
-    record: Record, columns: Sequence[tuple[Coordinate, int, int]]
-) -> tuple[list[Finding], set[Coordinate]]:
+def _exchanged(record: Record, columns: Sequence[tuple[Pair, int, int]]) -> tuple[list[Finding], set[Pair]]:
     own = dict(enumerate(record.observation.columns))
     nq = 0 if record.model is None else record.model.nq
     wanted = dict(own)
@@ -192,9 +205,7 @@ def _exchanged(
     return [finding], {c for c, _, _ in columns}
 
 
-def _slopes(
-    record: Record, pairs: Sequence[Coordinate], own: dict[Coordinate, Likeness], rules: Rules
-) -> list[Finding]:
+def _slopes(record: Record, pairs: Sequence[Pair], own: dict[Pair, Likeness], rules: Rules) -> list[Finding]:
     """Signs, units and the time step, from the seconds by which velocities explain the changes of positions."""
     if not pairs:
         return []
@@ -218,8 +229,8 @@ def _slopes(
     return found
 
 
-def _sign(record: Record, pairs: Sequence[Coordinate], ratio: dict[Coordinate, float]) -> Finding:
-    columns = [c.velocity for c in pairs if c.velocity is not None]
+def _sign(record: Record, pairs: Sequence[Pair], ratio: dict[Pair, float]) -> Finding:
+    columns = [c.velocity for c in pairs]
     what = f"{record.named(columns)} has the opposite sign of the position's changes"
     return Finding(
         "sign", tuple(record.label(i) for i in columns), what, "sure", evidence={c.name: ratio[c] for c in pairs},
@@ -228,7 +239,7 @@ def _sign(record: Record, pairs: Sequence[Coordinate], ratio: dict[Coordinate, f
     )  # fmt: skip
 
 
-def _unit(c: Coordinate, ratio: float, rules: Rules) -> tuple[bool, float, str] | None:
+def _unit(c: Pair, ratio: float, rules: Rules) -> tuple[bool, float, str] | None:
     """Whether the position is the one in another unit, the factor to the model's, and the unit."""
     for factor, name in UNITS[c.angle].items():
         for of_position, expected in ((True, 1 / factor), (False, factor)):
@@ -237,13 +248,12 @@ def _unit(c: Coordinate, ratio: float, rules: Rules) -> tuple[bool, float, str] 
     return None
 
 
-def _units(record: Record, pairs: Sequence[Coordinate], size: dict[Coordinate, float], rules: Rules) -> Finding:
+def _units(record: Record, pairs: Sequence[Pair], size: dict[Pair, float], rules: Rules) -> Finding:
     scale, words, columns = {}, [], []
     for c in pairs:
         unit = _unit(c, size[c], rules)
         assert unit is not None
         column = c.position if unit[0] else c.velocity
-        assert column is not None
         scale[record.signal(column)] = unit[1]
         columns.append(column)
         words.append(f"{record.named([column])} is in {unit[2]}{'' if unit[0] else ' per second'}")
@@ -254,7 +264,7 @@ def _units(record: Record, pairs: Sequence[Coordinate], size: dict[Coordinate, f
     )  # fmt: skip
 
 
-def _time_step(record: Record, pairs: Sequence[Coordinate], ratio: float) -> list[Finding]:
+def _time_step(record: Record, pairs: Sequence[Pair], ratio: float) -> list[Finding]:
     """All columns agree on another time between rows than the simulated one."""
     steps = ratio * record.frame_skip
     stamped = record.log.dt is not None and record.step is not None and abs(record.log.dt / record.step - 1) < 0.02
@@ -274,9 +284,7 @@ def _time_step(record: Record, pairs: Sequence[Coordinate], ratio: float) -> lis
     )]  # fmt: skip
 
 
-def _scale(record: Record, c: Coordinate, ratio: float, rules: Rules) -> Finding:
-    assert c.position is not None
-    assert c.velocity is not None
+def _scale(record: Record, c: Pair, ratio: float, rules: Rules) -> Finding:
     what = (
         f"{record.named([c.position])} changes by {ratio:.4g} times what {record.named([c.velocity])} says: one of both is "
         "in another unit or has another gain"
@@ -289,9 +297,9 @@ def _scale(record: Record, c: Coordinate, ratio: float, rules: Rules) -> Finding
     )  # fmt: skip
 
 
-def _delays(record: Record, pairs: Sequence[Coordinate], rules: Rules) -> list[Finding]:
+def _delays(record: Record, pairs: Sequence[Pair], rules: Rules) -> list[Finding]:
     """Velocities that fit the changes of positions of other rows."""
-    late: dict[Coordinate, tuple[int, float]] = {}
+    late: dict[Pair, tuple[int, float]] = {}
     for c in pairs:
         misfit = _shifted_misfits(record, c)
         if misfit is None:
@@ -306,7 +314,7 @@ def _delays(record: Record, pairs: Sequence[Coordinate], rules: Rules) -> list[F
         return []
     sure = all(share < rules.sure_late for _, share in clear.values()) and len(clear) >= 0.5 * len(pairs)
     rows = round(float(np.median([s for s, _ in clear.values()])))
-    columns = [c.velocity for c in clear if c.velocity is not None]
+    columns = [c.velocity for c in clear]
     direction = "late" if rows > 0 else "early"
     what = (
         f"{record.named(columns)}: the velocity stands {abs(rows)} {'row' if abs(rows) == 1 else 'rows'} {direction} "
@@ -321,14 +329,12 @@ def _delays(record: Record, pairs: Sequence[Coordinate], rules: Rules) -> list[F
     )]  # fmt: skip
 
 
-def _shares(late: dict[Coordinate, tuple[int, float]]) -> str:
+def _shares(late: dict[Pair, tuple[int, float]]) -> str:
     return ", ".join(f"{share:.0%}" for _, share in late.values())
 
 
-def _shifted_misfits(record: Record, c: Coordinate) -> dict[int, float] | None:
+def _shifted_misfits(record: Record, c: Pair) -> dict[int, float] | None:
     """What velocities so many rows later leave unexplained of the changes of a position."""
-    assert c.position is not None
-    assert c.velocity is not None
     runs, count, reach = record.runs, len(record.log), 2
     if count < 40:
         return None

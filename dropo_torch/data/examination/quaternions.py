@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 
-import mujoco
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence, first_rows
@@ -110,11 +109,10 @@ def rotations(before: np.ndarray, after: np.ndarray, frame: str) -> np.ndarray:
     """Return the rotation vectors ``(T, 3)`` from quaternions ``(T, 4)`` to others, in the body's or the world's frame."""
     inverse = before * np.array([1.0, -1.0, -1.0, -1.0])
     between = product(inverse, after) if frame == "body" else product(after, inverse)
-    out = np.empty((len(between), 3))
-    for row, quaternion in zip(out, between, strict=True):
-        length = np.linalg.norm(quaternion)
-        mujoco.mju_quat2Vel(row, quaternion / length if length > 1e-9 else np.array([1.0, 0, 0, 0]), 1.0)
-    return out
+    between = between * np.where(between[:, :1] < 0, -1.0, 1.0)
+    size = np.linalg.norm(between[:, 1:], axis=1, keepdims=True)
+    angle = 2 * np.arctan2(size, between[:, :1])
+    return np.asarray(between[:, 1:] * np.divide(angle, size, out=np.full_like(size, 2.0), where=size > 1e-12))
 
 
 def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:

@@ -12,6 +12,9 @@ import numpy as np
 from dropo_torch.data.observation import Observation, joint_name
 from dropo_torch.data.trajectory import Trajectories, column_names
 
+#: Windows of a log over which sums are compared, about.
+MOST_WINDOWS = 3000
+
 
 @dataclass(frozen=True)
 class Coordinate:
@@ -32,6 +35,14 @@ class Coordinate:
     dof: int
     angle: bool
     limits: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class Pair(Coordinate):
+    """A coordinate of which both position and velocity are observed."""
+
+    position: int
+    velocity: int
 
 
 @dataclass(frozen=True)
@@ -111,9 +122,18 @@ class Record:
         return () if self.model is None else tuple(_coordinates(self.model, self.observation))
 
     @cached_property
-    def pairs(self) -> tuple[Coordinate, ...]:
+    def pairs(self) -> tuple[Pair, ...]:
         """Those of which both position and velocity are observed."""
-        return tuple(c for c in self.coordinates if c.position is not None and c.velocity is not None)
+        return tuple(
+            Pair(c.name, c.position, c.velocity, c.qpos, c.dof, c.angle, c.limits)
+            for c in self.coordinates
+            if c.position is not None and c.velocity is not None
+        )
+
+    @property
+    def positions(self) -> list[tuple[Coordinate, int]]:
+        """Those of which the position is observed, with its column."""
+        return [(c, c.position) for c in self.coordinates if c.position is not None]
 
     @cached_property
     def orientations(self) -> tuple[Orientation, ...]:
@@ -183,7 +203,7 @@ def windows(record: Record, values: np.ndarray, length: int) -> tuple[np.ndarray
     if count < 1:
         return values[:0], np.empty(0, dtype=int)
     runs = record.runs
-    start = np.arange(0, count, max(1, length // 2))
+    start = np.arange(0, count, max(1, length // 2, count // MOST_WINDOWS))
     spoiled = np.concatenate([[0], np.cumsum(record.cut)])
     start = start[(runs[start] == runs[start + length - 1]) & (spoiled[start + length] == spoiled[start])]
     if length == 1:
