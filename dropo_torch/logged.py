@@ -84,7 +84,7 @@ def read_log(config: Config, *, uneven: bool = False) -> LoggedData:
 
 
 def completed(config: Config) -> Config:
-    """The config with what its bundled simulation says of the keys that it leaves out.
+    """Return the config with what its bundled simulation says of the keys that it leaves out.
 
     An environment has a model and a step of its own, an adapter without a model names of its own, too.
     """
@@ -106,11 +106,16 @@ def completed(config: Config) -> Config:
 
 
 def is_registered(environment: str | None) -> bool:
-    """Whether the name is one of Gymnasium's ids, and no adapter."""
+    """Return whether a name is one of Gymnasium's ids, and no adapter."""
     return environment is not None and re.search(r"-v\d+$", environment) is not None
 
 
 def log_of(config: Config, model: mujoco.MjModel | None, tolerance: float = TOLERANCE) -> Trajectories:
+    """Return the part of a config's log that is used.
+
+    Raises:
+        InputError: no log, or one that cannot be read as the config says.
+    """
     source = config.data
     if source is None:
         raise InputError("config: no data given; expected the path of a log, such as data: log.npz")
@@ -128,7 +133,7 @@ def log_of(config: Config, model: mujoco.MjModel | None, tolerance: float = TOLE
 
 
 def frame_skip_of(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> int:
-    """``frame_skip`` as given, or as the log's time step says."""
+    """Return ``frame_skip`` as given, or as the log's time step says."""
     if config.frame_skip is not None:
         return config.frame_skip
     if config.backend == "gymnasium":

@@ -87,10 +87,8 @@ def refuse(findings: Sequence[Finding], hint: str = "") -> None:
 
 def told(finding: Finding) -> str:
     """Return a finding in one line, with what cures it."""
-    cure = finding.cure_line or finding.advice
-    return f"{finding.name}: {finding.what}" + (
-        f"; cured by {cure}" if finding.cure_line else f"; {cure}" if cure else ""
-    )
+    cure = f"cured by {finding.cure_line}" if finding.cure_line else finding.advice
+    return f"{finding.name}: {finding.what}" + (f"; {cure}" if cure else "")
 
 
 def _table(findings: Sequence[Finding]) -> Table:

@@ -275,8 +275,8 @@ def _exchanged(record: Record, effects: _Effects, plain: Explained, rules: Rules
     names = [record.command(j) for j in reading.order]
     first, second = (record.command(i) for i in pair)
     what = (
-        f"the accelerations follow if {first} and {second} are exchanged: {found.share:.0%} of what commands can explain, "
-        f"{plain.share:.0%} as they stand"
+        f"the accelerations follow if {first} and {second} are exchanged: {found.share:.0%} of what commands can "
+        f"explain, {plain.share:.0%} as they stand"
     )
     return [Finding(
         "action_order", (first, second), what, confidence(sure),
@@ -313,29 +313,28 @@ def _negated(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
 def _units(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
     """Commands whose effect is another one by far than the model's."""
     found = []
-    model = record.model
-    assert model is not None
     for j, (gain, error, share) in enumerate(zip(plain.gains, plain.errors, plain.shares, strict=True)):
-        if (
-            gain < rules.sure_significance * error
-            or share < rules.command_share
-            or abs(np.log(gain)) < np.log(rules.gain)
-        ):
+        clear = gain > rules.sure_significance * error and share > rules.command_share
+        if not clear or abs(np.log(gain)) < np.log(rules.gain):
             continue
-        degrees = abs(np.log(gain / DEGREE)) < 0.3
-        joint = model.actuator_trntype[j] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_biasprm[j, 1] != 0
-        factor = DEGREE if degrees and joint else float(f"{gain:.3g}")
-        what = f"{record.command(j)} acts {gain:.3g} times as strongly as the model says: it is in another unit"
-        if degrees and joint:
-            what = (
-                f"the target {record.command(j)} acts {gain:.3g} times as strongly as the model says: it is in degrees"
-            )
+        degrees = abs(np.log(gain / DEGREE)) < 0.3 and _is_servo(record, j)
+        unit = "in degrees" if degrees else "in another unit"
+        factor = DEGREE if degrees else float(f"{gain:.3g}")
+        what = f"{record.command(j)} acts {gain:.3g} times as strongly as the model says: it is {unit}"
         found.append(Finding(
-            "action_unit", (record.command(j),), what, confidence(bool(degrees and joint)),
+            "action_unit", (record.command(j),), what, confidence(degrees),
             evidence={"gain": float(gain), "error": float(error), "share": float(share)},
             cure={"data": {"scale": {record.command(j): factor}}},
         ))  # fmt: skip
     return found
+
+
+def _is_servo(record: Record, actuator: int) -> bool:
+    """Whether an actuator's command is the target of a joint."""
+    model = record.model
+    assert model is not None
+    joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    return bool(joint and model.actuator_biasprm[actuator, 1] != 0)
 
 
 def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> list[Finding]:
@@ -359,14 +358,14 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
     cure = {"data": {"shift": shift}}
     if shift > 0:
         what = (
-            f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands than "
-            "those that act, or the observations come late"
+            f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands "
+            "than those that act, or the observations come late"
         )
         sure = better > rules.sure_significance and left < rules.earlier
         return [Finding("action_shift", names, what, confidence(sure), evidence=evidence, cure=cure)]
     what = (
-        f"the accelerations of a row follow from the commands logged {rows} before: rows carry later commands than those "
-        "that act, or the actuators answer with a delay"
+        f"the accelerations of a row follow from the commands logged {rows} before: rows carry later commands than "
+        "those that act, or the actuators answer with a delay"
     )
     advice = "leave a true delay to the model: dropo gap names it (actuator_delay, actuator_lag)"
     return [Finding("action_shift", names, what, "doubtful", evidence=evidence, cure=cure, advice=advice)]

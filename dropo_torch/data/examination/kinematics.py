@@ -120,7 +120,7 @@ def _order(
 def _matched(
     record: Record, group: Sequence[Pair], own: dict[Pair, Likeness], rules: Rules
 ) -> list[tuple[Pair, int, int]] | None:
-    """A position and a velocity column for each coordinate of a group, from among all of theirs, that fit far better."""
+    """The position and velocity columns, among all of a group's, that fit each coordinate far better."""
     pool = [i for c in group for i in (c.position, c.velocity)]
     table = np.zeros((len(pool), len(pool)))
     slopes = np.zeros_like(table)
@@ -272,8 +272,8 @@ def _time_step(record: Record, pairs: Sequence[Pair], ratio: float) -> list[Find
     sure = (len(pairs) > 1 or not 0.6 < ratio < 1.6) and whole and not stamped
     seconds = ratio * (record.step or 1.0)
     what = (
-        f"positions change by {ratio:.3g} times what the velocities say in the {record.step or 0:g} s of a row: rows are "
-        f"{seconds:.4g} s apart"
+        f"positions change by {ratio:.3g} times what the velocities say in the {record.step or 0:g} s of a row: rows "
+        f"are {seconds:.4g} s apart"
     )
     if stamped:
         what += ", or, since the time stamps say otherwise, all velocities are in another unit"
@@ -286,8 +286,8 @@ def _time_step(record: Record, pairs: Sequence[Pair], ratio: float) -> list[Find
 
 def _scale(record: Record, c: Pair, ratio: float, rules: Rules) -> Finding:
     what = (
-        f"{record.named([c.position])} changes by {ratio:.4g} times what {record.named([c.velocity])} says: one of both is "
-        "in another unit or has another gain"
+        f"{record.named([c.position])} changes by {ratio:.4g} times what {record.named([c.velocity])} says: one of "
+        "both is in another unit or has another gain"
     )
     sure = not 1 / rules.sure_slope < ratio < rules.sure_slope
     return Finding(

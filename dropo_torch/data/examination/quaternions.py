@@ -37,8 +37,8 @@ def _lengths(record: Record, o: Orientation, rules: Rules) -> list[Finding]:
     empty = bool((length < 1e-6).any())
     sure = empty or float(np.median(off)) > rules.sure_norm
     what = (
-        f"the quaternion of {o.name} has lengths from {length.min():.3g} to {length.max():.3g} instead of 1, off by more "
-        f"than {rules.norm:.0%} in {len(rows)} rows"
+        f"the quaternion of {o.name} has lengths from {length.min():.3g} to {length.max():.3g} instead of 1, off by "
+        f"more than {rules.norm:.0%} in {len(rows)} rows"
     )
     advice = "these columns are no quaternion: see observation" if sure else "noise, or an average of several rows"
     return [Finding(
@@ -98,15 +98,15 @@ def _pose(record: Record, o: Orientation) -> list[Finding]:
     if near["xyzw"] > 0.5 or near["wxyz"] < 1.5:
         return []
     what = (
-        f"the quaternion of {o.name} begins {np.rad2deg(near['wxyz']):.0f}° from the model's pose, and read as x, y, z, w "
-        f"{np.rad2deg(near['xyzw']):.0f}° from it"
+        f"the quaternion of {o.name} begins {np.rad2deg(near['wxyz']):.0f}° from the model's pose, and read as "
+        f"x, y, z, w {np.rad2deg(near['xyzw']):.0f}° from it"
     )
     labels = tuple(record.label(i) for i in o.quaternion)
     return [Finding("quaternion_order", labels, what, "doubtful", evidence=near, cure=_reordered(record, o))]
 
 
 def rotations(before: np.ndarray, after: np.ndarray, frame: str) -> np.ndarray:
-    """Return the rotation vectors ``(T, 3)`` from quaternions ``(T, 4)`` to others, in the body's or the world's frame."""
+    """Return the rotation vectors ``(T, 3)`` between quaternions ``(T, 4)``, in the body's or the world's frame."""
     inverse = before * np.array([1.0, -1.0, -1.0, -1.0])
     between = product(inverse, after) if frame == "body" else product(after, inverse)
     between = between * np.where(between[:, :1] < 0, -1.0, 1.0)

@@ -191,14 +191,14 @@ def resampled(record: Record, **settings: object) -> dict[str, object]:
 
 
 def entry(label: str, place: int, nq: int) -> str:
-    """Return an entry of ``observation`` for a single state column: its joint's, or its number where a joint has more."""
+    """Return an entry of ``observation`` for one state column: its joint's, or its number where a joint has more."""
     if "[" not in label:
         return label
     return f"qpos[{place}]" if place < nq else f"qvel[{place - nq}]"
 
 
 def windows(record: Record, values: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return sums of ``length`` rows of ``values (T, k)`` that follow one another, ``(W, k)``, and first rows ``(W,)``."""
+    """Return sums over ``length`` rows of ``values (T, k)`` that follow one another, ``(W, k)``, and first rows."""
     count = len(values) - length + 1
     if count < 1:
         return values[:0], np.empty(0, dtype=int)

@@ -48,7 +48,7 @@ class Rules:
         turned_worse: how many times more the reading of the log must leave.
         significance: paired standard errors over blocks by which one reading of the commands beats another.
         sure_significance: the same, for what stops a run.
-        command_share: share of the remaining accelerations that commands must explain for their order or sign to be sure.
+        command_share: share of the accelerations that commands must explain for their order or sign to be sure.
         earlier: what commands one row on must leave of the misfit to be sure: no actuator answers before it is told.
         gain: factor of the commands' effect that is told: a wrong gain is for the search to find.
     """
