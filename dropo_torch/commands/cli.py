@@ -19,8 +19,8 @@ from dropo_torch.errors import InputError, choices
 
 #: Commands, each with its module and what it does.
 COMMANDS = {
-    "fit": ("fit", "fit the distribution to the log"),
     "check": ("check", "examine the log before anything is fitted to it"),
+    "fit": ("fit", "fit the distribution to the log"),
     "gap": ("gap", "find where simulation and log disagree, and name the physical effect that is missing"),
     "train": ("train", "train a policy over the distribution"),
     "sweep-epsilon": ("sweep", "fit at several ε and choose one by the elbow"),
