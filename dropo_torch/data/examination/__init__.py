@@ -52,8 +52,12 @@ def examine(
         tolerance: relative deviation of time stamps above which they are refused by the reader.
         rules: the thresholds.
     """
-    rules = rules or Rules()
-    record, found = continuous(Record.of(log, observation, model, frame_skip, tolerance), rules)
+    with np.errstate(all="ignore"):  # whatever a wrong log holds
+        return _examined(Record.of(log, observation, model, frame_skip, tolerance), rules or Rules())
+
+
+def _examined(record: Record, rules: Rules) -> tuple[Finding, ...]:
+    record, found = continuous(record, rules)
     for check in () if any(finding.name == "next_observations" for finding in found) else CHECKS:
         found += check(record, rules)
     for check in LATER_CHECKS:

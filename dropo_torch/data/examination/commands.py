@@ -21,6 +21,8 @@ from dropo_torch.data.examination.rules import Rules
 REACH = 2
 #: Positions and velocities that may explain accelerations besides commands, at most so many each.
 TERMS = 8
+#: Rows below which commands are not examined: they would be as few as what may explain them.
+LEAST_ROWS = 100
 #: Blocks over which readings are compared.
 BLOCKS = 20
 DEGREE = float(np.pi / 180)
@@ -110,15 +112,15 @@ class _Effects:
         if seen.size == 0 or not (log.actions.std(axis=0) > 0).any():
             return None
         rows = chosen_rows(record, model.nu + 1, reach=REACH)
-        if len(rows) < 100:
+        if len(rows) < LEAST_ROWS:
             return None
         predicted, response = _responses(record, rows, seen)
         predicted = predicted - np.einsum("tvu,tu->tv", response, log.actions[rows])
         change = (record.after - record.before)[rows][:, seen] - predicted
         good = np.isfinite(change).all(axis=1) & np.isfinite(response).all(axis=(1, 2))
         rows, change, response = rows[good], change[good], response[good]
-        moved = np.abs(response).max(axis=(0, 2)) > 0
-        if len(rows) < 100 or not moved.any():
+        moved = np.abs(response).max(axis=(0, 2), initial=0.0) > 0
+        if len(rows) < LEAST_ROWS or not moved.any():
             return None
         logged = {s: log.actions[rows + s] for s in range(-REACH, REACH + 1)}
         terms = _terms(record, rows, predicted[good])

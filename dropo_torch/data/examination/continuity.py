@@ -50,12 +50,11 @@ def _other_row(record: Record) -> Finding | None:
     """The finding of next observations that are those of the same row, or of one too far on."""
     rows = np.flatnonzero(~record.log.terminals[:-2] & ~record.log.terminals[1:-1])
     scale = np.maximum(np.ptp(record.before, axis=0), 1e-12)
-    off = {
-        s: float(np.mean(np.abs(record.before[rows + s] - record.after[rows]) / scale)) if len(rows) else 0.0
-        for s in (0, 1, 2)
-    }  # fmt: skip
+    if len(rows) < 10:
+        return None
+    off = {s: float(np.mean(np.abs(record.before[rows + s] - record.after[rows]) / scale)) for s in (0, 1, 2)}
     best = min(off, key=lambda s: off[s])
-    if best == 1 or off[best] > 0.1 * off[1]:
+    if best == 1 or not off[best] < 0.1 * off[1]:
         return None
     words = {0: "the observations of the same row", 2: "the observations two rows further on"}[best]
     what = f"next_observations are {words}; they must be those of the next row"

@@ -97,9 +97,10 @@ def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
 
 def _explained(measured: np.ndarray, predicted: np.ndarray) -> float:
     """Share of a signal that a prediction explains, without the tenth of the rows that it explains worst."""
-    off = np.where(np.isfinite(predicted), (measured - predicted) ** 2, np.inf)
-    kept = off <= np.quantile(off, 0.9)
-    if not np.isfinite(off[kept]).all():
+    good = np.isfinite(predicted)
+    if good.mean() < 0.9:
         return 0.0
+    measured, off = measured[good], (measured - predicted)[good] ** 2
+    kept = off <= np.quantile(off, 0.9)
     whole = float((measured[kept] ** 2).sum())
     return 1 - min(1.0, float(off[kept].sum()) / whole) if whole > 0 else 0.0
