@@ -91,6 +91,7 @@ LAYERS = (
     "diagnostics", "verdict",
     "certify", "fit",
     "config",
+    "logged",
     "effects",
     "problem",
     "baselines", "gap", "rl",

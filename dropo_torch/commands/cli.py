@@ -8,6 +8,7 @@ may return an exit code.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import io
 import os
@@ -19,6 +20,7 @@ from dropo_torch.errors import InputError, choices
 
 #: Commands, each with its module and what it does.
 COMMANDS = {
+    "check": ("check", "examine the log before anything is fitted to it"),
     "fit": ("fit", "fit the distribution to the log"),
     "gap": ("gap", "find where simulation and log disagree, and name the physical effect that is missing"),
     "train": ("train", "train a policy over the distribution"),
@@ -85,7 +87,7 @@ def _dispatch(given: list[str]) -> int:
 
         console = Console(highlight=False)
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
-        with claimed(parsed.out):
+        with claimed(parsed.out) if parsed.out is not None else contextlib.nullcontext():
             return parsed.run(parsed, parse_overrides(rest), console) or 0
     return 0
 

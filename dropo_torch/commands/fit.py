@@ -12,6 +12,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from dropo_torch.commands.check import add_force, check_first
 from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, add_log
 from dropo_torch.commands.progress import fit_shown
@@ -30,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo fit``."""
     add_config(parser)
     add_log(parser, "the history")
+    add_force(parser)
 
 
 #: Exit code of a fit that is hopeless.
@@ -39,11 +41,13 @@ HOPELESS = 3
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> int:
     """Run ``dropo fit``."""
     config = load_config(given.config, overrides)
-    result = run_fit(config, given.out, console=console, resume=given.resume, log=given.log)
+    result = run_fit(config, given.out, console=console, resume=given.resume, log=given.log, force=given.force)
     return HOPELESS if result.judgment and result.judgment.verdict == "hopeless" else 0
 
 
-def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None) -> Fit:
+def run_fit(
+    config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None, force: bool = False
+) -> Fit:
     """Fit, and write ``fit.json``, ``report.html``, the distribution and the model to ``out``.
 
     Args:
@@ -52,16 +56,18 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         console: where progress and results are shown.
         resume: continue an interrupted run in ``out``.
         log: ``"tensorboard"`` writes the history as TensorBoard events too.
+        force: go on although the log is surely wrong.
     """
     from dropo_torch.baselines import make_search
     from dropo_torch.diagnostics import diagnose
     from dropo_torch.excitation import refuse_dead_parameters
-    from dropo_torch.problem import make_problem
+    from dropo_torch.problem import logged_data, make_problem
     from dropo_torch.verdict import judge
 
     if log is not None:
         require("tensorboard", f"--log {log}")
     problem = make_problem(config)
+    check_first(logged_data(problem), console, force=force)
     continued = resume and (out / "checkpoint.pkl").exists()
     make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not continued:

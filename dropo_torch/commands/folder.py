@@ -18,7 +18,7 @@ from dropo_torch.errors import InputError
 #: Files by which a folder is known to hold a run.
 _MARKS = (
     "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.pkl",
-    "gap-progress.pkl", "sweep-progress.json", "compare-progress.json", "train-progress.pt",
+    "check.json", "gap-progress.pkl", "sweep-progress.json", "compare-progress.json", "train-progress.pt",
 )  # fmt: skip
 #: What runs write; an earlier run's are moved aside together.
 _RESULTS = (

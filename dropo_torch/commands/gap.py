@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from dropo_torch.commands.check import add_force, check_first
 from dropo_torch.commands.folder import prepare_folder, provenance
-from dropo_torch.commands.options import add_config as add_arguments
+from dropo_torch.commands.options import add_config
 from dropo_torch.commands.progress import StageProgress
 from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
@@ -21,13 +22,17 @@ from dropo_torch.support.files import write_json
 if TYPE_CHECKING:
     from dropo_torch.gap import Gap
 
-__all__ = ["add_arguments", "run"]
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``dropo gap``."""
+    add_config(parser)
+    add_force(parser)
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo gap``, which writes ``gap.json``, ``report.html``, and the model and config with what was missing."""
     from dropo_torch.gap import add, find_gap, prepare
-    from dropo_torch.problem import make_problem
+    from dropo_torch.problem import logged_data, make_problem
     from dropo_torch.report import write_gap_report
 
     config, out = load_config(given.config, overrides), given.out
@@ -39,6 +44,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if written.exists() and not (out / "gap.json").exists():
         raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
     problem = make_problem(config, general=True)
+    check_first(logged_data(problem), console, force=given.force)
     store = out / "gap-progress.pkl"
     with StageProgress(console, "gap") as progress:
         progress.show("preparing", 0.0)

@@ -13,6 +13,38 @@ from dropo_torch.errors import InputError
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Where in its file a log stood, for messages and for the config lines that correct it.
+
+    Attributes:
+        observation_names: the file's name of each observed column.
+        action_names: of each column of the commands.
+        rows: row of the file at which each transition starts, ``(T,)``; ``None`` for what was resampled.
+        durations: seconds of each transition by the time stamps, ``(T,)``; ``None`` without stamps.
+    """
+
+    observation_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    rows: np.ndarray | None = None
+    durations: np.ndarray | None = None
+
+    def select(self, index: np.ndarray) -> Origin:
+        """Return the origin of the given transitions."""
+        kept = (None if array is None else array[index] for array in (self.rows, self.durations))
+        return Origin(self.observation_names, self.action_names, *kept)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Origin | None]) -> Origin | None:
+        """Return the origin of several logs, one after the other; ``None`` where their columns' names differ."""
+        known = [part for part in parts if part is not None]
+        names = {(part.observation_names, part.action_names) for part in known}
+        if len(known) < len(parts) or len(names) != 1:
+            return None
+        arrays = [[getattr(part, name) for part in known] for name in ("rows", "durations")]
+        return cls(*names.pop(), *(None if any(a is None for a in of) else np.concatenate(of) for of in arrays))
+
+
+@dataclass(frozen=True)
 class Trajectories:
     """Logged episodes, one row a transition, in the order in which they were recorded.
 
@@ -24,6 +56,7 @@ class Trajectories:
             last row always is.
         dt: duration of a transition in seconds, or ``None`` where the log does not say.
         source: where the log came from, for messages.
+        origin: what the file calls its columns and rows, where it was read from one.
 
     Raises:
         InputError: shapes that do not fit, a value that is not finite, no transition.
@@ -35,6 +68,7 @@ class Trajectories:
     terminals: np.ndarray
     dt: float | None = None
     source: str = "log"
+    origin: Origin | None = None
 
     def __post_init__(self) -> None:
         for name in ("observations", "next_observations", "actions"):
@@ -90,7 +124,8 @@ class Trajectories:
         index = np.arange(len(self))[rows]
         gap = np.append(np.diff(index) != 1, True)
         rest = {name: getattr(self, name)[index] for name in ("observations", "next_observations", "actions")}
-        return replace(self, **rest, terminals=self.terminals[index] | gap)
+        origin = None if self.origin is None else self.origin.select(index)
+        return replace(self, **rest, terminals=self.terminals[index] | gap, origin=origin)
 
     def select_episodes(self, which: Sequence[int]) -> Trajectories:
         """Return the given episodes, counted from 0."""
@@ -125,6 +160,7 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
         **{name: np.concatenate([getattr(log, name) for log in logs]) for name in names},
         dt=next((log.dt for log in logs if log.dt is not None), None),
         source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
+        origin=Origin.joined([log.origin for log in logs]),
     )
 
 
