@@ -18,7 +18,7 @@ from dropo_torch.data.readers import read_trajectories
 from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
-from dropo_torch.effects.simulator import effect_simulator
+from dropo_torch.effects.simulator import effect_simulator, first_known
 from dropo_torch.errors import InputError
 from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.models.load import load_model
@@ -48,6 +48,8 @@ class Problem:
         objective: the likelihood of the log.
         fingerprint: identifies config, model and log; an interrupted run continues only with the same.
         effects: the physical effects of the config, or ``None``.
+        since: transition of each episode from which on the commands that act are known from the log, ``(E,)``; ``None``
+            without effects.
     """
 
     config: Config
@@ -59,6 +61,12 @@ class Problem:
     objective: Objective
     fingerprint: str
     effects: EffectSet | None = None
+    since: np.ndarray | None = None
+
+    @property
+    def left_out(self) -> int:
+        """Transitions in which commands from before the log act, so that the likelihood leaves them out."""
+        return 0 if self.since is None else int(self.since.sum())
 
 
 def make_problem(config: Config, *, general: bool = False) -> Problem:
@@ -82,7 +90,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     trajectories = _log(config, space.model)
     frame_skip = _frame_skip(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
-    effects, history = None, 0
+    effects, history, since = None, 0, None
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
         observation = _observation(config, space.model, num_states, width)
@@ -92,15 +100,16 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         effects = place_effects(config.effects, space, setting, find_effect)
         space = space.with_limits(lowest(effects, space))
         simulator, history = _with_effects(config, source, effects, space, trajectories)
+        since = first_known(effects, space, trajectories, simulator.timestep or 1.0)
     else:
         simulator = _backend(config, source, frame_skip, space)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
-    transitions = make_transitions(trajectories, observation, lag=config.lag, history=history)
+    transitions = make_transitions(trajectories, observation, lag=config.lag, history=history, since=since)
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
-    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)
+    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects, since)
 
 
 def _completed(config: Config) -> Config:
