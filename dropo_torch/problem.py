@@ -17,14 +17,14 @@ from dropo_torch.data.observation import Observation, generic_observation, parse
 from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
-from dropo_torch.effects.simulator import effect_simulator
+from dropo_torch.effects.simulator import effect_simulator, first_known
 from dropo_torch.errors import InputError
 from dropo_torch.logged import SLOWEST, TIME_TOLERANCE, LoggedData, completed, frame_skip_of, is_registered, log_of
 from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import CheckedAdapter, MujocoEnvAdapter, Simulator, make_simulator
-from dropo_torch.simulators.hidden import POSE, filter_memory, prescribed_bodies, prescribed_names
+from dropo_torch.simulators.hidden import POSE, filter_memory, filters_known, prescribed_bodies, prescribed_names
 from dropo_torch.support.extras import extra
 from dropo_torch.support.usercode import load_callable, user_code
 
@@ -43,6 +43,8 @@ class Problem:
         objective: the likelihood of the log.
         fingerprint: identifies config, model and log; an interrupted run continues only with the same.
         effects: the physical effects of the config, or ``None``.
+        since: transition of each episode from which on the commands that act are known from the log, ``(E,)``; ``None``
+            where all of them are.
     """
 
     config: Config
@@ -54,6 +56,12 @@ class Problem:
     objective: Objective
     fingerprint: str
     effects: EffectSet | None = None
+    since: np.ndarray | None = None
+
+    @property
+    def left_out(self) -> int:
+        """Transitions in which commands from before the log act, so that the likelihood leaves them out."""
+        return 0 if self.since is None else int(self.since.sum())
 
 
 def logged_data(problem: Problem) -> LoggedData:
@@ -85,7 +93,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     trajectories = log_of(config, space.model)
     frame_skip = frame_skip_of(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
-    effects = None
+    effects, since = None, None
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
         observation = _observation(config, space.model, num_states, width)
@@ -95,15 +103,19 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         effects = place_effects(config.effects, space, setting, find_effect)
         space = space.with_limits(lowest(effects, space))
         simulator = _with_effects(config, source, effects, space, trajectories)
+        since = first_known(effects, space, trajectories, simulator.timestep or 1.0)
     else:
         simulator = _backend(config, source, frame_skip, space)
+    if config.backend == "mujoco" and (memory := filter_memory(space)):
+        known = filters_known(memory, frame_skip, np.bincount(trajectories.episodes))
+        since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
-    transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history)
+    transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history, since=since)
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
-    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)
+    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects, since)
 
 
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:

@@ -110,7 +110,9 @@ def test_a_fit_sees_a_log_of_filtered_actuators_as_it_was(tmp_path, effects: lis
     found = problem.simulator.simulate(
         objective.evaluator.states, objective.evaluator.controls, torch.from_numpy(problem.space.nominal[None])
     )
-    np.testing.assert_allclose(found[:, 0].numpy(), path[1:], atol=1e-6)
+    rows = objective.transitions.rows  # without those in which the filters may still remember what was before
+    assert 0 < problem.left_out == ROWS - len(rows) <= ROWS // 2
+    np.testing.assert_allclose(found[:, 0].numpy(), path[1:][rows], atol=1e-6)
 
 
 def test_a_mocap_pose_stands_beside_the_controls() -> None:

@@ -93,6 +93,7 @@ def _write(problem: Problem, result: Fit, diagnostics: Diagnostics, out: Path) -
     portable = yaml.safe_dump(config.portable(), sort_keys=False, allow_unicode=True)
     write_atomically(out / "fitted_config.yaml", portable.encode())
     title, notes = f"Fit of {config.sim or config.model or config.environment}", _write_model(problem, result, out)
+    notes += [_left_out(problem)] if problem.left_out else []
     about = {"title": title, "notes": notes, **provenance(config)}
     write_fit_report(out / "report.html", fit=result, diagnostics=diagnostics, space=problem.space, **about)
 
@@ -144,10 +145,19 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
         f"{result.seconds:.1f} s; stopped because {result.stop_reason}",
         soft_wrap=True,
     )
+    if problem.left_out:
+        console.print(_left_out(problem))
     if result.diverged:
         share = 100 * result.diverged / (len(problem.objective) * result.samples)
         console.print(f"{result.diverged} simulations ({share:.2g} %) diverged under the fitted distribution")
     show_report(out, console)
+
+
+def _left_out(problem: Problem) -> str:
+    return (
+        f"{problem.left_out} transitions are left out: commands from before the log still act in them, by a delay, a "
+        "lag or play."
+    )
 
 
 def show_report(out: Path, console: Console) -> None:

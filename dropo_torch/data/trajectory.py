@@ -119,6 +119,13 @@ class Trajectories:
         ends = np.cumsum(self.terminals)
         return np.concatenate([[0], ends[:-1]])
 
+    @property
+    def commands(self) -> np.ndarray:
+        """The commands of every episode, the last one repeated once more than the longest needs, ``(E, N, m)``."""
+        bounds = np.append(0, np.flatnonzero(self.terminals) + 1)
+        ahead = np.arange(np.diff(bounds).max() + 1)
+        return np.stack([self.actions[np.minimum(a + ahead, b - 1)] for a, b in itertools.pairwise(bounds)])
+
     def select(self, rows: np.ndarray | slice) -> Trajectories:
         """Return the given rows, ascending; an episode ends wherever rows are left out."""
         index = np.arange(len(self))[rows]
@@ -200,12 +207,24 @@ class Transitions:
 
 
 def make_transitions(
-    trajectories: Trajectories, observation: Observation, *, lag: int = 1, history: int = 0
+    trajectories: Trajectories,
+    observation: Observation,
+    *,
+    lag: int = 1,
+    history: int = 0,
+    since: np.ndarray | None = None,
 ) -> Transitions:
     """Cut a log into consecutive windows of ``lag`` transitions that never cross an episode's end.
 
     With ``history``, the controls of so many logged steps before each window stand before its own; before an
     episode's start its first control does.
+
+    Args:
+        trajectories: the log.
+        observation: its columns.
+        lag: transitions of a window.
+        history: logged steps before a window whose controls come with it.
+        since: transition of each episode at which its first window starts, ``(E,)``; its first one by default.
 
     Raises:
         InputError: a log without an episode of ``lag`` transitions.
@@ -218,11 +237,17 @@ def make_transitions(
             f"{trajectories.source}: {width} observed columns; the observation has {observation.log_width}"
         )
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
-    starts = [np.arange(a, b - lag + 1, lag) for a, b in itertools.pairwise(bounds)]
+    begin = bounds[:-1] if since is None else bounds[:-1] + since
+    starts = [np.arange(a, b - lag + 1, lag) for a, b in zip(begin, bounds[1:], strict=True)]
     rows = np.concatenate(starts)
     first = np.repeat(bounds[:-1], [len(s) for s in starts])
     if rows.size == 0:
         longest = int(np.diff(bounds).max())
+        if longest >= lag:
+            raise InputError(
+                f"{trajectories.source}: in every transition commands act that are from before its episode; record "
+                "longer episodes, or narrow the bounds of what delays, lags or has play"
+            )
         raise InputError(
             f"{trajectories.source}: too short for lag {lag}: the longest episode has {longest} transitions; "
             f"lag must be at most {longest}"
@@ -263,9 +288,15 @@ class Replay:
 
 
 def make_replay(
-    trajectories: Trajectories, observation: Observation, horizon: int, *, history: int = 0, about_start: bool = False
+    trajectories: Trajectories,
+    observation: Observation,
+    horizon: int,
+    *,
+    history: int = 0,
+    about_start: bool = False,
+    since: np.ndarray | None = None,
 ) -> Replay:
-    """Cut a log into consecutive windows of ``horizon`` transitions.
+    """Cut a log into consecutive windows of ``horizon`` transitions; see :func:`make_transitions`.
 
     Of the lengths down to half the horizon (or half the longest episode), windows have the one that leaves the fewest
     transitions out, the longest of several.
@@ -275,10 +306,10 @@ def make_replay(
     """
     if horizon < 1:
         raise InputError(f"horizon: {horizon} given; expected a whole number of logged steps, 1 or more")
-    lengths = np.bincount(trajectories.episodes)
-    longest = min(horizon, int(lengths.max()))
+    lengths = np.maximum(np.bincount(trajectories.episodes) - (0 if since is None else since), 0)
+    longest = max(min(horizon, int(lengths.max())), 1)
     steps = max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
-    windows = make_transitions(trajectories, observation, lag=steps, history=history)
+    windows = make_transitions(trajectories, observation, lag=steps, history=history, since=since)
     rows = (windows.rows[:, None] + np.arange(steps)).reshape(-1)
     measured = observation.observed(trajectories.next_observations[rows])
     return Replay(

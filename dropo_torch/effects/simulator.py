@@ -10,6 +10,7 @@ import mujoco
 import numpy as np
 import torch
 
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Placed, applied
 from dropo_torch.effects.engine import Variant, VariantEngine, parts, whole_ratio
 from dropo_torch.effects.filters import (
@@ -21,6 +22,7 @@ from dropo_torch.effects.filters import (
     placed_filters,
     rate_columns,
     sensed,
+    settled_after,
     unsensed,
 )
 from dropo_torch.effects.path import SensedPath
@@ -30,6 +32,8 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.simulators.hidden import filter_memory
 
+#: Shares of the search box of which one after the other is asked whether most of the log knows its commands.
+SHARES = (1.0, 0.5, 0.25, 0.0)
 #: Logged steps of history for a filter that remembers all of its past.
 LONGEST_HISTORY = 200
 
@@ -235,6 +239,35 @@ def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, lo
         return min(1, longest) if effects.having("sense").look_back(space) > 0 else 0
     steps = LONGEST_HISTORY if seconds == math.inf else math.ceil(seconds / timestep - 1e-9) + 1
     return min(steps, longest)
+
+
+def first_known(effects: EffectSet, space: ParameterSpace, log: Trajectories, timestep: float) -> np.ndarray:
+    """Return the transition of each episode from which on the commands that act are known from the log, ``(E,)``.
+
+    They are under all values in the search box; where that would leave out more than half of the log, under those of
+    its lower half, quarter, ...
+
+    Args:
+        effects: the effects.
+        space: what varies, numbers of effects among it.
+        log: the log.
+        timestep: seconds of a transition.
+    """
+    setting, commands = effects.setting, log.commands
+    skip, lengths = setting.frame_skip, np.bincount(log.episodes)
+    before = int(effects.having("sense").look_back(space) > 0)  # a late sensor asks for the command just before
+
+    def needed(share: float) -> np.ndarray:
+        placed = effects.at(space.low + share * (space.high - space.low))
+        filters = placed_filters(placed, "command", setting)
+        return np.maximum(settled_after(commands, filters, skip, timestep / skip), before)
+
+    found = np.zeros_like(lengths)
+    for share in SHARES:
+        found = np.minimum(np.maximum(needed(0.0), needed(share)), lengths)
+        if found.sum() <= 0.5 * lengths.sum():
+            break
+    return found
 
 
 def effect_simulator(

@@ -24,20 +24,30 @@ def episode_bounds(log: Trajectories) -> list[tuple[int, int]]:
     return list(zip(np.append(0, ends[:-1]).tolist(), ends.tolist(), strict=True))
 
 
-def cut_windows(log: Trajectories, observation: Observation, length: int, *, stride: int | None = None) -> Windows:
+def cut_windows(
+    log: Trajectories, observation: Observation, length: int, *, stride: int | None = None,
+    since: np.ndarray | None = None,
+) -> Windows:  # fmt: skip
     """Cut a log into windows of ``length`` logged steps, one every ``stride``.
 
     By default no two windows share a measurement. They never cross an episode's end; an episode shorter than a window
     gives none.
+
+    Args:
+        log: the log.
+        observation: its columns.
+        length: logged steps of a window.
+        stride: logged steps from one to the next.
+        since: logged step of each episode at which its first window starts, ``(E,)``.
     """
-    bounds, ahead = episode_bounds(log), np.arange(longest_episode(log) + 1)
-    commands = np.stack([log.actions[np.minimum(a + ahead, b - 1)] for a, b in bounds])
+    bounds, commands = episode_bounds(log), log.commands
+    begin = np.zeros(len(bounds), dtype=int) if since is None else since
     observed, following = observation.observed(log.observations), observation.observed(log.next_observations)
     found = []
     for e, (a, b) in enumerate(bounds):
         path = np.concatenate([observed[a : a + 1], following[a:b]])
         slope = np.gradient(path, axis=0)
-        starts = range(0, b - a - length + 1, stride or length + 1)
+        starts = range(int(begin[e]), b - a - length + 1, stride or length + 1)
         found += [(path[s : s + length + 1], slope[s], e, s) for s in starts]
     measured, rates, episodes, steps = zip(*found, strict=True) if found else ((), (), (), ())
     return Windows(
@@ -56,6 +66,11 @@ def feature_sizes(setting: Setting, columns: np.ndarray) -> np.ndarray:
     """Return the standard deviation of each feature ``(m,)`` over observed columns ``(..., n)``."""
     columns = columns.reshape(-1, columns.shape[-1])
     return Features.of(setting.observation).difference(columns, columns[:1]).std(0)
+
+
+def since_known(windows: Windows, since: np.ndarray) -> Windows:
+    """Return the windows that start no earlier than some logged step of their episode, ``(E,)``."""
+    return windows.select(windows.steps >= since[windows.episodes])
 
 
 def spread(windows: Windows, most: int) -> Windows:

@@ -16,7 +16,7 @@ from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Z90, Hypothesis, Refit, refit, standard_errors, step_errors
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Score, Strength
 from dropo_torch.gap.rules import WRONG
-from dropo_torch.gap.scene import Scene, short_windows
+from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
@@ -39,7 +39,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
     noise = evidence.noise
     final, weighted = _last_fit(evidence, naming.final.hypothesis) if naming.named else (naming.final, evidence)
-    short, base, best = short_windows(setting, scene.train), naming.base.hypothesis, final.hypothesis
+    short, base, best = scene.short, naming.base.hypothesis, final.hypothesis
     before = free_forces(twin, short, base.variant, noise)
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
     held = cut_held(evidence, scene.held, best)

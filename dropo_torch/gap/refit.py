@@ -167,7 +167,8 @@ def refit(
     """
     limits = limits_of(hypothesis, evidence.twin)
     relinearise = linear is None
-    linear = evidence.linearise(hypothesis.variant) if linear is None else linear
+    variant = hypothesis.variant
+    linear = evidence.linearise(variant) if linear is None else evidence.counting(linear, variant)
     tail = evidence.tail(linear)
 
     def at(vector: np.ndarray) -> Refit:

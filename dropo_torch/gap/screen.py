@@ -137,15 +137,19 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         residual = evidence.project(begin, linear).ravel() * factor
         change = (found[rows][1:] - begin) / steps[:, None, None]
         slope = evidence.project_slope(change, linear).reshape(len(moving), -1) * factor
+        known = evidence.twin.knows(variants[rows.start], evidence.windows)
+        here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
+        residual, slope = np.where(here, residual, before), slope * here
         lengths = np.sqrt((slope**2).sum(1))
         dead = bool(np.linalg.norm(residual - before) < DEAD and lengths.max(initial=0.0) < DEAD)
         start = np.array(placed.values)
         columns = np.concatenate([shared, slope])
-        move = _move(columns, residual, limits, start[moving])
+        move = _move(columns * here, residual * here, limits, start[moving])
         values = start.copy()
         values[moving] += move[len(shared) :] * limits.scale
         left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
-        yield Candidate(placed.at(placed.effect.settle(start, values)), float(left.sum()), residual, slope, dead)
+        chi2 = float(left[known].mean() * len(left)) if known.any() else np.inf
+        yield Candidate(placed.at(placed.effect.settle(start, values)), chi2, residual, slope, dead)
 
 
 def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:

@@ -129,6 +129,19 @@ def filter_memory(space: ParameterSpace) -> int:
     return found
 
 
+def filters_known(memory: int, frame_skip: int, lengths: np.ndarray) -> np.ndarray:
+    """Return the logged steps of each episode after which filters have forgotten what was before it, ``(E,)``.
+
+    At most half of an episode: nothing would be left of short ones.
+
+    Args:
+        memory: physics steps that the filters remember; see :func:`filter_memory`.
+        frame_skip: physics steps of a logged one.
+        lengths: logged steps of the episodes, ``(E,)``.
+    """
+    return np.minimum(math.ceil(memory / frame_skip), lengths // 2)
+
+
 def control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest control that acts, ``(nu,)`` each."""
     limited = model.actuator_ctrllimited.astype(bool) & ~bool(
