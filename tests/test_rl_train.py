@@ -369,7 +369,7 @@ def test_a_policy_is_loaded_in_three_lines_and_takes_arrays_and_tensors(folder: 
         load_policy(tmp_path / "absent.pt")
 
 
-RESULTS = {"train.json", "report.html", "policy.pt", "train-progress.pt"}
+RESULTS = {"train.json", "report.html", "policy.pt", "train-progress.bin"}
 
 
 def command(folder: Path, out: Path, *more: str) -> list[str]:
@@ -418,7 +418,7 @@ def test_kill_9_and_resume_give_the_policy_of_a_run_never_interrupted(folder: Pa
     arguments = command(folder, tmp_path / "pieces", *more, "--resume")
     process = subprocess.Popen([sys.executable, "-m", "dropo_torch", *arguments], stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 100
-    while not (tmp_path / "pieces" / "train-progress.pt").exists() and time.monotonic() < deadline:
+    while not (tmp_path / "pieces" / "train-progress.bin").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     assert process.wait() in (-signal.SIGKILL, 0)

@@ -53,12 +53,12 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
     if log is not None:
         require("tensorboard", f"--log {log}")
     problem = make_problem(config)
-    continued = resume and (out / "checkpoint.pkl").exists()
+    continued = resume and (out / "checkpoint.bin").exists()
     make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not continued:
         refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
-    result = fit_shown(problem, console, checkpoint=out / "checkpoint.pkl", resume=resume)
+    result = fit_shown(problem, console, checkpoint=out / "checkpoint.bin", resume=resume)
     if result.diverged == len(problem.objective) * result.samples:
         raise InputError(
             "parameters: every simulation of this log diverges, wherever in the bounds; "

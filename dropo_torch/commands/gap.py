@@ -39,7 +39,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if written.exists() and not (out / "gap.json").exists():
         raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
     problem = make_problem(config, general=True)
-    store = out / "gap-progress.pkl"
+    store = out / "gap-progress.bin"
     with StageProgress(console, "gap") as progress:
         progress.show("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside

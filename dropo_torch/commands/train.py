@@ -44,7 +44,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if given.log is not None:
         require("tensorboard", f"--log {given.log}")
     problem = make_training(load_config(given.config, overrides))
-    checkpoint = out / "train-progress.pt"
+    checkpoint = out / "train-progress.bin"
     continued = given.resume and checkpoint.exists()
     path = problem.distribution_path
     if path is not None and not continued and path.resolve().parent == out.resolve():

@@ -18,7 +18,7 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.scene import Scene, contact_windows, prepare, short_windows, shorter_windows
-from dropo_torch.gap.search import Checkpoint, search, start
+from dropo_torch.gap.search import kept, search, start
 from dropo_torch.gap.strategy import ContactWindows, Strategy
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
@@ -115,9 +115,9 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
     for suffix, make, strategy in SEARCHES:
         evidence = make(scene)
         if evidence is not None:
-            path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
+            path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
             here = replace(ground, evidence=evidence, strategy=strategy)
-            found.append(search(here, scene.begin, Checkpoint(path, resume, known)))
+            found.append(search(here, scene.begin, path, resume=resume))
             if found[-1].named or not found[0].gap:
                 break
     return found[-1] if found[-1].named else found[0]

@@ -81,6 +81,8 @@ class Optimizer(abc.ABC):
     method: ClassVar[str] = "dropo"
     #: Names of the attributes that change.
     STATE: ClassVar[tuple[str, ...]] = ()
+    #: Dataclasses in the state: beside them it holds plain values, arrays and tensors.
+    KINDS: ClassVar[tuple[type, ...]] = ()
 
     @abc.abstractmethod
     def ask(self) -> Request:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import pickle
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import cma
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.distribution import SearchBox
+from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import LikelihoodOptimizer, Optimizer, Progress, Request
 from dropo_torch.optimizers.settings import FitSettings
@@ -17,7 +19,7 @@ from dropo_torch.support.random import draw_uniforms
 
 
 class Normals:
-    """Standard normals for pycma from a generator of their own, which travels with a checkpoint."""
+    """Standard normals for pycma from a generator of their own."""
 
     def __init__(self, seed: int) -> None:
         self.generator = np.random.default_rng(seed)
@@ -59,25 +61,52 @@ def why_stopped(search: cma.CMAEvolutionStrategy, budget: str, value: str) -> st
 
 
 class Evolution(Optimizer):
-    """A search by pycma: a generation stands until it was told, and the state holds pycma's own pickle."""
+    """A search by pycma: a generation stands until it was told, and the state holds what every generation was told.
 
-    STATE: ClassVar[tuple[str, ...]] = ("_asked", "_best")
-    _search: cma.CMAEvolutionStrategy
-    _asked: list[np.ndarray] | None = None
+    Args:
+        begin: makes the search as it begins; from there what was told leads anywhere else.
+    """
+
+    STATE: ClassVar[tuple[str, ...]] = ("_told", "_best")
+
+    def __init__(self, begin: Callable[[], cma.CMAEvolutionStrategy]) -> None:
+        self._begin, self._search = begin, begin()
+        self._asked: list[np.ndarray] | None = None
+        self._told: list[list[float]] = []
 
     def state(self) -> dict[str, Any]:
-        """Return pycma's own pickle and what stands beside it."""
-        return super().state() | {"_search": self._search.pickle_dumps()}
+        """Return what every generation was told, and where that has led."""
+        return super().state() | {"mean": np.array(self._search.mean)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        super().restore(state | {"_search": pickle.loads(state["_search"])})
+        """Go on from a saved state: tell a new search the same once more.
+
+        Raises:
+            InputError: this leads elsewhere, as another version of pycma may.
+        """
+        super().restore({name: state[name] for name in self.STATE})
+        self._search, self._asked, told, self._told = self._begin(), None, self._told, []
+        for values in told:
+            self._search.stop()  # keeps records of its own, once a generation
+            self._generation()
+            self._rank(values)
+        if not np.array_equal(self._search.mean, state["mean"]):
+            raise InputError(
+                f"resume: pycma {cma.__version__} searches differently than the one that began; install that, or "
+                "start again without --resume"
+            )
 
     def _generation(self) -> np.ndarray:
         """The points in [0, 4] to be told next, ``(population, dimensions)``."""
         if self._asked is None:
             self._asked = self._search.ask()
         return np.array(self._asked)
+
+    def _rank(self, values: list[float]) -> None:
+        """Tell the search the generation's values, of which the least is the best."""
+        self._search.tell(self._asked, values)
+        self._told.append(values)
+        self._asked = None
 
 
 class CMAOptimizer(Evolution, LikelihoodOptimizer):
@@ -92,11 +121,11 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
     STATE = (*Evolution.STATE, "_best_phi")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
-        super().__init__(objective, settings)
-        self._search = evolution(
-            2 * len(self._space), seed=settings.seed, budget=settings.budget, population=settings.population,
-            tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
-        )  # fmt: skip
+        LikelihoodOptimizer.__init__(self, objective, settings)
+        Evolution.__init__(self, partial(
+            evolution, 2 * len(self._space), seed=settings.seed, budget=settings.budget,
+            population=settings.population, tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
+        ))  # fmt: skip
         self._best = -np.inf
         self._best_phi: np.ndarray | None = None
 
@@ -121,8 +150,7 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
         best = int(np.argmax(values))
         if values[best] > self._best:
             self._best, self._best_phi = float(values[best]), np.array(self._asked[best])
-        self._search.tell(self._asked, list(-values))
-        self._asked = None
+        self._rank((-values).tolist())
 
     @property
     def stop_reason(self) -> str | None:
