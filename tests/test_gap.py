@@ -572,7 +572,7 @@ def test_second_search_over_shorter_windows_goes_on_too(tmp_path: Path) -> None:
 def test_checkpoint_of_another_problem_is_refused(tmp_path: Path) -> None:
     store = tmp_path / "gap-progress.bin"
     search(hidden(), ("joint_damping",), checkpoint=store)
-    with pytest.raises(InputError, match="another config, model or log") as error:
+    with pytest.raises(InputError, match="another config, model, log or method") as error:
         search(hidden("joint_damping"), ("joint_damping",), checkpoint=store, resume=True)
     assert "\n" not in str(error.value)
 

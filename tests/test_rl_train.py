@@ -273,12 +273,12 @@ def test_a_checkpoint_of_another_training_is_refused(folder: Path, tmp_path: Pat
         {"train": {"gamma": 0.9}}, {"parameters": {"mass": {**MASS, "bounds": [1.0, 3.0]}}},
     ]  # fmt: skip
     for other in others:
-        with pytest.raises(dropo.InputError, match="another task, config, distribution or algorithm"):
+        with pytest.raises(dropo.InputError, match="belongs to another config, model, log or method"):
             train(problem(folder, **other), checkpoint=path, resume=True)
     train(problem(folder, threads=2, train={"checkpoint_seconds": 9}), checkpoint=path, resume=True)
     for content in (b"", b"hello", path.read_bytes()[:1000]):
         path.write_bytes(content)
-        with pytest.raises(dropo.InputError, match="cannot be read as the checkpoint of a training"):
+        with pytest.raises(dropo.InputError, match="is no checkpoint of a training"):
             train(problem(folder), checkpoint=path, resume=True)
         assert path.read_bytes() == content
 

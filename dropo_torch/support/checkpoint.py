@@ -112,7 +112,7 @@ def loads(
 class _Writer:
     """Makes JSON of a state and gathers its arrays."""
 
-    def __init__(self, known: tuple[type, ...], named: tuple[type, ...]) -> None:
+    def __init__(self, known: tuple[type, ...], named: tuple[Any, ...]) -> None:
         self._known, self._named = known, named
         self.kinds: list[list[Any]] = []
         self.parts: list[bytes] = []
