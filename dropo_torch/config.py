@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import pydantic
-import yaml
 from pydantic import Field
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.support.given import check_keys
+from dropo_torch.support.given import check_keys, read_text, user_path
+from dropo_torch.support.yaml_text import load_yaml
 
 if TYPE_CHECKING:
     from dropo_torch.optimizers.settings import FitSettings
@@ -98,7 +97,7 @@ class Config(pydantic.BaseModel):
 
     def path(self, given: str) -> Path:
         """Return a path of the config as one that can be opened."""
-        return self.base / Path(given).expanduser()
+        return user_path(self.base, given)
 
     def fit_settings(self) -> FitSettings:
         """Return what a fit is told.
@@ -173,10 +172,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
     path = Path(path)
     if not path.is_file():
         raise InputError(f"config: no file {path}; expected a YAML file with keys such as model, data and parameters")
-    try:
-        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"config: {path} is no valid YAML: {' '.join(str(error).split())}") from None
+    document = load_yaml(read_text(path, "config"), f"config: {path}")
     if not isinstance(document, Mapping):
         raise InputError(f"config: {path} holds no keys; expected model, data, parameters, ...")
     return make_config(document, overrides, base=path.parent, source=str(path))
@@ -192,7 +188,7 @@ def make_config(
     """Return the config of a mapping, with dotted overrides; errors are those of :func:`load_config`."""
     try:
         merged = json.loads(json.dumps(dict(document), default=str))
-    except ValueError:
+    except (ValueError, RecursionError):
         raise InputError(f"{source}: an entry contains itself; expected plain keys and values") from None
     for dotted, value in (overrides or {}).items():
         _override(merged, dotted, value)
@@ -256,36 +252,8 @@ def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
             if not waiting or waiting[0].startswith("--"):
                 raise InputError(f"--{key}: no value given; expected --{key} VALUE")
             value = waiting.pop(0)
-        try:
-            found[key] = yaml.load(value, Loader=_Loader)
-        except yaml.YAMLError:
-            raise InputError(f"--{key}: {value!r} is no valid value; expected YAML, such as '[1, 2]'") from None
+        found[key] = load_yaml(value, f"--{key}: {value!r}")
     return found
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML as people write numbers: 1e-5 is one, although YAML 1.1 wants 1.0e-5. No key may stand twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that would silently replace an earlier one."""
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
-                if key.value in seen:
-                    raise yaml.constructor.ConstructorError(
-                        None, None, f"key {key.value!r} stands there twice", key.start_mark
-                    )
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-_Loader.add_implicit_resolver(
-    "tag:yaml.org,2002:float",
-    re.compile(
-        r"^[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)$|^[-+]?(\d+\.\d*|\.\d+)$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
-    ),
-    list("-+0123456789."),
-)
 
 
 def _override(document: dict[str, Any], dotted: str, value: Any) -> None:

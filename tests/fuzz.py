@@ -157,7 +157,9 @@ def other_values(content: bytes, rng: random.Random) -> bytes:
         elif kind == 2:
             owner[key] = [owner[key]] * rng.choice((1, 2, 100))
         elif kind == 3 and isinstance(owner, dict):
-            owner[rng.choice([*VALUES[17:30], "more", key.upper() if isinstance(key, str) else key])] = rng.choice(VALUES)
+            owner[rng.choice([*VALUES[17:30], "more", key.upper() if isinstance(key, str) else key])] = rng.choice(
+                VALUES
+            )
         else:
             owner[key] = rng.choice(VALUES)
     try:
@@ -256,7 +258,9 @@ def model_numbers(path: Path) -> list[Any]:
 def problem_numbers(config: Any) -> list[Any]:
     """Make a config's problem and evaluate its objective once, where that takes no longer than a test may."""
     if config.samples > 1000 or (config.frame_skip or 1) > 1000:
-        config = config.model_copy(update={"samples": min(config.samples, 100), "frame_skip": min(config.frame_skip or 1, 100)})
+        config = config.model_copy(
+            update={"samples": min(config.samples, 100), "frame_skip": min(config.frame_skip or 1, 100)}
+        )
     settings = config.fit_settings() if config.method == "dropo" else None
     problem = make_problem(config)
     space = problem.space
@@ -287,7 +291,11 @@ def targets(folder: Path) -> dict[str, Target]:
     buffer = io.BytesIO()
     np.save(buffer, test_readers.arrays(following=True)["observations"])
     (inner / "log.npz").write_bytes(buffer.getvalue())
-    found.append(Target("npz_inside", (inner / "log.npz",), lambda: arrays_of(read_trajectories(inner / "log.npz")), repair=rezipped))
+    found.append(
+        Target(
+            "npz_inside", (inner / "log.npz",), lambda: arrays_of(read_trajectories(inner / "log.npz")), repair=rezipped
+        )
+    )
     arm = Folder(fresh("arm"))
     config = arm.config(
         noise=[1e-3] * 4, epsilon=1e-4, observation=["qpos", "qvel"], mask=["elbow.velocity"], covariance="diagonal", lag=2,
@@ -410,7 +418,9 @@ class Worker:
 
     def start(self) -> None:
         self.pipe, theirs = multiprocessing.Pipe()
-        self.process = multiprocessing.get_context("fork").Process(target=serve, args=(theirs, self.seed, self.folder), daemon=True)
+        self.process = multiprocessing.get_context("fork").Process(
+            target=serve, args=(theirs, self.seed, self.folder), daemon=True
+        )
         self.process.start()
         theirs.close()
         self.shares = self.pipe.recv()
@@ -482,7 +492,8 @@ def table(counts: dict[str, Counter[str]]) -> str:
     """Return the counts as a table."""
     head = f"{'target':<24}{'mutations':>10}" + "".join(f"{o:>11}" for o in OUTCOMES)
     rows = [
-        f"{name:<24}{sum(c.values()):>10}" + "".join(f"{c[o]:>11}" for o in OUTCOMES) for name, c in (*counts.items(), ("all", sum(counts.values(), Counter())))
+        f"{name:<24}{sum(c.values()):>10}" + "".join(f"{c[o]:>11}" for o in OUTCOMES)
+        for name, c in (*counts.items(), ("all", sum(counts.values(), Counter())))
     ]
     return "\n".join([head, *rows])
 

@@ -127,7 +127,7 @@ def _write_events(result: Fit, folder: Path) -> None:
 def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
     table = Table("parameter", "mean", "std", "unit", "search box")
     for name, entry in result.distribution.summary().items():
-        box = f"\\[{entry['low']:g}, {entry['high']:g}]"
+        box = f"[{entry['low']:g}, {entry['high']:g}]"
         table.add_row(name, f"{entry['mean']:.5g}", f"{entry['std']:.2g}", entry["unit"], box)
     console.print(table)
     console.print(
@@ -144,4 +144,4 @@ def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
 
 def show_report(out: Path, console: Console) -> None:
     """Print where the report is."""
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True, markup=False)
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)

@@ -61,7 +61,7 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
 
     headline, items = answer(gap)
     for line in (headline, *(f"  - {item}" for item in items)):
-        console.print(line, markup=False)
+        console.print(line)
     table = Table("held-out data", "before", "after", "noise alone")
     rows = (
         ("one-step mean squared error", "mse", "{:.3g}"),
@@ -72,10 +72,10 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
         table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
     console.print(table)
     for line in filter(None, (gap.next_experiment, *gap.notes)):
-        console.print(line, markup=False)
+        console.print(line)
     console.print(
         f"{gap.simulated_transitions} simulated transitions, {gap.seconds:.1f} s; report: {out / 'report.html'}",
-        soft_wrap=True, markup=False,
+        soft_wrap=True,
     )  # fmt: skip
     if (out / "config.yaml").exists():
-        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True, markup=False)
+        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True)

@@ -102,7 +102,7 @@ def _show(result: Training, out: Path, console: Console) -> None:
         soft_wrap=True,
     )  # fmt: skip
     for path in (out / "policy.pt", out / "report.html"):
-        console.print(f"{path.stem}: {path}", soft_wrap=True, markup=False)
+        console.print(f"{path.stem}: {path}", soft_wrap=True)
 
 
 class _Curves:
