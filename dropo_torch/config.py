@@ -56,19 +56,19 @@ class Config(pydantic.BaseModel):
     )
     method_options: Entries = Field({}, description="options of a method other than dropo; see docs/methods.md")
     optimizer: Literal["fisher", "cma", "adam"] = Field("fisher", description="how φ is searched")
-    entropy: float = Field(0.0, ge=0, description="weight of the entropy of the distribution in the fit")
+    entropy: float = Field(0.0, ge=0, le=1e6, description="weight of the entropy of the distribution in the fit")
     covariance: Literal["diagonal", "full"] = Field("diagonal", description="whether parameters vary together")
     epsilon: float | list[float] = Field(1e-5, description="ε, variance added to every column, or one each")
     noise: float | list[float] | None = Field(
         None, description="standard deviation of the measurement, or one per column; initial states are then uncertain"
     )
     samples: int = Field(100, ge=2, le=1_000_000, description="K, parameter vectors per transition")
-    lag: int = Field(1, ge=1, description="λ, logged steps per window")
+    lag: int = Field(1, ge=1, le=1_000_000, description="λ, logged steps per window")
     seed: int = Field(0, ge=0, lt=2**63, description="seed of everything that is random")
     mask: list[str | int] = Field([], description="observed columns which the likelihood leaves out")
     scaling: bool = Field(False, description="divide each column by its standard deviation over the log")
-    budget: int = Field(1000, ge=1, description="with cma: evaluations of the objective")
-    population: int | None = Field(None, ge=2, description="with cma: φ per generation")
+    budget: int = Field(1000, ge=1, le=10**9, description="with cma: evaluations of the objective")
+    population: int | None = Field(None, ge=2, le=100_000, description="with cma: φ per generation")
     common_random_numbers: bool = Field(False, description="with cma: the same samples in every generation")
     adam: Entries = Field(
         {}, description="with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers"
@@ -90,7 +90,7 @@ class Config(pydantic.BaseModel):
         {}, description="name: value, the model on which a trained policy is evaluated beside the nominal one"
     )
     threads: int = Field(0, ge=0, le=4096, description="threads of the simulator, 0 for all processors")
-    chunk_size: int = Field(10_000, ge=1, description="simulations held in memory at once")
+    chunk_size: int = Field(10_000, ge=1, le=10**9, description="simulations held in memory at once")
 
     #: Folder that relative paths start from; not a key of the file.
     base: Path = Field(Path(), exclude=True)
@@ -186,12 +186,9 @@ def make_config(
     source: str = "config",
 ) -> Config:
     """Return the config of a mapping, with dotted overrides; errors are those of :func:`load_config`."""
-    try:
-        merged = json.loads(json.dumps(dict(document), default=str))
-    except (ValueError, RecursionError):
-        raise InputError(f"{source}: an entry contains itself; expected plain keys and values") from None
+    merged = _plain(dict(document), source)
     for dotted, value in (overrides or {}).items():
-        _override(merged, dotted, value)
+        _override(merged, dotted, _plain(value, f"--{dotted}"))
     check_keys(merged, KEYS, source)
     for key, value in merged.items():
         known = Config.model_fields[key]
@@ -201,6 +198,16 @@ def make_config(
         return Config(**merged, base=base)
     except pydantic.ValidationError as error:
         raise InputError(f"{source}: {explained(error, merged)}") from None
+
+
+def _plain(document: Any, where: str) -> Any:
+    """A copy as JSON knows it: text for what is neither number nor list nor mapping, no whole number without end."""
+    try:
+        text = json.dumps(document, default=str)
+        return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 20 else float(digits))
+    except (TypeError, ValueError, RecursionError):
+        why = "an entry contains itself, or has a key that is no text"
+        raise InputError(f"{where}: {why}; expected plain keys and values") from None
 
 
 def explained(error: pydantic.ValidationError, document: Mapping[str, Any]) -> str:
@@ -228,7 +235,8 @@ def _expectation(error: Any) -> str:
         if bound in error.get("ctx", ()):
             return words.format(error["ctx"][bound])
     text = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ").split(",")[0]
-    return {"a integer": "a whole number", "a dictionary": "keys and values"}.get(text, text)
+    whole = dict.fromkeys(("a integer", "Unable to parse input string as an integer"), "a whole number")
+    return (whole | {"a dictionary": "keys and values"}).get(text, text)
 
 
 def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:

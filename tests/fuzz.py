@@ -27,6 +27,7 @@ import zipfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +43,7 @@ from dropo_torch.commands.options import Parser
 from dropo_torch.config import load_config, parse_overrides
 from dropo_torch.data.readers import read_trajectories
 from dropo_torch.distribution import Distribution
-from dropo_torch.errors import InputError
+from dropo_torch.errors import InputError, one_line
 from dropo_torch.fit import HistoryEntry
 from dropo_torch.models.load import load_model
 from dropo_torch.optimizers.fisher import FisherOptimizer
@@ -58,15 +59,16 @@ NUMBERS = (0, 1, 2, 3, 7, 8, 16, 63, 64, 127, 128, 255, 256, 1 << 15, 1 << 16, (
            1 << 40, (1 << 63) - 1, (1 << 64) - 1)  # fmt: skip
 #: Words on which text stumbles.
 WORDS = (
-    b"nan", b"inf", b"-inf", b"1e999", b"1e-999", b"-0", b"1e308", b"9" * 400, b"0x10", b"1_000", b"1:30:00", b"~", b"",
-    b"null", b"true", b"[]", b"{}", b"[[[[", b"}}", b"'", b'"', b"\\", b",", b",,", b"\n", b"\r\n", b"\r", b"\t", b"\x00",
-    b"\xff\xfe", b"\xef\xbb\xbf", b"\xed\xa0\x80", b"\x1b[31m", b"[bold]", b"[/]", b"[link=x]", b":smile:", b"<a>", b"&a ",
-    b"*a", b"<<: ", b"? ", b"- ", b": ", b"# ", b"!!python/object/apply:os.system [ls]", b"!!binary aaaa", b"!!set {a, b}",
-    b"!!timestamp 2024-01-01", b"2024-01-01", b"2024-01-01T10:00:00Z", b"!own x", b"---", b"...", b"%YAML 9.9\n", b"|\n",
-    b"=", b"~root/x", b"~nobody_here/x", b"/dev/zero", b"/dev/null", b"/proc/self/mem", b"..", b".", b"/", b"*", b"**",
-    b"%s", b"{0}", b"${HOME}", b"x" * 100_000, b'"\\ud800"', b'"\\0"', b'"\\x1b[2J"', b"\xc3\xa4", b"\xe2\x80\xae", b"1e-400",
-    b"-1", b"0", b"1e18", b"18446744073709551616", b"0.5", b"include", b'file="/dev/zero"', b'nconmax="2000000000"',
-    b'size="nan"', b'timestep="0"', b'mass="-1"', b'mass="1e300"', b'memory="1000G"', b'count="100000"',
+    b"nan", b"inf", b"-inf", b"1e999", b"1e-999", b"-0", b"1e308", b"9" * 400, b"0x10", b"1_000", b"1:30:00", b"~",
+    b"", b"null", b"true", b"[]", b"{}", b"[[[[", b"}}", b"'", b'"', b"\\", b",", b",,", b"\n", b"\r\n", b"\r", b"\t",
+    b"\x00", b"\xff\xfe", b"\xef\xbb\xbf", b"\xed\xa0\x80", b"\x1b[31m", b"[bold]", b"[/]", b"[link=x]", b":smile:",
+    b"<a>", b"&a ", b"*a", b"<<: ", b"? ", b"- ", b": ", b"# ", b"!!python/object/apply:os.system [ls]",
+    b"!!binary aaaa", b"!!set {a, b}", b"!!timestamp 2024-01-01", b"2024-01-01", b"2024-01-01T10:00:00Z", b"!own x",
+    b"---", b"...", b"%YAML 9.9\n", b"|\n", b"=", b"~root/x", b"~nobody_here/x", b"/dev/zero", b"/dev/null",
+    b"/proc/self/mem", b"..", b".", b"/", b"*", b"**", b"%s", b"{0}", b"${HOME}", b"x" * 100_000, b'"\\ud800"',
+    b'"\\0"', b'"\\x1b[2J"', b"\xc3\xa4", b"\xe2\x80\xae", b"1e-400", b"-1", b"0", b"1e18", b"18446744073709551616",
+    b"0.5", b"include", b'file="/dev/zero"', b'nconmax="2000000000"', b'size="nan"', b'timestep="0"', b'mass="-1"',
+    b'mass="1e300"', b'memory="1000G"', b'count="100000"',
 )  # fmt: skip
 
 
@@ -135,11 +137,12 @@ def _other_token(content: bytes, rng: random.Random) -> bytes:
 
 #: Values that no key of a config expects everywhere.
 VALUES: tuple[Any, ...] = (
-    None, True, False, 0, 1, -1, 2, 10**30, 10**400, -(10**18), 0.5, -0.5, 1e-320, 1e-300, 1e-30, 1e30, 1e154, 1e300, math.inf,
-    -math.inf, math.nan, "", " ", "x", "nan", "1e-5", "[bold]x[/]", "[/]", ":smile:", "a\nb", "x" * 100_000, "~nobody_here/x",
-    "~", "/", "/dev/zero", "\x00", "a\x1b[2J", "\ud800", "\u202e", [], [[]], [1], ["a"], [None], [[1, 2], [3]], list(range(1000)),
-    {}, {"a": 1}, {"a": {"b": {"c": []}}}, {1: 2}, {"x" * 300: 1}, {"[red]": 1}, "minari:x", "file.py:Class", "os:system", "a:b",
-    "qpos", "upper", "log.npz", "*.npz", "**", {"path": "log.npz", "time": "t"}, {"path": ["log.npz"]}, {"signal": "u", "scale": 1e300},
+    None, True, False, 0, 1, -1, 2, 10**30, 10**400, -(10**18), 0.5, -0.5, 1e-320, 1e-300, 1e-30, 1e30, 1e154, 1e300,
+    math.inf, -math.inf, math.nan, "", " ", "x", "nan", "1e-5", "[bold]x[/]", "[/]", ":smile:", "a\nb", "x" * 100_000,
+    "~nobody_here/x", "~", "/", "/dev/zero", "\x00", "a\x1b[2J", "\ud800", "\u202e", [], [[]], [1], ["a"], [None],
+    [[1, 2], [3]], list(range(1000)), {}, {"a": 1}, {"a": {"b": {"c": []}}}, {1: 2}, {"x" * 300: 1}, {"[red]": 1},
+    "minari:x", "file.py:Class", "os:system", "a:b", "qpos", "upper", "log.npz", "*.npz", "**",
+    {"path": "log.npz", "time": "t"}, {"path": ["log.npz"]}, {"signal": "u", "scale": 1e300},
 )  # fmt: skip
 
 
@@ -169,22 +172,24 @@ def other_values(content: bytes, rng: random.Random) -> bytes:
     return text.encode("utf-8", "surrogatepass")
 
 
-def _places(document: Any) -> Iterator[tuple[Any, Any]]:
-    """Every entry of nested mappings and lists, as what holds it and its key."""
+def _places(document: Any, depth: int = 0) -> Iterator[tuple[Any, Any]]:
+    """Every entry of nested mappings and lists, as what holds it and its key; one may contain itself."""
     for key, value in list(document.items() if isinstance(document, dict) else enumerate(document)):
         yield document, key
-        if isinstance(value, dict | list):
-            yield from _places(value)
+        if isinstance(value, dict | list) and depth < 10:
+            yield from _places(value, depth + 1)
 
 
+LETTERS = "abcdefghij"
 BOMBS = (
-    "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(f"{chr(98 + i)}: &{chr(98 + i)} [{','.join([f'*{chr(97 + i)}'] * 9)}]\n" for i in range(9)),
-    "a: &a {k: v}\n" + "".join(f"{chr(98 + i)}: &{chr(98 + i)} {{<<: [{','.join([f'*{chr(97 + i)}'] * 9)}]}}\n" for i in range(7)),
-    "[" * 20_000, "{a: " * 20_000, "- " * 20_000 + "x", "a: &a [*a]", "? " * 5000, "data: " + "'" * 50_000, "&a " * 3, "a: !!map [1]",
-    "a: !!int x", "a: !!float y", "a: !!bool z", "a: !!null {}", "a: !!seq x", "a: !!timestamp x", "a: 2024-13-45", "? [a, b]\n: c",
-    "{? {a: b} : c}", "a: 0b2", "a: 0o9", "a: 09:99:99", "a: " + "1" * 5000, "a: 1_0_0", "x: .nan", "a: =", "<<: 1", "<<: [1]", "a: b: c",
-    "\ufeffa: 1", "a:\t1", "--- a\n--- b", "!!python/name:os.system", "a: 'x\\0'", 'a: "\\ud800"', 'a: "\\U0011ffff"', "a: 1e400",
-    "parameters: [1]", "effects: {a: 1}", "effects: [[1]]", "effects: [{effect: [1]}]", "parameters: {m: {field: [a]}}", "a: !!binary x",
+    "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(f"{b}: &{b} [{','.join([f'*{a}'] * 9)}]\n" for a, b in pairwise(LETTERS)),
+    "a: &a {k: v}\n" + "".join(f"{b}: &{b} {{<<: [{','.join([f'*{a}'] * 9)}]}}\n" for a, b in pairwise(LETTERS[:8])),
+    "[" * 20_000, "{a: " * 20_000, "- " * 20_000 + "x", "a: &a [*a]", "? " * 5000, "data: " + "'" * 50_000, "&a " * 3,
+    "a: !!map [1]", "a: !!int x", "a: !!float y", "a: !!bool z", "a: !!null {}", "a: !!seq x", "a: !!timestamp x",
+    "a: 2024-13-45", "? [a, b]\n: c", "{? {a: b} : c}", "a: 0b2", "a: 0o9", "a: 09:99:99", "a: " + "1" * 5000,
+    "a: 1_0_0", "x: .nan", "a: =", "<<: 1", "<<: [1]", "a: b: c", "\ufeffa: 1", "a:\t1", "--- a\n--- b",
+    "!!python/name:os.system", "a: 'x\\0'", 'a: "\\ud800"', 'a: "\\U0011ffff"', "a: 1e400", "parameters: [1]",
+    "effects: {a: 1}", "effects: [[1]]", "effects: [{effect: [1]}]", "parameters: {m: {field: [a]}}", "a: !!binary x",
 )  # fmt: skip
 
 
@@ -246,7 +251,7 @@ def resummed(content: bytes) -> bytes:
 
 
 def model_numbers(path: Path) -> list[Any]:
-    """Load a model, find its parameters, simulate ten steps; what it consists of, and where that ends unless it diverges."""
+    """Load a model, find its parameters, simulate ten steps; return what it consists of."""
     model = load_model(path)
     ParameterSpace(model, {"m": {"field": "body_mass", "name": "*", "bounds": [0.5, 2.0]}})
     data = mujoco.MjData(model)
@@ -298,7 +303,8 @@ def targets(folder: Path) -> dict[str, Target]:
     )
     arm = Folder(fresh("arm"))
     config = arm.config(
-        noise=[1e-3] * 4, epsilon=1e-4, observation=["qpos", "qvel"], mask=["elbow.velocity"], covariance="diagonal", lag=2,
+        noise=[1e-3] * 4, epsilon=1e-4, observation=["qpos", "qvel"], mask=["elbow.velocity"], lag=2,
+        covariance="diagonal",
         effects=[{"effect": "joint_friction", "target": "elbow", "friction": 0.1}], entropy=0.0, seed=1,
         data={"path": "log.npz", "terminals": "terminals"}, adam={"steps": 10}, trajectories=2,
     )  # fmt: skip
@@ -378,7 +384,7 @@ def attempt(target: Target, seed: int, number: int) -> tuple[str, str]:
     except InputError as error:
         return _judged(str(error))
     except OSError as error:  # the command line says so in one line
-        text = f"{error.filename or 'output'}: {error.strerror}"
+        text = one_line(f"{error.filename or 'output'}: {error.strerror}")
         return ("traceback", repr(error)) if error.strerror is None else _judged(text)
     except BaseException:
         return "traceback", traceback.format_exc(limit=-4)

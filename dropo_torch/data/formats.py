@@ -83,9 +83,9 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
         reading(path, "a table of text"),
         warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
     ):
-        options = {"sep": separator, "skipinitialspace": True, "index_col": False, "low_memory": False}
-        head = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False, **options).iloc[0]
-        frame = pd.read_csv(path, **options)
+        read = partial(pd.read_csv, path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False)
+        head = read(header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
+        frame = read()
         frame.columns = pd.Index([name.strip() or f"Unnamed: {i}" for i, name in enumerate(head)])
     twice = frame.columns[frame.columns.duplicated()]
     if len(twice):
@@ -166,8 +166,9 @@ def mat_arrays(path: str) -> bytes:
 
     arrays = flatten(scipy.io.loadmat(path, simplify_cells=True), ".")
     arrays = {name: array for name, array in arrays.items() if not name.startswith("__")}
-    plain = {str(i): a if a.dtype.kind in "biufcUS" else np.empty(0, "V1") for i, a in enumerate(arrays.values())}
-    np.savez(buffer := io.BytesIO(), names=json.dumps(list(arrays)), **plain)
+    plain: dict[str, Any] = {"names": np.array(json.dumps(list(arrays)))}
+    plain |= {str(i): a if a.dtype.kind in "biufcUS" else np.empty(0, "V1") for i, a in enumerate(arrays.values())}
+    np.savez(buffer := io.BytesIO(), **plain)
     return buffer.getvalue()
 
 

@@ -85,19 +85,28 @@ class Observation:
     def states(self, observations: np.ndarray) -> np.ndarray:
         """Return full states ``(T, nq + nv)`` of logged observations ``(T, log_width)``."""
         observations = np.asarray(observations, dtype=np.float64)
+        self.check_quaternions(observations, "observations")
         states = np.tile(np.asarray(self.default_state), (len(observations), 1))
         states[:, self.index] = observations[:, list(self.log_columns)]
         for quaternion in self.quaternions:
             block = self.index[list(quaternion)]
-            norm = np.linalg.norm(states[:, block], axis=1, keepdims=True)
-            bad = np.flatnonzero(norm[:, 0] < 1e-6)
+            states[:, block] /= np.linalg.norm(states[:, block], axis=1, keepdims=True)
+        return states
+
+    def check_quaternions(self, log: np.ndarray, what: str) -> None:
+        """Refuse observations ``(T, log_width)`` with a quaternion that is no orientation.
+
+        Raises:
+            InputError: a zero quaternion, with its row and ``what`` it is in.
+        """
+        for quaternion in self.quaternions:
+            norm = np.linalg.norm(log[:, [self.log_columns[i] for i in quaternion]], axis=1)
+            bad = np.flatnonzero(norm < 1e-6)
             if bad.size:
                 raise InputError(
-                    f"log: row {bad[0]} has a zero quaternion in {self.labels[quaternion[0]]}; "
+                    f"log: row {bad[0]} of {what} has a zero quaternion in {self.labels[quaternion[0]]}; "
                     "a unit quaternion (w, x, y, z) is expected"
                 )
-            states[:, block] = states[:, block] / norm
-        return states
 
     def observed(self, log: np.ndarray) -> np.ndarray:
         """Return the observed columns ``(T, n)`` of a log ``(T, log_width)``."""

@@ -181,6 +181,8 @@ def make_transitions(
         raise InputError(
             f"{trajectories.source}: {width} observed columns; the observation has {observation.log_width}"
         )
+    for what in ("observations", "next_observations"):  # both ends, of the rows between windows too
+        observation.check_quaternions(getattr(trajectories, what), what)
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
     starts = [np.arange(a, b - lag + 1, lag) for a, b in itertools.pairwise(bounds)]
     rows = np.concatenate(starts)

@@ -62,13 +62,15 @@ class Checkpoint:
             InputError: a file that is damaged or no checkpoint of this kind, or that of another run.
         """
         try:
-            kind, owner, content = loads(self.path.read_bytes(), self.roots, self.named)
-            if kind != self.kind:
-                raise ValueError(f"it is that of a {kind}")
+            head, arrays = _opened(self.path.read_bytes())
+            if head["kind"] != self.kind:
+                raise ValueError(f"it is that of a {head['kind']}")
+            is_own = tuple(head["owner"]) == self.owner
+            content = _content(head, arrays, self.roots, self.named) if is_own else None
         except (ValueError, TypeError, LookupError, OverflowError, RecursionError, MemoryError) as error:
             what = f"{self.path} is no checkpoint of a {self.kind} ({error})"
             raise InputError(f"resume: {what}; start again without --resume") from None
-        if owner != self.owner:
+        if not is_own:
             what = f"{self.path} belongs to another config, model, log or method"
             raise InputError(f"resume: {what}; restore those, or start again without --resume")
         return content
@@ -97,16 +99,28 @@ def loads(
     Raises:
         ValueError, TypeError, LookupError: a file that :func:`dumps` has not written like this.
     """
+    head, arrays = _opened(data)
+    return head["kind"], tuple(head["owner"]), _content(head, arrays, roots, named or {})
+
+
+def _opened(data: bytes) -> tuple[dict[str, Any], memoryview]:
+    """The JSON of a file whose checksum is right, and the bytes of its arrays."""
     first = len(FORMAT) + 64 + 1
     if not data.startswith(FORMAT):
         raise ValueError("it does not begin as one")
     if data[len(FORMAT) : first] != hashlib.sha256(data[first:]).hexdigest().encode() + b"\n":
         raise ValueError("it is damaged: its checksum differs")
     end = data.index(b"\n", first)
-    head = json.loads(data[first:end])
-    reader = _Reader({c.__name__: c for c in _dataclasses(roots)}, {c.__name__: f for c, f in (named or {}).items()})
-    reader.take(head["arrays"], memoryview(data)[end + 1 :])
-    return head["kind"], tuple(head["owner"]), reader.value(head["content"])
+    return json.loads(data[first:end]), memoryview(data)[end + 1 :]
+
+
+def _content(
+    head: dict[str, Any], arrays: memoryview, roots: Iterable[type], named: Mapping[type, Callable[[str], Any]]
+) -> Any:
+    """The state that JSON and arrays stand for."""
+    reader = _Reader({c.__name__: c for c in _dataclasses(roots)}, {c.__name__: f for c, f in named.items()})
+    reader.take(head["arrays"], arrays)
+    return reader.value(head["content"])
 
 
 class _Writer:

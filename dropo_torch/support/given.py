@@ -97,7 +97,7 @@ def number(value: Any, what: str, *, least: float = -math.inf, above: float = -m
     """
     try:
         found = float(value)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         found = math.nan
     if isinstance(value, bool) or not math.isfinite(found) or found < least or found <= above:
         expected = "a positive number" if above == 0 else "0 or a positive number" if least == 0 else "a finite number"
