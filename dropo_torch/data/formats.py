@@ -83,7 +83,9 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
         reading(path, "a table of text"),
         warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
     ):
-        read = partial(pd.read_csv, path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False)
+        read: Callable[..., Any] = partial(
+            pd.read_csv, path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False
+        )
         head = read(header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
         frame = read()
         frame.columns = pd.Index([name.strip() or f"Unnamed: {i}" for i, name in enumerate(head)])
