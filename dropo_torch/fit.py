@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import math
-import pickle
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -22,7 +21,8 @@ from dropo_torch.excitation import refuse_dead_parameters
 from dropo_torch.initial_noise import InitialStateNoise
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FitSettings, Optimizer, Progress, Request, make_optimizer
-from dropo_torch.support.files import write_atomically, write_json
+from dropo_torch.support.checkpoint import Checkpoint
+from dropo_torch.support.files import write_json
 from dropo_torch.support.random import draw_uniforms
 from dropo_torch.verdict import Judgment, hopeless_at
 
@@ -163,8 +163,8 @@ def fit(
     if resume and checkpoint is None:
         raise InputError("resume: there is no checkpoint to go on from; name its file: checkpoint=PATH")
     owner = (fingerprint, search.method, search.name, repr(settings), _digest(objective))
-    kept = None if checkpoint is None else _Checkpoint(Path(checkpoint), owner)
-    state = kept.restore(search, objective) if resume and kept is not None else None
+    kept = None if checkpoint is None else Checkpoint(Path(checkpoint), "fit", owner, (HistoryEntry, *search.KINDS))
+    state = _restored(kept, search, objective) if resume and kept is not None else None
     if state is None:
         state = _State(simulated_transitions=refuse_dead_parameters(objective))
         if search.name == "adam" and has_reference(objective):
@@ -189,7 +189,7 @@ class _State:
 
 
 def _run(
-    search: Optimizer, objective: Objective, state: _State, kept: _Checkpoint | None, on_progress: OnProgress | None
+    search: Optimizer, objective: Objective, state: _State, kept: Checkpoint | None, on_progress: OnProgress | None
 ) -> None:
     """Ask and tell until the optimizer stops; keep the state after every batch."""
     evaluations, seconds = state.spent
@@ -211,7 +211,13 @@ def _run(
         entry = HistoryEntry(*cost, progress.log_likelihood, progress.stage, *map(np.array, search.candidates()[0]))
         state.history.append(entry)
         if kept is not None:
-            kept.save(search, state)
+            kept.save({
+                "optimizer": search.state(),
+                "history": state.history,
+                "simulated_transitions": state.simulated_transitions,
+                "hopeless": state.hopeless,
+                "linearised": state.initial and (state.initial.mean, state.initial.std, state.initial.is_widened),
+            })  # fmt: skip
         if on_progress is not None:
             on_progress(entry, progress)
 
@@ -293,45 +299,16 @@ def _retreat(
     return [replace(distribution, mean=np.clip(drawn[kept].mean(0), box.low, box.high), std=std)]
 
 
-@dataclass(frozen=True)
-class _Checkpoint:
-    """The file in which a fit's state is kept, and whose fit it is."""
-
-    path: Path
-    owner: tuple[str, ...]
-
-    def save(self, search: Optimizer, state: _State) -> None:
-        """Write the state, whole or not at all."""
-        content = {
-            "owner": self.owner,
-            "optimizer": search.state(),
-            "history": [vars(entry) for entry in state.history],
-            "simulated_transitions": state.simulated_transitions,
-            "hopeless": state.hopeless,
-            "linearised": state.initial and (state.initial.mean, state.initial.std, state.initial.is_widened),
-        }
-        write_atomically(self.path, pickle.dumps(content))
-
-    def restore(self, search: Optimizer, objective: Objective) -> _State | None:
-        """Restore the state of a fresh optimizer and its fit; ``None`` where there is none yet."""
-        if not self.path.is_file():
-            return None
-        try:
-            content = pickle.loads(self.path.read_bytes())
-            is_own, linearised = content["owner"] == self.owner, content["linearised"]
-            history = [HistoryEntry(**entry) for entry in content["history"]]
-            state = _State(content["simulated_transitions"], history, hopeless=content["hopeless"])
-            if is_own:
-                search.restore(content["optimizer"])
-        except Exception as error:
-            what = f"{self.path} is no checkpoint of a fit ({error})"
-            raise InputError(f"resume: {what}; start again without --resume") from None
-        if not is_own:
-            what = f"{self.path} belongs to another config, log or optimizer"
-            raise InputError(f"resume: {what}; restore those, or start again without --resume")
-        if linearised is not None:
-            state.initial = objective.initial_noise(*linearised)  # already counted
-        return state
+def _restored(kept: Checkpoint, search: Optimizer, objective: Objective) -> _State | None:
+    """Restore the state of a fresh optimizer and its fit; ``None`` where there is none yet."""
+    if not kept.path.is_file():
+        return None
+    content = kept.load()
+    search.restore(content["optimizer"])
+    state = _State(content["simulated_transitions"], content["history"], hopeless=content["hopeless"])
+    if content["linearised"] is not None:
+        state.initial = objective.initial_noise(*content["linearised"])  # already counted
+    return state
 
 
 def _digest(objective: Objective) -> str:

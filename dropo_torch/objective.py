@@ -254,6 +254,10 @@ def sampled_likelihood(
     return torch.cat([values.sum(0), gaussian.sum(0), squared.nansum(0), kept, lost.sum(0)])
 
 
+#: Of ε and of the standard deviation of noise: beyond, a covariance has no digits left beside the other columns'.
+LIMITS = {"epsilon": (1e-20, 1e20), "noise": (0.0, 1e10)}
+
+
 def _per_entry(key: str, given: float | Sequence[float], count: int, what: str, labels: Sequence[str]) -> torch.Tensor:
     """A scalar or list of the config as a tensor ``(count,)`` of positive numbers."""
     try:
@@ -264,8 +268,8 @@ def _per_entry(key: str, given: float | Sequence[float], count: int, what: str, 
         shape = len(entries) if entries.ndim == 1 else tuple(entries.shape)
         raise InputError(f"{key}: {shape} values given; expected one, or one per {what}: {', '.join(labels)}")
     entries = entries.expand(count).clone()
-    lowest = float(entries.min())
-    if not bool(torch.isfinite(entries).all()) or lowest < 0 or (key == "epsilon" and lowest <= 0):
+    low, high = LIMITS[key]
+    if not bool(((entries >= low) & (entries <= high)).all()):
         least = "positive numbers" if key == "epsilon" else "numbers of at least 0"
-        raise InputError(f"{key}: {given} given; expected {least}")
+        raise InputError(f"{key}: {given} given; expected {least}, from {low:g} to {high:g}")
     return entries

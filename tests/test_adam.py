@@ -1,7 +1,5 @@
 """Adam, exact scores and certificates on the Warp backend."""
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -15,6 +13,7 @@ from dropo_torch.fit import answer
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, FisherOptimizer, FitSettings
 from dropo_torch.optimizers.settings import adam_settings
+from dropo_torch.support.checkpoint import dumps, loads
 from dropo_torch.support.random import draw_uniforms
 
 pytest.importorskip("warp")
@@ -81,7 +80,7 @@ def test_adam_approaches_the_masses_and_continues_from_any_state(objective: Obje
     error = []
     while whole.stop_reason is None:
         if len(error) in (0, 1, 7, 63, 64, 80):  # before and after the basis is computed, in both stages
-            state = pickle.loads(pickle.dumps(whole.state()))
+            state = loads(b"".join(dumps("fit", (), whole.state())))[2]
             whole = AdamOptimizer(objective, settings)
             whole.restore(state)
         advance(whole, objective)

@@ -507,16 +507,14 @@ def test_an_interrupted_run_ends_as_one_never_interrupted(folder: Path, tmp_path
     for _ in range(2):  # killed after the first batch, and again after the second
         with pytest.raises(Stop):
             fit(
-                again.objective, FitSettings(samples=10), search=make_search(again), checkpoint=tmp_path / "c.pkl",
+                again.objective, FitSettings(samples=10), search=make_search(again), checkpoint=tmp_path / "c.bin",
                 resume=True, on_progress=stop,
             )  # fmt: skip
     last = problem(folder, method, "noisy", method_options=options)
     resumed = fit(
-        last.objective, FitSettings(samples=10), search=make_search(last), checkpoint=tmp_path / "c.pkl", resume=True
+        last.objective, FitSettings(samples=10), search=make_search(last), checkpoint=tmp_path / "c.bin", resume=True
     )  # fmt: skip
-    assert resumed.distribution.mean == pytest.approx(whole.distribution.mean, rel=1e-12)
-    assert resumed.distribution.std == pytest.approx(whole.distribution.std, rel=1e-12)
-    assert resumed.evaluations == whole.evaluations
+    assert {**resumed.document(), "seconds": 0} == {**whole.document(), "seconds": 0}
 
 
 @pytest.mark.parametrize("method", ["droid", "simopt", "bayessim", "laplace", "udr"])

@@ -449,7 +449,7 @@ def test_a_fit_resumed_from_any_checkpoint_is_the_fit_never_interrupted(tmp_path
 
     whole = fit(spread_objective(), FitSettings(samples=10))
     for steps in (1, len(whole.history) // 2):
-        path = tmp_path / f"{steps}.pkl"
+        path = tmp_path / f"{steps}.bin"
         with pytest.raises(Stop):
             fit(spread_objective(), FitSettings(samples=10), checkpoint=path, on_progress=stop_after(steps))
         again = fit(spread_objective(), FitSettings(samples=10), checkpoint=path, resume=True)

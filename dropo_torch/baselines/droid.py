@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -40,11 +41,11 @@ class DroidOptimizer(Evolution):
 
     def __init__(self, objective: Objective, *, settings: DroidSettings, seed: int) -> None:
         self._space, self._box, self._settings = objective.simulator.parameters, objective.box, settings
-        self._search = evolution(
-            max(2, len(self._space)),  # pycma needs two dimensions; the second is idle
+        super().__init__(partial(
+            evolution, max(2, len(self._space)),  # pycma needs two dimensions; the second is idle
             seed=seed, budget=settings.budget, population=settings.population,
             tolerances={"tolfun": 1e-12, "tolfunhist": 1e-13},
-        )  # fmt: skip
+        ))  # fmt: skip
         self._best = np.inf
 
     def ask(self) -> Request:

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Sequence
 
 from dropo_torch.commands.options import Parser
-from dropo_torch.errors import InputError, choices
+from dropo_torch.errors import InputError, choices, one_line
 
 #: Commands, each with its module and what it does.
 COMMANDS = {
@@ -55,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, code: int) -> int:
     """Say in one line why the command ends, and return its exit code."""
-    print(f"dropo: {' '.join(message.split())}", file=sys.stderr)
+    print(f"dropo: {one_line(message)}", file=sys.stderr)
     return code
 
 
@@ -85,7 +85,7 @@ def _dispatch(given: list[str]) -> int:
         from dropo_torch.commands.folder import claimed
         from dropo_torch.config import parse_overrides
 
-        console = Console(highlight=False)
+        console = Console(highlight=False, markup=False, emoji=False)  # names are the user's, and no markup
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
         with claimed(parsed.out) if parsed.out is not None else contextlib.nullcontext():
             return parsed.run(parsed, parse_overrides(rest), console) or 0

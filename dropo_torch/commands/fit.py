@@ -68,12 +68,12 @@ def run_fit(
         require("tensorboard", f"--log {log}")
     problem = make_problem(config)
     check_first(logged_data(problem), console, force=force)
-    continued = resume and (out / "checkpoint.pkl").exists()
+    continued = resume and (out / "checkpoint.bin").exists()
     make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not continued:
         refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
-    result = fit_shown(problem, console, checkpoint=out / "checkpoint.pkl", resume=resume)
+    result = fit_shown(problem, console, checkpoint=out / "checkpoint.bin", resume=resume)
     diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed)
     lost = result.diverged / (len(problem.objective) * result.samples)
     result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))
@@ -133,7 +133,7 @@ def _write_events(result: Fit, folder: Path) -> None:
 def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
     table = Table("parameter", "mean", "std", "unit", "search box")
     for name, entry in result.distribution.summary().items():
-        box = f"\\[{entry['low']:g}, {entry['high']:g}]"
+        box = f"[{entry['low']:g}, {entry['high']:g}]"
         table.add_row(name, f"{entry['mean']:.5g}", f"{entry['std']:.2g}", entry["unit"], box)
     console.print(table)
     if result.judgment is not None:
@@ -162,4 +162,4 @@ def _left_out(problem: Problem) -> str:
 
 def show_report(out: Path, console: Console) -> None:
     """Print where the report is."""
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True, markup=False)
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)

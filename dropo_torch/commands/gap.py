@@ -45,7 +45,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
     problem = make_problem(config, general=True)
     check_first(logged_data(problem), console, force=given.force)
-    store = out / "gap-progress.pkl"
+    store = out / "gap-progress.bin"
     with StageProgress(console, "gap") as progress:
         progress.show("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside
@@ -64,7 +64,7 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
 
     headline, items = answer(gap)
     for line in (headline, *(f"  - {item}" for item in items)):
-        console.print(line, markup=False)
+        console.print(line)
     table = Table("held-out data", "before", "after", "noise alone")
     rows = (
         ("one-step mean squared error", "mse", "{:.3g}"),
@@ -75,10 +75,10 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
         table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
     console.print(table)
     for line in filter(None, (gap.next_experiment, *gap.notes)):
-        console.print(line, markup=False)
+        console.print(line)
     console.print(
         f"{gap.simulated_transitions} simulated transitions, {gap.seconds:.1f} s; report: {out / 'report.html'}",
-        soft_wrap=True, markup=False,
+        soft_wrap=True,
     )  # fmt: skip
     if (out / "config.yaml").exists():
-        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True, markup=False)
+        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True)

@@ -50,7 +50,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     problem = make_training(config)
     if config.data is not None:  # training needs no log; one that its distribution may come from is examined
         check_first(read_log(config), console, force=given.force)
-    checkpoint = out / "train-progress.pt"
+    checkpoint = out / "train-progress.bin"
     continued = given.resume and checkpoint.exists()
     path = problem.distribution_path
     if path is not None and not continued and path.resolve().parent == out.resolve():
@@ -104,7 +104,7 @@ def _show(result: Training, out: Path, console: Console) -> None:
         soft_wrap=True,
     )  # fmt: skip
     for path in (out / "policy.pt", out / "report.html"):
-        console.print(f"{path.stem}: {path}", soft_wrap=True, markup=False)
+        console.print(f"{path.stem}: {path}", soft_wrap=True)
 
 
 class _Curves:

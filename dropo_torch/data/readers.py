@@ -24,7 +24,7 @@ from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
 from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.extras import extra
-from dropo_torch.support.given import check_keys, number, reading
+from dropo_torch.support.given import check_keys, number, reading, user_path
 
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
 
@@ -164,7 +164,7 @@ def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories
 
 def _paths(source: str | Path, base: Path) -> list[Path]:
     """The path meant, or those that a pattern matches."""
-    path = base / Path(source).expanduser()
+    path = user_path(base, source)
     if path.exists() or not glob.has_magic(str(source)):
         return [path]
     found = sorted(Path(match) for match in glob.glob(str(path), recursive=True))

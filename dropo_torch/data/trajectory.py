@@ -236,6 +236,8 @@ def make_transitions(
         raise InputError(
             f"{trajectories.source}: {width} observed columns; the observation has {observation.log_width}"
         )
+    for what in ("observations", "next_observations"):  # both ends, of the rows between windows too
+        observation.check_quaternions(getattr(trajectories, what), what)
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
     begin = bounds[:-1] if since is None else bounds[:-1] + since
     starts = [np.arange(a, b - lag + 1, lag) for a, b in zip(begin, bounds[1:], strict=True)]

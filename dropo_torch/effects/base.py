@@ -153,7 +153,7 @@ class Effect(abc.ABC):
     shares: ClassVar[tuple[float, ...]] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by name: whoever reads it must have registered the effect, too."""
+        """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""
         return find_effect, (self.name,)
 
     @abc.abstractmethod

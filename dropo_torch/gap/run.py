@@ -16,7 +16,7 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.scene import Scene, prepare, searched
-from dropo_torch.gap.search import Checkpoint, Naming, search, start
+from dropo_torch.gap.search import Naming, kept, search, start
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
 
@@ -98,8 +98,8 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
     found = []
     for suffix, evidence in searched(scene):
-        path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
-        found.append(search(replace(ground, evidence=evidence), scene.begin, Checkpoint(path, resume, known)))
+        path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
+        found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume))
         if found[-1].named or not found[0].gap:
             break
     return found[-1] if found[-1].named else found[0]

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dropo_torch.effects.base import Placed
-from dropo_torch.errors import InputError
+from dropo_torch.effects import find_effect
+from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.accept import add, canonical, everywhere, extend, is_done, prune, swap, ties
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, Screening, State
@@ -17,7 +16,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import allowance, significant
-from dropo_torch.support.files import write_atomically
+from dropo_torch.support.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -49,52 +48,42 @@ class Naming:
     partial: bool = False
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """Where a search keeps its state between rounds.
+def kept(path: Path, fingerprint: str) -> Checkpoint:
+    """Return where a search keeps its state between rounds.
 
-    Attributes:
-        path: the file; ``None`` for nowhere.
-        resume: whether to go on from it.
+    Args:
+        path: the file.
         fingerprint: identifies config, model, log and vocabulary.
     """
+    return Checkpoint(path, "gap", (fingerprint,), (State,), {Effect: find_effect})
 
-    path: Path | None
-    resume: bool
-    fingerprint: str
 
-    def load(self) -> State | None:
-        """Return the state of an interrupted search, if there is one.
+def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = None, *, resume: bool = False) -> Naming:
+    """Return what is missing, beginning from the declared parameters' values.
 
-        Raises:
-            InputError: it is of another config, model or log.
-        """
-        if self.path is None or not self.resume or not self.path.exists():
-            return None
-        try:
-            document = pickle.loads(self.path.read_bytes())
-            known, state = document["fingerprint"], document["state"]
-        except Exception:  # whatever bytes that are no checkpoint make of a pickle
-            raise InputError(f"--resume: {self.path} is no checkpoint; run without --resume") from None
-        if known != self.fingerprint:
-            raise InputError(
-                f"--resume: {self.path} is of another config, model or log; run without --resume, "
-                "or name another folder"
-            )
+    Args:
+        ground: what the search stands on.
+        begin: the declared parameters' values.
+        checkpoint: where the state is kept between rounds, ``None`` for nowhere.
+        resume: go on from there, if there is one.
+
+    Raises:
+        InputError: a checkpoint that is damaged, or of another search.
+    """
+    twin = ground.evidence.twin
+
+    def keep(state: State) -> State:
+        if checkpoint is not None:
+            checkpoint.save({"state": state, "simulated_transitions": twin.simulated_transitions})
         return state
 
-    def save(self, state: State) -> State:
-        """Write the state, whole or not at all, and return it."""
-        if self.path is not None:
-            write_atomically(self.path, pickle.dumps({"fingerprint": self.fingerprint, "state": state}))
-        return state
-
-
-def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint) -> Naming:
-    """Return what is missing, beginning from the declared parameters' values."""
-    state = checkpoint.load() or checkpoint.save(start(ground, begin))
+    if resume and checkpoint is not None and checkpoint.path.exists():
+        content = checkpoint.load()
+        state, twin.simulated_transitions = content["state"], content["simulated_transitions"]
+    else:
+        state = keep(start(ground, begin))
     while not state.done:
-        state = checkpoint.save(step(ground.at(state), state))
+        state = keep(step(ground.at(state), state))
     return conclude(ground.at(state), state)
 
 

@@ -86,6 +86,8 @@ class Optimizer(abc.ABC):
     improves: ClassVar[bool] = False
     #: Names of the attributes that change.
     STATE: ClassVar[tuple[str, ...]] = ()
+    #: Dataclasses in the state: beside them it holds plain values, arrays and tensors.
+    KINDS: ClassVar[tuple[type, ...]] = ()
 
     @abc.abstractmethod
     def ask(self) -> Request:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-import pickle
+from collections.abc import Callable
+from functools import partial
 from typing import Any, ClassVar
 
 import cma
@@ -10,6 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.distribution import SearchBox
+from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import LikelihoodOptimizer, Optimizer, Progress, Request
 from dropo_torch.optimizers.settings import FitSettings
@@ -20,7 +22,7 @@ DIVERGED = 1e100
 
 
 class Normals:
-    """Standard normals for pycma from a generator of their own, which travels with a checkpoint."""
+    """Standard normals for pycma from a generator of their own."""
 
     def __init__(self, seed: int) -> None:
         self.generator = np.random.default_rng(seed)
@@ -62,24 +64,44 @@ def why_stopped(search: cma.CMAEvolutionStrategy, budget: str, value: str) -> st
 
 
 class Evolution(Optimizer):
-    """A search by pycma: a generation stands until it was told, and the state holds pycma's own pickle.
+    """A search by pycma: a generation stands until it was told, and the state holds what every generation was told.
 
     Nothing outweighs a divergence: whatever diverges more often than the least of all generations ranks behind all
     that does not, whatever it costs.
+
+    Args:
+        begin: makes the search as it begins; from there what was told leads anywhere else.
     """
 
-    STATE: ClassVar[tuple[str, ...]] = ("_asked", "_best", "_least")
-    _search: cma.CMAEvolutionStrategy
-    _asked: list[np.ndarray] | None = None
+    STATE: ClassVar[tuple[str, ...]] = ("_told", "_best", "_least")
     _least: float = np.inf
 
+    def __init__(self, begin: Callable[[], cma.CMAEvolutionStrategy]) -> None:
+        self._begin, self._search = begin, begin()
+        self._asked: list[np.ndarray] | None = None
+        self._told: list[list[float]] = []
+
     def state(self) -> dict[str, Any]:
-        """Return pycma's own pickle and what stands beside it."""
-        return super().state() | {"_search": self._search.pickle_dumps()}
+        """Return what every generation was told, and where that has led."""
+        return super().state() | {"mean": np.array(self._search.mean)}
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        super().restore(state | {"_search": pickle.loads(state["_search"])})
+        """Go on from a saved state: tell a new search the same once more.
+
+        Raises:
+            InputError: this leads elsewhere, as another version of pycma may.
+        """
+        super().restore({name: state[name] for name in self.STATE})
+        self._search, self._asked, told, self._told = self._begin(), None, self._told, []
+        for values in told:
+            self._search.stop()  # keeps records of its own, once a generation
+            self._generation()
+            self._rank(values)
+        if not np.array_equal(self._search.mean, state["mean"]):
+            raise InputError(
+                f"resume: pycma {cma.__version__} searches differently than the one that began; install that, or "
+                "start again without --resume"
+            )
 
     def _generation(self) -> np.ndarray:
         """The points in [0, 4] to be told next, ``(population, dimensions)``."""
@@ -89,11 +111,15 @@ class Evolution(Optimizer):
 
     def _tell(self, costs: np.ndarray, lost: np.ndarray) -> None:
         """Rank the generation by how often each point diverged, then by its costs, ``(population,)`` each."""
-        assert self._asked is not None
         self._least = min(self._least, float(lost.min()))
         costs = np.minimum(np.nan_to_num(costs, nan=DIVERGED), DIVERGED)
         rank = np.argsort(np.lexsort((costs, lost)))
-        self._search.tell(self._asked, np.where(lost > self._least, DIVERGED * (1.0 + rank), costs).tolist())
+        self._rank(np.where(lost > self._least, DIVERGED * (1.0 + rank), costs).tolist())
+
+    def _rank(self, values: list[float]) -> None:
+        """Tell the search the generation's values, of which the least is the best."""
+        self._search.tell(self._asked, values)
+        self._told.append(values)
         self._asked = None
 
 
@@ -110,11 +136,11 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
     _best: tuple[float, float] = (-np.inf, -np.inf)
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
-        super().__init__(objective, settings)
-        self._search = evolution(
-            2 * len(self._space), seed=settings.seed, budget=settings.budget, population=settings.population,
-            tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
-        )  # fmt: skip
+        LikelihoodOptimizer.__init__(self, objective, settings)
+        Evolution.__init__(self, partial(
+            evolution, 2 * len(self._space), seed=settings.seed, budget=settings.budget,
+            population=settings.population, tolerances={"tolfun": 1e-3, "tolfunhist": 1e-4, "tolstagnation": 200},
+        ))  # fmt: skip
         self._best_phi: np.ndarray | None = None
 
     def ask(self) -> Request:

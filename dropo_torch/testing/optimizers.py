@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -18,6 +17,7 @@ from dropo_torch.fit import answer, noise_of
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.checkpoint import dumps, loads
 from dropo_torch.testing.laws import NotApplicable, Report, require, require_same, try_laws
 from dropo_torch.testing.linear import LinearSimulator, linear_objective
 
@@ -161,12 +161,17 @@ def run_search(make: MakeOptimizer, objective: Objective, seed: int) -> Search:
     steps: list[Step] = []
     while optimizer.stop_reason is None:
         require(len(steps) < _ENDLESS, f"a search that goes on after {_ENDLESS} batches", "a stop_reason in the end")
-        before = pickle.dumps(optimizer.state())
+        before = _kept(optimizer)
         request = optimizer.ask()
-        between = pickle.dumps(optimizer.state())
+        between = _kept(optimizer)
         optimizer.tell(*told(objective, request))
         steps.append(Step(before, between, request, optimizer.progress, optimizer.candidates()))
     return Search(objective, optimizer, steps)
+
+
+def _kept(optimizer: Optimizer) -> bytes:
+    """The optimizer's state as a checkpoint holds it."""
+    return b"".join(dumps("fit", (), optimizer.state(), optimizer.KINDS))
 
 
 def _flat(candidates: list[tuple[np.ndarray, np.ndarray]]) -> torch.Tensor:
@@ -269,7 +274,7 @@ def _it_goes_on_from_any_state_as_if_never_interrupted(case: OptimizerCase) -> N
         objective = case.problem.objective()
         other = used if number == 1 else case.make(objective, case.seed)
         step = whole.steps[at]
-        other.restore(pickle.loads(step.between if number % 2 else step.before))
+        other.restore(loads(step.between if number % 2 else step.before, other.KINDS)[2])
         for i in range(at, len(whole.steps)):
             request = other.ask()
             _require_same_request(request, whole.steps[i].request, f"request {i} after going on from {at}", "the first")
