@@ -79,7 +79,7 @@ class Rules:
     frozen_travel: float = 0.05
     quantum: float = 0.5
     jitter: float = 0.05
-    gap: float = 1.5
+    gap: float = 1.75
     norm: float = 0.02
     sure_norm: float = 0.2
     turned: float = 0.3
