@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +19,6 @@ from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.placing import plain_setting
-from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, add
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import cut_windows, make_setting
@@ -43,7 +40,7 @@ NOISE = (1e-5, 1e-4)
 FINER = Placed(find_effect("integration"), None, (STEP / 8,))
 #: Numbers at which an effect acts on the rig, beside those from which a search begins.
 NUMBERS = {"joint_limit": {"lower": 0.4, "upper": -0.4}, "actuator_saturation": {"limit": 0.3}}
-TASK = '''
+TASK = """
 import mujoco, torch
 from pathlib import Path
 from dropo_torch.rl import Task
@@ -62,7 +59,7 @@ class Rig(Task):
         return next_states[:, 0]
     def terminated(self, next_states):
         return torch.zeros(len(next_states), dtype=torch.bool)
-'''
+"""
 
 
 @functools.cache
@@ -164,9 +161,7 @@ def vector(problem: Problem, hypothesis: Hypothesis, setting: Setting, model: mu
 def likelihood(problem: Problem, values: np.ndarray) -> np.ndarray:
     """The objective of a fit at one parameter vector, of each row, with the noise as it is given, ``(T,)``."""
     objective = problem.objective
-    initial = objective.initial_noise(
-        values, widen=lambda residual, _: torch.ones(len(residual), dtype=residual.dtype)
-    )
+    initial = objective.initial_noise(values, widen=lambda residual, _: torch.ones(len(residual), dtype=residual.dtype))
     out: list[torch.Tensor] = []
 
     def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
@@ -197,7 +192,8 @@ def test_what_is_written_is_what_was_found(names: tuple[str, ...], tmp_path: Pat
     values = vector(written, hypothesis, setting, written.space.model)
     assert (values >= written.space.low).all() and (values <= written.space.high).all()
     assert "timestep" not in " ".join(written.space.names)
-    after = score(evidence, Held(windows, windows, 0.0), hypothesis).log_likelihood
+    log = problem.trajectories
+    after = score(evidence, Held(log, np.arange(len(log)), windows, 0.0), hypothesis).log_likelihood
     found = likelihood(written, values)
     assert len(found) == len(windows)
     assert abs(found.sum() - after) <= len(found) / 100, notes

@@ -70,6 +70,7 @@ class Twin:
         warp: bool = False, standing: Callable[[np.ndarray], tuple[Placed, ...]] | None = None,
     ) -> None:  # fmt: skip
         self.setting, self.space, self._standing, self._chunk = setting, space, standing, chunk_size
+        self.num_threads = num_threads
         self._engine = VariantEngine(setting, space, num_threads=num_threads, warp=warp)
         self.rates = np.array(observed_rates(setting))
         self._commands: np.ndarray | None = None
@@ -81,6 +82,11 @@ class Twin:
         before, twin = self._standing, copy.copy(self)
         twin._standing = lambda declared: (*(before(declared) if before is not None else ()), placed)
         return twin
+
+    def effects(self, variant: Variant) -> tuple[Placed, ...]:
+        """Return all effects of a variant, those that every variant has among them."""
+        standing = () if self._standing is None else self._standing(np.asarray(variant.declared))
+        return (*standing, *variant.placed)
 
     def predict(
         self,
@@ -103,8 +109,7 @@ class Twin:
             the simulation can know, of the same shape.
         """
         num_k, num_w, length = len(variants), len(windows), windows.length
-        if self._standing is not None:
-            variants = [replace(v, placed=(*self._standing(np.asarray(v.declared)), *v.placed)) for v in variants]
+        variants = [replace(v, placed=self.effects(v)) for v in variants]
         shown = windows.measured[:, 0] if starts is None else starts
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
