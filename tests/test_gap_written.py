@@ -194,7 +194,8 @@ def test_what_is_written_is_what_was_found(names: tuple[str, ...], tmp_path: Pat
     assert (values >= written.space.low).all()
     assert (values <= written.space.high).all()
     assert "timestep" not in " ".join(written.space.names)
-    after = score(evidence, Held(windows, windows, 0.0), hypothesis).log_likelihood
+    log = problem.trajectories
+    after = score(evidence, Held(log, np.arange(len(log)), windows, 0.0), hypothesis).log_likelihood
     found = likelihood(written, values)
     assert len(found) == len(windows)
     assert abs(found.sum() - after) <= len(found) / 100, notes

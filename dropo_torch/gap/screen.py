@@ -54,7 +54,7 @@ class Focus:
     @cached_property
     def slope(self) -> np.ndarray:
         """Their derivatives by its numbers, ``(q, W·N)``."""
-        return self.fitted.slope.reshape(len(self.fitted.slope), -1) * self.factor
+        return self.fitted.slope.reshape(len(self.fitted.slope), self.factor.size) * self.factor
 
     @property
     def excess(self) -> float:
@@ -136,7 +136,7 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         begin = found[rows][0]
         residual = evidence.project(begin, linear).ravel() * factor
         change = (found[rows][1:] - begin) / steps[:, None, None]
-        slope = evidence.project_slope(change, linear).reshape(len(moving), -1) * factor
+        slope = evidence.project_slope(change, linear).reshape(len(moving), factor.size) * factor
         known = evidence.twin.knows(variants[rows.start], evidence.windows)
         here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
         residual, slope = np.where(here, residual, before), slope * here
