@@ -393,7 +393,7 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     scene, (truth,) = scene_of(name), hidden(name).effects
     base = refit(scene.evidence, scene.begin)
     candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
-    ranked = screen(Focus(scene.evidence, base), candidates)
+    ranked = screen(Focus(scene.evidence, base), candidates, Rules().tried)
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
 
@@ -428,9 +428,9 @@ def test_robust_factors_are_the_slope_of_the_robust_loss() -> None:
 
 def test_what_is_better_everywhere_and_right_nowhere_clears_nothing() -> None:
     base = spoilt(100.0, 1.0)
-    assert clears(base, spoilt(1000.0, 0.4))  # right in six of ten windows, worse in the others
-    assert not clears(base, spoilt(3.0, 1.0))  # imitates it everywhere
-    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0))  # was right in most windows before
+    assert clears(base, spoilt(1000.0, 0.4), Rules())  # right in six of ten windows, worse in the others
+    assert not clears(base, spoilt(3.0, 1.0), Rules())  # imitates it everywhere
+    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0), Rules())  # was right in most windows before
 
 
 # --- intervals ------------------------------------------------------------------------------------------------

@@ -33,6 +33,8 @@ class Quantity:
         neutral: the value at which the effect is absent.
         low, high: values outside are no physics, or freeze the model.
         scale: a size that matters on this log; steps and thresholds are taken relative to it.
+        discrete: whether only some values in between mean anything, such as those of the starts: nothing moves it,
+            it has no interval, and it is no parameter.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Quantity:
     low: float
     high: float
     scale: float
+    discrete: bool = False
 
 
 @dataclass(frozen=True)
