@@ -237,7 +237,8 @@ def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
 
 NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
-    "schema": str, "where": list, "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
+    "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
+    "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
 }  # fmt: skip
@@ -272,13 +273,24 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
     assert set(document["declared"]["pole_mass"]) == {"given", "alone", "with_effects"}
     assert list(document["noise"]) == ["rail.position", "hinge.position", "rail.velocity", "hinge.velocity"]
     assert set(document["chi2_per_degree"]) == {"before", "after"}
+    assert document["verdict"] == {0: "no gap", 1: "unnamed", 2: "explained"}[len(document["effects"])]
+    assert document["verdict_reason"]
+    assert document["remaining"] is None
 
 
 def test_every_key_of_gap_json_is_documented() -> None:
     text = (Path(__file__).parents[1] / "docs" / "gap.md").read_text()
     assert not [key for key in CONTRACT if f"`{key}`" not in text]
     assert not [name for name in FILES if f"`{name}`" not in text]
-    assert not [f.name for f in dataclasses.fields(Rules) if f"`{f.name}`" not in text]
+    assert not [f"{g}{f.name}" for g, f in thresholds() if f"`{g}{f.name}`" not in text]
+
+
+def thresholds() -> list[tuple[str, dataclasses.Field]]:
+    """Every threshold, after the name of its group and a dot."""
+    groups = {f.name: getattr(Rules(), f.name) for f in dataclasses.fields(Rules)}
+    nested = {g: v for g, v in groups.items() if dataclasses.is_dataclass(v)}
+    own = [("", f) for f in dataclasses.fields(Rules) if f.name not in nested]
+    return own + [(f"{g}.", f) for g, v in nested.items() for f in dataclasses.fields(v)]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -393,7 +405,7 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     scene, (truth,) = scene_of(name), hidden(name).effects
     base = refit(scene.evidence, scene.begin)
     candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
-    ranked = screen(Focus(scene.evidence, base), candidates)
+    ranked = screen(Focus(scene.evidence, base), candidates, Rules().tried)
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
 
@@ -428,9 +440,9 @@ def test_robust_factors_are_the_slope_of_the_robust_loss() -> None:
 
 def test_what_is_better_everywhere_and_right_nowhere_clears_nothing() -> None:
     base = spoilt(100.0, 1.0)
-    assert clears(base, spoilt(1000.0, 0.4))  # right in six of ten windows, worse in the others
-    assert not clears(base, spoilt(3.0, 1.0))  # imitates it everywhere
-    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0))  # was right in most windows before
+    assert clears(base, spoilt(1000.0, 0.4), Rules())  # right in six of ten windows, worse in the others
+    assert not clears(base, spoilt(3.0, 1.0), Rules())  # imitates it everywhere
+    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0), Rules())  # was right in most windows before
 
 
 # --- intervals ------------------------------------------------------------------------------------------------

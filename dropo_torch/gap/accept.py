@@ -10,19 +10,30 @@ import numpy as np
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit
-from dropo_torch.gap.rules import near, significant, simplest
+from dropo_torch.gap.rules import significant, simplest
 from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
+from dropo_torch.gap.sound import absurd
 
-#: Cosine of two candidates' derivatives from which on they are the same thing on this log.
-SAME = 0.9999
 #: The round of attempts that only look for ties.
 TIES = -1
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
-    """Return whether a hypothesis removes most of another's excess, or less of it all over the log."""
+    """Return whether a hypothesis removes most of another's excess, or so much that the search goes on with it."""
     most = better.cost.excess < (1 - ground.rules.most) * worse.cost.excess
-    return most or ground.advantage(better, worse) >= ground.rules.significance
+    return most or ground.chance(better, worse) <= ground.rules.chance.explore
+
+
+def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
+    """Return whether an effect may have a name: it removes enough, and chance among all candidates does not."""
+    rules = ground.rules
+    enough = without.cost.excess - whole.cost.excess >= rules.least * state.base.cost.excess
+    return enough and ground.chance(whole, without) * ground.comparisons <= rules.chance.error
+
+
+def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
+    """Return those hypotheses whose numbers are no nonsense."""
+    return [r for r in fitted if not any(absurd(ground.part, r, ground.rules.sound))]
 
 
 def is_done(ground: Ground, state: State) -> bool:
@@ -38,17 +49,21 @@ def add(ground: Ground, state: State) -> State:
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
     alive = [c for c in ranked if not c.dead]
-    singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
+    singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.tried.refits]], "refitting")
+    singles = sound(ground, singles)
     if not singles:
         return replace(state, done=True)
-    best = simplest(singles)
+    best = simplest(singles, rules)
     if best.cost.excess / current.cost.excess > 1 - rules.most:
         focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
-        pairs = promising_pairs(focus, screen(focus, [c.placed for c in alive[:16]]))
-        families = promising_families(ground.focus(current), alive)
+        pairs = promising_pairs(
+            focus, screen(focus, [c.placed for c in alive[: rules.tried.paired]], rules.tried), rules.tried
+        )
+        families = promising_families(ground.focus(current), alive, rules.tried)
         for words, groups in (("pairs", pairs), ("families", families)):
             tried, state = ground.refits(state, current, groups, f"refitting {words}")
-            if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
+            tried = sound(ground, tried)
+            if tried and tried[0].cost.excess < rules.tried.clearer * best.cost.excess:
                 best = tried[0]
     gained = current.cost.excess - best.cost.excess
     hopeless = best.cost.excess > rules.hopeless * current.cost.excess or gained < rules.least * state.base.cost.excess
@@ -59,6 +74,7 @@ def add(ground: Ground, state: State) -> State:
 
 def swap(ground: Ground, state: State) -> State:
     """Try to put another effect in the place of each accepted one."""
+    tried = ground.rules.tried
     for _ in range(2):
         before = state.current
         for index in range(len(before.hypothesis.placed)):
@@ -66,9 +82,11 @@ def swap(ground: Ground, state: State) -> State:
             focus = ground.focus(without)
             here = refit(focus.evidence, state.current.hypothesis, iterations=0).cost.chi2
             alive = [c for c in ground.screened(without) if not c.dead]
-            rivals = [(c.placed,) for c in alive[:3] if c.chi2 < 0.8 * here]  # that promise to explain more
+            rivals = [
+                (c.placed,) for c in alive[: tried.rivals] if c.chi2 < tried.promises * here
+            ]  # that promise to explain more
             found, state = ground.refits(state, without, rivals, "swapping")
-            better = [r for r in found[:1] if r.cost.excess < state.current.cost.excess]
+            better = [r for r in sound(ground, found[:1]) if r.cost.excess < state.current.cost.excess]
             if better and beats(ground, better[0], state.current):
                 state = replace(state, current=better[0])
         if state.current is before:
@@ -113,13 +131,13 @@ def everywhere(ground: Ground, state: State) -> State:
 def prune(ground: Ground, state: State) -> State:
     """Drop effects that are not needed, the least needed first."""
     current = state.current
-    while len(current.hypothesis.placed) > 1:
-        without = [ground.refit(current.hypothesis.without(i)) for i in range(len(current.hypothesis.placed))]
-        least = min(without, key=lambda r: r.cost.excess)
-        needed = least.cost.excess - current.cost.excess
-        if needed >= ground.rules.least * state.base.cost.excess and beats(ground, current, least):
+    while current.hypothesis.placed:
+        placed = current.hypothesis.placed
+        without = [ground.refit(current.hypothesis.without(i)) for i in range(len(placed))]
+        idle = [r for r in without if not is_needed(ground, state, current, r)]
+        if not idle:
             break
-        current = least
+        current = min(idle, key=lambda r: r.cost.excess)
     return replace(state, current=current)
 
 
@@ -129,28 +147,28 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
     ranked = ground.screened(without) if origin.placed else state.first.ranked
-    same = equivalents(ground.setting, own, ranked)
+    same = equivalents(ground.setting, own, ranked, ground.rules.alike.cosine)
     known = {own.key, *(p.key for p in same)}
     fits = [c for c in ranked if not c.dead and len(c.placed.values) <= len(own.values)]
-    others = [(c.placed,) for c in fits if c.key not in known][: max(5 - len(same), 2)]
+    others = [(c.placed,) for c in fits if c.key not in known][: max(ground.rules.alike.most - len(same), 2)]
     alike = [ground.refit(origin.with_effects([p]), iterations=3) for p in same]
     rivals, state = ground.refits(replace(state, number=TIES), without, others, "looking for ties", origin)
     found = []
     for fitted in (*alike, *rivals):
         as_clear = ground.clears(state.base, fitted) or not ground.clears(state.base, current)
-        close = fitted.cost.excess - current.cost.excess < near(current.cost)
-        if close and as_clear and ground.advantage(current, fitted) < ground.rules.tie:
+        if as_clear and ground.as_good(fitted, current):
             found.append(fitted.hypothesis.placed[-1])
     return tuple(found), without.cost.excess - current.cost.excess, state
 
 
-def equivalents(setting: Setting, own: Placed, ranked: Sequence[Candidate]) -> list[Placed]:
+def equivalents(setting: Setting, own: Placed, ranked: Sequence[Candidate], same: float) -> list[Placed]:
     """Return candidates of one number whose derivatives point the same way, with the values that do the same.
 
     Args:
         setting: the model and its columns.
         own: the effect, with its value.
         ranked: a screening beside the hypothesis without it.
+        same: cosine of two candidates' derivatives from which on they point the same way.
     """
     single = [c for c in ranked if len(c.slope) == len(c.placed.values) == 1]
     mine = next((c.slope[0] for c in single if c.key == own.key), None)
@@ -160,7 +178,7 @@ def equivalents(setting: Setting, own: Placed, ranked: Sequence[Candidate]) -> l
     for other in single:
         slope = other.slope[0]
         cosine = float(mine @ slope / max(np.linalg.norm(mine) * np.linalg.norm(slope), 1e-300))
-        if other.key == own.key or other.dead or abs(cosine) < SAME:
+        if other.key == own.key or other.dead or abs(cosine) < same:
             continue
         here, there = (p.effect.quantities(setting, p.target)[0] for p in (own, other.placed))
         ratio = float(mine @ slope / (slope @ slope)) / here.scale * there.scale

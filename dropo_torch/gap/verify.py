@@ -152,7 +152,7 @@ def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[n
 
 
 def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Objective:
-    """Return the likelihood that a fit with the effects of a hypothesis in its simulator would have of held-out data."""
+    """Return the likelihood that a fit with a hypothesis' effects in its simulator would have of held-out data."""
     twin = evidence.twin
     setting, space, threads = twin.setting, twin.space, twin.num_threads
     placed = twin.effects(hypothesis.variant)
