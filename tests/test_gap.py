@@ -21,7 +21,7 @@ from arm import Folder
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
 from benchmarks.hidden.systems import CART_POLE, TORQUE_ARM
-from benchmarks.hidden.truths import Case, Effect, simulate_truth
+from benchmarks.hidden.truths import Before, Case, Effect, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
@@ -315,6 +315,41 @@ def test_windows_share_no_measurement_and_cross_no_end() -> None:
         assert np.array_equal(measured[:-1], observed[row : row + length])
         assert np.array_equal(measured[-1], ends[row + length - 1])
     assert len(cut_windows(log, problem.observation, 101)) == 0
+
+
+REMEMBERING = [
+    Effect("actuator_delay", "push", {"delay": 0.025}), Effect("actuator_lag", "push", {"time_constant": 0.03}),
+    Effect("actuator_backlash", "push", {"width": 0.6}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("truth", REMEMBERING, ids=lambda e: e.name)
+def test_what_was_commanded_before_the_log_is_no_gap(truth: Effect) -> None:
+    """A log that begins in motion: until then the commands were zero, and are not in it."""
+    case = simulate_truth(CART_POLE, [truth], 4, before=Before(quiet=True), **SIZE)
+    gap = search(case, (*FEW, "actuator_backlash"))
+    assert [(e.effect, e.target) for e in gap.effects] == [(truth.name, truth.target)]
+    ((number, value),) = truth.parameters.items()
+    told = gap.effects[0].parameters[number]
+    half = 0.5 * (told.high - told.low)
+    assert told.low - half <= value <= told.high + half
+    assert half < 0.01 * value
+    assert gap.reduced[1] == pytest.approx(1, abs=0.15)
+    assert gap.after.log_likelihood == pytest.approx(gap.noise_floor.log_likelihood, rel=0.02)
+
+
+@pytest.mark.parametrize("truth", REMEMBERING, ids=lambda e: e.name)
+def test_windows_whose_commands_are_known_are_predicted_as_in_the_whole_log(truth: Effect) -> None:
+    scene, hypothesis = scene_of(), true(dataclasses.replace(hidden(), effects=(truth,)))
+    whole = cut_windows(scene.train, scene.setting.observation, 4, stride=1)
+    late = whole.select((whole.steps >= 37) & (whole.episodes == 0))
+    cut = dataclasses.replace(late, steps=late.steps - 37, commands=late.commands[:1, 37:], episodes=0 * late.episodes)
+    known = scene.twin.knows(hypothesis.variant, cut)
+    assert 0 < np.argmax(known) < 40
+    assert known[np.argmax(known) :].all()
+    (in_whole,), (in_cut,) = (scene.twin.predict([hypothesis.variant], w)[0] for w in (late, cut))
+    np.testing.assert_allclose(in_cut[known], in_whole[known], atol=1e-4)
+    assert np.abs(in_cut[0] - in_whole[0]).max() > 1e-3
 
 
 # --- the noise ------------------------------------------------------------------------------------------------
