@@ -701,7 +701,7 @@ def test_config_is_one_that_a_fit_accepts(cart: Path, tmp_path: Path) -> None:
     fitted = json.loads((tmp_path / "fit" / "fit.json").read_text())["parameters"]
     means = {name: entry["mean"] for name, entry in fitted.items()}
     assert means.pop("pole_mass") == pytest.approx(hidden("joint_damping").declared["pole_mass"], rel=0.05)
-    assert means == {"hinge_damping": pytest.approx(0.01 + 0.02, rel=1e-3)}  # the model's own and what was missing
+    assert means == {"hinge_damping": pytest.approx(0.01 + 0.02, rel=3e-3)}  # the model's own and what was missing
 
 
 @pytest.mark.usefixtures("one_effect")

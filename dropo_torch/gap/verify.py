@@ -132,11 +132,8 @@ def _log_likelihood(covariance: np.ndarray, distance: np.ndarray | int) -> float
 
 def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
     """Errors of single steps ``(T, m)``, and their covariance by the noise ``(T, m, m)``."""
-    objective, values, twin = (
-        one_step_objective(evidence, held, hypothesis),
-        np.array(hypothesis.declared),
-        evidence.twin,
-    )
+    twin, values = evidence.twin, np.array(hypothesis.declared)
+    objective = one_step_objective(evidence, held, hypothesis)
     initial = objective.initial_noise(to_coordinates(values, twin.space.is_log), widen=False)
     parts: list[tuple[torch.Tensor, ...]] = []
 
@@ -152,7 +149,7 @@ def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[n
 
 
 def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Objective:
-    """Return the likelihood that a fit with a hypothesis' effects in its simulator would have of held-out data."""
+    """Return the likelihood that a fit would have of held-out data, with a hypothesis in its simulator."""
     twin = evidence.twin
     setting, space, threads = twin.setting, twin.space, twin.num_threads
     placed = twin.effects(hypothesis.variant)
@@ -174,7 +171,8 @@ def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -
     transitions = make_transitions(held.log, setting.observation, history=simulator.history).select(held.rows)
     noise = Features.of(setting.observation).column_noise(evidence.noise)
     mask = [setting.observation.labels[c] for c in sorted(setting.masked)]
-    return Objective(simulator, transitions, setting.observation, epsilon=below(noise), noise=noise.tolist(), mask=mask)
+    given = {"epsilon": below(noise), "noise": noise.tolist(), "mask": mask}
+    return Objective(simulator, transitions, setting.observation, **given)
 
 
 def below(noise: np.ndarray) -> float:
