@@ -183,11 +183,11 @@ def promising_pairs(focus: Focus, candidates: Sequence[Candidate]) -> list[list[
 
 def _best(focus: Focus, groups: Iterable[Sequence[Candidate]]) -> list[tuple[float, Sequence[Candidate]]]:
     """Groups of candidates with the χ² that they leave together, the best first."""
-    return sorted(((_left(focus, members), members) for members in groups), key=lambda item: item[0])
+    return sorted(((left_by(focus, members), members) for members in groups), key=lambda item: item[0])
 
 
-def _left(focus: Focus, members: Sequence[Candidate]) -> float:
-    """χ² that is left beside the shared numbers, the members' numbers, and the steps to the members' starts."""
+def left_by(focus: Focus, members: Sequence[Candidate]) -> float:
+    """Return the χ² that is left beside the shared numbers, the members' numbers, and the steps to their starts."""
     before = focus.residual
     columns = np.stack([*focus.slope, *(s for c in members for s in c.slope), *(c.residual - before for c in members)])
     norm = np.sqrt((columns**2).sum(1))

@@ -10,12 +10,13 @@ import numpy as np
 
 from dropo_torch.effects.base import Placed
 from dropo_torch.errors import InputError
-from dropo_torch.gap.accept import add, canonical, everywhere, extend, is_done, prune, swap, ties
+from dropo_torch.gap.accept import add, everywhere, extend, is_done, prune, swap
 from dropo_torch.gap.evidence import Evidence, caps_of
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import allowance, significant
+from dropo_torch.gap.ties import canonical, ties
 from dropo_torch.support.files import write_atomically
 
 #: Least ratio of a feature's residuals to the noise at which that noise stays as it is.
