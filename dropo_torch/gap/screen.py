@@ -68,6 +68,7 @@ class Candidate:
 
     Attributes:
         placed: the effect with the predicted numbers.
+        start: the effect where the prediction began.
         chi2: predicted χ² on the screened windows.
         residual: projected residuals at the candidate's start, ``(W·N,)``.
         slope: projected derivatives by its numbers, ``(p, W·N)``.
@@ -75,6 +76,7 @@ class Candidate:
     """
 
     placed: Placed
+    start: Placed
     chi2: float
     residual: np.ndarray
     slope: np.ndarray
@@ -143,7 +145,8 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         values = start.copy()
         values[moving] += move[len(shared) :] * limits.scale
         left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
-        yield Candidate(placed.at(placed.effect.settle(start, values)), float(left.sum()), residual, slope, dead)
+        predicted = placed.at(placed.effect.settle(start, values))
+        yield Candidate(predicted, placed, float(left.sum()), residual, slope, dead)
 
 
 def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:

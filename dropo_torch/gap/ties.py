@@ -7,7 +7,7 @@ from dataclasses import replace
 
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import Refit
+from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import near
 from dropo_torch.gap.screen import Candidate, Focus, left_by
 
@@ -35,14 +35,15 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
     ranked = ground.screened(without) if origin.placed else state.first.ranked
-    others = [(p,) for p in promising(ground.focus(without), ranked, own)]
+    focus = ground.focus(without)
+    others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own)]
     looking = replace(state, number=ROUND)
     rivals, found = ground.refits(looking, without, others, "looking for ties", origin, most=FULLY)
     tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
     return tied, without.cost.excess - current.cost.excess, replace(state, attempts=found.attempts)
 
 
-def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed) -> list[Placed]:
+def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed) -> list[Candidate]:
     """Return candidates that explain, to first order, most of what is left without an effect; the best first."""
     degrees = focus.evidence.degrees(focus.fitted.linear) - len(focus.slope)
     before = max(float(focus.residual @ focus.residual) - degrees, 1e-12)
@@ -50,7 +51,17 @@ def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed) -> list[Pl
     most = max(PROMISING, 2 * share.get(own.key, 0.0))
     found = [c for c in ranked if not c.dead and c.key != own.key and share[c.key] < most]
     found = [c for c in found if not (own.effect.name in c.placed.effect.contains and c.placed.target == own.target)]
-    return [c.placed for c in sorted(found, key=lambda c: share[c.key])][:ROUGHLY]
+    return sorted(found, key=lambda c: share[c.key])[:ROUGHLY]
+
+
+def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
+    """Return a candidate with the numbers, predicted or begun with, that explain more beside a hypothesis."""
+
+    def loss(placed: Placed) -> float:
+        hypothesis = origin.with_effects([placed])
+        return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0).loss
+
+    return min((candidate.placed, candidate.start), key=loss)
 
 
 def as_good(ground: Ground, state: State, rival: Refit) -> bool:
