@@ -101,7 +101,7 @@ def noise_ratios(case: Case, document: Mapping[str, Any]) -> dict[str, float]:
     found = {}
     for label, told in (document.get("noise") or {}).items():
         stem, _, part = label.partition(".rotation[")
-        level = 2 * true[f"{stem}.position[q{part}"] if part else true[label]
+        level = 2 * true[f"{stem}[q{part}"] if part else true[label]
         found[label] = float(told) / level
     return found
 

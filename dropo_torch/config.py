@@ -5,17 +5,16 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import pydantic
-import yaml
 from pydantic import Field
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.support.given import check_keys
+from dropo_torch.support.given import check_keys, read_text, user_path
+from dropo_torch.support.yaml_text import load_yaml
 
 if TYPE_CHECKING:
     from dropo_torch.optimizers.settings import FitSettings
@@ -57,19 +56,22 @@ class Config(pydantic.BaseModel):
     )
     method_options: Entries = _key({}, "options of a method other than dropo; see docs/methods.md")
     optimizer: Literal["fisher", "cma", "adam"] = _key("fisher", "how φ is searched")
-    entropy: float = _key(0.0, "weight of the entropy of the distribution in the fit", ge=0)
+    entropy: float = _key(0.0, "weight of the entropy of the distribution in the fit", ge=0, le=1e6)
     covariance: Literal["diagonal", "full"] = _key("diagonal", "whether parameters vary together")
     epsilon: float | list[float] = _key(1e-5, "ε, variance added to every column, or one each")
     noise: float | list[float] | None = _key(
         None, "standard deviation of the measurement, or one per column; initial states are then uncertain"
     )
     samples: int = _key(100, "K, parameter vectors per transition", ge=2, le=1_000_000)
-    lag: int = _key(1, "λ, logged steps per window", ge=1)
+    lag: int = _key(1, "λ, logged steps per window", ge=1, le=1_000_000)
     seed: int = _key(0, "seed of everything that is random", ge=0, lt=2**63)
     mask: list[str | int] = _key([], "observed columns which the likelihood leaves out")
     scaling: bool = _key(False, "divide each column by its standard deviation over the log")
-    budget: int = _key(1000, "with cma: evaluations of the objective", ge=1)
-    population: int | None = _key(None, "with cma: φ per generation", ge=2)
+    orientation: Literal["rotation_vector", "angle"] = _key(
+        "rotation_vector", "how orientations are compared: as rotation vectors, or by the angle as in the paper"
+    )
+    budget: int = _key(1000, "with cma: evaluations of the objective", ge=1, le=10**9)
+    population: int | None = _key(None, "with cma: φ per generation", ge=2, le=100_000)
     common_random_numbers: bool = _key(False, "with cma: the same samples in every generation")
     adam: Entries = _key({}, "with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers")
     device: str = _key("cpu", "with warp: cpu, or a GPU such as cuda:0")
@@ -85,14 +87,14 @@ class Config(pydantic.BaseModel):
     train: Entries = _key({}, "how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md")
     target: Entries = _key({}, "name: value, the model on which a trained policy is evaluated beside the nominal one")
     threads: int = _key(0, "threads of the simulator, 0 for all processors", ge=0, le=4096)
-    chunk_size: int = _key(10_000, "simulations held in memory at once", ge=1)
+    chunk_size: int = _key(10_000, "simulations held in memory at once", ge=1, le=10**9)
 
     #: Folder that relative paths start from; not a key of the file.
     base: Path = Field(Path(), exclude=True)
 
     def path(self, given: str) -> Path:
         """Return a path of the config as one that can be opened."""
-        return self.base / Path(given).expanduser()
+        return user_path(self.base, given)
 
     def fit_settings(self) -> FitSettings:
         """Return what a fit is told.
@@ -167,10 +169,7 @@ def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) ->
     path = Path(path)
     if not path.is_file():
         raise InputError(f"config: no file {path}; expected a YAML file with keys such as model, data and parameters")
-    try:
-        document = yaml.load(path.read_text(encoding="utf-8"), Loader=_Loader)
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise InputError(f"config: {path} is no valid YAML: {' '.join(str(error).split())}") from None
+    document = load_yaml(read_text(path, "config"), f"config: {path}")
     if not isinstance(document, Mapping):
         raise InputError(f"config: {path} holds no keys; expected model, data, parameters, ...")
     return make_config(document, overrides, base=path.parent, source=str(path))
@@ -184,12 +183,9 @@ def make_config(
     source: str = "config",
 ) -> Config:
     """Return the config of a mapping, with dotted overrides; errors are those of :func:`load_config`."""
-    try:
-        merged = json.loads(json.dumps(dict(document), default=str))
-    except ValueError:
-        raise InputError(f"{source}: an entry contains itself; expected plain keys and values") from None
+    merged = _plain(dict(document), source)
     for dotted, value in (overrides or {}).items():
-        _override(merged, dotted, value)
+        _override(merged, dotted, _plain(value, f"--{dotted}"))
     check_keys(merged, KEYS, source)
     for key, value in merged.items():
         known = Config.model_fields[key]
@@ -199,6 +195,16 @@ def make_config(
         return Config(**merged, base=base)
     except pydantic.ValidationError as error:
         raise InputError(f"{source}: {explained(error, merged)}") from None
+
+
+def _plain(document: Any, where: str) -> Any:
+    """A copy as JSON knows it: text for what is neither number nor list nor mapping, no whole number without end."""
+    try:
+        text = json.dumps(document, default=str)
+        return json.loads(text, parse_int=lambda digits: int(digits) if len(digits) < 20 else float(digits))
+    except (TypeError, ValueError, RecursionError):
+        why = "an entry contains itself, or has a key that is no text"
+        raise InputError(f"{where}: {why}; expected plain keys and values") from None
 
 
 def explained(error: pydantic.ValidationError, document: Mapping[str, Any]) -> str:
@@ -226,7 +232,8 @@ def _expectation(error: Any) -> str:
         if bound in error.get("ctx", ()):
             return words.format(error["ctx"][bound])
     text = error["msg"].removeprefix("Input should be ").replace("a valid ", "a ").split(",")[0]
-    return {"a integer": "a whole number", "a dictionary": "keys and values"}.get(text, text)
+    whole = dict.fromkeys(("a integer", "Unable to parse input string as an integer"), "a whole number")
+    return (whole | {"a dictionary": "keys and values"}).get(text, text)
 
 
 def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
@@ -250,32 +257,8 @@ def parse_overrides(arguments: Sequence[str]) -> dict[str, Any]:
             if not waiting or waiting[0].startswith("--"):
                 raise InputError(f"--{key}: no value given; expected --{key} VALUE")
             value = waiting.pop(0)
-        try:
-            found[key] = yaml.load(value, Loader=_Loader)
-        except yaml.YAMLError:
-            raise InputError(f"--{key}: {value!r} is no valid value; expected YAML, such as '[1, 2]'") from None
+        found[key] = load_yaml(value, f"--{key}: {value!r}")
     return found
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML as people write numbers: 1e-5 is one, although YAML 1.1 wants 1.0e-5. No key may stand twice."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Refuse a key that would silently replace an earlier one."""
-        seen: set[str] = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
-                if key.value in seen:
-                    twice = f"key {key.value!r} stands there twice"
-                    raise yaml.constructor.ConstructorError(None, None, twice, key.start_mark)
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
-
-
-_FLOAT = re.compile(
-    r"^[-+]?(\d[\d_]*(\.\d*)?|\.\d+)([eE][-+]?\d+)$|^[-+]?(\d+\.\d*|\.\d+)$|^[-+]?\.(inf|Inf)$|^\.(nan|NaN)$"
-)
-_Loader.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, list("-+0123456789."))
 
 
 def _override(document: dict[str, Any], dotted: str, value: Any) -> None:

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from dropo_torch.distribution import Distribution
+from dropo_torch.distribution import Distribution, coordinate_limits, truncated_interval, truncated_moments
 from dropo_torch.initial_noise import InitialStateNoise
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.support.random import draw_uniforms
 
+#: Windows that follow on each other in what is judged of a log that is too long to be judged whole.
+RUN = 20
 #: Two parameters whose estimates are correlated more than this cannot be told apart on the log.
 CONFOUNDED = 0.95
 
@@ -30,14 +32,19 @@ class Diagnostics:
         spread: their standard deviation, ``(T, m)``.
         expected: square root of the diagonal of Σ: spread, ε and noise together, ``(T, m)``.
         given: what ε and the noise alone let expect, ``(T, m)``.
+        change: by how much each column changed over the window, measured, ``(T, m)``.
+        follows: whether the next window begins where this one ends, ``(T,)``; not the last.
         at_center: the simulated next state at μ, ``(T, m)``.
         sensitivity: root mean square change of each column when a parameter moves by 1 % of its
             search width, ``(d, m)``.
-        standard_error: of each mean, in coordinates, from the likelihood's curvature, ``(d,)``.
+        standard_error: of each mean, in coordinates, ``(d,)``, by the Fisher information of the whole covariance: that
+            of parameters that vary, ε and noise.
+        std_error: of each σ, likewise; NaN where it is at its floor, or parameters are correlated.
         correlation: of the estimates of the means, ``(d, d)``.
         confounded: pairs of parameters that this log cannot tell apart, with their correlation.
         diverged: simulations that diverged.
         at_rest: joints at rest in every initial state, because the log has their position alone.
+        noisy_starts: whether initial states are noisy, so that windows that follow on each other share a measurement.
     """
 
     labels: tuple[str, ...]
@@ -49,13 +56,17 @@ class Diagnostics:
     spread: np.ndarray
     expected: np.ndarray
     given: np.ndarray
+    change: np.ndarray
+    follows: np.ndarray
     at_center: np.ndarray
     sensitivity: np.ndarray
     standard_error: np.ndarray
+    std_error: np.ndarray
     correlation: np.ndarray
     confounded: tuple[tuple[str, str, float], ...]
     diverged: int
     at_rest: tuple[str, ...] = ()
+    noisy_starts: bool = False
 
     @property
     def residual(self) -> np.ndarray:
@@ -68,19 +79,22 @@ def diagnose(
 ) -> Diagnostics:
     """Simulate the log under a distribution, and around its center.
 
-    A log of more than ``max_transitions`` windows is judged on that many, spread evenly over it.
+    A log of more than ``max_transitions`` windows is judged on about that many, in runs spread evenly over it.
     """
     if len(objective) > max_transitions:
-        chosen = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
+        begins = np.linspace(0, len(objective) - RUN, max(1, max_transitions // RUN)).astype(int)
+        chosen = np.unique(begins[:, None] + np.arange(RUN))
         objective = objective.on(objective.transitions.select(chosen))
     initial = objective.initial_noise_of(distribution)
     values = distribution.rsample(draw_uniforms(samples, len(distribution), seed, 3))
     mean, variance, center, jacobian, lost = _simulate(objective, distribution, values, initial)
-    covariance = torch.cat([objective.base_covariance(slice(i, i + 1), initial) for i in range(len(objective))])
-    information = torch.einsum("tdm,tmn,ten->de", jacobian, torch.linalg.inv(covariance), jacobian).numpy()
-    error, correlation = estimates(information)
+    covariance = objective.base_covariance(slice(None), initial)
+    error, correlation, std_error = _standard_errors(objective, distribution, covariance, jacobian)
     base = torch.diagonal(covariance, dim1=-2, dim2=-1)
-    widened = torch.ones(1) if initial is None else initial.widening[:, None]
+    widened = torch.ones(1, dtype=torch.float64) if initial is None else initial.widening[:, None]
+    log = objective.transitions
+    follows = np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
+    started, columns = objective.evaluator.columns_at_start, objective.evaluator.columns
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
     return Diagnostics(
@@ -93,14 +107,49 @@ def diagnose(
         spread=variance.sqrt().numpy(),
         expected=(variance + base).sqrt().numpy(),
         given=(base / widened).sqrt().numpy(),
+        change=(objective.measured - objective.features.values(started, columns)).numpy(),
+        follows=follows,
         at_center=center.numpy(),
         sensitivity=0.01 * objective.box.width[:, None] * jacobian.square().mean(0).sqrt().numpy(),
         standard_error=error,
+        std_error=std_error,
         correlation=correlation,
         confounded=tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs),
         diverged=lost,
         at_rest=objective.observation.at_rest,
+        noisy_starts=objective.noise is not None,
     )
+
+
+def _standard_errors(
+    objective: Objective, distribution: Distribution, covariance: torch.Tensor, jacobian: torch.Tensor
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Standard errors of μ and their correlations, and standard errors of σ, in coordinates.
+
+    They are the Fisher information's of N(s̄(μ), A Σ_ξ Aᵀ + C), with C of ε and noise: AᵀΣ⁻¹A for μ, and
+    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ.
+
+    Args:
+        objective: gives the floor of σ.
+        distribution: the fit.
+        covariance: C, ``(T, m, m)``.
+        jacobian: A, ``(T, d, m)``.
+    """
+    limits = coordinate_limits(distribution.limits, distribution.is_log)
+    a, b = truncated_interval(*map(torch.as_tensor, (distribution.mean, distribution.std, *limits)))
+    first, second, _ = truncated_moments(a, b)
+    drawn = torch.as_tensor(distribution.std) * (second - first**2).clamp(min=0).sqrt()
+    shared = torch.eye(len(drawn)) if distribution.correlation is None else torch.as_tensor(distribution.correlation)
+    spread = shared * torch.outer(drawn, drawn)
+    total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
+    gram = jacobian @ torch.linalg.solve(total, jacobian.mT)
+    error, correlation = estimates(gram.sum(0).numpy())
+    std_error = np.full(len(drawn), np.nan)
+    free = distribution.std > 2 * objective.box.min_std
+    if distribution.correlation is None and free.any():
+        information = (2 * torch.outer(drawn, drawn).square() * gram.square().sum(0)).numpy()[np.ix_(free, free)]
+        std_error[free] = distribution.std[free] * estimates(information)[0]
+    return error, correlation, std_error
 
 
 def _simulate(
@@ -134,6 +183,6 @@ def estimates(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information / np.outer(scale, scale))
-    inverse = (vectors / np.maximum(values, 1e-12 * max(float(values.max()), 1e-300))) @ vectors.T
+    inverse = (vectors / np.maximum(values, 1e-12 * max(float(values.max()), 1e-6))) @ vectors.T
     error = np.sqrt(np.maximum(np.diag(inverse), 1e-300))
     return error / scale, np.clip(inverse / np.outer(error, error), -1, 1)

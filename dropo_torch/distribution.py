@@ -24,8 +24,9 @@ import yaml
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.support.given import reading
+from dropo_torch.support.given import read_text, reading
 from dropo_torch.support.random import base_uniforms
+from dropo_torch.support.yaml_text import load_yaml
 
 _YAML = (".yaml", ".yml")
 SCHEMA = "dropo-torch/distribution/1"
@@ -215,12 +216,17 @@ class Distribution:
         if not path.is_file():
             raise InputError(f"distribution: no file {path}; expected a fit.json or a saved distribution")
         is_yaml = path.suffix in _YAML  # JSON is not quite YAML 1.1, which reads 1e-05 as text
-        with reading(f"distribution: {path}", "YAML" if is_yaml else "JSON"):
-            text = path.read_text(encoding="utf-8")
-            document = yaml.safe_load(text) if is_yaml else json.loads(text)
+        text = read_text(path, "distribution")
+        with reading(f"distribution: {path}", "the distribution of a fit"):
+            document = load_yaml(text, f"distribution: {path}") if is_yaml else json.loads(text)
         entries = document.get("parameters") if isinstance(document, Mapping) else None
         if not isinstance(entries, Mapping) or not entries:
             raise InputError(f"distribution: {path} has no 'parameters'; expected name → mean, std, low, high, unit")
+        with reading(f"distribution: {path}", "the distribution of a fit"):
+            return cls._read(document, entries, path)
+
+    @classmethod
+    def _read(cls, document: Mapping[str, Any], entries: Mapping[str, Any], path: Path) -> Distribution:
         correlation = _correlation(document.get("correlation"), len(entries), path)
         laws = {str(entry.get("law", "normal")) for entry in entries.values() if isinstance(entry, Mapping)}
         rows = [_numbers(path, name, entry) for name, entry in entries.items()]
@@ -228,6 +234,7 @@ class Distribution:
             raise InputError(f"distribution: {path}: law {', '.join(sorted(laws))}; expected all normal or all uniform")
         mean, std, low, high = np.array(rows).T
         limits = np.array([entry.get("limits") or [None, None] for entry in entries.values()], dtype=np.float64)
+        limits = limits.reshape(len(entries), 2)
         limits = np.where(np.isnan(limits), [-np.inf, np.inf], limits)
         is_log = np.array([entry.get("scale") == "log" for entry in entries.values()])
         units = tuple(str(entry.get("unit", "")) for entry in entries.values())

@@ -5,16 +5,29 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+#: Characters of a message.
+LONGEST = 1200
+
+
+def one_line(text: object) -> str:
+    """Return text as one line that any terminal can show: what is unprintable written out, its middle left out."""
+    line = " ".join(str(text).split())
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST - 400]} ... [{len(line) - LONGEST + 100:,} characters left out] ... {line[-300:]}"
+    if line.isprintable():
+        return line
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+
 
 class InputError(ValueError):
     """A config, log, model or option that cannot be used as given.
 
     The message is one line: what is wrong, where it stands, and what would be right. The command
-    line prints it and exits with code 2. Line breaks and runs of spaces in it become one space.
+    line prints it and exits with code 2; :func:`one_line` makes it one.
     """
 
     def __init__(self, message: object = "") -> None:
-        super().__init__(" ".join(str(message).split()))
+        super().__init__(one_line(message))
 
 
 class UnsupportedModel(InputError):

@@ -78,6 +78,11 @@ class Evaluator:
         """Observed columns measured at the windows' ends, ``(T, n)``."""
         return _tensor(self.transitions.measured)
 
+    @property
+    def columns_at_start(self) -> torch.Tensor:
+        """Observed columns measured at the windows' starts, ``(T, n)``."""
+        return self.states[:, self.observation.index]
+
     @cached_property
     def measured(self) -> torch.Tensor:
         """Their features, ``(T, m)``; rotations are 0."""

@@ -4,31 +4,38 @@ from __future__ import annotations
 
 import hashlib
 import math
-import pickle
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from dropo_torch.certify import certify, has_reference
-from dropo_torch.distribution import Distribution
+from dropo_torch.distribution import Distribution, to_coordinates
 from dropo_torch.errors import InputError
 from dropo_torch.evaluator import Sums
 from dropo_torch.excitation import refuse_dead_parameters
 from dropo_torch.initial_noise import InitialStateNoise
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import FitSettings, Optimizer, Progress, Request, make_optimizer
-from dropo_torch.support.files import write_atomically, write_json
+from dropo_torch.support.checkpoint import Checkpoint
+from dropo_torch.support.files import write_json
 from dropo_torch.support.random import draw_uniforms
+from dropo_torch.verdict import Judgment, hopeless_at
 
 SCHEMA = "dropo-torch/fit/1"
+#: Share of a search after which it is asked once whether it is hopeless to go on.
+LOOK_AT = 0.4
+#: Distributions that are judged in the end, at most, where simulations diverge under all those before.
+RETREATS = 12
 #: Keys of ``fit.json``, before what a method adds; ``correlation`` only where parameters vary together.
 KEYS = (
-    "schema", "method", "parameters", "correlation", "log_likelihood", "mse", "epsilon", "backend", "optimizer",
-    "samples", "evaluations", "simulated_transitions", "diverged_simulations", "seconds", "seed", "stop_reason",
+    "schema", "method", "verdict", "verdict_reason", "parameters", "standard_errors", "correlation", "log_likelihood",
+    "log_likelihood_eq3", "mse", "epsilon", "backend", "optimizer", "samples", "evaluations", "simulated_transitions",
+    "diverged_simulations", "seconds", "seed", "stop_reason",
 )  # fmt: skip
 
 
@@ -78,6 +85,8 @@ class Fit:
         history: one entry a batch.
         method: how the distribution was found.
         extras: what that method found beside it, as plain data.
+        judgment: whether the model explains the log, once that was judged.
+        log_likelihood_eq3: the log-likelihood by eq. 3, which it is on a log without noise.
     """
 
     distribution: Distribution
@@ -97,12 +106,17 @@ class Fit:
     caveat: str = ""
     method: str = "dropo"
     extras: Mapping[str, Any] = field(default_factory=dict)
+    judgment: Judgment | None = None
+    log_likelihood_eq3: float = math.nan
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
-        correlation = self.distribution.correlation
+        correlation, judgment = self.distribution.correlation, self.judgment
         plain = vars(self) | {
             "schema": SCHEMA,
+            "verdict": judgment and judgment.verdict,
+            "verdict_reason": judgment and judgment.reason,
+            "standard_errors": judgment and judgment.standard_errors,
             "parameters": self.distribution.summary(),
             "correlation": None if correlation is None else correlation.tolist(),
             "epsilon": self.epsilon[0] if len(set(self.epsilon)) == 1 else list(self.epsilon),
@@ -149,8 +163,8 @@ def fit(
     if resume and checkpoint is None:
         raise InputError("resume: there is no checkpoint to go on from; name its file: checkpoint=PATH")
     owner = (fingerprint, search.method, search.name, repr(settings), _digest(objective))
-    kept = None if checkpoint is None else _Checkpoint(Path(checkpoint), owner)
-    state = kept.restore(search, objective) if resume and kept is not None else None
+    kept = None if checkpoint is None else Checkpoint(Path(checkpoint), "fit", owner, (HistoryEntry, *search.KINDS))
+    state = _restored(kept, search, objective) if resume and kept is not None else None
     if state is None:
         state = _State(simulated_transitions=refuse_dead_parameters(objective))
         if search.name == "adam" and has_reference(objective):
@@ -166,6 +180,7 @@ class _State:
     simulated_transitions: int
     history: list[HistoryEntry] = field(default_factory=list)
     initial: InitialStateNoise | None = None
+    hopeless: str | None = None  # why, empty where it is not; None before that was looked at
 
     @property
     def spent(self) -> tuple[int, float]:
@@ -174,29 +189,43 @@ class _State:
 
 
 def _run(
-    search: Optimizer, objective: Objective, state: _State, kept: _Checkpoint | None, on_progress: OnProgress | None
+    search: Optimizer, objective: Objective, state: _State, kept: Checkpoint | None, on_progress: OnProgress | None
 ) -> None:
     """Ask and tell until the optimizer stops; keep the state after every batch."""
     evaluations, seconds = state.spent
     begun = time.monotonic() - seconds
-    while search.stop_reason is None:
+    while search.stop_reason is None and not state.hopeless:
         request = search.ask()
-        at, std = request.linearise_at, request.linearise_std
-        if at is not None and (state.initial is None or not state.initial.is_at(at, std)):
-            state.initial = objective.initial_noise(at, std)
+        at, rest = request.linearise_at, (request.linearise_std, request.widen)
+        if at is not None and (state.initial is None or not state.initial.is_at(at, *rest)):
+            state.initial = noise_of(objective, request)
             state.simulated_transitions += state.initial.simulated_transitions if state.initial else 0
         sums = answer(objective, request, state.initial)
         search.tell(sums.total, sums.gradient)
         evaluations += request.evaluations
         state.simulated_transitions += sums.simulated_transitions
         progress = search.progress
+        if state.hopeless is None and search.improves and progress.fraction >= LOOK_AT:
+            state.hopeless = hopeless_at(objective, search.candidates()[0][0])
         cost = (evaluations, state.simulated_transitions, time.monotonic() - begun)
         entry = HistoryEntry(*cost, progress.log_likelihood, progress.stage, *map(np.array, search.candidates()[0]))
         state.history.append(entry)
         if kept is not None:
-            kept.save(search, state)
+            kept.save({
+                "optimizer": search.state(),
+                "history": state.history,
+                "simulated_transitions": state.simulated_transitions,
+                "hopeless": state.hopeless,
+                "linearised": state.initial and (state.initial.mean, state.initial.std, state.initial.is_widened),
+            })  # fmt: skip
         if on_progress is not None:
             on_progress(entry, progress)
+
+
+def noise_of(objective: Objective, request: Request) -> InitialStateNoise | None:
+    """Return the noise of initial states around which a request is answered."""
+    at = request.linearise_at
+    return None if at is None else objective.initial_noise(at, request.linearise_std, request.widen)
 
 
 def answer(objective: Objective, request: Request, initial: InitialStateNoise | None = None) -> Sums:
@@ -219,17 +248,22 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
     space = objective.simulator.parameters
     uniforms = draw_uniforms(settings.samples, len(space), settings.seed, 0)
     results = []
-    for candidate in search.distributions(space):
-        initial = objective.initial_noise_of(candidate)
+    waiting = search.distributions(space)
+    while waiting:
+        candidate = waiting.pop(0)
+        initial = objective.initial_noise(candidate.mean, widen=False)
         evaluation = objective.evaluate_values(candidate.rsample(uniforms)[None], initial)[0]
-        results.append((evaluation.log_likelihood + search.bonus(candidate), candidate, evaluation))
+        results.append((evaluation.order(search.bonus(candidate)), candidate, evaluation))
         state.simulated_transitions += sum(x.simulated_transitions for x in (evaluation, initial) if x is not None)
-    _, distribution, best = max(results, key=lambda r: -math.inf if math.isnan(r[0]) else r[0])
+        if evaluation.diverged and search.method == "dropo" and len(results) < RETREATS:
+            waiting += _retreat(objective, candidate, uniforms, state)
+    _, distribution, best = max(results, key=lambda r: r[0])
     dropped = distribution.correlation is None and any(c.correlation is not None for _, c, _ in results)
     remark = "makes the log no likelier: parameters vary independently" if dropped else ""
     return Fit(
         distribution=distribution,
         log_likelihood=best.log_likelihood,
+        log_likelihood_eq3=best.gaussian,
         mse=best.mse,
         epsilon=tuple(objective.epsilon.tolist()),
         backend=objective.simulator.name,
@@ -240,7 +274,8 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
         simulated_transitions=state.simulated_transitions,
         diverged=best.diverged,
         seconds=seconds + time.monotonic() - begun,
-        stop_reason=(search.stop_reason or "") + (f", but {remark}" if remark else ""),
+        stop_reason=("it is hopeless" if state.hopeless else search.stop_reason or "")
+        + (f", but {remark}" if remark else ""),
         history=tuple(state.history),
         caveat=f"a full covariance {remark}" if remark else search.caveat,
         method=search.method,
@@ -248,44 +283,32 @@ def _conclude(search: Optimizer, objective: Objective, state: _State, settings: 
     )
 
 
-@dataclass(frozen=True)
-class _Checkpoint:
-    """The file in which a fit's state is kept, and whose fit it is."""
+def _retreat(
+    objective: Objective, distribution: Distribution, uniforms: torch.Tensor, state: _State
+) -> list[Distribution]:
+    """The distribution of those samples under which fewest simulations diverge; none where they are all alike."""
+    values = distribution.rsample(uniforms)
+    found = objective.map(values, lambda features, *_: (~torch.isfinite(features).all(-1)).sum(0).double())
+    state.simulated_transitions += found.simulated_transitions
+    kept = (found.total == found.total.min()).numpy()
+    if kept.all():
+        return []
+    drawn, box = to_coordinates(values.numpy(), distribution.is_log), objective.box
+    share = drawn[kept].std(0) / np.maximum(drawn.std(0), 1e-300)
+    std = np.clip(distribution.std * share**2, box.min_std, distribution.std)
+    return [replace(distribution, mean=np.clip(drawn[kept].mean(0), box.low, box.high), std=std)]
 
-    path: Path
-    owner: tuple[str, ...]
 
-    def save(self, search: Optimizer, state: _State) -> None:
-        """Write the state, whole or not at all."""
-        content = {
-            "owner": self.owner,
-            "optimizer": search.state(),
-            "history": [vars(entry) for entry in state.history],
-            "simulated_transitions": state.simulated_transitions,
-            "linearised": None if state.initial is None else (state.initial.mean, state.initial.std),
-        }
-        write_atomically(self.path, pickle.dumps(content))
-
-    def restore(self, search: Optimizer, objective: Objective) -> _State | None:
-        """Restore the state of a fresh optimizer and its fit; ``None`` where there is none yet."""
-        if not self.path.is_file():
-            return None
-        try:
-            content = pickle.loads(self.path.read_bytes())
-            is_own, linearised = content["owner"] == self.owner, content["linearised"]
-            history = [HistoryEntry(**entry) for entry in content["history"]]
-            state = _State(content["simulated_transitions"], history)
-            if is_own:
-                search.restore(content["optimizer"])
-        except Exception as error:
-            what = f"{self.path} is no checkpoint of a fit ({error})"
-            raise InputError(f"resume: {what}; start again without --resume") from None
-        if not is_own:
-            what = f"{self.path} belongs to another config, log or optimizer"
-            raise InputError(f"resume: {what}; restore those, or start again without --resume")
-        if linearised is not None:
-            state.initial = objective.initial_noise(*linearised)  # already counted
-        return state
+def _restored(kept: Checkpoint, search: Optimizer, objective: Objective) -> _State | None:
+    """Restore the state of a fresh optimizer and its fit; ``None`` where there is none yet."""
+    if not kept.path.is_file():
+        return None
+    content = kept.load()
+    search.restore(content["optimizer"])
+    state = _State(content["simulated_transitions"], content["history"], hopeless=content["hopeless"])
+    if content["linearised"] is not None:
+        state.initial = objective.initial_noise(*content["linearised"])  # already counted
+    return state
 
 
 def _digest(objective: Objective) -> str:

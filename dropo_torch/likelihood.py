@@ -9,11 +9,8 @@ import math
 from collections.abc import Callable
 
 import torch
+from torch.nn.functional import pad
 
-#: Log-likelihood taken from a transition for the share of its samples that diverged, in nats.
-DIVERGENCE_PENALTY = 1e3
-#: Log-likelihood of a transition of which fewer than two samples are left.
-LOST_TRANSITION = -1e4
 #: Degrees of freedom of Student's t distribution, by which windows that noise does not explain are widened.
 STUDENT_DOF = 5.0
 #: Log-density ``(...)`` of residuals ``(..., n)``, given covariances or scale matrices ``(..., n, n)``.
@@ -103,10 +100,10 @@ def log_likelihood(
 
 def survivors(
     features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, float]:
-    """Return the transitions of which no simulation diverged, and the log-likelihood of the others together."""
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return the transitions of which no simulation diverged, and how many the others are, ``()``."""
     alive = torch.isfinite(features).flatten(1).all(-1)
-    return features[alive], measured[alive], covariance[alive], float((~alive).sum()) * LOST_TRANSITION
+    return features[alive], measured[alive], covariance[alive], (~alive).sum().to(features.dtype)
 
 
 def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -135,48 +132,65 @@ def widening(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
 
 
 def likelihood_with_losses(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int,
+    samples: torch.Tensor,
+    measured: torch.Tensor,
+    covariance: torch.Tensor,
+    num_angles: int,
     log_density: LogDensity = gaussian_log_density,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:  # fmt: skip
-    """Log-likelihood, squared error and number of diverged samples, ``(t, P)`` each, of ``(t, P, K, m)``.
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return log-likelihood, eq. 3, squared error and number of diverged samples, ``(t, P)`` each.
 
-    The squared error of a transition of which nothing is left is NaN.
+    Diverged samples are left out. A transition of which fewer than two are left has log-likelihood 0 and a squared
+    error that is NaN: whoever compares counts what diverged first.
+
+    Args:
+        samples: features of the samples, ``(t, P, K, m)``.
+        measured: ``(t, 1, m)``.
+        covariance: what no parameter explains, ``(t, 1, m, m)``.
+        num_angles: of how many rotations, the last features, the angle counts in place of the vector.
+        log_density: of the log-likelihood.
     """
     finite = torch.isfinite(samples).all(-1)
     lost = (~finite).sum(-1)
     if not bool(lost.any()):
-        values, squared = _likelihood(samples, measured, covariance, num_rotations, log_density)
-        return values, squared, lost.double()
-    values = torch.full(lost.shape, LOST_TRANSITION, dtype=samples.dtype)
+        return *_likelihood(samples, measured, covariance, num_angles, log_density), lost.double()
+    values, gaussian = samples.new_zeros(lost.shape), samples.new_zeros(lost.shape)
     squared = torch.full_like(values, torch.nan)
     for t, p in (finite.sum(-1) >= 2).nonzero().tolist():
         kept = samples[t, p, finite[t, p]]
-        one, squared[t, p] = _likelihood(kept, measured[t, 0], covariance[t, 0], num_rotations, log_density)
-        values[t, p] = one - DIVERGENCE_PENALTY * lost[t, p] / samples.shape[2]
-    return values, squared, lost.double()
+        values[t, p], gaussian[t, p], squared[t, p] = _likelihood(
+            kept, measured[t, 0], covariance[t, 0], num_angles, log_density
+        )
+    return values, gaussian, squared, lost.double()
 
 
 def _likelihood(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int, log_density: LogDensity
-) -> tuple[torch.Tensor, torch.Tensor]:
-    """Log-likelihood, with rotations by their angles and both signs, and squared error of the mean features."""
-    squared = (measured - samples.mean(-2)).square().sum(-1)
-    if num_rotations:
-        samples, measured, covariance = _rotation_angles(samples, measured, covariance, num_rotations)
-    mean, sampled = sample_moments(samples)
-    return log_density(measured - mean, sampled + covariance), squared
-
-
-def _rotation_angles(
-    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_rotations: int
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_angles: int, log_density: LogDensity
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Replace each rotation vector by its angle α, the sample by its union with all angles negated."""
-    plain = samples.shape[-1] - 3 * num_rotations
-    angles = samples[..., plain:].unflatten(-1, (num_rotations, 3)).norm(dim=-1)
-    rest = samples[..., :plain]
-    both = torch.cat([torch.cat([rest, angles], -1), torch.cat([rest, -angles], -1)], -2)
-    # an angle's variance is its rotation vector's, averaged over the axes
-    axes = torch.full((3, 1), 3**-0.5, dtype=samples.dtype)
-    average = torch.block_diag(torch.eye(plain, dtype=samples.dtype), *num_rotations * [axes])
-    flat = torch.cat([measured[..., :plain], torch.zeros_like(angles[..., 0, :])], -1)
-    return both, flat, average.T @ covariance @ average
+    """Log-likelihood, eq. 3, and squared error of the mean features."""
+    squared = (measured - samples.mean(-2)).square().sum(-1)
+    if num_angles:
+        residual, total = _angle_moments(samples, measured, covariance, num_angles)
+    else:
+        mean, sampled = sample_moments(samples)
+        residual, total = measured - mean, sampled + covariance
+    value = log_density(residual, total)
+    is_same = log_density is gaussian_log_density
+    return value, value if is_same else gaussian_log_density(residual, total), squared
+
+
+def _angle_moments(
+    samples: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, num_angles: int
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Residual and covariance with each rotation vector's angle α in its place: of the paper's sample, α and −α.
+
+    Measured, an angle is 0, and so is its sample's mean; it goes with no other feature, which the signs cancel. The
+    variance that no parameter explains is the rotation vector's, averaged over the axes.
+    """
+    plain = samples.shape[-1] - 3 * num_angles
+    mean, sampled = sample_moments(samples[..., :plain])
+    angles = samples[..., plain:].unflatten(-1, (num_angles, 3)).norm(dim=-1)
+    base = torch.diagonal(covariance, dim1=-2, dim2=-1)[..., plain:].unflatten(-1, (num_angles, 3)).mean(-1)
+    variance = 2 * angles.square().sum(-2) / (2 * samples.shape[-2] - 1) + base
+    total = pad(sampled + covariance[..., :plain, :plain], (0, num_angles, 0, num_angles))
+    return pad(measured[..., :plain] - mean, (0, num_angles)), total + torch.diag_embed(pad(variance, (plain, 0)))

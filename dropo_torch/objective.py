@@ -6,6 +6,8 @@ import copy
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from typing import Literal
 
 import numpy as np
 import torch
@@ -14,18 +16,15 @@ from dropo_torch.data.features import Features, masked_columns
 from dropo_torch.data.observation import Observation
 from dropo_torch.data.trajectory import Transitions
 from dropo_torch.distribution import Distribution, SearchBox
-from dropo_torch.errors import InputError
+from dropo_torch.errors import InputError, choices
 from dropo_torch.evaluator import Evaluator, Rows, Sums, Visit
-from dropo_torch.initial_noise import InitialStateNoise, Widening, propagate_noise
-from dropo_torch.likelihood import (
-    LogDensity,
-    gaussian_log_density,
-    likelihood_with_losses,
-    student_log_density,
-    widening,
-)
+from dropo_torch.initial_noise import InitialStateNoise, propagate_noise
+from dropo_torch.likelihood import LogDensity, gaussian_log_density, likelihood_with_losses, student_log_density
 from dropo_torch.simulators.base import Simulator
 
+Orientation = Literal["rotation_vector", "angle"]
+#: How an orientation enters the likelihood: by its rotation vector, or by the angle alone, as in the paper.
+ORIENTATIONS: tuple[Orientation, ...] = ("rotation_vector", "angle")
 #: ``reduce(features (t, P, m), measured (t, m), covariance (t, m, m)) -> (r,)``, summed over chunks.
 Reduce = Callable[[torch.Tensor, torch.Tensor, torch.Tensor], torch.Tensor]
 
@@ -35,7 +34,10 @@ class Evaluation:
     """The sampled objective at one φ.
 
     Attributes:
-        log_likelihood: sum over the log's transitions, in nats.
+        log_likelihood: sum over the log's transitions, in nats; −∞ where one is lost: fewer than two of its samples did
+            not diverge.
+        gaussian: the same by eq. 3, which it is on a log without noise.
+        remaining: the log-likelihood of the transitions that are not lost.
         mse: mean squared difference between measured and simulated mean, over features and those transitions
             of which at least two samples did not diverge.
         diverged: number of simulations that diverged.
@@ -43,9 +45,20 @@ class Evaluation:
     """
 
     log_likelihood: float
+    gaussian: float
+    remaining: float
     mse: float
     diverged: int
     simulated_transitions: int
+
+    def order(self, bonus: float = 0.0) -> tuple[int, float]:
+        """Return what candidates are compared by, the best is largest: nothing outweighs a simulation that diverges.
+
+        Args:
+            bonus: what counts beside the log-likelihood.
+        """
+        value = self.remaining + bonus
+        return -self.diverged, -math.inf if math.isnan(value) else value
 
 
 class Objective:
@@ -64,10 +77,12 @@ class Objective:
             column; initial states are then uncertain too. ``None``: they are exact.
         mask: labels (or numbers) of observed columns which the likelihood leaves out.
         scaling: divide each column by its standard deviation over the log.
+        orientation: whether orientations enter by their rotation vectors, or by the angles alone as in the paper.
         chunk_size: rows (transition, parameter vector) held at once.
 
     Raises:
-        InputError: ε that is not positive, noise that is negative, or a wrong number of either; a mask of no column.
+        InputError: ε that is not positive, noise that is negative, or a wrong number of either; a mask of no column; an
+            unknown orientation.
     """
 
     def __init__(
@@ -80,12 +95,16 @@ class Objective:
         noise: float | Sequence[float] | None = None,
         mask: Sequence[str | int] = (),
         scaling: bool = False,
+        orientation: Orientation = "rotation_vector",
         chunk_size: int = 20_000,
     ) -> None:
+        if orientation not in ORIENTATIONS:
+            raise InputError(f"orientation: unknown {orientation!r}" + choices(orientation, ORIENTATIONS))
         self.simulator, self.transitions, self.observation = simulator, transitions, observation
         every = Features.of(observation, masked_columns(observation, mask))
         self._every_feature = every.scaled(transitions.measured) if scaling else every
         self.features = self._every_feature.compared()
+        self.orientation = orientation
         self.evaluator = Evaluator(simulator, transitions, observation, self.features, chunk_size)
         self.box = SearchBox.of(simulator.parameters)
         self.epsilon = _per_entry("epsilon", epsilon, self.features.size, "feature", self.features.labels)
@@ -122,14 +141,15 @@ class Objective:
         return self._every_feature.column_noise(np.full(self._every_feature.size, variance**0.5)).tolist()
 
     def initial_noise(
-        self, mean: np.ndarray, std: np.ndarray | None = None, widen: Widening = widening
+        self, mean: np.ndarray, std: np.ndarray | None = None, widen: bool = True
     ) -> InitialStateNoise | None:
         """Return the noise of the initial states propagated at μ and σ, in coordinates; ``None`` without noise.
 
         Args:
             mean: μ, ``(d,)``.
             std: σ, which then counts as explained where windows are widened, ``(d,)``.
-            widen: by how much covariances are widened.
+            widen: whether to widen what it does not explain, as a search does; else the noise is as given, as the
+                objective has it.
         """
         if self.noise is None:
             return None
@@ -176,6 +196,23 @@ class Objective:
         mu, sigma = (torch.as_tensor(x)[:, None, :] for x in (mean, std))
         return self.box.draw(uniforms.expand(len(mean), *uniforms.shape[-2:]), mu, sigma)
 
+    @property
+    def log_density(self) -> LogDensity:
+        """What the objective makes of a residual and its covariance: eq. 3; Student's t where initial states are noisy.
+
+        A start that is off by half a millimeter may miss a contact: such windows are outliers of any Gaussian.
+        """
+        return gaussian_log_density if self.noise is None else student_log_density
+
+    def likelihood(self, num_phi: int = 1) -> Reduce:
+        """Return the reduction to the sampled objective of P φ, ``(5 P,)``, P entries for each sum.
+
+        The sums are log-likelihood, that of eq. 3, squared error, transitions that are left, and diverged samples.
+        Lost transitions, of which fewer than two samples are left, count in the last alone.
+        """
+        num_angles = len(self.features.quaternions) if self.orientation == "angle" else 0
+        return partial(sampled_likelihood, num_phi=num_phi, num_angles=num_angles, log_density=self.log_density)
+
     def evaluate(
         self, mean: np.ndarray, std: np.ndarray, uniforms: torch.Tensor, initial: InitialStateNoise | None = None
     ) -> list[Evaluation]:
@@ -184,50 +221,41 @@ class Objective:
         Args:
             mean, std: μ and σ in coordinates, ``(P, d)`` each.
             uniforms: base uniforms, ``(K, d)`` common to all or ``(P, K, d)``.
-            initial: noise of the initial states.
+            initial: noise of the initial states; the objective's own is propagated at each φ's μ, as given.
         """
         return self.evaluate_values(self.values(mean, std, uniforms), initial)
 
     def evaluate_values(self, values: torch.Tensor, initial: InitialStateNoise | None = None) -> list[Evaluation]:
         """Evaluate the sampled objective of P distributions given by their samples ``(P, K, d)``, in units."""
-        sums = self.map(values.flatten(0, 1), likelihood_reduction(self.features, len(values)), initial=initial)
+        sums = self.map(values.flatten(0, 1), self.likelihood(len(values)), initial=initial)
         cost = sums.simulated_transitions // len(values)
-        return [
-            Evaluation(value, squared / (kept * self.features.size) if kept else math.nan, int(lost), cost)
-            for value, squared, kept, lost in sums.total.reshape(4, len(values)).T.tolist()
-        ]
+        found = []
+        for value, gaussian, squared, kept, lost in sums.total.reshape(5, len(values)).T.tolist():
+            whole = kept == len(self)
+            mse = squared / (kept * self.features.size) if kept else math.nan
+            likelihood, eq3 = (value, gaussian) if whole else (-math.inf, -math.inf)
+            found.append(Evaluation(likelihood, eq3, value, mse, int(lost), cost))
+        return found
 
 
-def robust_log_likelihood(objective: Objective, mean: np.ndarray, values: torch.Tensor) -> float:
-    """Return the log-likelihood of φ under Student's t distribution, with the noise as it is given.
+def sampled_likelihood(
+    simulated: torch.Tensor,
+    measured: torch.Tensor,
+    covariance: torch.Tensor,
+    num_phi: int,
+    num_angles: int,
+    log_density: LogDensity,
+) -> torch.Tensor:
+    """Return the sums of :meth:`Objective.likelihood`, ``(5 P,)``, of features ``(t, P K, m)``."""
+    values, gaussian, squared, lost = likelihood_with_losses(
+        simulated.unflatten(1, (num_phi, -1)), measured[:, None], covariance[:, None], num_angles, log_density
+    )
+    kept = (simulated.shape[1] // num_phi - lost >= 2).sum(0).double()
+    return torch.cat([values.sum(0), gaussian.sum(0), squared.nansum(0), kept, lost.sum(0)])
 
-    The Gaussian one widens what the noise does not explain, window by window, and so hardly tells a noise that is
-    too small; this one may be compared between noises.
 
-    Args:
-        objective: the likelihood of the log.
-        mean: μ in coordinates, ``(d,)``, at which the initial states' noise is propagated.
-        values: samples of φ, ``(K, d)``, in units.
-    """
-    as_given = objective.initial_noise(mean, widen=lambda residual, _: torch.ones(len(residual), dtype=residual.dtype))
-    reduction = likelihood_reduction(objective.features, 1, student_log_density)
-    return float(objective.map(values, reduction, initial=as_given).total[0])
-
-
-def likelihood_reduction(features: Features, num_phi: int, log_density: LogDensity = gaussian_log_density) -> Reduce:
-    """Return the reduction to log-likelihood, squared error, transitions and divergences of P φ, ``(4 P,)``.
-
-    The squared error counts only transitions of which some samples are left.
-    """
-
-    def reduce(simulated: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-        values, squared, lost = likelihood_with_losses(
-            simulated.unflatten(1, (num_phi, -1)), measured[:, None], covariance[:, None], len(features.quaternions),
-            log_density,
-        )  # fmt: skip
-        return torch.cat([values.sum(0), squared.nansum(0), squared.isfinite().sum(0).double(), lost.sum(0)])
-
-    return reduce
+#: Of ε and of the standard deviation of noise: beyond, a covariance has no digits left beside the other columns'.
+LIMITS = {"epsilon": (1e-20, 1e20), "noise": (0.0, 1e10)}
 
 
 def _per_entry(key: str, given: float | Sequence[float], count: int, what: str, labels: Sequence[str]) -> torch.Tensor:
@@ -240,8 +268,8 @@ def _per_entry(key: str, given: float | Sequence[float], count: int, what: str, 
         shape = len(entries) if entries.ndim == 1 else tuple(entries.shape)
         raise InputError(f"{key}: {shape} values given; expected one, or one per {what}: {', '.join(labels)}")
     entries = entries.expand(count).clone()
-    lowest = float(entries.min())
-    if not bool(torch.isfinite(entries).all()) or lowest < 0 or (key == "epsilon" and lowest <= 0):
+    low, high = LIMITS[key]
+    if not bool(((entries >= low) & (entries <= high)).all()):
         least = "positive numbers" if key == "epsilon" else "numbers of at least 0"
-        raise InputError(f"{key}: {given} given; expected {least}")
+        raise InputError(f"{key}: {given} given; expected {least}, from {low:g} to {high:g}")
     return entries

@@ -475,7 +475,7 @@ def _interval(where: str, key: str, pair: Any) -> tuple[float, float]:
     is_pair = isinstance(pair, (list, tuple, np.ndarray)) and len(pair) == 2
     if not is_pair or any(isinstance(x, (bool, str)) or not np.isscalar(x) for x in pair):
         raise InputError(f"{where}: {key} is {pair!r}; expected [low, high]")
-    low, high = (float(x) for x in pair)
+    low, high = (float(np.float64(str(x))) if isinstance(x, int) else float(x) for x in pair)
     if np.isnan(low) or np.isnan(high) or (key == "bounds" and not np.isfinite([low, high]).all()):
         raise InputError(f"{where}: {key} is [{low:g}, {high:g}]; expected finite numbers")
     if low >= high:

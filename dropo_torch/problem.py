@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-import re
+import math
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,24 +14,19 @@ import numpy as np
 
 from dropo_torch.config import TRAINING_KEYS, Config
 from dropo_torch.data.observation import Observation, generic_observation, parse_observation
-from dropo_torch.data.readers import read_trajectories
 from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
-from dropo_torch.effects.simulator import effect_simulator
+from dropo_torch.effects.simulator import effect_simulator, first_known
 from dropo_torch.errors import InputError
-from dropo_torch.models.bundled import bundled_sim
+from dropo_torch.logged import SLOWEST, TIME_TOLERANCE, LoggedData, completed, frame_skip_of, is_registered, log_of
 from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import CheckedAdapter, MujocoEnvAdapter, Simulator, make_simulator
+from dropo_torch.simulators.hidden import POSE, filter_memory, filters_known, prescribed_bodies, prescribed_names
 from dropo_torch.support.extras import extra
 from dropo_torch.support.usercode import load_callable, user_code
-
-#: Relative difference between the log's time step and the simulator's that is still called equal.
-TIME_TOLERANCE = 1e-3
-#: Seconds between rows beyond which stamps are rather in another unit.
-SLOWEST = 1.0
 
 
 @dataclass(frozen=True)
@@ -48,6 +43,8 @@ class Problem:
         objective: the likelihood of the log.
         fingerprint: identifies config, model and log; an interrupted run continues only with the same.
         effects: the physical effects of the config, or ``None``.
+        since: transition of each episode from which on the commands that act are known from the log, ``(E,)``; ``None``
+            where all of them are.
     """
 
     config: Config
@@ -59,6 +56,20 @@ class Problem:
     objective: Objective
     fingerprint: str
     effects: EffectSet | None = None
+    since: np.ndarray | None = None
+
+    @property
+    def left_out(self) -> int:
+        """Transitions in which commands from before the log act, so that the likelihood leaves them out."""
+        return 0 if self.since is None else int(self.since.sum())
+
+
+def logged_data(problem: Problem) -> LoggedData:
+    """Return the log of a problem."""
+    model = problem.space.model if problem.config.backend != "gymnasium" else None
+    return LoggedData(
+        problem.model_path, model, problem.trajectories, problem.observation, problem.simulator.frame_skip
+    )  # fmt: skip
 
 
 def make_problem(config: Config, *, general: bool = False) -> Problem:
@@ -71,7 +82,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     Raises:
         InputError: anything that does not fit, by key.
     """
-    given, config = config, _completed(config)
+    given, config = config, completed(config)
     load_effects(config.own_effects, config.path)
     if config.backend == "gymnasium":
         model_path, space, source = _gymnasium_source(config)
@@ -79,10 +90,10 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         model_path = config.path(str(config.model))
         space = _space(load_model(model_path, general=general or config.moves_centres), config)
         source = space.model
-    trajectories = _log(config, space.model)
-    frame_skip = _frame_skip(config, space.model, trajectories)
+    trajectories = log_of(config, space.model)
+    frame_skip = frame_skip_of(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
-    effects, history = None, 0
+    effects, since = None, None
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
         observation = _observation(config, space.model, num_states, width)
@@ -91,55 +102,34 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         setting = plain_setting(space.model, observation, frame_skip)
         effects = place_effects(config.effects, space, setting, find_effect)
         space = space.with_limits(lowest(effects, space))
-        simulator, history = _with_effects(config, source, effects, space, trajectories)
+        simulator = _with_effects(config, source, effects, space, trajectories)
+        since = first_known(effects, space, trajectories, simulator.timestep or 1.0)
     else:
         simulator = _backend(config, source, frame_skip, space)
+    if config.backend == "mujoco" and (memory := filter_memory(space)):
+        known = filters_known(memory, frame_skip, np.bincount(trajectories.episodes))
+        since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
-    transitions = make_transitions(trajectories, observation, lag=config.lag, history=history)
-    likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling")}
+    transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history, since=since)
+    likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
-    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects)
-
-
-def _completed(config: Config) -> Config:
-    """The config with what its bundled simulation says of the keys that it leaves out.
-
-    An environment has a model and a step of its own, an adapter without a model names of its own, too.
-    """
-    sim = None if config.sim is None else bundled_sim(config.sim)
-    own: dict[str, Any] = {}
-    if sim is not None:
-        own["data"] = str(sim.log)
-        if config.backend != "gymnasium" or _is_registered(config.environment) or config.model is not None:
-            own |= {"parameters": dict(sim.parameters), "observation": list(sim.observation)}
-    if config.backend != "gymnasium":
-        if config.environment is not None:
-            raise InputError("config: environment belongs to backend: gymnasium; add that, or leave environment out")
-        if (config.model is None) == (sim is None):
-            both = "both model and sim are" if sim else "neither model nor sim is"
-            raise InputError(f"config: {both} given; expected one: model: robot.xml, or sim: hopper")
-        if sim is not None:
-            own |= {"model": str(sim.model), "frame_skip": sim.frame_skip}
-    return config.model_copy(update={key: value for key, value in own.items() if getattr(config, key) is None})
-
-
-def _is_registered(environment: str | None) -> bool:
-    """Whether the name is one of Gymnasium's ids, and no adapter."""
-    return environment is not None and re.search(r"-v\d+$", environment) is not None
+    return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects, since)
 
 
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
     """The simulator of the config's backend."""
     means: dict[str, Any] = {"num_threads": config.threads, "chunk_size": config.chunk_size, "device": config.device}
+    if config.backend == "mujoco":
+        means["history"] = math.ceil(filter_memory(space) / frame_skip)
     return make_simulator(config.backend, source, parameters=space, frame_skip=frame_skip, **means)
 
 
 def _with_effects(
     config: Config, source: Any, effects: EffectSet, space: ParameterSpace, trajectories: Trajectories
-) -> tuple[Simulator, int]:
-    """The simulator with effects in it, and the logged steps before each window that it needs."""
+) -> Simulator:
+    """The simulator with effects in it."""
     other = config.backend == "gymnasium"
     step = source.timestep if other else float(source.opt.timestep)
     if step is None:
@@ -170,7 +160,7 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
     name = config.environment
     if name is None:
         raise InputError("config: backend gymnasium needs environment: an id such as Hopper-v5, or file.py:function")
-    if _is_registered(name):
+    if is_registered(name):
         if config.model is not None:
             raise InputError(f"config: both model and environment {name} are given; the environment has its own model")
         with extra("gymnasium", f"environment: {name}"):
@@ -193,56 +183,21 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
     return path, space, CheckedAdapter(adapter, name)
 
 
-def _log(config: Config, model: mujoco.MjModel | None) -> Trajectories:
-    source = config.data
-    if source is None:
-        raise InputError("config: no data given; expected the path of a log, such as data: log.npz")
-    if isinstance(source, dict) and isinstance(source.get("preprocess"), dict) and "dt" not in source["preprocess"]:
-        if model is None or config.frame_skip is None:
-            raise InputError("data: preprocess needs dt, the seconds of one transition (or frame_skip, and a model)")
-        step = float(model.opt.timestep) * config.frame_skip
-        source = {**source, "preprocess": {"dt": step, **source["preprocess"]}}
-    log, wanted = read_trajectories(source, base=config.base), config.trajectories
-    if isinstance(wanted, int):
-        if not 1 <= wanted <= log.num_episodes:
-            raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")
-        wanted = list(range(wanted))
-    return log if wanted is None else log.select_episodes(wanted)
-
-
-def _frame_skip(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> int:
-    """``frame_skip`` as given, or as the log's time step says."""
-    if config.frame_skip is not None:
-        return config.frame_skip
-    if config.backend == "gymnasium":
-        return 1  # an environment's step is what its designer calls one
-    assert model is not None
-    step = float(model.opt.timestep)
-    if trajectories.dt is None:
-        raise InputError(
-            f"config: no frame_skip given, and the log has no time stamps; the model's step is {step:g} s, "
-            "so a log sampled every x seconds needs frame_skip: x / step"
-        )
-    if trajectories.dt > SLOWEST:
-        raise InputError(
-            f"data: sampled every {trajectories.dt:g} s by its time stamps; are they in seconds? Milliseconds are "
-            "data: {time: {signal: NAME, scale: 1e-3}}. If they are, say frame_skip"
-        )
-    ratio = trajectories.dt / step
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > TIME_TOLERANCE * ratio:
-        raise InputError(
-            f"data: sampled every {trajectories.dt:g} s, which is no whole number of the model's steps of {step:g} s; "
-            "resample the log (data: preprocess: dt) or change the model's timestep"
-        )
-    return round(ratio)
-
-
 def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int) -> None:
     """The log's actions and time stamps must be the simulator's."""
     width = trajectories.actions.shape[1]
     if width != simulator.num_controls:
+        model = simulator.parameters.model
+        poses = 0 if model is None else POSE * len(prescribed_bodies(model))
+        also = ""
+        if poses and model is not None:
+            also = (
+                f" and {poses} numbers of mocap poses ({prescribed_names(model)}: position and quaternion w, x, y, z, "
+                "after the actions)"
+            )
         raise InputError(
-            f"data: {width} action column{'s' * (width != 1)}, but the simulator has {simulator.num_controls} actuators"
+            f"data: {width} action column{'s' * (width != 1)}, but the simulator has "
+            f"{simulator.num_controls - poses} actuators{also}"
         )
     ours, theirs = simulator.timestep, trajectories.dt
     if ours is None or theirs is None or abs(ours - theirs) <= TIME_TOLERANCE * theirs:

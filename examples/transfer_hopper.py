@@ -95,10 +95,10 @@ def run(cell: tuple[int, str], given: argparse.Namespace, threads: int) -> dict[
         fit = given.out / f"fit-{seed}" / "fit.json"
         problem = make_training(training_config(method, fit, seed, given, given.threads or threads))
         tell = functools.partial(show_progress, f"{method:<8} seed {seed}")
-        found = train(problem, checkpoint=folder / "train-progress.pt", resume=True, on_progress=tell)
+        found = train(problem, checkpoint=folder / "train-progress.bin", resume=True, on_progress=tell)
         found.policy.save(folder / "policy.pt")
         write_atomically(result, json.dumps(found.document(), indent=2).encode())
-        (folder / "train-progress.pt").unlink()
+        (folder / "train-progress.bin").unlink()
     document = json.loads(result.read_text())
     evaluation = document["evaluation"]
     return {

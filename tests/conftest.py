@@ -18,6 +18,7 @@ import torch
 from dropo_torch.data.observation import generic_observation as generic_observation
 from dropo_torch.data.trajectory import Transitions
 from dropo_torch.effects import VOCABULARY
+from dropo_torch.fit import noise_of
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import Optimizer, Request
 from dropo_torch.parameters import ParameterSpace
@@ -252,9 +253,7 @@ def drive(optimizer: Optimizer, objective: Objective, after_tell: Callable[[], N
 
 def answered(objective: Objective, request: Request) -> torch.Tensor:
     """The sums that an optimizer asks for, around the noise of the initial states."""
-    at = request.linearise_at
-    initial = None if at is None else objective.initial_noise(at)
-    return objective.map(request.values, request.reduce, initial=initial).total
+    return objective.map(request.values, request.reduce, initial=noise_of(objective, request)).total
 
 
 def numerical_gradient(function: Callable[[np.ndarray], float], at: np.ndarray, step: float = 1e-5) -> np.ndarray:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import pickle
 import random
 import shutil
 import signal
@@ -21,6 +20,9 @@ from pathlib import Path
 from typing import Any
 
 from dropo_torch.commands.cli import main
+from dropo_torch.fit import HistoryEntry
+from dropo_torch.optimizers.fisher import FisherOptimizer
+from dropo_torch.support.checkpoint import loads
 
 RESULTS = ("distribution.yaml", "model.xml", "fitted_config.yaml")
 
@@ -67,17 +69,17 @@ def run(config: str, out: Path, kills: int, seed: int) -> dict[str, Any]:
     shutil.rmtree(out, ignore_errors=True)
     code, error = attempt(config, out / "whole", None)
     assert (code, error) == (0, ""), error
-    entries = pickle.loads((out / "whole" / "checkpoint.pkl").read_bytes())["history"]
+    entries = kept(out / "whole")
     deaths, resumed, part = [], 0, 0
     for number in range(kills):
         plan = {
             "signal": rng.choice(["SIGKILL", "SIGINT"]),
             "when": ["before", "later", "after"][number % 3],
             "write": rng.randint(2, 1 + len(entries) // 4),
-            "seconds": rng.uniform(0, 0.5) * entries[-1]["seconds"],
+            "seconds": rng.uniform(0, 0.5) * entries[-1].seconds,
         }
         pieces = out / f"pieces-{part}"
-        resumed += (pieces / "checkpoint.pkl").exists()
+        resumed += (pieces / "checkpoint.bin").exists()
         code, error = attempt(config, pieces, plan)
         if code == 0:  # it was quicker than its death: the next kills fall on another run
             compare(out / "whole", pieces)
@@ -106,8 +108,14 @@ def compare(whole: Path, pieces: Path) -> None:
 
 def history(folder: Path) -> list[str]:
     """Every batch of a fit, but for the time it took, to the last digit."""
-    entries = pickle.loads((folder / "checkpoint.pkl").read_bytes())["history"]
+    entries = [vars(entry) for entry in kept(folder)]
     return [repr({k: getattr(v, "tolist", lambda v=v: v)() for k, v in e.items() if k != "seconds"}) for e in entries]
+
+
+def kept(folder: Path) -> list[HistoryEntry]:
+    """The history in a checkpoint."""
+    roots = (HistoryEntry, *FisherOptimizer.KINDS)
+    return loads((folder / "checkpoint.bin").read_bytes(), roots)[2]["history"]
 
 
 if __name__ == "__main__":

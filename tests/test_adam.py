@@ -1,7 +1,5 @@
 """Adam, exact scores and certificates on the Warp backend."""
 
-import pickle
-
 import numpy as np
 import pytest
 import torch
@@ -12,9 +10,10 @@ import dropo_torch as dropo
 from dropo_torch.certify import certify
 from dropo_torch.errors import InputError
 from dropo_torch.fit import answer
-from dropo_torch.objective import Objective, likelihood_reduction
+from dropo_torch.objective import Objective
 from dropo_torch.optimizers import AdamOptimizer, AdamSettings, FisherOptimizer, FitSettings
 from dropo_torch.optimizers.settings import adam_settings
+from dropo_torch.support.checkpoint import dumps, loads
 from dropo_torch.support.random import draw_uniforms
 
 pytest.importorskip("warp")
@@ -39,7 +38,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_its_differences(objective: Ob
     uniforms = draw_uniforms(6, len(space), 1)
     mean, std = space.nominal * 1.05, np.full(len(space), 0.2)
     values = objective.values(mean[None], std[None], uniforms)[0].numpy()
-    reduce = likelihood_reduction(objective.features, 1)
+    reduce = objective.likelihood()
     sums = objective.evaluator.gradient(values, objective.comparing(reduce))
     assert sums.gradient is not None
     gradient = sums.gradient
@@ -81,7 +80,7 @@ def test_adam_approaches_the_masses_and_continues_from_any_state(objective: Obje
     error = []
     while whole.stop_reason is None:
         if len(error) in (0, 1, 7, 63, 64, 80):  # before and after the basis is computed, in both stages
-            state = pickle.loads(pickle.dumps(whole.state()))
+            state = loads(b"".join(dumps("fit", (), whole.state())))[2]
             whole = AdamOptimizer(objective, settings)
             whole.restore(state)
         advance(whole, objective)
@@ -105,7 +104,7 @@ def test_adam_finds_what_fisher_scoring_finds(variant: str) -> None:
 def test_some_rows_are_simulated_as_a_log_of_their_own(objective: Objective) -> None:
     rows = np.array([3, 11, 40])
     values = np.tile(objective.simulator.parameters.nominal, (3, 1)) * np.array([[1.0], [1.01], [0.98]])
-    reduce = likelihood_reduction(objective.features, 1)
+    reduce = objective.likelihood()
     part = objective.on(objective.transitions.select(rows))
     torch.testing.assert_close(
         objective.map(values, reduce, rows).total, part.map(values, reduce).total, rtol=0, atol=0

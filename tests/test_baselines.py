@@ -29,7 +29,6 @@ from dropo_torch.diagnostics import diagnose, estimates
 from dropo_torch.distribution import DRAWN_STD, Distribution, truncated_moments
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, fit
-from dropo_torch.likelihood import DIVERGENCE_PENALTY
 from dropo_torch.optimizers import FitSettings
 from dropo_torch.optimizers.correlated import random_effects
 from dropo_torch.optimizers.gauss_newton import MeansStage
@@ -176,7 +175,7 @@ def test_laplace_keeps_a_direction_that_the_log_knows_where_another_is_unknown()
 def test_a_lost_transition_does_not_widen_laplace() -> None:
     """The reduced χ² is that of the transitions that survived."""
     sums = np.zeros(2 + 2 * 1 + 2 * 1)
-    sums[0] = 0.5 * 38 + DIVERGENCE_PENALTY
+    sums[0] = 0.5 * 38
     sums[1], sums[4] = 1, 1.0  # one lost; a curvature
     stage = MeansStage(np.zeros(1), np.ones(1), np.full(1, 0.5), (20, 2))
     stage.tell(torch.from_numpy(sums))
@@ -508,16 +507,14 @@ def test_an_interrupted_run_ends_as_one_never_interrupted(folder: Path, tmp_path
     for _ in range(2):  # killed after the first batch, and again after the second
         with pytest.raises(Stop):
             fit(
-                again.objective, FitSettings(samples=10), search=make_search(again), checkpoint=tmp_path / "c.pkl",
+                again.objective, FitSettings(samples=10), search=make_search(again), checkpoint=tmp_path / "c.bin",
                 resume=True, on_progress=stop,
             )  # fmt: skip
     last = problem(folder, method, "noisy", method_options=options)
     resumed = fit(
-        last.objective, FitSettings(samples=10), search=make_search(last), checkpoint=tmp_path / "c.pkl", resume=True
+        last.objective, FitSettings(samples=10), search=make_search(last), checkpoint=tmp_path / "c.bin", resume=True
     )  # fmt: skip
-    assert resumed.distribution.mean == pytest.approx(whole.distribution.mean, rel=1e-12)
-    assert resumed.distribution.std == pytest.approx(whole.distribution.std, rel=1e-12)
-    assert resumed.evaluations == whole.evaluations
+    assert {**resumed.document(), "seconds": 0} == {**whole.document(), "seconds": 0}
 
 
 @pytest.mark.parametrize("method", ["droid", "simopt", "bayessim", "laplace", "udr"])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -23,7 +22,7 @@ from dropo_torch.commands.cli import COMMANDS, main
 from dropo_torch.commands.folder import claimed
 from dropo_torch.config import KEYS
 
-RESULTS = {"fit.json", "report.html", "distribution.yaml", "fitted_config.yaml", "model.xml", "checkpoint.pkl"}
+RESULTS = {"fit.json", "report.html", "distribution.yaml", "fitted_config.yaml", "model.xml", "checkpoint.bin"}
 MASS = PARAMETERS["upper_mass"]
 
 
@@ -108,10 +107,6 @@ WRONG_CONFIGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "data of no known kind": ({"data": "arm.xml"}, ("unknown kind of log", ".npz")),
     "option of data": ({"data": {"path": "log.npz", "epsiode": 1}}, ("'epsiode'", "did you mean 'episode'")),
     "environment without backend": ({"environment": "adapter.py:make"}, ("backend: gymnasium",)),
-    "everything diverges": (
-        {"parameters": {"gear": {"field": "actuator_gear", "name": "lift", "bounds": [1e16, 1e17]}}},
-        ("every simulation of this log diverges", "bounds"),
-    ),
 }  # fmt: skip
 
 
@@ -130,7 +125,7 @@ WRONG_FILES = {
     "not YAML": (b"a: [1, 2", "no valid YAML"),
     "a list": (b"- 1\n- 2", "holds no keys"),
     "empty": (b"", "holds no keys"),
-    "not text": (b"\xff\xfe\x00", "no valid YAML"),
+    "not text": (b"\xff\xfe\x00", "cannot be read as text in UTF-8"),
     "a key twice": (b"samples: 3\nsamples: 4\n", "'samples' stands there twice"),
     "an entry in itself": (b"data: &a [*a]\nmodel: arm.xml", "contains itself"),
     "code": (b"model: !!python/object:os.system x", "no valid YAML"),
@@ -168,7 +163,7 @@ WRONG_LINES: dict[str, tuple[str, tuple[str, ...]]] = {
     "option without value before another": ("fit CONFIG --out OUT --epsilon --seed 3", ("--epsilon: no value given",)),
     "two configs": ("fit CONFIG CONFIG --out OUT", ("not understood",)),
     "negative seed": ("fit CONFIG --out OUT --seed -3", ("seed is -3", "0 or more")),
-    "value that is no YAML": ("fit CONFIG --out OUT --mask [1", ("--mask: '[1' is no valid value",)),
+    "value that is no YAML": ("fit CONFIG --out OUT --mask [1", ("--mask: '[1' is no valid YAML",)),
     "nested key of nothing": ("fit CONFIG --out OUT --parameters.x.bounds [1,2]", ("no 'x' to change",)),
     "nested key of a value": ("fit CONFIG --out OUT --model.x 1", ("model is 'arm.xml', which has no keys",)),
     "log": ("fit CONFIG --out OUT --log tensorbord", ("--log", "expected tensorboard")),
@@ -304,7 +299,7 @@ def test_two_runs_do_not_share_a_folder(folder: Folder, refused: Callable[..., s
     first = start("fit", folder.config(optimizer="cma", budget=1_000_000, samples=100), "--out", out)
     try:
         deadline = time.monotonic() + 100
-        while not (out / "checkpoint.pkl").exists():
+        while not (out / "checkpoint.bin").exists():
             assert first.poll() is None
             assert time.monotonic() < deadline
             time.sleep(0.05)
@@ -354,9 +349,9 @@ def test_a_run_touches_nothing_of_the_users_in_its_folder(
 
 
 def test_an_interrupted_run_is_moved_aside_by_a_fresh_one(folder: Folder, tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.pkl").write_bytes(b"hours of work")
+    (tmp_path / "checkpoint.bin").write_bytes(b"hours of work")
     assert main(["fit", str(folder.config()), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "previous-1" / "checkpoint.pkl").read_bytes() == b"hours of work"
+    assert (tmp_path / "previous-1" / "checkpoint.bin").read_bytes() == b"hours of work"
 
 
 def test_the_config_of_a_result_gives_the_same_result_from_any_folder(folder: Folder, tmp_path: Path) -> None:
@@ -381,9 +376,9 @@ def test_resume_refuses_what_is_no_checkpoint_of_this_fit(
     capfd.readouterr()
     assert "another config" in refused(*command, "--resume", "--seed", 5)
     assert "another config" in refused(*command, "--resume", "--optimizer", "cma")
-    path = tmp_path / "checkpoint.pkl"
+    path = tmp_path / "checkpoint.bin"
     whole = path.read_bytes()
-    for content in (whole[:100], b"", b"hello", pickle.dumps([1]), pickle.dumps({"fingerprint": 1})):
+    for content in (whole[:100], whole[:-1], b"", b"hello", whole[:200] + b"9" + whole[201:]):
         path.write_bytes(content)
         line = refused(*command, "--resume")
         assert f"{path} is no checkpoint" in line
@@ -487,10 +482,10 @@ def test_ctrl_c_ends_with_130_and_one_line(folder: Folder, tmp_path: Path) -> No
     config = folder.config(optimizer="cma", budget=1_000_000, samples=100)
     process = start("fit", config, "--out", tmp_path, stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 100
-    while not (tmp_path / "checkpoint.pkl").exists() and time.monotonic() < deadline:
+    while not (tmp_path / "checkpoint.bin").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=60)[1]
     assert process.returncode == 130
     assert error == "dropo: interrupted; the same command with --resume goes on where it stopped\n"
-    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.pkl"]
+    assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]

@@ -215,7 +215,7 @@ def test_readme_config_is_fitted_by_its_command(robot: Path, tmp_path: Path, cap
     assert cli.main(["fit", str(robot / "robot.yaml"), "--out", str(out), "--samples", "10", "--threads", "1"]) == 0
     written = {p.name for p in out.iterdir()}
     assert written == {
-        "fit.json", "distribution.yaml", "model.xml", "fitted_config.yaml", "report.html", "checkpoint.pkl",
+        "fit.json", "distribution.yaml", "model.xml", "fitted_config.yaml", "report.html", "checkpoint.bin",
     }  # fmt: skip
     documented = (ROOT / "docs" / "config.md").read_text()
     assert not [name for name in written if f"`{name}`" not in documented]

@@ -87,7 +87,8 @@ def simulator_of(
         return make_simulator(backend, changed, parameters=parameters, frame_skip=frame_skip, num_threads=1)
 
     step = float(model.opt.timestep)
-    return effect_simulator(backend, found, space, make, timestep=skip * step, longest=1000, num_threads=1)
+    simulator = effect_simulator(backend, found, space, make, timestep=skip * step, longest=1000, num_threads=1)
+    return simulator, simulator.history
 
 
 def entry(effect: Effect, target: str | None, values: np.ndarray, setting: Setting) -> dict:

@@ -195,13 +195,13 @@ def test_a_fit_killed_twenty_times_resumes_to_the_same_result(make: Callable[[Fo
 
 
 def test_a_checkpoint_of_another_log_is_refused_without_a_fingerprint(tmp_path: Path) -> None:
-    path, settings = tmp_path / "checkpoint.pkl", FitSettings(samples=10)
+    path, settings = tmp_path / "checkpoint.bin", FitSettings(samples=10)
 
     def objective(truth: float) -> Objective:
         return linear_objective(LinearSimulator(space_of(a=[0.0, 3.0]), np.eye(1)), np.full((20, 1), truth))
 
     fit(objective(1.2), settings, checkpoint=path)
-    with pytest.raises(InputError, match="belongs to another config, log or optimizer"):
+    with pytest.raises(InputError, match="belongs to another config, model, log or method"):
         fit(objective(1.7), settings, checkpoint=path, resume=True)
     with pytest.raises(InputError, match="resume: there is no checkpoint to go on from"):
         fit(objective(1.2), settings, resume=True)

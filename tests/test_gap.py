@@ -7,7 +7,6 @@ import copy
 import dataclasses
 import functools
 import json
-import pickle
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
@@ -39,6 +38,7 @@ from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, screen
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
 from dropo_torch.problem import Problem, make_problem
+from dropo_torch.support.checkpoint import dumps
 from dropo_torch.support.files import plain_numbers
 
 #: The vocabulary of searches that are not about the whole of it.
@@ -56,7 +56,7 @@ STIFFNESS = Effect("joint_stiffness", "hinge", {"stiffness": 0.2, "reference": 0
 UNEVEN = {"friction": 1.0, "waves": 6.0, "phase": 0.3}
 HYSTERESIS = Effect("hysteresis", "hinge", {"stiffness": 0.5, "yield": 0.4})
 SIZE = {"episodes": 4, "transitions": 100}
-FILES = {"gap.json", "report.html", "model.xml", "config.yaml", "gap-progress.pkl"}
+FILES = {"gap.json", "report.html", "model.xml", "config.yaml", "gap-progress.bin"}
 
 
 @functools.cache
@@ -606,10 +606,10 @@ class Stopped(Exception):
 
 
 def test_interrupted_search_goes_on_to_the_same_result(tmp_path: Path) -> None:
-    store = tmp_path / "gap-progress.pkl"
+    store = tmp_path / "gap-progress.bin"
 
     def stop(stage: str, _share: float) -> None:
-        if store.exists() and pickle.loads(store.read_bytes())["state"].number == 1:
+        if store.exists() and b'"number":1' in store.read_bytes():
             raise Stopped(stage)
 
     with pytest.raises(Stopped):
@@ -617,30 +617,31 @@ def test_interrupted_search_goes_on_to_the_same_result(tmp_path: Path) -> None:
     stages: list[str] = []
     gap = search(hidden(*TWO), FEW, lambda stage, _: stages.append(stage), checkpoint=store, resume=True)
     assert lasting(gap) == lasting(found(TWO))
-    assert gap.simulated_transitions < found(TWO).simulated_transitions
+    assert gap.simulated_transitions == found(TWO).simulated_transitions
     assert "fitting the declared parameters" not in stages
 
 
 def test_second_search_over_shorter_windows_goes_on_too(tmp_path: Path) -> None:
-    store, names = tmp_path / "gap-progress.pkl", ("joint_stiffness",)
+    store, names = tmp_path / "gap-progress.bin", ("joint_stiffness",)
     plain = search(hidden("hysteresis"), names, checkpoint=store)
     assert [e.effect for e in plain.effects] == ["unnamed"]
     stages: list[str] = []
     gap = search(hidden("hysteresis"), names, lambda stage, _: stages.append(stage), checkpoint=store, resume=True)
     assert lasting(gap) == lasting(plain)
+    assert gap.simulated_transitions == plain.simulated_transitions
     assert set(stages) <= {"preparing", "verifying"}
 
 
 def test_checkpoint_of_another_problem_is_refused(tmp_path: Path) -> None:
-    store = tmp_path / "gap-progress.pkl"
+    store = tmp_path / "gap-progress.bin"
     search(hidden(), ("joint_damping",), checkpoint=store)
-    with pytest.raises(InputError, match="another config, model or log") as error:
+    with pytest.raises(InputError, match="another config, model, log or method") as error:
         search(hidden("joint_damping"), ("joint_damping",), checkpoint=store, resume=True)
     assert "\n" not in str(error.value)
 
 
 def test_checkpoint_of_another_vocabulary_gives_no_other_answer(tmp_path: Path) -> None:
-    store, case = tmp_path / "gap-progress.pkl", hidden("joint_damping")
+    store, case = tmp_path / "gap-progress.bin", hidden("joint_damping")
     search(case, ("joint_damping",), checkpoint=store)
     with contextlib.suppress(InputError):
         gap = search(case, ("joint_stiffness",), checkpoint=store, resume=True)
@@ -650,13 +651,12 @@ def test_checkpoint_of_another_vocabulary_gives_no_other_answer(tmp_path: Path) 
 @pytest.mark.parametrize(
     "content",
     [
-        b"", b"hello", pickle.dumps({})[:-1],
-        pytest.param(b"garbage\n"),
-        pickle.dumps([1]),
+        b"", b"hello", pytest.param(b"garbage\n"),
+        b"".join(dumps("fit", ("",), {})), b"".join(dumps("gap", ("",), {}))[:-1],
     ],
 )  # fmt: skip
 def test_what_is_no_checkpoint_is_refused(tmp_path: Path, content: bytes) -> None:
-    store = tmp_path / "gap-progress.pkl"
+    store = tmp_path / "gap-progress.bin"
     store.write_bytes(content)
     with pytest.raises(InputError, match="is no checkpoint"):
         search(hidden(), ("joint_damping",), checkpoint=store, resume=True)

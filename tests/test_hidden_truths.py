@@ -8,10 +8,25 @@ import mujoco
 import numpy as np
 import pytest
 
-from benchmarks.hidden import cases, truths
-from benchmarks.hidden.systems import CART_POLE, DT, HOPPER, PUCK, SERVO_ARM, SYSTEMS, TORQUE_ARM, System
-from benchmarks.hidden.truths import Effect
-from benchmarks.hidden_effects import judge, reductions
+from benchmarks.hidden import cases, ties, truths
+from benchmarks.hidden.systems import (
+    CART_POLE,
+    CORE,
+    DOUBLE_PENDULUM,
+    DT,
+    HOPPER,
+    PASSIVE_PUCK,
+    PUCK,
+    RUNNER,
+    SERVO_ARM,
+    SYSTEMS,
+    TORQUE_ARM,
+    TUMBLER,
+    System,
+    load,
+)  # fmt: skip
+from benchmarks.hidden.truths import Before, Effect
+from benchmarks.hidden_effects import by_trait, interval, judge, noise_ratios, reductions, scores
 from dropo_torch.config import load_config
 from dropo_torch.problem import make_problem
 
@@ -273,7 +288,150 @@ def test_the_list_of_cases() -> None:
     assert {e for s in specs if s.kind == "single" for e in s.effects} == set(cases.VOCABULARY)
     assert {s.name for s in specs} != {s.name for s in cases.cases(5)}
     assert len(cases.cases(4, "small")) < 15
-    assert set(cases.DRAWS) == set(cases.OPTIONS) - {"integration"}
+    assert set(cases.DRAWS) == (set(cases.OPTIONS) - {"integration"}) | {"payload_on_roll_axis"}
+
+
+def test_unusual_cases_follow_the_plain_ones() -> None:
+    specs = cases.cases(4)
+    plain, unusual = specs[:95], specs[95:]
+    assert {s.trait for s in plain} == {""}
+    assert {s.system for s in plain} <= {s.name for s in CORE}
+    assert all(s.name.startswith(f"{s.trait}-") for s in unusual)
+    count = {
+        trait: sum(s.trait == trait for s in unusual) for trait in ("motion", "passive", "coarse", "unequal", "tie")
+    }
+    assert min(count.values()) >= 4
+    assert sum(count.values()) == len(unusual) >= 20
+    assert all(s.effects[0] == "integration" and len(s.effects) == 2 for s in unusual if s.trait == "coarse")
+    assert {s.trait for s in unusual if s.kind == "null"} >= {"motion", "passive", "unequal"}
+
+
+@pytest.mark.parametrize("system", [PASSIVE_PUCK, DOUBLE_PENDULUM, TUMBLER], ids=lambda s: s.name)
+def test_passive_systems_have_no_actuators_and_move(system: System) -> None:
+    case = short(system, noise=0.0)
+    assert load(system.xml).nu == 0
+    assert case.trajectories.actions.shape == (40, 0)
+    assert np.ptp(case.trajectories.observations, axis=0).max() > 0.1
+    assert {s.system for s in cases.cases(4) if s.trait == "passive"} >= {system.name}
+
+
+@pytest.mark.parametrize("quiet", [True, False])
+def test_a_log_that_begins_in_motion_has_a_history(quiet: bool) -> None:
+    late = [Effect("actuator_delay", "push", {"delay": 0.025})]
+    before = Before(quiet=quiet)
+    log = truths.make_recording(CART_POLE, late, 3, episodes=2, transitions=40, before=before).log
+    lengths = [len(u) - 1 for u in log.unlogged]  # the first of them was held before
+    assert all(0.3 / DT - 1 <= n <= 1.0 / DT + 1 for n in lengths)
+    assert [len(c) for c in log.commands] == [40, 40]
+    for states, commands, unlogged in zip(log.states, log.commands, log.unlogged, strict=True):
+        assert np.abs(states[0, 2:]).min() > 1e-3
+        assert np.abs(unlogged[-3:] - commands[0]).max() > 1e-3
+        assert (np.abs(unlogged).max() == 0) == quiet
+        pushes = [_pushed(states[0], c, late) for c in (unlogged[-1], commands[0])]
+        true = states[1] - states[0]
+        noise = np.repeat([truths.POSITION_NOISE, truths.VELOCITY_NOISE], 2)
+        errors = [np.abs((p - states[0] - true) / noise).max() for p in pushes]
+        if quiet:
+            assert errors[0] < 0.2  # what was commanded before is what acts
+            assert errors[1] > 10.0  # and not the first command
+
+
+def _pushed(state: np.ndarray, held: np.ndarray, effects: list[Effect]) -> np.ndarray:
+    """The state a logged step after another, where a command was held all the while."""
+    declared = truths.true_declared(CART_POLE, np.random.default_rng(3))
+    plant = truths.make_plant(CART_POLE, declared, effects, 20)
+    plant.reset(state[:2].copy(), state[2:].copy(), held)
+    plant.advance(held, None)
+    return np.concatenate([plant.q, plant.v])
+
+
+def test_a_log_that_begins_at_its_first_command_is_as_before() -> None:
+    log = truths.make_recording(CART_POLE, [], 3, episodes=1, transitions=5).log
+    np.testing.assert_array_equal(log.unlogged[0], log.commands[0][:1])
+
+
+@pytest.mark.parametrize("noise", [*truths.UNEQUAL, truths.ONE_ROUGH])
+def test_unequal_noises_are_realised(noise: str) -> None:
+    recording = truths.make_recording(SERVO_ARM, [], 3, noise=noise, episodes=2, transitions=300)
+    case = truths.make_case(SERVO_ARM, [], recording)
+    clean = np.concatenate([s[:-1] for s in recording.log.states])
+    found = (case.trajectories.observations - clean).std(0)
+    np.testing.assert_allclose(found, case.noise, rtol=0.15)
+    if noise in truths.UNEQUAL:
+        np.testing.assert_allclose(case.noise, np.repeat(truths.UNEQUAL[noise], 3))
+    else:
+        usual = truths.make_recording(SERVO_ARM, [], 3, episodes=1, transitions=2).noise
+        assert sorted(np.round(np.array(case.noise) / usual, 6)) == [1, 1, 1, 1, 1, truths.ROUGHER]
+
+
+def test_the_runner_runs() -> None:
+    speeds = np.abs(short(RUNNER, noise=0.0, transitions=80).trajectories.observations[:, 9:]).max(0)
+    assert speeds.min() > 4.0
+
+
+def _ties(system: System, *effects: Effect) -> tuple:
+    recording = truths.make_recording(system, effects, 3, episodes=2, transitions=150)
+    return ties.exact_ties(system, effects, recording)
+
+
+def test_ties_are_those_of_the_mechanism() -> None:
+    force = Effect("external_force", "cart", {"x": 1.0, "y": 0.0, "z": 0.0})
+    assert _ties(CART_POLE, force) == ((("actuator_bias", "push"),),)
+    assert _ties(CART_POLE, Effect("actuator_delay", "push", {"delay": 0.02})) == ((),)
+
+
+#: What is hidden, and its rival with the values that do the same.
+SAME = [
+    (
+        CART_POLE,
+        Effect("external_force", "cart", {"x": 2.0, "y": 0.0, "z": 0.0}),
+        Effect("actuator_bias", "push", {"force": 0.2}),
+    ),
+    (
+        TORQUE_ARM,
+        Effect("actuator_damping", "shoulder_motor", {"damping": 0.01}),
+        Effect("joint_damping", "shoulder", {"damping": 0.64}),
+    ),
+    (
+        SERVO_ARM,
+        Effect("payload", "hand", {"mass": 0.15, "x": 0.1, "y": 0.0, "z": 0.0}),
+        Effect("payload", "fore", {"mass": 0.15, "x": 0.4, "y": 0.0, "z": 0.0}),
+    ),
+    (
+        DOUBLE_PENDULUM,
+        Effect("gravity_tilt", None, {"roll": 0.0, "pitch": 0.05}),
+        Effect("sensor_bias", "pivot.position", {"bias": -0.05}),
+    ),
+    (
+        TUMBLER,
+        Effect("gravity_tilt", None, {"roll": 0.05, "pitch": 0.0}),
+        Effect(
+            "external_force",
+            "brick",
+            dict(zip("xyz", 0.6 * ((truths.tilt(0.05, 0) - np.eye(3)) @ [0, 0, -9.81]), strict=True)),
+        ),
+    ),
+]
+
+
+def test_ties_beside_an_integration_gap(monkeypatch) -> None:
+    tried = [r for r in ties.rivals(CART_POLE) if r.effect in ("external_force", "gravity_tilt", "sensor_bias")]
+    monkeypatch.setattr(ties, "rivals", lambda _: iter(tried))
+    beside, bias = Effect("integration", None, {"timestep": 0.01}), Effect("actuator_bias", "push", {"force": 0.1})
+    assert _ties(SYSTEMS["coarse_cart_pole"], beside, bias) == ((), (("external_force", "cart"),))
+
+
+@pytest.mark.parametrize(("system", "effect", "rival"), SAME, ids=lambda x: getattr(x, "name", ""))
+def test_ties_simulate_the_same_log(system: System, effect: Effect, rival: Effect, monkeypatch) -> None:
+    one, other, none = (short(system, *e, noise=0.0).trajectories for e in ([effect], [rival], []))
+    size = np.array(short(system, transitions=2).noise)
+    if not rival.name.startswith("sensor"):  # with which the same readings are another start
+        assert np.abs((other.next_observations - one.next_observations) / size).max() < 0.05
+    assert np.abs((none.next_observations - one.next_observations) / size).max() > 5.0
+    pair, others = (rival.name, rival.target), ("fluid_drag", "joint_damping", "sensor_scale")
+    tried = [r for r in ties.rivals(system) if (r.effect, r.target) == pair or r.effect in others]
+    monkeypatch.setattr(ties, "rivals", lambda _: iter(tried))
+    assert _ties(system, effect) == ((pair,),)
 
 
 def test_a_case_has_the_gap_that_was_asked_for() -> None:
@@ -284,8 +442,10 @@ def test_a_case_has_the_gap_that_was_asked_for() -> None:
     assert case.name == "push"
 
 
-def answer(*effects: tuple, equivalents: tuple = ()) -> dict:
+def answer(*effects: tuple, equivalents: tuple = (), noise: dict | None = None) -> dict:
     return {
+        "noise": noise or {},
+        "chi2_per_degree": {"before": 50.0, "after": 1.2},
         "effects": [
             {
                 "effect": e,
@@ -323,3 +483,55 @@ def test_judging() -> None:
     assert judge(outside, answer(("unnamed", None, {})))["right"]
     assert not judge(outside, answer(("joint_damping", "leg_joint", {})))["right"]
     assert reductions({}) == {}
+
+
+def test_scores_of_noise_ties_and_intervals() -> None:
+    force = Effect("external_force", "cart", {"x": 2.0, "y": 0.0, "z": 0.0})
+    case = dataclasses.replace(
+        short(CART_POLE, force, transitions=2), ties=((("actuator_bias", "push"),),), trait="tie"
+    )
+    labels, levels = truths.observed(CART_POLE).labels, np.array(case.noise)
+    told = dict(zip(labels, 1.1 * levels, strict=True))
+    named = ("external_force", "cart", {"x": 2.5, "z": 0.0})
+    silent = judge(case, answer(named, noise=told))
+    assert silent["right"]
+    assert silent["noise_right"]
+    assert silent["ties_missing"] == [[("actuator_bias", "push")]]
+    assert silent["covered"] == [False, True]
+    assert silent["deviations"]["external_force.x"] == pytest.approx(2.0)
+    assert (silent["chi2"], silent["left"]) == (1.2, pytest.approx(1.05))
+    complete = judge(case, answer(named, equivalents=(("actuator_bias", "push"),), noise={**told, labels[0]: 2.0}))
+    assert complete["ties_missing"] == [[]]
+    assert not complete["noise_right"]
+    by_tie = judge(case, answer(("actuator_bias", "push", {"force": 0.2})))
+    assert by_tie["ties_missing"] == [[("external_force", "cart")]]
+    assert by_tie["noise_right"] is None
+    common = {"kind": "single", "trait": "tie", "seconds": 1.0, "cpu_seconds": 2.0}
+    results = [{**r, **common} for r in (silent, complete, by_tie)]
+    table = scores(results)
+    assert table["exact ties all told"] == " 33.3 %  (1 of 3)"
+    assert table["noise within 15 %, effects named right"] == " 50.0 %  (1 of 2)"
+    assert table["true value in the 90 % interval"].startswith(" 50.0 %  (2 of 4), ")
+    assert by_trait([*results, {**common, "failure": "x"}]).splitlines()[1].split()[:4] == ["tie", "3", "of", "4"]
+
+
+def test_noise_of_rotations_is_twice_that_of_quaternions() -> None:
+    case = short(PUCK, transitions=2)
+    level = case.noise[4]
+    assert noise_ratios(case, {"noise": {"root.position.rotation[x]": 2 * level}}) == {
+        "root.position.rotation[x]": pytest.approx(1.0)
+    }
+
+
+def test_amplitudes_and_phases_are_those_of_the_same_wave() -> None:
+    hidden = Effect("joint_cogging", "elbow", {"amplitude": 0.5, "poles": 6.0, "phase": 3.0})
+    case = short(TORQUE_ARM, hidden, transitions=2)
+    told = {"amplitude": -0.5, "poles": 6.0, "phase": 3.0 - 3 * np.pi}
+    found = judge(case, answer(("joint_cogging", "elbow", told)))
+    assert found["deviations"]["joint_cogging.phase"] == pytest.approx(0.0, abs=1e-6)
+    assert found["errors"] == pytest.approx([0.0])
+
+
+def test_wilson_interval() -> None:
+    low, high = interval(9, 10, z=1.96)
+    assert (low, high) == pytest.approx((0.5958, 0.9821), abs=1e-4)

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import copy
+
+import hypothesis
 import mujoco
 import numpy as np
 import pytest
+import scipy.spatial
 import scipy.stats
 import torch
 from conftest import (
@@ -25,14 +29,8 @@ from hypothesis import strategies as st
 from dropo_torch.data.observation import generic_observation, parse_observation
 from dropo_torch.errors import InputError
 from dropo_torch.excitation import no_effect
-from dropo_torch.likelihood import (
-    DIVERGENCE_PENALTY,
-    LOST_TRANSITION,
-    gaussian_log_density,
-    log_likelihood,
-    robust_cholesky,
-)
-from dropo_torch.objective import Objective, likelihood_reduction, robust_log_likelihood
+from dropo_torch.likelihood import gaussian_log_density, likelihood_with_losses, log_likelihood, robust_cholesky
+from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators import MujocoSimulator
 from dropo_torch.support.random import draw_uniforms
@@ -222,8 +220,9 @@ def box_objective(**options) -> Objective:
     return Objective(simulator, full, observation, **options)
 
 
-def test_an_orientation_enters_by_its_angle_with_both_signs_measured_zero():
-    objective = box_objective(epsilon=1e-4)
+def test_as_in_the_paper_an_orientation_enters_by_its_angle_with_both_signs_measured_zero():
+    """Of the angle's sample alone: that of the position is as it is."""
+    objective = box_objective(epsilon=1e-4, orientation="angle")
     assert objective.features.labels[3:] == tuple(f"root.position.rotation[{a}]" for a in "xyz")
     mean, std = middle(objective)
     uniforms = draw_uniforms(25, 3, 0)
@@ -232,10 +231,110 @@ def test_an_orientation_enters_by_its_angle_with_both_signs_measured_zero():
     for samples, measured in zip(simulated, objective.transitions.measured, strict=True):
         cosine = np.abs(samples[:, 3:] @ measured[3:]) / np.linalg.norm(samples[:, 3:], axis=1)
         angle = 2 * np.arccos(np.clip(cosine, 0, 1))[:, None]
-        position = samples[:, :3]
-        both = np.concatenate([np.hstack([position, angle]), np.hstack([position, -angle])])
-        theirs += literal(both, np.append(measured[:3], 0.0), 1e-4)
+        theirs += literal(samples[:, :3], measured[:3], 1e-4) + literal(np.vstack([angle, -angle]), np.zeros(1), 1e-4)
     assert evaluate(objective, uniforms) == pytest.approx(theirs, rel=1e-8)
+
+
+def turned_world(objective: Objective, model: mujoco.MjModel, turn: np.ndarray, **options) -> Objective:
+    """The same motions seen in a world turned by a unit quaternion: gravity, positions, velocities, orientations."""
+    model = copy.copy(model)
+    model.opt.gravity = rotated(turn, model.opt.gravity)
+    space = ParameterSpace(model, SPINNING)
+    log = objective.transitions
+    states, measured = log.states.copy(), log.measured.copy()
+    states[:, 7:10] = rotated(turn, states[:, 7:10])  # a free body's angular velocity is in its own frame
+    for rows in (states, measured):
+        rows[:, :3], rows[:, 3:7] = rotated(turn, rows[:, :3]), product(turn, rows[:, 3:7])
+    simulator = MujocoSimulator(model, parameters=space, frame_skip=10)
+    moved = windows(torch.from_numpy(states), torch.from_numpy(log.controls), measured)
+    return Objective(simulator, moved, parse_observation(model, ["qpos"]), **options)
+
+
+def rotated(turn: np.ndarray, vectors: np.ndarray) -> np.ndarray:
+    return scipy.spatial.transform.Rotation.from_quat(turn, scalar_first=True).apply(vectors)
+
+
+def product(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    w0, v0, w1, v1 = first[0], first[1:], second[:, :1], second[:, 1:]
+    return np.hstack([w0 * w1 - v1 @ v0[:, None], w0 * v1 + w1 * v0 + np.cross(v0, v1)])
+
+
+#: A body in the air: nothing but gravity pulls.
+FLYING_XML = """
+<mujoco>
+  <option timestep="0.004"/>
+  <worldbody>
+    <body name="top"><freejoint/><inertial mass="1.5" pos="0 0 0" diaginertia=".005 .006 .009"/></body>
+  </worldbody>
+</mujoco>"""
+SPINNING = {
+    "x": {"field": "body_inertia[0]", "name": "top", "bounds": [0.003, 0.008]},
+    "y": {"field": "body_inertia[1]", "name": "top", "bounds": [0.004, 0.010]},
+}
+
+
+def flying_objective(seed: int, **options) -> tuple[Objective, mujoco.MjModel]:
+    """A spinning body, measured with noise that is as large in every direction."""
+    model, generator = compiled(FLYING_XML), np.random.default_rng(seed)
+    simulator = MujocoSimulator(model, parameters=ParameterSpace(model, SPINNING), frame_skip=10)
+    states = random_states(model, 12, seed)
+    states[:, 10:] *= 8
+    controls = torch.zeros(12, 1, 0, dtype=torch.float64)
+    truth = torch.tensor([[0.005, 0.006]], dtype=torch.float64)
+    measured = simulator.simulate(states, controls, truth)[:, 0, :7].numpy()
+    measured[:, :3] += generator.normal(0, 0.02, (12, 3))
+    for row, noise in zip(measured, generator.normal(0, 0.05, (12, 3)), strict=True):
+        mujoco.mju_quatIntegrate(row[3:], noise, 1.0)
+    return Objective(
+        simulator, windows(states, controls, measured), parse_observation(model, ["qpos"]), **options
+    ), model
+
+
+@pytest.mark.parametrize("orientation", ["rotation_vector", "angle"])
+@pytest.mark.parametrize("noise", [None, [0, 0, 0, 0.02, 0.02, 0.02, 0.02]])
+@given(seed=st.integers(0, 1000), turn=st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(np.any))
+@hypothesis.settings(max_examples=10)
+def test_in_a_turned_world_the_likelihood_is_the_same(orientation, noise, seed, turn):
+    options = {"epsilon": 1e-4, "orientation": orientation, "noise": noise}
+    objective, model = flying_objective(seed, **options)
+    other = turned_world(objective, model, np.array(turn) / np.linalg.norm(turn), **options)
+    mean, std, uniforms = *middle(objective), draw_uniforms(15, 2, seed)
+    ours, theirs = (
+        o.evaluate(mean[None], 2 * std[None], uniforms, o.initial_noise(mean, widen=False))[0]
+        for o in (objective, other)
+    )
+    assert ours.log_likelihood == pytest.approx(theirs.log_likelihood, rel=1e-8, abs=1e-6)
+    assert ours.gaussian == pytest.approx(theirs.gaussian, rel=1e-8, abs=1e-6)
+
+
+def test_the_same_noise_of_an_orientation_counts_the_same_about_every_axis():
+    """Of a spread about one axis, as much is explained whichever axis of the body it is."""
+    found = []
+    for axis in ([1, 0, 0], [0, 1, 0], [0.6, 0, -0.8], [3**-0.5] * 3):
+        turn = torch.tensor(axis, dtype=torch.float64)
+        samples = torch.linspace(-0.2, 0.2, 20, dtype=torch.float64)[:, None] * turn
+        base = 0.1**2 * torch.outer(turn, turn) + 1e-4 * torch.eye(3)
+        values = likelihood_with_losses(samples[None, None], 0.15 * turn[None, None], base[None, None], 0)
+        found.append(float(values[0]))
+    np.testing.assert_allclose(found, found[0], rtol=1e-9)
+
+
+def test_how_an_orientation_enters_does_not_touch_other_columns():
+    both = [slide_objective(None, orientation=way)[0] for way in ("rotation_vector", "angle")]
+    assert len({evaluate(o, draw_uniforms(10, 1, 0), np.array([2.0]), np.array([0.1])) for o in both}) == 1
+    with pytest.raises(InputError, match="orientation: unknown 'angel'; did you mean 'angle'"):
+        box_objective(orientation="angel")
+
+
+@pytest.mark.parametrize("orientation", ["rotation_vector", "angle"])
+def test_the_likelihood_of_orientations_is_differentiable(orientation):
+    objective = box_objective(epsilon=1e-4, orientation=orientation)
+    reduce = objective.likelihood()
+    simulated = objective.evaluator.after(slice(0, 2), objective.values(*(x[None] for x in middle(objective)),
+                                                                       draw_uniforms(6, 3, 0))[0])  # fmt: skip
+    target, base = objective.target(slice(0, 2)), objective.base_covariance(slice(0, 2))
+    leaf = simulated.requires_grad_(True)
+    assert torch.autograd.gradcheck(lambda x: reduce(x, target, base)[0], (leaf,), eps=1e-7, atol=1e-3, rtol=1e-4)
 
 
 def test_the_sign_of_a_measured_quaternion_does_not_matter():
@@ -292,7 +391,7 @@ def fragile_objective() -> Objective:
     return Objective(simulator, transitions, generic_observation(2), epsilon=1e-2)
 
 
-def test_diverged_samples_are_counted_and_penalised_and_the_rest_still_count():
+def test_diverged_samples_are_counted_and_the_rest_still_count():
     objective = fragile_objective()
     mean, std, uniforms = np.array([1.0]), np.array([0.2]), draw_uniforms(20, 1, 0)
     values = objective.values(mean[None], std[None], uniforms)[0].numpy()
@@ -300,21 +399,23 @@ def test_diverged_samples_are_counted_and_penalised_and_the_rest_still_count():
     assert 2 < lost < 18
     samples = values * np.array([1.0, 0.5])
     measured = objective.transitions.measured
-    theirs = literal(samples[values[:, 0] <= 1], measured[0], 1e-2) - DIVERGENCE_PENALTY * lost / 20
+    theirs = literal(samples[values[:, 0] <= 1], measured[0], 1e-2)
     theirs += literal(samples, measured[1], 1e-2) + literal(samples, measured[2], 1e-2)
     found = objective.evaluate(mean[None], std[None], uniforms)[0]
     assert found.log_likelihood == pytest.approx(theirs, rel=1e-9)
     assert found.diverged == lost
 
 
-def test_a_transition_whose_samples_all_diverge_is_lost_and_the_value_stays_finite():
+def test_a_transition_whose_samples_all_diverge_is_lost_and_the_log_has_no_likelihood():
     objective = fragile_objective()
     uniforms = draw_uniforms(20, 1, 0)
     found = objective.evaluate(np.array([[1.5], [0.5]]), np.full((2, 1), 0.01), uniforms)
     samples = objective.values(np.array([[1.5]]), np.array([[0.01]]), uniforms)[0].numpy() * [1.0, 0.5]
     rest = sum(literal(samples, m, 1e-2) for m in objective.transitions.measured[1:])
-    assert found[0].log_likelihood == pytest.approx(LOST_TRANSITION + rest, rel=1e-9)
+    assert found[0].log_likelihood == found[0].gaussian == -np.inf
+    assert found[0].remaining == pytest.approx(rest, rel=1e-9)
     assert [f.diverged for f in found] == [20, 0]
+    assert found[1].log_likelihood == found[1].remaining == found[1].gaussian
 
 
 def test_a_covariance_that_rounding_left_indefinite_still_has_a_density():
@@ -379,7 +480,7 @@ def test_a_window_that_the_noise_does_not_explain_is_widened_as_under_students_l
     np.testing.assert_allclose(found[3], covariance, rtol=1e-9)
 
 
-def test_the_robust_likelihood_is_students_under_the_noise_as_it_is_given():
+def test_with_noisy_starts_the_objective_is_students_under_the_noise_as_it_is_given_with_eq_3_beside_it():
     noise = np.array([0.02, 0.3])
     objective, _ = slide_objective(noise)
     measured = objective.transitions.measured.copy()
@@ -389,11 +490,14 @@ def test_the_robust_likelihood_is_students_under_the_noise_as_it_is_given():
     mean, std, uniforms = np.array([2.1]), np.array([0.3]), draw_uniforms(12, 1, 0)
     values = objective.values(mean[None], std[None], uniforms)[0]
     base = matrix_at(objective, mean) + np.diag(noise**2) + 1e-6 * np.eye(2)
-    theirs = 0.0
+    theirs, eq3 = 0.0, 0.0
     for samples, logged in zip(objective.simulated(values).numpy(), measured, strict=True):
         scale = base + np.cov(samples, rowvar=False)
         theirs += scipy.stats.multivariate_t.logpdf(logged - samples.mean(0), shape=scale, df=5)
-    assert robust_log_likelihood(objective, mean, values) == pytest.approx(theirs, rel=1e-9)
+        eq3 += scipy.stats.multivariate_normal.logpdf(logged, samples.mean(0), scale)
+    found = objective.evaluate_values(values[None], objective.initial_noise(mean, widen=False))[0]
+    assert found.log_likelihood == pytest.approx(theirs, rel=1e-9)
+    assert found.gaussian == pytest.approx(eq3, rel=1e-9)
 
 
 def matrix_at(objective: Objective, mean: np.ndarray) -> np.ndarray:
@@ -449,7 +553,7 @@ def test_evaluations_do_not_interfere_whatever_their_order():
 
     first = [value(i) for i in (0, 1, 2)]
     assert len(set(first)) == 3
-    robust_log_likelihood(objective, np.array([2.5]), objective.values(np.array([[2.5]]), std[None], uniforms)[0])
+    evaluate(objective, uniforms, np.array([2.5]), std, initial=objective.initial_noise(np.array([2.5]), widen=False))
     assert [value(i) for i in (2, 1, 2, 0)] == [first[i] for i in (2, 1, 2, 0)]
     again = objective.initial_noise(np.array([1.5]))
     for found in (again, noises[1]):
@@ -458,6 +562,7 @@ def test_evaluations_do_not_interfere_whatever_their_order():
     assert vars(objective) == before
     assert again.is_at(np.array([1.5]), None)
     assert not again.is_at(np.array([1.5]), std)
+    assert not again.is_at(np.array([1.5]), None, widen=False)
     assert noises[2].is_at(np.array([3.0]), std.copy())
 
 
@@ -477,7 +582,7 @@ def test_what_an_evaluation_takes_is_what_the_simulator_did(noise, monkeypatch):
     found = objective.evaluate(np.full((2, 1), 2.0), np.full((2, 1), 0.1), draw_uniforms(7, 1, 0), initial)
     assert sum(f.simulated_transitions for f in found) == sum(done) == 2 * 7 * 8 * 3
     done.clear()
-    sums = objective.map(np.full((4, 1), 2.0), likelihood_reduction(objective.features, 1), np.array([1, 5, 7]))
+    sums = objective.map(np.full((4, 1), 2.0), objective.likelihood(), np.array([1, 5, 7]))
     assert sums.simulated_transitions == sum(done) == 4 * 3 * 3
 
 
@@ -491,7 +596,7 @@ def test_no_noise_and_noise_of_zero_are_the_same():
     assert len(set(values)) == 1
 
 
-def test_noise_enters_the_likelihood_as_a_covariance():
+def test_noise_enters_eq_3_as_a_covariance():
     objective, _ = slide_objective([0.02, 0.3])
     initial = objective.initial_noise(np.array([2.0]))
     mean, std, uniforms = np.array([2.1]), np.array([0.3]), draw_uniforms(12, 1, 0)
@@ -501,7 +606,8 @@ def test_noise_enters_the_likelihood_as_a_covariance():
         scipy.stats.multivariate_normal.logpdf(m, s.mean(0), np.cov(s, rowvar=False) + c)
         for s, m, c in zip(simulated, objective.transitions.measured, base, strict=True)
     )
-    assert evaluate(objective, uniforms, mean, std, initial=initial) == pytest.approx(theirs, rel=1e-9)
+    found = objective.evaluate(mean[None], std[None], uniforms, initial)[0]
+    assert found.gaussian == pytest.approx(theirs, rel=1e-9)
 
 
 def dead(objective: Objective) -> list[str]:

@@ -106,7 +106,7 @@ def test_states_hold_unit_quaternions():
 def test_a_zero_quaternion_is_refused_with_its_row():
     log = random_states(BOX, 3).numpy()
     log[1, 3:7] = 0
-    with pytest.raises(InputError, match=r"row 1 has a zero quaternion in root\.position\[qw\]"):
+    with pytest.raises(InputError, match=r"row 1 of observations has a zero quaternion in root\.position\[qw\]"):
         parse_observation(BOX, None).states(log)
 
 

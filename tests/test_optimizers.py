@@ -1,8 +1,10 @@
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
 
+import hypothesis
 import numpy as np
 import pytest
 import torch
@@ -16,6 +18,8 @@ from conftest import (
     space_of,
     windows,
 )
+from hypothesis import given
+from hypothesis import strategies as st
 
 from dropo_torch.baselines.bayessim import BayesSimOptimizer
 from dropo_torch.baselines.droid import DroidOptimizer
@@ -27,9 +31,8 @@ from dropo_torch.data.observation import parse_observation
 from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import to_values, truncated_interval, truncated_moments
 from dropo_torch.fit import fit
-from dropo_torch.likelihood import LOST_TRANSITION
 from dropo_torch.objective import Objective
-from dropo_torch.optimizers import AdamSettings, CMAOptimizer, FisherOptimizer, FitSettings, make_optimizer
+from dropo_torch.optimizers import AdamSettings, CMAOptimizer, FisherOptimizer, FitSettings, Optimizer, make_optimizer
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.sampled import SampledStage
 from dropo_torch.optimizers.sigma_points import SigmaPointStage
@@ -277,7 +280,7 @@ AWAY = (np.array([1.1, 4.2]), np.array([0.3, 0.2]))
 def test_scores_are_the_gradient_of_the_sigma_point_likelihood():
     objective = mixed_objective()
     sums, expected = stage_gradient(lambda m, s: SigmaPointStage(objective.box, m, s), objective, *AWAY)
-    np.testing.assert_allclose(sums[1:5], expected, rtol=1e-6)
+    np.testing.assert_allclose(sums[2:6], expected, rtol=1e-6)
     assert sums[-1] == pytest.approx(0, abs=1e-6)  # nothing bends
 
 
@@ -288,7 +291,7 @@ def test_at_a_physical_limit_the_mean_of_the_samples_moves_with_the_deviation():
     effect = np.array([[1.0, 0.2], [-0.3, 2.0], [0.5, 0.5]])
     objective = linear_objective(LinearSimulator(space, effect), np.full((5, 3), 1.5), epsilon=1e-2)
     sums, expected = stage_gradient(lambda m, s: SigmaPointStage(objective.box, m, s), objective, space.low, AWAY[1])
-    np.testing.assert_allclose(sums[3:5], expected[2:], rtol=1e-6)
+    np.testing.assert_allclose(sums[4:6], expected[2:], rtol=1e-6)
 
 
 def test_sampled_scores_are_the_gradient_of_the_sampled_likelihood():
@@ -300,7 +303,7 @@ def test_sampled_scores_are_the_gradient_of_the_sampled_likelihood():
             objective,
             *AWAY,
         )
-        np.testing.assert_allclose(sums[1:5], expected, rtol=1e-6)
+        np.testing.assert_allclose(sums[2:6], expected, rtol=1e-6)
         value = objective.evaluate(AWAY[0][None], AWAY[1][None], uniforms)[0].log_likelihood
         assert sums[0] == pytest.approx(value, rel=1e-12)
 
@@ -311,7 +314,7 @@ def test_sampled_scores_see_curvature():
     sums, expected = stage_gradient(
         lambda m, s: SampledStage(objective.box, m, s, uniforms=draw_uniforms(40, 2, 0)), objective, *AWAY
     )
-    np.testing.assert_allclose(sums[1:5], expected, rtol=1e-6)
+    np.testing.assert_allclose(sums[2:6], expected, rtol=1e-6)
 
 
 def test_fisher_information_is_that_of_the_gaussians():
@@ -320,10 +323,10 @@ def test_fisher_information_is_that_of_the_gaussians():
     effect = objective.simulator.effect.numpy()
     total = 1e-2 * np.eye(3) + effect @ np.diag(VARIANCE * AWAY[1] ** 2) @ effect.T
     inverse = np.linalg.inv(total)
-    np.testing.assert_allclose(sums[5:9].reshape(2, 2), 25 * effect.T @ inverse @ effect, rtol=1e-8)
+    np.testing.assert_allclose(sums[6:10].reshape(2, 2), 25 * effect.T @ inverse @ effect, rtol=1e-8)
     change = [VARIANCE * 2 * s**2 * np.outer(c, c) for s, c in zip(AWAY[1], effect.T, strict=True)]
     expected = [[25 * 0.5 * np.trace(inverse @ a @ inverse @ b) for a in change] for b in change]
-    np.testing.assert_allclose(sums[9:13].reshape(2, 2), expected, rtol=1e-8)
+    np.testing.assert_allclose(sums[10:14].reshape(2, 2), expected, rtol=1e-8)
 
 
 def test_the_gradient_of_the_means_is_that_of_their_cost():
@@ -338,18 +341,80 @@ def test_the_gradient_of_the_means_is_that_of_their_cost():
     np.testing.assert_allclose(sums(AWAY[0])[2:4], expected, rtol=1e-5)
 
 
-def test_lost_transitions_weigh_the_same_in_every_likelihood():
+def test_lost_transitions_are_counted_and_left_out_by_every_likelihood():
     def fragile(v: torch.Tensor) -> torch.Tensor:
         return torch.where(v > -1, torch.nan, v)
 
     objective = linear_objective(LinearSimulator(linear_space(), np.diag(GAINS), transform=fragile), spread_data(5))
     box = objective.box
     for stage in (SigmaPointStage(box, *AWAY), SampledStage(box, *AWAY, uniforms=draw_uniforms(9, 2, 0))):
-        assert float(objective.map(stage.points(), stage.reduction()).total[0]) == 5 * LOST_TRANSITION
-    assert (
-        objective.evaluate(AWAY[0][None], AWAY[1][None], draw_uniforms(9, 2, 0))[0].log_likelihood
-        == 5 * LOST_TRANSITION
-    )
+        assert objective.map(stage.points(), stage.reduction()).total[:2].tolist() == [0, 5]
+    found = objective.evaluate(AWAY[0][None], AWAY[1][None], draw_uniforms(9, 2, 0))[0]
+    assert (found.log_likelihood, found.diverged, found.order()) == (-np.inf, 45, (-45, 0.0))
+
+
+def unstable_objective(cut: float, truth: float, epsilon: float, number: int = 8) -> Objective:
+    """Two parameters in [0, 1]; all simulations diverge where one exceeds ``cut``, towards which the log pulls."""
+
+    def unstable(values: torch.Tensor) -> torch.Tensor:
+        return torch.where(values[..., :1] > cut, torch.nan, values)
+
+    simulator = LinearSimulator(space_of(a=[0, 1], b=[0, 1]), np.array([[1.0, 0.2], [0.3, -1.0]]), transform=unstable)
+    noise = np.random.default_rng(0).normal(0, 0.03, (number, 2))
+    return linear_objective(simulator, np.array([truth, 0.4]) @ simulator.effect.numpy().T + noise, epsilon=epsilon)
+
+
+CLIMBERS: dict[str, Callable[[Objective], tuple[FitSettings, Optimizer | None]]] = {
+    "fisher": lambda o: (FitSettings(samples=10), None),
+    "fisher, full covariance": lambda o: (FitSettings(samples=10, covariance="full"), None),
+    "gauss-newton": lambda o: (FitSettings(samples=10), LaplaceOptimizer(o)),
+    "adam": lambda o: (FitSettings("adam", samples=10, adam=AdamSettings(steps=40, samples=4)), None),
+    "cma": lambda o: (FitSettings("cma", samples=10, budget=150), None),
+    "droid": lambda o: (FitSettings(samples=10), DroidOptimizer(o, settings=DroidSettings(budget=150), seed=0)),
+}
+
+
+@pytest.mark.parametrize("name", CLIMBERS)
+@given(cut=st.floats(0.55, 0.9), truth=st.floats(0.7, 3.0), exponent=st.floats(-12, 0))
+@hypothesis.settings(max_examples=6, phases=[hypothesis.Phase.generate])
+def test_nothing_outweighs_a_divergence_whatever_epsilon(name, cut, truth, exponent):
+    """The log calls for values at which every simulation diverges: the fit stays where none does.
+
+    σ of DROID and Laplace is no choice of theirs, so there it is the mean that must be finite.
+    """
+    objective = unstable_objective(cut, truth, 10**exponent)
+    settings, search = CLIMBERS[name](objective)
+    found = fit(objective, settings, search=search)
+    assert found.distribution.mean[0] <= cut
+    if search is None:
+        assert found.diverged == 0
+        assert np.isfinite(found.log_likelihood)
+
+
+@given(cut=st.floats(0.1, 0.45), truth=st.floats(0.0, 1.0), exponent=st.floats(-12, 0))
+@hypothesis.settings(max_examples=6, phases=[hypothesis.Phase.generate])
+def test_a_search_that_begins_where_everything_diverges_looks_elsewhere(cut, truth, exponent):
+    objective = unstable_objective(cut, truth, 10**exponent)
+    found = fit(objective, FitSettings(samples=10))
+    assert found.diverged == 0
+    assert found.distribution.mean[0] <= cut
+
+
+@given(
+    costs=st.lists(st.floats(-1e300, 1e300), min_size=6, max_size=6),
+    lost=st.lists(st.integers(0, 3), min_size=6, max_size=6),
+)
+def test_cma_is_told_of_divergence_before_all_costs(costs, lost):
+    objective = unstable_objective(0.9, 0.5, 1e-2)
+    search = DroidOptimizer(objective, settings=DroidSettings(population=6), seed=0)
+    search.ask()
+    told, tell = [], search._search.tell
+    search._search.tell = lambda points, values: (told.extend(values), tell(points, values))
+    search.tell(torch.tensor([*costs, *map(float, lost)], dtype=torch.float64))
+    assert np.isfinite(told).all()
+    for i, j in itertools.permutations(range(6), 2):
+        if lost[i] < lost[j]:
+            assert told[i] < told[j]
 
 
 def test_a_fit_with_noisy_starts_still_finds_the_parameter():
@@ -384,7 +449,7 @@ def test_a_fit_resumed_from_any_checkpoint_is_the_fit_never_interrupted(tmp_path
 
     whole = fit(spread_objective(), FitSettings(samples=10))
     for steps in (1, len(whole.history) // 2):
-        path = tmp_path / f"{steps}.pkl"
+        path = tmp_path / f"{steps}.bin"
         with pytest.raises(Stop):
             fit(spread_objective(), FitSettings(samples=10), checkpoint=path, on_progress=stop_after(steps))
         again = fit(spread_objective(), FitSettings(samples=10), checkpoint=path, resume=True)

@@ -56,9 +56,12 @@ def make_diagnostics(distribution: Distribution, count: int = 50, columns: int =
         spread=0.5 * expected,
         expected=expected,
         given=expected,
+        change=np.ones(shape),
+        follows=np.arange(count) < count - 1,
         at_center=simulated,
         sensitivity=np.full((d, columns), 0.004),
         standard_error=np.full(d, 0.01),
+        std_error=np.full(d, 0.01),
         correlation=np.eye(d),
         confounded=(),
         diverged=0,
@@ -76,7 +79,7 @@ def page(path: Path, fit: Fit | None = None, diagnostics: Diagnostics | None = N
 def said(fit: Fit, diagnostics: Diagnostics) -> str:
     """All that a page warns of, as text."""
     return " ".join(
-        [words.verdict(fit, diagnostics)[1], *(f"{f.title}. {f.text}" for f in words.findings(fit, diagnostics))]
+        [words.judgment(fit, diagnostics).reason, *(f"{f.title}. {f.text}" for f in words.findings(fit, diagnostics))]
     )
 
 

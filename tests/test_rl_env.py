@@ -583,12 +583,12 @@ def rollout_of(case: str, backend: str, values: np.ndarray, shown: np.ndarray, a
     given, parameters = CASES[case]
     space = ParameterSpace(CartPole().model, parameters)
     effects = effects_on(space, given, 2, RAIL)
-    simulator, history = effect_simulator(
+    simulator = effect_simulator(
         backend, effects, space,
         lambda model, skip, inner: make_simulator(backend, model, parameters=inner, frame_skip=skip),
         timestep=0.02, longest=100,
     )  # fmt: skip
-    controls = np.concatenate([np.repeat(actions[:, :1], history, 1), actions], 1)
+    controls = np.concatenate([np.repeat(actions[:, :1], simulator.history, 1), actions], 1)
     found = [
         simulator.rollout(*(torch.from_numpy(x[None]) for x in (shown[i], controls[i], values[i])))[0, 0]
         for i in range(len(values))

@@ -271,12 +271,12 @@ def test_a_checkpoint_of_another_training_is_refused(folder: Path, tmp_path: Pat
         {"train": {"gamma": 0.9}}, {"parameters": {"mass": {**MASS, "bounds": [1.0, 3.0]}}},
     ]  # fmt: skip
     for other in others:
-        with pytest.raises(dropo.InputError, match="another task, config, distribution or algorithm"):
+        with pytest.raises(dropo.InputError, match="belongs to another config, model, log or method"):
             train(problem(folder, **other), checkpoint=path, resume=True)
     train(problem(folder, threads=2, train={"checkpoint_seconds": 9}), checkpoint=path, resume=True)
     for content in (b"", b"hello", path.read_bytes()[:1000]):
         path.write_bytes(content)
-        with pytest.raises(dropo.InputError, match="cannot be read as the checkpoint of a training"):
+        with pytest.raises(dropo.InputError, match="is no checkpoint of a training"):
             train(problem(folder), checkpoint=path, resume=True)
         assert path.read_bytes() == content
 
@@ -367,7 +367,7 @@ def test_a_policy_is_loaded_in_three_lines_and_takes_arrays_and_tensors(folder: 
         load_policy(tmp_path / "absent.pt")
 
 
-RESULTS = {"train.json", "report.html", "policy.pt", "train-progress.pt"}
+RESULTS = {"train.json", "report.html", "policy.pt", "train-progress.bin"}
 
 
 def command(folder: Path, out: Path, *more: str) -> list[str]:
@@ -416,7 +416,7 @@ def test_kill_9_and_resume_give_the_policy_of_a_run_never_interrupted(folder: Pa
     arguments = command(folder, tmp_path / "pieces", *more, "--resume")
     process = subprocess.Popen([sys.executable, "-m", "dropo_torch", *arguments], stdout=subprocess.DEVNULL)
     deadline = time.monotonic() + 100
-    while not (tmp_path / "pieces" / "train-progress.pt").exists() and time.monotonic() < deadline:
+    while not (tmp_path / "pieces" / "train-progress.bin").exists() and time.monotonic() < deadline:
         time.sleep(0.01)
     process.send_signal(signal.SIGKILL)
     assert process.wait() in (-signal.SIGKILL, 0)

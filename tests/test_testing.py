@@ -522,7 +522,7 @@ BROKEN_EFFECTS: dict[str, Effect] = {
     "it has places": Nowhere(),
     "its numbers are consistent": Upside(),
     "searches begin within the bounds": FarOff(),
-    "it pickles by name": Twin(),
+    "it is kept by its name": Twin(),
     "the same numbers do the same and nothing given is changed": Rough(),
     "rows do not depend on each other": OneForAll(),
     "commands in pieces are those in one": Amnesic(),
@@ -541,7 +541,7 @@ OTHERS = {"fit and training agree"}
 def test_a_sound_effect_keeps_every_law(effect: Effect) -> None:
     places = ("root.position[x]", "root.position[y]", "rail.position") if isinstance(effect, Shifted) else ()
     report = check_effect(effect, idle=places)
-    assert report.skipped["it pickles by name"] == "the effect is not registered"
+    assert report.skipped["it is kept by its name"] == "the effect is not registered"
     assert {*report.checked, *report.skipped} == law_names(effect_laws.LAWS) == {*BROKEN_EFFECTS, *OTHERS}
 
 

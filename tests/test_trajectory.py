@@ -168,3 +168,21 @@ def test_transitions_carry_full_states_where_the_log_is_partial():
     found = make_transitions(log, observation)
     np.testing.assert_array_equal(found.states, [[0.0, 2.0]])
     np.testing.assert_array_equal(found.measured, [[3.0]])
+
+
+BALL_XML = """
+<mujoco><worldbody><body name="ball"><freejoint name="root"/><geom size=".1"/></body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("what", ["observations", "next_observations"])
+@pytest.mark.parametrize("lag", [1, 2])
+def test_a_zero_quaternion_at_either_end_is_refused_with_its_row(what: str, lag: int) -> None:
+    """It is no orientation, and would count as a perfect match; with windows of two steps, between them, too."""
+    model = compiled(BALL_XML)
+    states = np.tile(np.concatenate([model.qpos0, np.zeros(6)]), (6, 1))
+    arrays = {"observations": states, "next_observations": states.copy()}
+    arrays[what] = states.copy()
+    arrays[what][3, 3:7] = 0
+    log = Trajectories(**arrays, actions=np.zeros((6, 0)), terminals=np.zeros(6, dtype=bool))
+    with pytest.raises(InputError, match=rf"row 3 of {what} has a zero quaternion in root\.position\[qw\]"):
+        make_transitions(log, parse_observation(model, None), lag=lag)

@@ -24,7 +24,7 @@ MEMORY = frozenset({"actuator_delay", "actuator_lag", "actuator_backlash", "sens
 #: What a rival may leave of what the effect does, to be the same thing; and as whose special case it does not count.
 EXACT, SPECIAL = 1e-4, {"joint_friction": "joint_stribeck"}
 #: States that are compared: spread over the log, and those where the effect shows most.
-SPREAD, STRONGEST, SEARCHED = 40, 40, 600
+SPREAD, STRONGEST, SEARCHED = 25, 25, 500
 #: Fine steps of a logged one.
 SUBSTEPS = 20
 #: Steps of least squares: at first, and until convergence; what must be gone after the first ones.

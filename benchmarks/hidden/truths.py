@@ -513,11 +513,17 @@ OUTSIDE_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = 
 # --- what has to change the model -----------------------------------------------------------------------------
 
 
+#: Effects for which a model is compiled anew.
+BUILT = frozenset({"payload", "inertia", "slosh", "center_of_mass"})
+
+
 def _added_bodies(spec: mujoco.MjSpec, base: mujoco.MjModel, effects: Sequence[Effect]) -> None:
     """Weld or hang further bodies: payloads, rotational inertia, a mass that slides on a spring."""
     for n, e in enumerate(effects):
         x = e.parameters
-        if e.name == "payload" and x["mass"] > 0:
+        if e.name == "center_of_mass":
+            spec.body(e.target).simple = False  # or MuJoCo takes its center for its frame's origin
+        elif e.name == "payload" and x["mass"] > 0:
             _weld(spec, e.target, f"payload{n}", [x["x"], x["y"], x["z"]], x["mass"], [1e-9] * 3)
         elif e.name == "inertia" and x["factor"] > 1:
             own = base.body(e.target)
@@ -566,9 +572,14 @@ def _change_contact(model: mujoco.MjModel, geom: int, e: Effect) -> None:
     x = e.parameters
     if e.name == "contact_friction":
         model.geom_friction[geom, 0] = x["friction"]
+        model.geom_priority[geom], model.geom_condim[geom] = 1, model.geom_condim.max()  # whatever it touches
     elif e.name == "contact_stiffness":
         model.geom_solref[geom] = (x["time_constant"], x["damping_ratio"])
         model.geom_solmix[geom] = 1e9  # its solref rules whatever it touches
+    elif e.name == "contact_margin" and model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:  # it rises
+        normal = np.zeros(3)
+        mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), model.geom_quat[geom])
+        model.geom_pos[geom] += x["margin"] * normal
     elif e.name == "contact_margin":  # the geom grows; mass and inertia stay
         thickness = {int(mujoco.mjtGeom.mjGEOM_CYLINDER): 1, int(mujoco.mjtGeom.mjGEOM_BOX): 2}
         model.geom_size[geom, thickness.get(int(model.geom_type[geom]), 0)] += x["margin"]
@@ -582,10 +593,11 @@ def _change_contact(model: mujoco.MjModel, geom: int, e: Effect) -> None:
 def true_model(system: System, declared: Mapping[str, float], effects: Sequence[Effect] = ()) -> mujoco.MjModel:
     """Return the system's model with the true declared values and whatever effects must change it."""
     space = ParameterSpace(load(system.xml), system.declared)  # type: ignore[arg-type]
-    base = space.apply(declared)
-    spec = mujoco.MjSpec.from_string(system.xml)
-    _added_bodies(spec, base, effects)
-    model = ParameterSpace(spec.compile(), system.declared).apply(declared)  # type: ignore[arg-type]
+    model = space.apply(declared)
+    if any(e.name in BUILT for e in effects):
+        spec = mujoco.MjSpec.from_string(system.xml)
+        _added_bodies(spec, model, effects)
+        model = ParameterSpace(spec.compile(), system.declared).apply(declared)  # type: ignore[arg-type]
     for e in effects:
         _change_model(model, e)
     mujoco.mj_setConst(model, mujoco.MjData(model))

@@ -72,6 +72,7 @@ class BayesSimOptimizer(Optimizer):
     name = "mixture-density network"
     method = "bayessim"
     STATE = ("_sums", "_logged", "_mixture", "_distance")
+    KINDS = (Mixture,)
 
     def __init__(self, objective: Objective, replay: Replay, *, settings: BayesSimSettings, seed: int) -> None:
         require("baselines", "method: bayessim")

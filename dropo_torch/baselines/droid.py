@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -14,14 +15,12 @@ from dropo_torch.optimizers.base import Progress, Request
 from dropo_torch.optimizers.cma import Evolution, evolution, why_stopped
 from dropo_torch.parameters import ParameterSpace
 
-#: Squared error that a diverged transition counts as, per column.
-_LOST = 1e6
-
 
 def squared_errors(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-    """Return Σ‖s − s'‖² of each parameter vector, ``(P,)``; a diverged column counts a million."""
-    error = (features - measured[:, None]).square()
-    return torch.nan_to_num(error, nan=_LOST).sum((0, 2))
+    """Return Σ‖s − s'‖² of each parameter vector and how many transitions diverge under it, which it leaves out."""
+    error = (features - measured[:, None]).square().sum(-1)
+    alive = error.isfinite()
+    return torch.cat([torch.where(alive, error, 0.0).sum(0), (~alive).sum(0).double()])
 
 
 class DroidOptimizer(Evolution):
@@ -42,11 +41,11 @@ class DroidOptimizer(Evolution):
 
     def __init__(self, objective: Objective, *, settings: DroidSettings, seed: int) -> None:
         self._space, self._box, self._settings = objective.simulator.parameters, objective.box, settings
-        self._search = evolution(
-            max(2, len(self._space)),  # pycma needs two dimensions; the second is idle
+        super().__init__(partial(
+            evolution, max(2, len(self._space)),  # pycma needs two dimensions; the second is idle
             seed=seed, budget=settings.budget, population=settings.population,
             tolerances={"tolfun": 1e-12, "tolfunhist": 1e-13},
-        )  # fmt: skip
+        ))  # fmt: skip
         self._best = np.inf
 
     def ask(self) -> Request:
@@ -56,10 +55,11 @@ class DroidOptimizer(Evolution):
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
         """Rank the generation by its errors."""
-        assert self._asked is not None
-        self._best = min(self._best, float(sums.min()))
-        self._search.tell(self._asked, sums.tolist())
-        self._asked = None
+        costs, lost = sums.reshape(2, -1).numpy()
+        best = int(np.lexsort((costs, lost))[0])
+        if (lost[best], costs[best]) < (self._least, self._best):
+            self._best = float(costs[best])
+        self._tell(costs, lost)
 
     @property
     def stop_reason(self) -> str | None:

@@ -31,6 +31,7 @@ class LaplaceOptimizer(Optimizer):
     name = "gauss-newton"
     method = "laplace"
     STATE = ("_means", "_linearised", "_round")
+    KINDS = (MeansStage,)
 
     def __init__(self, objective: Objective) -> None:
         self._box = objective.box

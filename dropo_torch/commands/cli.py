@@ -1,12 +1,14 @@
 """The command line: ``dropo fit``, ``gap``, ``train``, ``sweep-epsilon``, ``compare``, ``reproduce`` and others.
 
 A command is a module of this folder, imported when it is called. It has ``add_arguments(parser)``, among them ``out``,
-and ``run(given, overrides, console)``: the arguments, the config's keys that were given as options, where to print.
+and ``run(given, overrides, console)``: the arguments, the config's keys that were given as options, where to print. It
+may return an exit code.
 """
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib.metadata
 import io
 import os
@@ -14,10 +16,11 @@ import sys
 from collections.abc import Sequence
 
 from dropo_torch.commands.options import Parser
-from dropo_torch.errors import InputError, choices
+from dropo_torch.errors import InputError, choices, one_line
 
 #: Commands, each with its module and what it does.
 COMMANDS = {
+    "check": ("check", "examine the log before anything is fitted to it"),
     "fit": ("fit", "fit the distribution to the log"),
     "gap": ("gap", "find where simulation and log disagree, and name the physical effect that is missing"),
     "train": ("train", "train a policy over the distribution"),
@@ -30,13 +33,13 @@ COMMANDS = {
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run a command; return 0 on success, 2 on bad input, 130 when interrupted."""
+    """Run a command; return 0 on success, 2 on bad input, 3 after a hopeless fit, 130 when interrupted."""
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")  # a terminal without Greek letters is no reason to stop
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        _dispatch(given)
+        return _dispatch(given)
     except InputError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:
@@ -52,7 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _fail(message: str, code: int) -> int:
     """Say in one line why the command ends, and return its exit code."""
-    print(f"dropo: {' '.join(message.split())}", file=sys.stderr)
+    print(f"dropo: {one_line(message)}", file=sys.stderr)
     return code
 
 
@@ -63,8 +66,8 @@ def _silence() -> None:
     os.close(nowhere)
 
 
-def _dispatch(given: list[str]) -> None:
-    """Run the command that was given; what it does not know are overrides of its config."""
+def _dispatch(given: list[str]) -> int:
+    """Run the command that was given, and return its exit code; what it does not know are overrides of its config."""
     command = given[0] if given else ""
     if command not in (*COMMANDS, "", "-h", "--help", "--version"):
         if command.startswith("-"):
@@ -82,10 +85,11 @@ def _dispatch(given: list[str]) -> None:
         from dropo_torch.commands.folder import claimed
         from dropo_torch.config import parse_overrides
 
-        console = Console(highlight=False)
+        console = Console(highlight=False, markup=False, emoji=False)  # names are the user's, and no markup
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
-        with claimed(parsed.out):
-            parsed.run(parsed, parse_overrides(rest), console)
+        with claimed(parsed.out) if parsed.out is not None else contextlib.nullcontext():
+            return parsed.run(parsed, parse_overrides(rest), console) or 0
+    return 0
 
 
 def _parser(called: str) -> argparse.ArgumentParser:

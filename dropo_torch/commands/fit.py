@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +12,7 @@ import yaml
 from rich.console import Console
 from rich.table import Table
 
+from dropo_torch.commands.check import add_force, check_first
 from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, add_log
 from dropo_torch.commands.progress import fit_shown
@@ -20,6 +22,7 @@ from dropo_torch.support.extras import require
 from dropo_torch.support.files import write_atomically
 
 if TYPE_CHECKING:
+    from dropo_torch.diagnostics import Diagnostics
     from dropo_torch.fit import Fit
     from dropo_torch.problem import Problem
 
@@ -28,15 +31,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo fit``."""
     add_config(parser)
     add_log(parser, "the history")
+    add_force(parser)
 
 
-def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
+#: Exit code of a fit that is hopeless.
+HOPELESS = 3
+
+
+def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> int:
     """Run ``dropo fit``."""
+    config = load_config(given.config, overrides)
+    result = run_fit(config, given.out, console=console, resume=given.resume, log=given.log, force=given.force)
+    return HOPELESS if result.judgment and result.judgment.verdict == "hopeless" else 0
 
-    run_fit(load_config(given.config, overrides), given.out, console=console, resume=given.resume, log=given.log)
 
-
-def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None) -> Fit:
+def run_fit(
+    config: Config, out: Path, *, console: Console, resume: bool = False, log: str | None = None, force: bool = False
+) -> Fit:
     """Fit, and write ``fit.json``, ``report.html``, the distribution and the model to ``out``.
 
     Args:
@@ -45,34 +56,35 @@ def run_fit(config: Config, out: Path, *, console: Console, resume: bool = False
         console: where progress and results are shown.
         resume: continue an interrupted run in ``out``.
         log: ``"tensorboard"`` writes the history as TensorBoard events too.
+        force: go on although the log is surely wrong.
     """
     from dropo_torch.baselines import make_search
+    from dropo_torch.diagnostics import diagnose
     from dropo_torch.excitation import refuse_dead_parameters
-    from dropo_torch.problem import make_problem
+    from dropo_torch.problem import logged_data, make_problem
+    from dropo_torch.verdict import judge
 
     if log is not None:
         require("tensorboard", f"--log {log}")
     problem = make_problem(config)
-    continued = resume and (out / "checkpoint.pkl").exists()
+    check_first(logged_data(problem), console, force=force)
+    continued = resume and (out / "checkpoint.bin").exists()
     make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not continued:
         refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
-    result = fit_shown(problem, console, checkpoint=out / "checkpoint.pkl", resume=resume)
-    if result.diverged == len(problem.objective) * result.samples:
-        raise InputError(
-            "parameters: every simulation of this log diverges, wherever in the bounds; "
-            "check the log's units, the order of its columns (observation), frame_skip and the bounds"
-        )
-    _write(problem, result, out)
+    result = fit_shown(problem, console, checkpoint=out / "checkpoint.bin", resume=resume)
+    diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed)
+    lost = result.diverged / (len(problem.objective) * result.samples)
+    result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))
+    _write(problem, result, diagnostics, out)
     if log is not None:
         _write_events(result, out / "tensorboard")
     _show(problem, result, out, console)
     return result
 
 
-def _write(problem: Problem, result: Fit, out: Path) -> None:
-    from dropo_torch.diagnostics import diagnose
+def _write(problem: Problem, result: Fit, diagnostics: Diagnostics, out: Path) -> None:
     from dropo_torch.report import write_fit_report
 
     config = problem.config
@@ -80,10 +92,10 @@ def _write(problem: Problem, result: Fit, out: Path) -> None:
     result.distribution.save(out / "distribution.yaml")
     portable = yaml.safe_dump(config.portable(), sort_keys=False, allow_unicode=True)
     write_atomically(out / "fitted_config.yaml", portable.encode())
-    found = diagnose(problem.objective, result.distribution, seed=config.seed)
     title, notes = f"Fit of {config.sim or config.model or config.environment}", _write_model(problem, result, out)
+    notes += [_left_out(problem)] if problem.left_out else []
     about = {"title": title, "notes": notes, **provenance(config)}
-    write_fit_report(out / "report.html", fit=result, diagnostics=found, space=problem.space, **about)
+    write_fit_report(out / "report.html", fit=result, diagnostics=diagnostics, space=problem.space, **about)
 
 
 def _write_model(problem: Problem, result: Fit, out: Path) -> list[str]:
@@ -121,21 +133,33 @@ def _write_events(result: Fit, folder: Path) -> None:
 def _show(problem: Problem, result: Fit, out: Path, console: Console) -> None:
     table = Table("parameter", "mean", "std", "unit", "search box")
     for name, entry in result.distribution.summary().items():
-        box = f"\\[{entry['low']:g}, {entry['high']:g}]"
+        box = f"[{entry['low']:g}, {entry['high']:g}]"
         table.add_row(name, f"{entry['mean']:.5g}", f"{entry['std']:.2g}", entry["unit"], box)
     console.print(table)
+    if result.judgment is not None:
+        verdict = result.judgment.verdict.replace("_", " ")
+        console.print(f"verdict: {verdict}: {result.judgment.reason}", soft_wrap=True, markup=False)
     console.print(
         f"log-likelihood {result.log_likelihood:.2f}, mean squared error {result.mse:.3g}, "
         f"{len(problem.objective)} windows, {result.simulated_transitions} simulated transitions, "
         f"{result.seconds:.1f} s; stopped because {result.stop_reason}",
         soft_wrap=True,
     )
+    if problem.left_out:
+        console.print(_left_out(problem))
     if result.diverged:
         share = 100 * result.diverged / (len(problem.objective) * result.samples)
         console.print(f"{result.diverged} simulations ({share:.2g} %) diverged under the fitted distribution")
     show_report(out, console)
 
 
+def _left_out(problem: Problem) -> str:
+    return (
+        f"{problem.left_out} transitions are left out: commands from before the log still act in them, by a delay, a "
+        "lag or play."
+    )
+
+
 def show_report(out: Path, console: Console) -> None:
     """Print where the report is."""
-    console.print(f"report: {out / 'report.html'}", soft_wrap=True, markup=False)
+    console.print(f"report: {out / 'report.html'}", soft_wrap=True)

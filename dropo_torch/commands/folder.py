@@ -17,12 +17,12 @@ from dropo_torch.errors import InputError
 
 #: Files by which a folder is known to hold a run.
 _MARKS = (
-    "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.pkl",
-    "gap-progress.pkl", "sweep-progress.json", "compare-progress.json", "train-progress.pt",
+    "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.bin",
+    "check.json", "gap-progress.bin", "sweep-progress.json", "compare-progress.json", "train-progress.bin",
 )  # fmt: skip
 #: What runs write; an earlier run's are moved aside together.
 _RESULTS = (
-    *_MARKS, "policy.pt", "gap-progress-shorter.pkl", "gap-progress-contact.pkl", "distribution.yaml",
+    *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "distribution.yaml",
     "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "tensorboard",
 )  # fmt: skip
 _PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")

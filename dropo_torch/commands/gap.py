@@ -11,8 +11,9 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from dropo_torch.commands.check import add_force, check_first
 from dropo_torch.commands.folder import prepare_folder, provenance
-from dropo_torch.commands.options import add_config as add_arguments
+from dropo_torch.commands.options import add_config
 from dropo_torch.commands.progress import StageProgress
 from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
@@ -21,13 +22,17 @@ from dropo_torch.support.files import write_json
 if TYPE_CHECKING:
     from dropo_torch.gap import Gap
 
-__all__ = ["add_arguments", "run"]
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``dropo gap``."""
+    add_config(parser)
+    add_force(parser)
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo gap``, which writes ``gap.json``, ``report.html``, and the model and config with what was missing."""
     from dropo_torch.gap import add, find_gap, prepare
-    from dropo_torch.problem import make_problem
+    from dropo_torch.problem import logged_data, make_problem
     from dropo_torch.report import write_gap_report
 
     config, out = load_config(given.config, overrides), given.out
@@ -39,7 +44,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if written.exists() and not (out / "gap.json").exists():
         raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
     problem = make_problem(config, general=True)
-    store = out / "gap-progress.pkl"
+    check_first(logged_data(problem), console, force=given.force)
+    store = out / "gap-progress.bin"
     with StageProgress(console, "gap") as progress:
         progress.show("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside
@@ -58,7 +64,7 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
 
     headline, items = answer(gap)
     for line in (headline, *(f"  - {item}" for item in items)):
-        console.print(line, markup=False)
+        console.print(line)
     table = Table("held-out data", "before", "after", "noise alone")
     rows = (
         ("one-step mean squared error", "mse", "{:.3g}"),
@@ -69,10 +75,10 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
         table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
     console.print(table)
     for line in filter(None, (gap.next_experiment, *gap.notes)):
-        console.print(line, markup=False)
+        console.print(line)
     console.print(
         f"{gap.simulated_transitions} simulated transitions, {gap.seconds:.1f} s; report: {out / 'report.html'}",
-        soft_wrap=True, markup=False,
+        soft_wrap=True,
     )  # fmt: skip
     if (out / "config.yaml").exists():
-        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True, markup=False)
+        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True)

@@ -18,12 +18,15 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; usage: {usage}")
 
 
-def add_config(parser: argparse.ArgumentParser) -> None:
+def add_config(parser: argparse.ArgumentParser, *, out_required: bool = True) -> None:
     """Add the config, the folder of the results, and to the help every key of the config, as each is an option."""
     from dropo_torch.config import Config
 
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file")
-    add_folder(parser)
+    if out_required:
+        add_folder(parser)
+    else:
+        parser.add_argument("--out", type=_folder, metavar="DIR", help="folder of the results")
     lines = ["every key of the config is an option too (--epsilon 1e-4, --parameters.mass.bounds '[1, 2]'):"]
     for name, entry in Config.model_fields.items():
         if name != "base":

@@ -24,8 +24,8 @@ class _Live(Progress):
 
     def __init__(self, console: Console, label: str) -> None:
         super().__init__(
-            SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=20),
-            TextColumn("{task.fields[status]}"), TimeElapsedColumn(),
+            SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(bar_width=20),
+            TextColumn("{task.fields[status]}", markup=False), TimeElapsedColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
         self._label, self._last = label, time.monotonic()

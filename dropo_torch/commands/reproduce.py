@@ -34,4 +34,4 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         found = study(out, reduced=given.reduced, resume=given.resume, report=progress.show, workers=workers)
     lines = [*(f"  - {line}" for line in found), f"tables: {out / 'tables.md'}; report: {out / 'report.html'}"]
     for line in lines:
-        console.print(line, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from dropo_torch.commands.fit import show_report
 from dropo_torch.commands.folder import prepare_folder, provenance
@@ -64,8 +65,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     def point_at(epsilon: float) -> SweepPoint:
         part = make_problem(config.model_copy(update=keys_of(epsilon)))
         fit = fit_shown(part, console, f"ε = {epsilon:g}")
-        robust = study.robust_log_likelihood(part.objective, fit) if noisy_starts else None
-        return study.SweepPoint.of(epsilon, fit, robust)
+        return study.SweepPoint.of(epsilon, fit, noisy_starts=noisy_starts)
 
     sweep = study.sweep_epsilon(
         point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store
@@ -87,13 +87,13 @@ def _show(sweep: Sweep, chosen: Mapping[str, Any], names: Sequence[str], console
     heads = ("variance of the noise", "robust log-likelihood") if sweep.noisy_starts else ("ε", "log-likelihood")
     table = Table(heads[0], "mean squared error", heads[1], *names)
     for p in sweep.points:
-        marked = "[bold]" if p.epsilon == sweep.chosen else ""
         cells = [f"{p.mean[n]:.4g} ± {p.std[n]:.2g}" for n in names]
         value = p.log_likelihood if p.robust_log_likelihood is None else p.robust_log_likelihood
-        table.add_row(f"{marked}{p.epsilon:g}", f"{p.mse:.4g}", f"{value:.1f}", *cells)
+        first = Text(f"{p.epsilon:g}", "bold" if p.epsilon == sweep.chosen else "")
+        table.add_row(first, f"{p.mse:.4g}", f"{value:.1f}", *cells)
     console.print(table)
     keys = yaml.safe_dump(dict(chosen), default_flow_style=True, sort_keys=False, width=10_000).strip()[1:-1]
-    console.print(f"chosen: [bold]{keys}[/], since {sweep.reason}", soft_wrap=True)
+    console.print(Text.assemble("chosen: ", (keys, "bold"), f", since {sweep.reason}"), soft_wrap=True)
 
 
 def _numbers(text: str) -> list[float]:

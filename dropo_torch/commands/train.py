@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
+from dropo_torch.commands.check import add_force, check_first
 from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, add_log
 from dropo_torch.commands.progress import TrainProgress
@@ -32,10 +33,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo train``."""
     add_config(parser)
     add_log(parser, "the learning curves")
+    add_force(parser)
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo train``, which writes ``policy.pt``, ``train.json`` and ``report.html``."""
+    from dropo_torch.logged import read_log
     from dropo_torch.rl.problem import make_training
     from dropo_torch.rl.train import check_training, train
 
@@ -43,8 +46,11 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     logging.getLogger("torchrl").setLevel(logging.WARNING)  # it tells every storage it allocates
     if given.log is not None:
         require("tensorboard", f"--log {given.log}")
-    problem = make_training(load_config(given.config, overrides))
-    checkpoint = out / "train-progress.pt"
+    config = load_config(given.config, overrides)
+    problem = make_training(config)
+    if config.data is not None:  # training needs no log; one that its distribution may come from is examined
+        check_first(read_log(config), console, force=given.force)
+    checkpoint = out / "train-progress.bin"
     continued = given.resume and checkpoint.exists()
     path = problem.distribution_path
     if path is not None and not continued and path.resolve().parent == out.resolve():
@@ -98,7 +104,7 @@ def _show(result: Training, out: Path, console: Console) -> None:
         soft_wrap=True,
     )  # fmt: skip
     for path in (out / "policy.pt", out / "report.html"):
-        console.print(f"{path.stem}: {path}", soft_wrap=True, markup=False)
+        console.print(f"{path.stem}: {path}", soft_wrap=True)
 
 
 class _Curves:

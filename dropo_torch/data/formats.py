@@ -14,6 +14,9 @@ A new one is a function that opens such a file as tables, and an entry of :data:
 
 from __future__ import annotations
 
+import io
+import json
+import math
 import re
 import warnings
 from collections.abc import Callable, Iterator, Mapping
@@ -21,14 +24,15 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import TYPE_CHECKING, Any
+from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
 from dropo_torch.data.tables import Table
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.child import read_in_child
 from dropo_torch.support.extras import extra
-from dropo_torch.support.given import reading
+from dropo_torch.support.given import check_size, reading
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -43,6 +47,9 @@ def open_npz(path: Path, _: str | None) -> list[Table]:
 
     def read(name: str) -> np.ndarray:
         with reading(f"{path}: {name}", "a plain array"), _npz(path) as archive:
+            member = name if name in archive.zip.namelist() else f"{name}.npy"
+            with archive.zip.open(member) as stream:
+                _check_npy(stream, f"{path}: {name}")
             return np.asarray(archive[name])
 
     return [Table(str(path), names, read)]
@@ -59,8 +66,10 @@ def open_npy(path: Path, _: str | None) -> list[Table]:
             raise InputError(f"{folder}: there is no {files[name].name} beside {first.name}")
 
     def read(name: str) -> np.ndarray:
-        with reading(files[name], "a plain .npy array"):
-            return np.asarray(np.load(files[name], allow_pickle=False))
+        with reading(files[name], "a plain .npy array"), files[name].open("rb") as stream:
+            _check_npy(stream, files[name])
+            stream.seek(0)
+            return np.asarray(np.load(stream, allow_pickle=False))
 
     return [Table(str(folder), tuple(name for name, file in files.items() if file.exists()), read)]
 
@@ -74,8 +83,21 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
         reading(path, "a table of text"),
         warnings.catch_warnings(action="error", category=pd.errors.ParserWarning),  # rows longer than the header
     ):
-        frame = pd.read_csv(path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False)
-    frame.columns = frame.columns.str.strip()
+        read: Callable[..., Any] = partial(
+            pd.read_csv, path, sep=separator, skipinitialspace=True, index_col=False, low_memory=False
+        )
+        head = read(header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
+        frame = read()
+        frame.columns = pd.Index([name.strip() or f"Unnamed: {i}" for i, name in enumerate(head)])
+    twice = frame.columns[frame.columns.duplicated()]
+    if len(twice):
+        raise InputError(f"{path}: two columns are named {str(twice[0])!r}; give each a name of its own")
+    for name in frame.columns[[kind.kind not in "biuf" for kind in frame.dtypes]]:
+        rows = np.flatnonzero(frame[name].astype(str).str.contains("[\n\r]"))
+        if rows.size:
+            raise InputError(
+                f"{path}: {name} has a line break at row {rows[0]} (counted from 0); is a quotation mark left open?"
+            )
     only = str(frame.columns[0])
     other = next((mark for mark in ";\t," if mark != separator and mark in only), None)
     if len(frame.columns) == 1 and other is not None:
@@ -87,8 +109,10 @@ def open_parquet(path: Path, _: str | None) -> list[Table]:
     """A data frame with its index."""
     with extra("formats", str(path)):
         import pandas as pd
-        import pyarrow  # noqa: F401  # what pandas reads it with
+        from pyarrow import parquet
     with reading(path, "Parquet"):
+        with parquet.ParquetFile(path) as file:
+            check_size(file.metadata.num_rows * file.metadata.num_columns, 8, path)
         frame = pd.read_parquet(path, engine="pyarrow")
     named = any(name is not None for name in frame.index.names)
     return [_frame(path, frame.reset_index() if named else frame)]
@@ -107,6 +131,7 @@ def open_hdf5(path: Path, group: str | None) -> list[Table]:
 
     def read(name: str, below: str = "") -> np.ndarray:
         with reading(f"{path}: {below}{name}", "an HDF5 data set"), h5py.File(path, "r") as file:
+            check_size(file[below + name].size or 0, file[below + name].dtype.itemsize, f"{path}: {below}{name}")
             return np.asarray(file[below + name][()])
 
     with reading(path, "HDF5"), h5py.File(path, "r") as file:
@@ -126,11 +151,27 @@ def open_mat(path: Path, _: str | None) -> list[Table]:
     with path.open("rb") as file:
         if _HDF5_SIGNATURE in file.read(1024):
             return [_mat73(open_hdf5(path, None)[0])]
+    # a damaged file crashes scipy's reader
+    content = read_in_child(f"{__name__}:mat_arrays", path, where=path, kind="a MATLAB file")
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+        names = json.loads(str(archive["names"]))
+        arrays = {name: archive[f"{number}"] for number, name in enumerate(names)}
+    return [Table(str(path), tuple(names), arrays.__getitem__)]
+
+
+def mat_arrays(path: str) -> bytes:
+    """Return the variables of a MATLAB file as an archive: ``names``, and each array by its number.
+
+    What holds neither numbers nor text is left as an array without a number type, which no column map takes.
+    """
     import scipy.io
 
-    with reading(path, "a MATLAB file"):
-        arrays = flatten(scipy.io.loadmat(path, simplify_cells=True), ".")
-    return [Table(str(path), tuple(n for n in arrays if not n.startswith("__")), arrays.__getitem__)]
+    arrays = flatten(scipy.io.loadmat(path, simplify_cells=True), ".")
+    arrays = {name: array for name, array in arrays.items() if not name.startswith("__")}
+    plain: dict[str, Any] = {"names": np.array(json.dumps(list(arrays)))}
+    plain |= {str(i): a if a.dtype.kind in "biufcUS" else np.empty(0, "V1") for i, a in enumerate(arrays.values())}
+    np.savez(buffer := io.BytesIO(), **plain)
+    return buffer.getvalue()
 
 
 @dataclass(frozen=True)
@@ -205,6 +246,14 @@ def flatten(nested: object, joint: str, prefix: str = "") -> dict[str, np.ndarra
     for key, value in nested.items():
         leaves |= flatten(value, joint, f"{prefix}{joint}{key}" if prefix else str(key))
     return leaves
+
+
+def _check_npy(stream: IO[bytes], where: object) -> None:
+    """Refuse an array in NumPy's own format that declares more than there may be."""
+    version = np.lib.format.read_magic(stream)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, _, dtype = header(stream)
+    check_size(math.prod(shape), dtype.itemsize, where)
 
 
 @contextmanager

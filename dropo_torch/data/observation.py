@@ -84,18 +84,27 @@ class Observation:
 
     def states(self, observations: np.ndarray) -> np.ndarray:
         """Return full states ``(T, nq + nv)`` of logged observations ``(T, log_width)``."""
+        self.check_quaternions(np.asarray(observations, dtype=np.float64), "observations")
         states = self.full(self.observed(observations))
         for quaternion in self.quaternions:
             block = self.index[list(quaternion)]
-            norm = np.linalg.norm(states[:, block], axis=1, keepdims=True)
-            bad = np.flatnonzero(norm[:, 0] < 1e-6)
+            states[:, block] /= np.linalg.norm(states[:, block], axis=1, keepdims=True)
+        return states
+
+    def check_quaternions(self, log: np.ndarray, what: str) -> None:
+        """Refuse observations ``(T, log_width)`` with a quaternion that is no orientation.
+
+        Raises:
+            InputError: a zero quaternion, with its row and ``what`` it is in.
+        """
+        for quaternion in self.quaternions:
+            norm = np.linalg.norm(log[:, [self.log_columns[i] for i in quaternion]], axis=1)
+            bad = np.flatnonzero(norm < 1e-6)
             if bad.size:
                 raise InputError(
-                    f"log: row {bad[0]} has a zero quaternion in {self.labels[quaternion[0]]}; "
+                    f"log: row {bad[0]} of {what} has a zero quaternion in {self.labels[quaternion[0]]}; "
                     "a unit quaternion (w, x, y, z) is expected"
                 )
-            states[:, block] = states[:, block] / norm
-        return states
 
     def full(self, columns: np.ndarray) -> np.ndarray:
         """Return full states ``(T, nq + nv)`` of observed columns ``(T, n)``; what is not observed has its default."""

@@ -15,16 +15,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
-from scipy.interpolate import Akima1DInterpolator
-from scipy.signal import butter, sosfiltfilt
 
 from dropo_torch.data.recording import Recording, resolve_names
-from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
+from dropo_torch.data.trajectory import Origin, Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.given import check_keys, number
+
+if TYPE_CHECKING:
+    from scipy.interpolate import Akima1DInterpolator
 
 Actions = Literal["hold", "mean", "position", "velocity"]
 
@@ -145,6 +146,8 @@ class _Samples:
 
     @property
     def spline(self) -> Akima1DInterpolator:
+        from scipy.interpolate import Akima1DInterpolator  # heavy, and most logs need none
+
         return Akima1DInterpolator(self.time, self.values)
 
 
@@ -296,7 +299,8 @@ class _Episode:
             actions = {name: self._commands(name, grid[:-1]) for name in self.part.action_names}
         observations = np.stack([*position.values(), *velocity.values()], axis=1)
         commands = np.stack(list(actions.values()), axis=1) if actions else np.empty((len(grid) - 1, 0))
-        return Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
+        log = Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
+        return replace(log, origin=Origin((*position, *velocity), tuple(actions)))
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
         return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")
@@ -333,6 +337,8 @@ class _Episode:
 
     def _filtered(self, name: str, samples: _Samples, cutoff: float) -> _Samples:
         """The samples, put on an even grid at their own rate, through the zero-phase low-pass filter."""
+        from scipy.signal import butter, sosfiltfilt
+
         first, last = samples.time[0], samples.time[-1]
         count = round((last - first) / float(np.median(np.diff(samples.time)))) + 1
         rate = (count - 1) / (last - first)

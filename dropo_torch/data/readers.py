@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from dropo_torch.data.corrections import Corrections, break_rows, corrected
 from dropo_torch.data.formats import missing_file, open_tables
 from dropo_torch.data.minari import PREFIX, read_minari
 from dropo_torch.data.preprocess import Preprocess, preprocess
@@ -23,7 +24,7 @@ from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
 from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.extras import extra
-from dropo_torch.support.given import check_keys, number, reading
+from dropo_torch.support.given import check_keys, number, reading, user_path
 
 Source = str | Path | Mapping[str, Any] | Sequence["Source"]
 
@@ -43,8 +44,18 @@ class ReadOptions:
     group: str | None = None
     separator: str | None = None
     preprocess: Preprocess | Mapping[str, Any] | None = None
+    scale: Mapping[str, float] | None = None
+    unwrap: Sequence[str] | None = None
+    shift: int = 0
+    breaks: Sequence[int] | None = None
+
+    @property
+    def corrections(self) -> Corrections:
+        """What is corrected in the values."""
+        return Corrections.of(self.scale, self.unwrap, self.shift)
 
     def __post_init__(self) -> None:
+        Corrections.of(self.scale, self.unwrap, self.shift)
         for name in ("dt", "tolerance"):
             value = getattr(self, name)
             if value is not None:
@@ -73,6 +84,10 @@ def read_trajectories(
     group: str | None = None,
     separator: str | None = None,
     preprocess: Preprocess | Mapping[str, Any] | None = None,
+    scale: Mapping[str, float] | None = None,
+    unwrap: Sequence[str] | None = None,
+    shift: int = 0,
+    breaks: Sequence[int] | None = None,
     base: str | Path | None = None,
 ) -> Trajectories:
     """Read one or more logs.
@@ -95,14 +110,19 @@ def read_trajectories(
         group: pattern of HDF5 groups with an episode each, such as ``data/demo_*``.
         separator: what separates the columns of a text file.
         preprocess: how to synchronise, filter and resample; see :class:`~dropo_torch.data.preprocess.Preprocess`.
+        scale: signal → factor by which its values are multiplied: 0.0174532925 for degrees, -1 for a sign.
+        unwrap: angles in rad that wrap at ±π or at 2π, which become continuous in each episode.
+        shift: rows by which the commands stand too late; each row takes the command of so many rows further on.
+        breaks: rows, counted from 0, at which an episode begins, for a log that does not say.
         base: folder from which relative paths start, by default the current one.
 
     Raises:
         InputError: a file, name or value that cannot be used; its one line says which.
     """
     options = ReadOptions(
-        observations, next_observations, actions, time, episode, terminals, dt, tolerance, group, separator, preprocess
-    )
+        observations, next_observations, actions, time, episode, terminals, dt, tolerance, group, separator, preprocess,
+        scale, unwrap, shift, breaks,
+    )  # fmt: skip
     return concatenate(_read(source, options, Path(base or ".")))
 
 
@@ -144,7 +164,7 @@ def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories
 
 def _paths(source: str | Path, base: Path) -> list[Path]:
     """The path meant, or those that a pattern matches."""
-    path = base / Path(source).expanduser()
+    path = user_path(base, source)
     if path.exists() or not glob.has_magic(str(source)):
         return [path]
     found = sorted(Path(match) for match in glob.glob(str(path), recursive=True))
@@ -169,14 +189,17 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
             raise InputError(
                 f"{table.source}: preprocess works on samples in time; leave next_observations out, they are resampled"
             )
-        return preprocess(_recording(table, options), options.preprocess)
+        samples, _ = corrected(_recording(table, options), None, options.corrections)
+        return preprocess(samples, options.preprocess)
     following = options.next_observations
     if following is None and options.observations is None and "next_observations" in table.names:
         following = "next_observations"
     rows = _recording(table, options)
     if following is None:
-        return rows.trajectories(tolerance=options.tolerance)
-    next_observations, next_names = table.matrix(following, "next_observations", len(rows))
+        return corrected(rows, None, options.corrections)[0].trajectories(tolerance=options.tolerance)
+    found, next_names = table.matrix(following, "next_observations", len(rows))
+    rows, next_observations = corrected(rows, found, options.corrections)
+    assert next_observations is not None
     check_values(rows.observations, rows.observation_names, f"{rows.source}: observations")
     check_values(next_observations, next_names, f"{rows.source}: next_observations")
     check_values(rows.actions, rows.action_names, f"{rows.source}: actions")
@@ -187,6 +210,7 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
         terminals=np.append(np.diff(rows.episodes) != 0, True),
         dt=rows.interval(options.tolerance) or options.dt,
         source=rows.source,
+        origin=rows.origin(np.arange(len(rows))),
     )
 
 
@@ -244,6 +268,7 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
         if empty.size:
             raise InputError(f"{table.source}: {options.episode} has no value at row {empty[0]} (counted from 0)")
         start[1:] |= label[1:] != label[:-1]
+    start[break_rows(options.breaks, rows, table.source)] = True
     return np.cumsum(start)
 
 
@@ -283,8 +308,20 @@ def _are_dates(stamps: np.ndarray) -> bool:
 
 
 def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
-    for name in ("next_observations", "time", "episode", "terminals", "group", "separator", "preprocess"):
-        if getattr(options, name) is not None:
+    for name in (
+        "next_observations",
+        "time",
+        "episode",
+        "terminals",
+        "group",
+        "separator",
+        "preprocess",
+        "scale",
+        "unwrap",
+        "shift",
+        "breaks",
+    ):
+        if getattr(options, name):
             source = f"{PREFIX}{dataset}" if isinstance(dataset, str) else dataset
             raise InputError(
                 f"{source}: {name} has no meaning for a Minari dataset, which holds transitions; leave it out"

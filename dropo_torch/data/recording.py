@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dropo_torch.data.trajectory import Trajectories, check_values, set_frozen
+from dropo_torch.data.trajectory import Origin, Trajectories, check_values, set_frozen
 from dropo_torch.errors import InputError, choices
 
 TOLERANCE = 0.05
@@ -30,6 +30,7 @@ class Recording:
         observation_names: a name for each column of ``observations``.
         action_names: a name for each column of ``actions``.
         source: where it came from, for messages.
+        rows: row of the file of each sample, ``(N,)``; by default all from 0 on.
 
     Raises:
         InputError: shapes that do not fit, an infinite value, a name that stands twice, time stamps
@@ -43,6 +44,7 @@ class Recording:
     observation_names: tuple[str, ...]
     action_names: tuple[str, ...]
     source: str = "recording"
+    rows: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         rows = len(self.observations)
@@ -62,6 +64,7 @@ class Recording:
         if episodes.shape != (rows,) or (np.diff(episodes) < 0).any():
             raise InputError(f"{self.source}: episodes must be {rows} whole numbers that never fall")
         set_frozen(self, "episodes", episodes)
+        set_frozen(self, "rows", np.arange(rows) if self.rows is None else np.array(self.rows, dtype=np.int64))
         if self.time is not None:
             set_frozen(self, "time", self._checked_time(self.time))
 
@@ -77,7 +80,9 @@ class Recording:
     def split(self) -> tuple[Recording, ...]:
         """Return each episode as a recording of its own."""
         bounds = np.flatnonzero(np.diff(self.episodes)) + 1
-        names = [name for name in ("observations", "actions", "time", "episodes") if getattr(self, name) is not None]
+        names = [
+            name for name in ("observations", "actions", "time", "episodes", "rows") if getattr(self, name) is not None
+        ]
         parts = zip(*(np.split(getattr(self, name), bounds) for name in names), strict=True)
         return tuple(replace(self, **dict(zip(names, part, strict=True))) for part in parts)
 
@@ -91,6 +96,16 @@ class Recording:
             if name in names:
                 return values[:, names.index(name)]
         raise InputError(f"{self.source}: there is no signal {name!r}{choices(name, self.names)}")
+
+    def origin(self, start: np.ndarray) -> Origin:
+        """Return what the file says of the transitions that start at the given samples."""
+        assert self.rows is not None
+        durations = None
+        if self.time is not None:
+            follows = start + 1 < len(self)
+            durations = np.where(follows, self.time[np.where(follows, start + 1, start)] - self.time[start], np.nan)
+            durations[np.append(np.diff(self.episodes) != 0, True)[start]] = np.nan
+        return Origin(self.observation_names, self.action_names, self.rows[start], durations)
 
     def interval(self, tolerance: float) -> float | None:
         """Return the mean spacing of the time stamps in seconds; ``None`` without them, or if no episode has two.
@@ -144,6 +159,7 @@ class Recording:
             terminals=np.diff(start, append=len(self) + 1) != 1,
             dt=dt,
             source=self.source,
+            origin=self.origin(start),
         )
 
     def _checked_time(self, time: np.ndarray) -> np.ndarray:

@@ -13,6 +13,38 @@ from dropo_torch.errors import InputError
 
 
 @dataclass(frozen=True)
+class Origin:
+    """Where in its file a log stood, for messages and for the config lines that correct it.
+
+    Attributes:
+        observation_names: the file's name of each observed column.
+        action_names: of each column of the commands.
+        rows: row of the file at which each transition starts, ``(T,)``; ``None`` for what was resampled.
+        durations: seconds of each transition by the time stamps, ``(T,)``; ``None`` without stamps.
+    """
+
+    observation_names: tuple[str, ...]
+    action_names: tuple[str, ...]
+    rows: np.ndarray | None = None
+    durations: np.ndarray | None = None
+
+    def select(self, index: np.ndarray) -> Origin:
+        """Return the origin of the given transitions."""
+        kept = (None if array is None else array[index] for array in (self.rows, self.durations))
+        return Origin(self.observation_names, self.action_names, *kept)
+
+    @classmethod
+    def joined(cls, parts: Sequence[Origin | None]) -> Origin | None:
+        """Return the origin of several logs, one after the other; ``None`` where their columns' names differ."""
+        known = [part for part in parts if part is not None]
+        names = {(part.observation_names, part.action_names) for part in known}
+        if len(known) < len(parts) or len(names) != 1:
+            return None
+        arrays = [[getattr(part, name) for part in known] for name in ("rows", "durations")]
+        return cls(*names.pop(), *(None if any(a is None for a in of) else np.concatenate(of) for of in arrays))
+
+
+@dataclass(frozen=True)
 class Trajectories:
     """Logged episodes, one row a transition, in the order in which they were recorded.
 
@@ -24,6 +56,7 @@ class Trajectories:
             last row always is.
         dt: duration of a transition in seconds, or ``None`` where the log does not say.
         source: where the log came from, for messages.
+        origin: what the file calls its columns and rows, where it was read from one.
 
     Raises:
         InputError: shapes that do not fit, a value that is not finite, no transition.
@@ -35,6 +68,7 @@ class Trajectories:
     terminals: np.ndarray
     dt: float | None = None
     source: str = "log"
+    origin: Origin | None = None
 
     def __post_init__(self) -> None:
         for name in ("observations", "next_observations", "actions"):
@@ -85,12 +119,20 @@ class Trajectories:
         ends = np.cumsum(self.terminals)
         return np.concatenate([[0], ends[:-1]])
 
+    @property
+    def commands(self) -> np.ndarray:
+        """The commands of every episode, the last one repeated once more than the longest needs, ``(E, N, m)``."""
+        bounds = np.append(0, np.flatnonzero(self.terminals) + 1)
+        ahead = np.arange(np.diff(bounds).max() + 1)
+        return np.stack([self.actions[np.minimum(a + ahead, b - 1)] for a, b in itertools.pairwise(bounds)])
+
     def select(self, rows: np.ndarray | slice) -> Trajectories:
         """Return the given rows, ascending; an episode ends wherever rows are left out."""
         index = np.arange(len(self))[rows]
         gap = np.append(np.diff(index) != 1, True)
         rest = {name: getattr(self, name)[index] for name in ("observations", "next_observations", "actions")}
-        return replace(self, **rest, terminals=self.terminals[index] | gap)
+        origin = None if self.origin is None else self.origin.select(index)
+        return replace(self, **rest, terminals=self.terminals[index] | gap, origin=origin)
 
     def select_episodes(self, which: Sequence[int]) -> Trajectories:
         """Return the given episodes, counted from 0."""
@@ -125,6 +167,7 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
         **{name: np.concatenate([getattr(log, name) for log in logs]) for name in names},
         dt=next((log.dt for log in logs if log.dt is not None), None),
         source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
+        origin=Origin.joined([log.origin for log in logs]),
     )
 
 
@@ -164,12 +207,24 @@ class Transitions:
 
 
 def make_transitions(
-    trajectories: Trajectories, observation: Observation, *, lag: int = 1, history: int = 0
+    trajectories: Trajectories,
+    observation: Observation,
+    *,
+    lag: int = 1,
+    history: int = 0,
+    since: np.ndarray | None = None,
 ) -> Transitions:
     """Cut a log into consecutive windows of ``lag`` transitions that never cross an episode's end.
 
     With ``history``, the controls of so many logged steps before each window stand before its own; before an
     episode's start its first control does.
+
+    Args:
+        trajectories: the log.
+        observation: its columns.
+        lag: transitions of a window.
+        history: logged steps before a window whose controls come with it.
+        since: transition of each episode at which its first window starts, ``(E,)``; its first one by default.
 
     Raises:
         InputError: a log without an episode of ``lag`` transitions.
@@ -181,12 +236,20 @@ def make_transitions(
         raise InputError(
             f"{trajectories.source}: {width} observed columns; the observation has {observation.log_width}"
         )
+    for what in ("observations", "next_observations"):  # both ends, of the rows between windows too
+        observation.check_quaternions(getattr(trajectories, what), what)
     bounds = np.append(0, np.flatnonzero(trajectories.terminals) + 1)
-    starts = [np.arange(a, b - lag + 1, lag) for a, b in itertools.pairwise(bounds)]
+    begin = bounds[:-1] if since is None else bounds[:-1] + since
+    starts = [np.arange(a, b - lag + 1, lag) for a, b in zip(begin, bounds[1:], strict=True)]
     rows = np.concatenate(starts)
     first = np.repeat(bounds[:-1], [len(s) for s in starts])
     if rows.size == 0:
         longest = int(np.diff(bounds).max())
+        if longest >= lag:
+            raise InputError(
+                f"{trajectories.source}: in every transition commands act that are from before its episode; record "
+                "longer episodes, or narrow the bounds of what delays, lags or has play"
+            )
         raise InputError(
             f"{trajectories.source}: too short for lag {lag}: the longest episode has {longest} transitions; "
             f"lag must be at most {longest}"
@@ -227,9 +290,15 @@ class Replay:
 
 
 def make_replay(
-    trajectories: Trajectories, observation: Observation, horizon: int, *, history: int = 0, about_start: bool = False
+    trajectories: Trajectories,
+    observation: Observation,
+    horizon: int,
+    *,
+    history: int = 0,
+    about_start: bool = False,
+    since: np.ndarray | None = None,
 ) -> Replay:
-    """Cut a log into consecutive windows of ``horizon`` transitions.
+    """Cut a log into consecutive windows of ``horizon`` transitions; see :func:`make_transitions`.
 
     Of the lengths down to half the horizon (or half the longest episode), windows have the one that leaves the fewest
     transitions out, the longest of several.
@@ -239,10 +308,10 @@ def make_replay(
     """
     if horizon < 1:
         raise InputError(f"horizon: {horizon} given; expected a whole number of logged steps, 1 or more")
-    lengths = np.bincount(trajectories.episodes)
-    longest = min(horizon, int(lengths.max()))
+    lengths = np.maximum(np.bincount(trajectories.episodes) - (0 if since is None else since), 0)
+    longest = max(min(horizon, int(lengths.max())), 1)
     steps = max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
-    windows = make_transitions(trajectories, observation, lag=steps, history=history)
+    windows = make_transitions(trajectories, observation, lag=steps, history=history, since=since)
     rows = (windows.rows[:, None] + np.arange(steps)).reshape(-1)
     measured = observation.observed(trajectories.next_observations[rows])
     return Replay(

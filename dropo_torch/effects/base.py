@@ -33,6 +33,8 @@ class Quantity:
         neutral: the value at which the effect is absent.
         low, high: values outside are no physics, or freeze the model.
         scale: a size that matters on this log; steps and thresholds are taken relative to it.
+        discrete: whether only some values in between mean anything, such as those of the starts: nothing moves it,
+            it has no interval, and it is no parameter.
     """
 
     name: str
@@ -41,6 +43,7 @@ class Quantity:
     low: float
     high: float
     scale: float
+    discrete: bool = False
 
 
 @dataclass(frozen=True)
@@ -152,7 +155,7 @@ class Effect(abc.ABC):
     contains: ClassVar[tuple[str, ...]] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Pickle by name: whoever reads it must have registered the effect, too."""
+        """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""
         return find_effect, (self.name,)
 
     @abc.abstractmethod

@@ -12,10 +12,12 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Method, Placed, Setting
+from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED
-from dropo_torch.simulators.mujoco import control_range, default_row, filter_activations
+from dropo_torch.simulators.hidden import filter_memory, filters_of, prescribed_bodies, prescribed_names
+from dropo_torch.simulators.mujoco import default_row
 
 Models = Sequence[mujoco.MjModel | None]
 #: Simulations below which handing work to threads costs more than it saves.
@@ -88,6 +90,9 @@ class VariantEngine:
         space: the declared parameters.
         num_threads: threads, 0 for all processors; results do not depend on it.
         warp: simulate with the Warp backend wherever it can; MuJoCo does the rest, with the same physics.
+
+    Attributes:
+        lead: physics steps before a window whose commands come with it, over which actuators' filters are replayed.
     """
 
     def __init__(self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, warp: bool = False) -> None:
@@ -99,7 +104,10 @@ class VariantEngine:
             self._warp = Variants(space, num_threads=num_threads)
         self._base = copy.copy(setting.model)
         self._base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        self._filters = filter_activations(self._base)
+        if prescribed_bodies(self._base):
+            raise InputError(f"effects: mocap bodies ({prescribed_names(self._base)}) cannot be had together with them")
+        self._filters = filters_of(self._base)
+        self.lead = filter_memory(space.on(self._base))
         self._data = mujoco.MjData(self._base)
         self._row = default_row(self._base)
         self._forces = Forces(setting)
@@ -113,8 +121,11 @@ class VariantEngine:
         """
         model = copy.copy(self._base)
         self._space.write_into(model, variant.declared)
+        step = model.opt.timestep
         for placed in variant.placed:
             placed.effect.apply(model, placed.target, np.asarray(placed.values))
+        if model.opt.timestep != step and whole_ratio(self._base.opt.timestep, model.opt.timestep) is None:
+            raise ModelRefused(f"no whole number of its steps of {model.opt.timestep:g} s is the model's")
         if (model.body_mass < 0).any() or (model.body_inertia < 0).any() or (model.dof_armature < 0).any():
             raise ModelRefused("a mass or an inertia is negative")
         try:
@@ -142,7 +153,8 @@ class VariantEngine:
             variants: the hypotheses, K of them.
             models: their models, of :meth:`models`.
             starts: true states, ``(K, W, nq + nv)``.
-            signals: commands of every physics step, ``(K, W, S, nu)``.
+            signals: commands of every physics step, those of ``lead`` steps before the window first,
+                ``(K, W, lead + S, nu)``.
             fine: return the states after every physics step instead of every logged one.
             pushes: further generalised forces in every logged step, ``(K, S / skip, nv)``; none by default.
 
@@ -155,11 +167,11 @@ class VariantEngine:
         for k, (variant, model) in enumerate(zip(variants, models, strict=True)):
             if model is not None:
                 groups.setdefault(self._kind(variant, model), []).append(k)
-        out = np.full((*starts.shape[:2], signals.shape[2] // every, starts.shape[2]), np.nan)
+        out = np.full((*starts.shape[:2], (signals.shape[2] - self.lead) // every, starts.shape[2]), np.nan)
         for (finer, *_), members in groups.items():
             rows = members if len(members) < len(variants) else slice(None)  # all of them need no copy
             own, their = [models[k] for k in members], [variants[k] for k in members]
-            forced = pushes is not None or self._filters or any(v.has("force", "wrench") for v in their)
+            forced = pushes is not None or len(self._filters) or any(v.has("force", "wrench") for v in their)
             found = None if forced else self._by_warp(own, starts[rows], signals[rows], finer, every)
             out[rows] = found if found is not None else self._by_mujoco(
                 own, their, starts[rows], signals[rows], None if pushes is None else pushes[rows], finer, every
@@ -193,22 +205,24 @@ class VariantEngine:
         Args:
             models, variants: K that go together.
             starts: states, ``(K, W, nq + nv)``.
-            signals: commands of every physics step of the base model, ``(K, W, S, nu)``.
+            signals: commands of every physics step of the base model, ``(K, W, lead + S, nu)``.
             pushes: further generalised forces, as for :meth:`paths`.
             finer: steps of the models that make one of the base's.
             every: steps of the base from one wanted state to the next.
         """
-        num_k, num_w, total = signals.shape[:3]
+        num_k, num_w, total = *signals.shape[:2], signals.shape[2] - self.lead
         rows, nq = num_k * num_w, self._base.nq
         batch = self._batch(rows)
         batch.set_models([m for m in models for _ in range(num_w)])
         batch.state[:] = self._row
         qpos, qvel, ctrl, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
-        starts, control = starts.reshape(rows, -1), signals.reshape(rows, total, -1)
+        starts, control = starts.reshape(rows, -1), signals.reshape(rows, self.lead + total, -1)
         qpos[:], qvel[:] = starts[:, :nq], starts[:, nq:]
-        if self._filters:
-            activation, source = (list(x) for x in zip(*self._filters, strict=True))
-            batch.bind("act")[:, activation] = np.clip(control[:, 0], *control_range(self._base))[:, source]
+        if len(self._filters):
+            constants = np.array([m.actuator_dynprm[self._filters.actuators, 0] for m in models if m is not None])
+            acting = self._filters.replayed(self._base, control[:, : self.lead], 1, constants.repeat(num_w, 0))
+            batch.bind("act")[:, self._filters.activations] = acting
+        control = control[:, self.lead :]
         forces = []
         for k, variant in enumerate(variants):
             own = slice(k * num_w, (k + 1) * num_w)
@@ -252,6 +266,12 @@ class VariantEngine:
         return self._batches[rows]
 
 
+def whole_ratio(longer: float, shorter: float) -> int | None:
+    """Return how many of the shorter steps make the longer one; ``None`` if that is no whole number."""
+    ratio = longer / shorter if shorter > 0 else 0.0
+    return round(ratio) if round(ratio) >= 1 and abs(ratio - round(ratio)) <= 1e-6 * ratio else None
+
+
 def parts(total: int, size: int) -> list[slice]:
     """Return slices of at most ``size`` that make up ``total``."""
     return [slice(a, min(a + size, total)) for a in range(0, total, size)]
@@ -259,7 +279,8 @@ def parts(total: int, size: int) -> list[slice]:
 
 def _varies(control: np.ndarray, every: int) -> bool:
     """Whether commands change within a logged step."""
-    if every == 1:
+    rows, steps, width = control.shape
+    if every == 1 or width == 0:
         return False
-    blocks = control.reshape(control.shape[0], -1, every, control.shape[2])
+    blocks = control.reshape(rows, steps // every, every, width)
     return bool((blocks != blocks[:, :, :1]).any())

@@ -13,6 +13,9 @@ import torch
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.path import SensedPath
 
+#: Share of a command's range within which two commands as they act are the same.
+AGREE = 1e-3
+
 
 @dataclass(frozen=True)
 class Filter:
@@ -50,6 +53,29 @@ def filtered(signal: np.ndarray, filters: Iterable[Filter], step: float) -> np.n
         given = out[..., f.column]
         out[..., f.column], _ = f.effect.command(given, f.values, step, f.effect.settled(given[:, :1], f.values, step))
     return out.numpy()
+
+
+def settled_after(commands: np.ndarray, filters: Sequence[Filter], skip: int, step: float) -> np.ndarray:
+    """Return the logged steps of each episode after which commands from before them no longer matter, ``(E,)``.
+
+    Whatever the filters are: they run from several pasts, and what was before matters for as long as the commands as
+    they act differ. All steps where they do so to the end.
+
+    Args:
+        commands: commands of the episodes' logged steps, ``(E, N, nu)``.
+        filters: what the commands go through.
+        skip: physics steps of a logged one.
+        step: seconds of a physics step.
+    """
+    if not any(f.effect.memory(v) > 0 for f in filters for v in f.values.numpy()):
+        return np.zeros(len(commands), dtype=int)
+    low, high = np.minimum(commands.min((0, 1)), 0.0), np.maximum(commands.max((0, 1)), 0.0)
+    signal = np.repeat(commands, skip, axis=1)
+    pasts = [np.broadcast_to(past, commands[:, 0].shape)[:, None] for past in (low, high, commands[:, 0])]
+    acting = np.stack([filtered(np.concatenate([past, signal], 1), filters, step)[:, 1:] for past in pasts])
+    differ = (np.ptp(acting, axis=0) > AGREE * (high - low)).any(-1)
+    last = np.where(differ.any(1), signal.shape[1] - np.argmax(differ[:, ::-1], axis=1), 0)
+    return -(-last // skip)
 
 
 def sensed(path: SensedPath, sensors: Iterable[Filter]) -> torch.Tensor:

@@ -147,7 +147,13 @@ def place_effects(given: Sequence[Mapping[str, Any]], space: ParameterSpace, set
             where = f"parameters.{parameter.name}"
             document = {"effect": parameter.effect, "name": next(iter(parameter.objects), None)}
             effect, target = key = _located(where, document, "name", setting, find)
-            quantity = _quantity(where, parameter, effect.quantities(setting, target))
+            quantities = effect.quantities(setting, target)
+            quantity = _quantity(where, parameter, quantities)
+            if next(q for q in quantities if q.name == quantity).discrete:
+                raise InputError(
+                    f"{where}: {quantity} of {effect.name} is a choice, which cannot vary; "
+                    f"give it in effects: {{effect: {effect.name}, {quantity}: a number}}"
+                )
             if known.setdefault(key, {}).get(quantity, (0.0, -1))[1] >= 0:
                 raise InputError(f"{where}: {quantity} of {effect.name} is already a parameter; keep one of them")
             known[key][quantity] = math.nan, column

@@ -10,8 +10,9 @@ import mujoco
 import numpy as np
 import torch
 
+from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Placed, applied
-from dropo_torch.effects.engine import Variant, VariantEngine, parts
+from dropo_torch.effects.engine import Variant, VariantEngine, parts, whole_ratio
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -21,6 +22,7 @@ from dropo_torch.effects.filters import (
     placed_filters,
     rate_columns,
     sensed,
+    settled_after,
     unsensed,
 )
 from dropo_torch.effects.path import SensedPath
@@ -28,7 +30,10 @@ from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.hidden import filter_memory
 
+#: Shares of the search box of which one after the other is asked whether most of the log knows its commands.
+SHARES = (1.0, 0.5, 0.25, 0.0)
 #: Logged steps of history for a filter that remembers all of its past.
 LONGEST_HISTORY = 200
 
@@ -57,7 +62,7 @@ def outer_engine(effects: EffectSet, inner: Simulator) -> Engine:
     def engine(values: np.ndarray, starts: np.ndarray, signals: np.ndarray, fine: bool) -> np.ndarray:
         first, kind = effects.kinds(values)  # parameter vectors whose effects are the same go together
         every = 1 if fine else effects.setting.frame_skip
-        out = np.empty((len(values), starts.shape[1], signals.shape[2] // every, starts.shape[2]))
+        out = np.empty((len(values), starts.shape[1], (signals.shape[2] - inner.history) // every, starts.shape[2]))
         for number, row in enumerate(first):
             given = (starts[row], np.ascontiguousarray(signals[row]), values[kind == number])
             found = inner.rollout(*map(torch.from_numpy, given)).numpy().swapaxes(0, 1)
@@ -78,6 +83,7 @@ class EffectSimulator(Simulator):
         effects: the effects, understood in a setting.
         parameters: what varies, numbers of effects among it.
         history: logged steps of controls before each window.
+        lead: physics steps before a window whose commands the engine gets, too, for filters in the model.
         timestep: seconds of a logged transition.
         name: the backend's name.
         chunk_size: simulations held at once.
@@ -87,8 +93,8 @@ class EffectSimulator(Simulator):
     differentiable: ClassVar[bool] = False
 
     def __init__(
-        self, engine: Engine, effects: EffectSet, *, parameters: ParameterSpace, history: int, timestep: float,
-        name: str, chunk_size: int,
+        self, engine: Engine, effects: EffectSet, *, parameters: ParameterSpace, history: int, lead: int,
+        timestep: float, name: str, chunk_size: int,
     ) -> None:  # fmt: skip
         setting = effects.setting
         self.name = name  # type: ignore[misc]  # the backend's own
@@ -96,7 +102,7 @@ class EffectSimulator(Simulator):
             f"effects such as {effects.entries[0].effect.name} are simulated without gradients; "
             "use optimizer: fisher or cma"
         )
-        self.parameters, self.history = parameters, history
+        self.parameters, self.history, self._lead = parameters, history, lead
         self.frame_skip, self.timestep = setting.frame_skip, timestep
         self.num_states = setting.model.nq + setting.model.nv
         self.num_controls = setting.model.nu
@@ -137,11 +143,11 @@ class EffectSimulator(Simulator):
     def _chunk(self, start: np.ndarray, control: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return states as the sensors show them, ``(K, T, lag, num_states)``."""
         signals = self._signals(control, values)
-        begin = self.history * self.frame_skip
+        begin = self.history * self.frame_skip - self._lead
         starts = np.repeat(start[None], len(values), 0)
         if not len(self._sensors):
             return self._engine(values, starts, signals[:, :, begin:], False)
-        rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0)], values)
+        rates = self._start_rates(starts, signals[:, :, max(begin - 1, 0) :][:, :, : self._lead + 1], values)
         index, known = self._setting.observation.index, self._rates >= 0
         shown = starts[..., index].copy()
         numbers = ((e, torch.from_numpy(e.values(values).repeat(len(start), 0))) for e in self._sensors.entries)
@@ -167,12 +173,12 @@ class EffectSimulator(Simulator):
     def _start_rates(self, starts: np.ndarray, command: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return time derivatives of the states at the starts, ``(K, T, num_states)``, just before them.
 
-        A position's is the velocity; a velocity's is found by one physics step under the last command ``(K, T, nu)``
-        before the window, where a sensor is late.
+        A position's is the velocity; a velocity's is found by one physics step under the last command
+        before the window, where a sensor is late; the engine's lead comes with it, ``(K, T, lead + 1, nu)``.
         """
         if not self._late:
             return np.zeros_like(starts)
-        after = self._engine(values, starts, command[:, :, None], True)[:, :, 0]
+        after = self._engine(values, starts, command, True)[:, :, 0]
         rates = np.nan_to_num((after - starts) * (self.frame_skip / (self.timestep or 1.0)))
         known = self._rates >= 0
         rates[..., known] = starts[..., self._rates[known]]
@@ -220,13 +226,48 @@ def overlap(effects: EffectSet, space: ParameterSpace) -> tuple[Entry, str] | No
     return None
 
 
-def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, longest: int) -> int:
-    """Return how many logged steps of controls the effects need before a window, of an episode of ``longest``."""
+def history_steps(effects: EffectSet, space: ParameterSpace, timestep: float, longest: int, lead: int = 0) -> int:
+    """Return how many logged steps of controls the effects need before a window, of an episode of ``longest``.
+
+    With filters in the model, those of their ``lead`` (physics steps) come before.
+    """
     seconds = effects.having("command").look_back(space)
+    own = math.ceil((lead + 1) / effects.setting.frame_skip) if lead else 0
+    if own:
+        return own + (LONGEST_HISTORY if seconds == math.inf else math.ceil(seconds / timestep - 1e-9) + 1)
     if seconds == 0:  # a late sensor asks for the command just before the window
         return min(1, longest) if effects.having("sense").look_back(space) > 0 else 0
     steps = LONGEST_HISTORY if seconds == math.inf else math.ceil(seconds / timestep - 1e-9) + 1
     return min(steps, longest)
+
+
+def first_known(effects: EffectSet, space: ParameterSpace, log: Trajectories, timestep: float) -> np.ndarray:
+    """Return the transition of each episode from which on the commands that act are known from the log, ``(E,)``.
+
+    They are under all values in the search box; where that would leave out more than half of the log, under those of
+    its lower half, quarter, ...
+
+    Args:
+        effects: the effects.
+        space: what varies, numbers of effects among it.
+        log: the log.
+        timestep: seconds of a transition.
+    """
+    setting, commands = effects.setting, log.commands
+    skip, lengths = setting.frame_skip, np.bincount(log.episodes)
+    before = int(effects.having("sense").look_back(space) > 0)  # a late sensor asks for the command just before
+
+    def needed(share: float) -> np.ndarray:
+        placed = effects.at(space.low + share * (space.high - space.low))
+        filters = placed_filters(placed, "command", setting)
+        return np.maximum(settled_after(commands, filters, skip, timestep / skip), before)
+
+    found = np.zeros_like(lengths)
+    for share in SHARES:
+        found = np.minimum(np.maximum(needed(0.0), needed(share)), lengths)
+        if found.sum() <= 0.5 * lengths.sum():
+            break
+    return found
 
 
 def effect_simulator(
@@ -240,8 +281,8 @@ def effect_simulator(
     num_threads: int = 0,
     chunk_size: int = 10_000,
     owns_model: bool = True,
-) -> tuple[Simulator, int]:
-    """Return a simulator with effects in it, and how many logged steps of controls each window needs before it.
+) -> Simulator:
+    """Return a simulator with effects in it.
 
     Effects that are fixed and native become part of the model, and the backend's own simulator comes back where
     there are no others.
@@ -263,6 +304,7 @@ def effect_simulator(
     native, outer = effects.native, effects.outer
     if check_backend(backend, effects, space):
         make(setting.model, setting.frame_skip, space)  # for what it refuses
+        lead = filter_memory(space)
         engine, kept = inner_engine(effects, space, num_threads), effects
         for vector in (space.low, 0.5 * (space.low + space.high)):  # the finer steps must fill the model's
             finer_steps(setting.model, applied(setting.model, native.at(vector)), native)
@@ -280,12 +322,14 @@ def effect_simulator(
             )
         inner_space = space.on(model)
         if not len(outer):
-            return make(model, setting.frame_skip * finer, inner_space), 0
-        engine, kept = outer_engine(outer, make(model, finer, inner_space)), outer
-    history = history_steps(kept, space, timestep, longest)
+            return make(model, setting.frame_skip * finer, inner_space)
+        inner = make(model, finer, inner_space)
+        engine, kept, lead = outer_engine(outer, inner), outer, inner.history
+    history = history_steps(kept, space, timestep, longest, lead)
     return EffectSimulator(
-        engine, kept, parameters=space, history=history, timestep=timestep, name=backend, chunk_size=chunk_size
-    ), history  # fmt: skip
+        engine, kept, parameters=space, history=history, lead=lead, timestep=timestep, name=backend,
+        chunk_size=chunk_size,
+    )  # fmt: skip
 
 
 def check_backend(backend: str, effects: EffectSet, space: ParameterSpace) -> bool:
@@ -321,11 +365,11 @@ def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSe
     Raises:
         InputError: no whole number.
     """
-    ratio = model.opt.timestep / changed.opt.timestep
-    if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-6 * ratio:
+    ratio = whole_ratio(model.opt.timestep, changed.opt.timestep)
+    if ratio is None:
         entry = next((e for e in native.entries if e.effect.name == "integration"), native.entries[0])
         raise InputError(
             f"effects: {entry.place} makes steps of {changed.opt.timestep:g} s, of which no whole number is the "
             f"model's {model.opt.timestep:g} s"
         )
-    return round(ratio)
+    return ratio

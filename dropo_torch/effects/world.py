@@ -79,7 +79,7 @@ class Integration(WorldEffect):
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         step = float(setting.model.opt.timestep)
-        return (Quantity("timestep", "s", step, step / self.FINER, step, step),)
+        return (Quantity("timestep", "s", step, step / self.FINER, step, step, discrete=True),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] == model.opt.timestep:

@@ -19,6 +19,7 @@ from dropo_torch.config import Config
 from dropo_torch.data.features import Features
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed, Quantity, Setting, applied
+from dropo_torch.effects.engine import whole_ratio
 from dropo_torch.effects.export import write_model
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.effects.simulator import overlap
@@ -38,6 +39,8 @@ _Specifications = dict[str, dict[str, Any]]
 
 #: Half widths of a number's interval that its search box reaches, and the box's least half width, relative.
 REACH, LEAST = 4.0, 0.2
+#: ε of a config that had none, relative to the smallest variance of the measurement.
+EPSILON = 1e-3
 
 
 def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, float]]]:
@@ -52,8 +55,8 @@ def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, flo
         effect, numbers = find_effect(e.effect), e.parameters
         members = {t: (s,) for t, s in numbers.items()} if e.target == FAMILY else {e.target: tuple(numbers.values())}
         for target, strengths in members.items():
-            names = [q.name for q in effect.quantities(setting, target)]
-            ranges = {n: (s.low, s.high) for n, s in zip(names, strengths, strict=True)}
+            quantities = effect.quantities(setting, target)
+            ranges = {q.name: (s.low, s.high) for q, s in zip(quantities, strengths, strict=True) if not q.discrete}
             found[Placed(effect, target, tuple(s.value for s in strengths))] = ranges
     return found
 
@@ -72,41 +75,63 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     Returns:
         Remarks for a person: what the model file lacks, or why there is none.
     """
-    if not gap.effects or problem.model_path is None:
-        return []
     setting = make_setting(problem, problem.trajectories)
     found = named(gap, setting)
     if not found:
         return []
+    if problem.model_path is None:
+        return ["No model.xml and no config.yaml were written: the environment's model is no file; name one by model."]
     notes = []
     values = problem.space.vector({n: after for n, (_, _, after) in gap.declared.items()})
     before = () if problem.effects is None else problem.effects.at(values)
-    model = folder / "model.xml"
+    model: Path | None = folder / "model.xml"
     try:
-        rest = write_model(problem.model_path, [*before, *found], model, problem.space, values)
+        rest = write_model(problem.model_path, [*before, *found], folder / "model.xml", problem.space, values)
         if rest:
-            names = ", ".join(f"{p.effect.name} of {p.target}" if p.target else p.effect.name for p in rest)
+            names = ", ".join(_place(p) for p in rest)
             notes.append(f"MJCF cannot express {names}: model.xml lacks it, config.yaml has it.")
+        finer = whole_ratio(setting.model.opt.timestep, applied(setting.model, [*before, *found]).opt.timestep)
+        if finer != 1 and finer is not None:
+            notes.append(f"{setting.frame_skip * finer} steps of model.xml make one logged transition.")
     except InputError as error:
+        model = None
         notes.append(f"No model.xml was written: {error}.")
-    config = problem.config
-    if config.noise is None:
-        columns = Features.of(problem.observation).column_noise(np.array(gap.noise))
-        config = config.model_copy(update={"noise": [float(f"{v:.3g}") for v in columns]})
+    if again := [p for p in found if p.key in {b.key for b in before}]:
+        return [*notes, f"No config.yaml was written: the config has {_place(again[0])} already; let its numbers vary."]
     ranges = {placed.key: intervals for placed, intervals in found.items()}
+    config = _with_noise(problem, np.array(gap.noise))
     write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml")
     return notes
 
 
+def _place(placed: Placed) -> str:
+    return f"{placed.effect.name} of {placed.target}" if placed.target else placed.effect.name
+
+
+def _with_noise(problem: Problem, noise: np.ndarray) -> Config:
+    """The config with the noise of features ``(m,)``, and with ε below it, where it said nothing of them."""
+    config = problem.config
+    columns = Features.of(problem.observation).column_noise(noise)
+    changes: dict[str, Any] = {}
+    if config.noise is None:
+        changes["noise"] = [float(f"{v:.3g}") for v in columns]
+    if "epsilon" not in config.model_fields_set:
+        compared = problem.objective.features.feature_noise(columns)
+        if (compared > 0).any():
+            changes["epsilon"] = float(f"{EPSILON * compared[compared > 0].min() ** 2:.2g}")
+    return config.model_copy(update=changes)
+
+
 def write_config(
     config: Config, space: ParameterSpace, setting: Setting, placed: Sequence[Placed], intervals: Intervals,
-    model_path: Path, path: Path,
+    model_path: Path | None, path: Path,
 ) -> None:  # fmt: skip
     """Write the config of a fit of the effects' numbers, together with the parameters that the config had.
 
     Numbers with an interval become parameters around their value; others stay fixed. Where fields of the model express
     every native effect's numbers, one each, the config names ``model_path``, the model with these effects, and its
-    fields. Otherwise it names the model as it was, and its native effects stand in ``effects`` like all others.
+    fields. Otherwise it names the model as it was, and its native effects stand in ``effects`` like all others; so it
+    does where one of them changes the step, of which the log's, the filters' and a task's are whole numbers.
 
     Args:
         config: the config by which the effects were found.
@@ -114,7 +139,7 @@ def write_config(
         setting: where the effects were found.
         placed: the effects with values.
         intervals: where a number lies, as ``(low, high)``, by the effect's key and the number's name.
-        model_path: the model that :func:`~dropo_torch.effects.export.write_model` wrote.
+        model_path: the model that :func:`~dropo_torch.effects.export.write_model` wrote, or ``None``.
         path: where to write.
     """
     document = _document(config, path.parent)
@@ -123,21 +148,25 @@ def write_config(
     # Fields are written after the model is read: what both a parameter and an effect write must stay an effect.
     entries = tuple(Entry(p.effect, p.target, p.values, (-1,) * len(p.values)) for p in native.values())
     fields: dict[tuple[str, str | None], _Specifications | None] = {}
+    if config.backend == "gymnasium" and any(not p.effect.outer for p in placed):
+        document = {k: v for k, v in document.items() if k != "environment"}  # it has its model for itself
+        document |= {"backend": "mujoco", "frame_skip": setting.frame_skip}
     if not (
-        config.backend == "gymnasium"
+        model_path is None
+        or config.backend == "gymnasium"
         or config.effects
+        or applied(setting.model, list(native.values())).opt.timestep != setting.model.opt.timestep
         or overlap(EffectSet(entries, setting), space)
         or any(spec.get("relative") for spec in document["parameters"].values())
     ):
         fields = {key: _fields(p, setting, boxes[key]) for key, p in native.items()}
     plain = None not in fields.values()
-    if fields and plain:
+    if model_path is not None and fields and plain:
         document["model"] = os.path.relpath(model_path.resolve(), path.parent.resolve())
     for p in placed:
         found = fields.get(p.key) if plain else None
         if found is None:
-            fixed = config.backend == "gymnasium" and p.effect.native
-            entry, found = _effect(p, setting, {} if fixed else boxes[p.key])
+            entry, found = _effect(p, setting, boxes[p.key])
             document["effects"] = [*document.get("effects", []), entry]
         for number, specification in found.items():
             document["parameters"][_free_name(document["parameters"], p, number)] = specification
@@ -172,6 +201,7 @@ def _document(config: Config, folder: Path) -> dict[str, Any]:
         own = {
             "model": str(sim.model), "data": str(sim.log), "frame_skip": sim.frame_skip,
             "observation": list(sim.observation), "parameters": {n: dict(s) for n, s in sim.parameters.items()},
+            **({"task": config.sim} if sim.task is not None else {}),
         }  # fmt: skip
         document = {**own, **{k: v for k, v in document.items() if k != "sim"}}
     document.setdefault("parameters", {})

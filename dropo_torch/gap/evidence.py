@@ -23,6 +23,8 @@ PAIRS, SEED = 16, 11
 LOST = 1e3
 #: Largest share of all windows' χ² that one window may have.
 CAP = 0.03
+#: Least share of the windows that a hypothesis must know the commands of, or it cannot be judged by them.
+LEAST_KNOWN = 0.25
 #: Expected χ² of a window, times this: from there on a robust cost grows with the logarithm only.
 TAIL = 3.0
 
@@ -34,7 +36,7 @@ class Linearisation:
     Attributes:
         basis: orthonormal columns that a change of the initial states spans, ``(W, N, m)``; N = (L + 1)·m.
         weights: factors of the whitened residuals, ``(W, N)``: below 1 where noise on the initial state bends the
-            simulation, 0 where nothing is known.
+            simulation, 0 where nothing is known, such as all of a window under commands from before the log.
         shift: mean residual minus the residual at the measured initial state, ``(W, N)``.
         roughness: share of residuals whose variance the linear part does not explain.
     """
@@ -43,6 +45,11 @@ class Linearisation:
     weights: np.ndarray
     shift: np.ndarray
     roughness: float
+
+    @property
+    def counted(self) -> np.ndarray:
+        """Which windows count at all, ``(W,)`` bool."""
+        return np.asarray((self.weights > 0).any(-1))
 
     def select(self, rows: np.ndarray) -> Linearisation:
         """Return that of some of the windows."""
@@ -118,7 +125,13 @@ class Evidence:
 
     def linearise(self, variant: Variant) -> Linearisation:
         """Return how a hypothesis' residuals depend on the initial states."""
-        return self._statistical(variant) if self.rough else self._differences(variant)
+        found = self._statistical(variant) if self.rough else self._differences(variant)
+        return self.counting(found, variant)
+
+    def counting(self, linear: Linearisation, variant: Variant) -> Linearisation:
+        """Return a linearisation without windows in which commands act that a hypothesis cannot know from the log."""
+        known = self.twin.knows(variant, self.windows)
+        return linear if known.all() else replace(linear, weights=linear.weights * known[:, None])
 
     def _differences(self, variant: Variant) -> Linearisation:
         m = self.chart.size
@@ -154,8 +167,10 @@ class Evidence:
         return _beside(linear, np.nan_to_num(slope))
 
     def degrees(self, linear: Linearisation) -> float:
-        """Return the degrees of freedom that the windows have beside their initial states."""
-        return float((linear.weights > 0).sum() - len(self.windows) * self.chart.size)
+        """Return the degrees of freedom that the windows have beside their initial states, as if all were counted."""
+        counted = float(linear.counted.sum())
+        known = float((linear.weights > 0).sum()) - counted * self.chart.size
+        return known * len(self.windows) / max(counted, 1.0)
 
     def cost(self, projected: np.ndarray, linear: Linearisation, numbers: int = 0) -> Cost:
         """Return the cost of projected residuals ``(W, N)`` to which some numbers were fitted."""
@@ -210,6 +225,8 @@ def cost_of(
 ) -> Cost:  # fmt: skip
     """Return the cost of projected residuals ``(W, N)``.
 
+    Windows that do not count cost as much as the others do on average, so that costs of the same windows compare.
+
     Args:
         projected: the residuals.
         linear: the linearisation in the initial states.
@@ -221,6 +238,11 @@ def cost_of(
     chi2, penalty = (projected**2).sum(-1) * caps**2, -2 * np.log(weights).sum(-1) * caps**2
     if tail is not None:
         chi2 = robust_loss(chi2, tail) / (TAIL * np.log1p(1 / TAIL))
+    counted = linear.counted
+    if not counted.all():
+        judged = counted.mean() >= LEAST_KNOWN
+        chi2 = np.where(counted, chi2, chi2[counted].mean() if judged else LOST**2 * projected.shape[-1])
+        penalty = np.where(counted, penalty, penalty[counted].mean() if judged else 0.0)
     return Cost(chi2, penalty, degrees)
 
 

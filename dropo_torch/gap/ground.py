@@ -10,11 +10,12 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import blocks_of, spread
+from dropo_torch.gap.log import blocks_of, since_known, spread
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import Rules, clears, paired
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, screen
+from dropo_torch.gap.twin import Windows
 
 #: Windows that refits use, and that the screening uses; all if there are fewer.
 FEW, FEWER = 40, 10
@@ -48,7 +49,8 @@ class State:
     """Where a search stands; a checkpoint holds nothing else.
 
     Attributes:
-        noise: standard deviation of each feature, ``(m,)``: lower than the scene's where a fit showed that it is.
+        noise: standard deviation of each feature, ``(m,)``, as it is beside the hypothesis so far.
+        since: logged step of each episode from which on the commands that act under it are known, ``(E,)``.
         caps: factors of the windows' residuals in all fits, ``(W,)``, or 1.
         base: the declared parameters alone.
         first: the screening beside them.
@@ -59,6 +61,7 @@ class State:
     """
 
     noise: np.ndarray
+    since: np.ndarray
     caps: np.ndarray | float
     base: Refit
     first: Screening
@@ -78,6 +81,7 @@ class Ground:
         rules: thresholds.
         report: called with a stage and its share done.
         caps: factors of the refitted windows' residuals, ``(W,)``, or 1.
+        short: short windows from which the noise is estimated; ``None`` where it is given.
     """
 
     evidence: Evidence
@@ -85,10 +89,16 @@ class Ground:
     rules: Rules
     report: Report = lambda stage, share: None
     caps: np.ndarray | float = 1.0
+    short: Windows | None = None
 
     def at(self, state: State) -> Ground:
-        """Return the ground with the noise and the caps that a state has found."""
-        return replace(self, evidence=replace(self.evidence, noise=state.noise), caps=state.caps)
+        """Return the ground with the noise, the windows and the caps that a state has found."""
+        return self.on(state.noise, state.since, state.caps)
+
+    def on(self, noise: np.ndarray, since: np.ndarray, caps: np.ndarray | float = 1.0) -> Ground:
+        """Return the ground with another noise, and without windows that start before some steps, ``(E,)``."""
+        evidence = replace(self.evidence, windows=since_known(self.evidence.windows, since), noise=noise)
+        return replace(self, evidence=evidence, caps=caps)
 
     @property
     def setting(self) -> Setting:

@@ -24,20 +24,30 @@ def episode_bounds(log: Trajectories) -> list[tuple[int, int]]:
     return list(zip(np.append(0, ends[:-1]).tolist(), ends.tolist(), strict=True))
 
 
-def cut_windows(log: Trajectories, observation: Observation, length: int, *, stride: int | None = None) -> Windows:
+def cut_windows(
+    log: Trajectories, observation: Observation, length: int, *, stride: int | None = None,
+    since: np.ndarray | None = None,
+) -> Windows:  # fmt: skip
     """Cut a log into windows of ``length`` logged steps, one every ``stride``.
 
     By default no two windows share a measurement. They never cross an episode's end; an episode shorter than a window
     gives none.
+
+    Args:
+        log: the log.
+        observation: its columns.
+        length: logged steps of a window.
+        stride: logged steps from one to the next.
+        since: logged step of each episode at which its first window starts, ``(E,)``.
     """
-    bounds, ahead = episode_bounds(log), np.arange(longest_episode(log) + 1)
-    commands = np.stack([log.actions[np.minimum(a + ahead, b - 1)] for a, b in bounds])
+    bounds, commands = episode_bounds(log), log.commands
+    begin = np.zeros(len(bounds), dtype=int) if since is None else since
     observed, following = observation.observed(log.observations), observation.observed(log.next_observations)
     found = []
     for e, (a, b) in enumerate(bounds):
         path = np.concatenate([observed[a : a + 1], following[a:b]])
         slope = np.gradient(path, axis=0)
-        starts = range(0, b - a - length + 1, stride or length + 1)
+        starts = range(int(begin[e]), b - a - length + 1, stride or length + 1)
         found += [(path[s : s + length + 1], slope[s], e, s) for s in starts]
     measured, rates, episodes, steps = zip(*found, strict=True) if found else ((), (), (), ())
     return Windows(
@@ -58,6 +68,11 @@ def feature_sizes(setting: Setting, columns: np.ndarray) -> np.ndarray:
     return Features.of(setting.observation).difference(columns, columns[:1]).std(0)
 
 
+def since_known(windows: Windows, since: np.ndarray) -> Windows:
+    """Return the windows that start no earlier than some logged step of their episode, ``(E,)``."""
+    return windows.select(windows.steps >= since[windows.episodes])
+
+
 def spread(windows: Windows, most: int) -> Windows:
     """Return at most so many windows, evenly spread."""
     if len(windows) <= most:
@@ -74,8 +89,9 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     """Return where effects are looked for: the model, its columns, and the sizes of the log."""
     model, observation = copy.copy(problem.space.model), problem.observation
     assert model is not None
-    frame_skip, nq, nv = problem.simulator.frame_skip, model.nq, model.nv
-    step = frame_skip * float(model.opt.timestep)
+    nq, nv, physics, step = model.nq, model.nv, float(model.opt.timestep), problem.simulator.timestep
+    step = problem.simulator.frame_skip * physics if step is None else step
+    frame_skip = round(step / physics)  # steps of the given model, whatever the simulator makes of them
     states, after = observation.states(log.observations), observation.states(log.next_observations)
     rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
     inertia, force, speed, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.nbody), np.zeros(model.ngeom, bool)

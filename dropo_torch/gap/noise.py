@@ -63,7 +63,7 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
         pushes[1 + m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
     moved = np.eye(len(pushes), m, -1)[:, None]
     found, _ = evidence.residuals([variant] * len(pushes), moved, pushes)
-    usable = np.isfinite(found).all((0, 2))
+    usable = np.isfinite(found).all((0, 2)) & twin.knows(variant, windows)
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
     relative = _relative_noise(residual, slope, m) if noise is None else np.ones(m)
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))

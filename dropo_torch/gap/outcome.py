@@ -9,14 +9,14 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.effects.base import Placed, Setting
+from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Score, Strength
 from dropo_torch.gap.rules import WRONG
-from dropo_torch.gap.scene import Scene, short_windows
+from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
@@ -42,7 +42,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     noise = evidence.noise
     last = _last_fit(evidence, naming.final.hypothesis) if naming.named else None
     final = naming.final if last is None else last.fit
-    short, base, best = short_windows(setting, scene.train), naming.base.hypothesis, final.hypothesis
+    short, base, best = scene.short, naming.base.hypothesis, final.hypothesis
     before = free_forces(twin, short, base.variant, noise)
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
     held = cut_held(evidence, scene.held, best)
@@ -137,13 +137,19 @@ def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffec
     for placed, tied, excess in zip(final.hypothesis.placed, naming.ties, naming.shares, strict=True):
         quantities = placed.effect.quantities(setting, placed.target)
         numbers = {
-            q.name: Strength(value, max(value - half, q.low), min(value + half, q.high), q.unit)
-            for q, value, half in zip(quantities, placed.values, own, strict=False)
+            q.name: _strength(q, value, half) for q, value, half in zip(quantities, placed.values, own, strict=False)
         }
         share = float(np.clip(excess / naming.base.cost.excess, 0, 1))
         sentence = placed.effect.sentence.format(target=placed.target)
         found.append(NamedEffect(*placed.key, numbers, share, tuple(p.key for p in tied), sentence))
     return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)
+
+
+def _strength(quantity: Quantity, value: float, half: float) -> Strength:
+    """A number with its interval, cut at its bounds; a discrete one has none."""
+    if quantity.discrete:
+        return Strength(value, float("nan"), float("nan"), quantity.unit)
+    return Strength(value, max(value - half, quantity.low), min(value + half, quantity.high), quantity.unit)
 
 
 def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[NamedEffect, ...]:

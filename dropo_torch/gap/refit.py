@@ -80,6 +80,11 @@ class Limits:
     high: np.ndarray
     scale: np.ndarray
 
+    @property
+    def free(self) -> np.ndarray:
+        """Which numbers move, ``(q,)`` bool."""
+        return self.low < self.high
+
     def moves(self, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return the smallest and the largest move from values within the bounds, in units of the scale."""
         return (self.low - values) / self.scale, (self.high - values) / self.scale
@@ -90,11 +95,12 @@ class Limits:
 
 
 def limits_of(hypothesis: Hypothesis, twin: Twin) -> Limits:
-    """Return the bounds and sizes of a hypothesis' numbers."""
+    """Return the bounds and sizes of a hypothesis' numbers; both bounds of a discrete one are its value."""
     space = twin.space
     numbers = [(low, high, 0.25 * (high - low)) for low, high in zip(space.low, space.high, strict=True)]
     for p in hypothesis.placed:
-        numbers += [(q.low, q.high, q.scale) for q in p.effect.quantities(twin.setting, p.target)]
+        quantities = zip(p.effect.quantities(twin.setting, p.target), p.values, strict=True)
+        numbers += [(v if q.discrete else q.low, v if q.discrete else q.high, q.scale) for q, v in quantities]
     return Limits(*np.array(numbers).reshape(-1, 3).T)
 
 
@@ -159,13 +165,15 @@ def refit(
     """
     limits = limits_of(hypothesis, evidence.twin)
     relinearise = linear is None
-    linear = evidence.linearise(hypothesis.variant) if linear is None else linear
+    variant = hypothesis.variant
+    linear = evidence.linearise(variant) if linear is None else evidence.counting(linear, variant)
 
     def at(vector: np.ndarray) -> Refit:
         there = hypothesis.at(np.clip(vector, limits.low, limits.high))
-        moved, steps = beside(there, limits, np.arange(len(vector)), STEP)
+        moved, steps = beside(there, limits, np.flatnonzero(limits.free), STEP)
         found, _ = evidence.residuals([h.variant for h in (there, *moved)])
-        slope = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
+        slope = np.zeros((len(vector), *found.shape[1:]))  # none by discrete numbers
+        slope[limits.free] = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
         return _fitted(evidence, there, found[0], slope, linear, limits.scale)
 
     def distance(vector: np.ndarray, other: Hypothesis) -> float:

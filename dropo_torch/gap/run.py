@@ -15,8 +15,8 @@ from dropo_torch.gap.outcome import make_result
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules
-from dropo_torch.gap.scene import Scene, prepare, searched, short_windows
-from dropo_torch.gap.search import Checkpoint, Naming, search, start
+from dropo_torch.gap.scene import Scene, prepare, searched
+from dropo_torch.gap.search import Naming, kept, search, start
 from dropo_torch.gap.verify import cut_held, floor_score, score
 from dropo_torch.problem import Problem
 
@@ -34,9 +34,8 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
     state = start(_ground(scene, effects, rules), scene.begin)
     if state.done:
         return ()
-    short = short_windows(scene.setting, scene.train)
     return places(
-        scene.setting, free_forces(scene.twin, short, state.base.hypothesis.variant, scene.noise), state.first
+        scene.setting, free_forces(scene.twin, scene.short, state.base.hypothesis.variant, state.noise), state.first
     )
 
 
@@ -99,8 +98,8 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
     found = []
     for suffix, evidence in searched(scene):
-        path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{suffix}")
-        found.append(search(replace(ground, evidence=evidence), scene.begin, Checkpoint(path, resume, known)))
+        path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
+        found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume))
         if found[-1].named or not found[0].gap:
             break
     return found[-1] if found[-1].named else found[0]
@@ -108,4 +107,5 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
 
 def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None) -> Ground:
     """What a search stands on, by default with the whole vocabulary and the package's thresholds."""
-    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or Rules())
+    short = None if scene.problem.objective.noise is not None else scene.short
+    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or Rules(), short=short)

@@ -9,12 +9,23 @@ import numpy as np
 
 from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories
+from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Setting
+from dropo_torch.effects.engine import Variant
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, make_setting, spread, start_values
+from dropo_torch.gap.log import (
+    cut_windows,
+    episode_bounds,
+    feature_sizes,
+    longest_episode,
+    make_setting,
+    spread,
+    start_values,
+)
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.screen import all_candidates
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
@@ -28,6 +39,8 @@ BENT = 0.001
 ASTRAY = 0.08
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
+#: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
+LEAD, LEAD_SHARE = 20, 0.1
 
 
 @dataclass(frozen=True)
@@ -39,6 +52,7 @@ class Scene:
         setting: the model, its columns, the sizes of the log.
         twin: simulates windows.
         train, held: the log's two parts.
+        since: logged step of each episode of the training part from which on the commands that act are known, ``(E,)``.
         noise: standard deviation of each feature, ``(m,)``.
         evidence: all windows of the training part.
         begin: the declared parameters as given.
@@ -49,9 +63,15 @@ class Scene:
     twin: Twin
     train: Trajectories
     held: Trajectories
+    since: np.ndarray
     noise: np.ndarray
     evidence: Evidence
     begin: Hypothesis
+
+    @property
+    def short(self) -> Windows:
+        """Short windows of the training part, in which forces may be left free."""
+        return short_windows(self.setting, self.train, self.since)
 
 
 def prepare(problem: Problem) -> Scene:
@@ -75,21 +95,42 @@ def prepare(problem: Problem) -> Scene:
         standing=None if problem.effects is None else problem.effects.at,
     )  # fmt: skip
     begin = Hypothesis(tuple(start_values(problem).tolist()))
-    given = problem.objective.noise
+    given, since = problem.objective.noise, first_steps(twin, train, begin)
     if given is None:
-        noise = free_forces(twin, short_windows(setting, train), begin.variant).noise
+        noise = free_forces(twin, short_windows(setting, train, since), begin.variant).noise
     else:
         noise = Features.of(problem.observation).feature_noise(given.numpy())
-    return Scene(problem, setting, twin, train, held, noise, _choose_windows(twin, train, begin, noise), begin)
+    evidence = _choose_windows(twin, train, begin, noise, since)
+    return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
 
 
-def short_windows(setting: Setting, log: Trajectories) -> Windows:
+def first_steps(twin: Twin, log: Trajectories, begin: Hypothesis) -> np.ndarray:
+    """Return the logged step of each episode at which its first window starts, ``(E,)``.
+
+    A log may begin in motion, and what was commanded before is not in it. Windows begin where nothing is left of it
+    under the config's own effects, and under what candidates for the gap begin with as far as the episode's length
+    allows.
+    """
+    commands, lengths = log.commands, np.array([b - a for a, b in episode_bounds(log)])
+    remembering = [e for e in VOCABULARY.values() if e.has("command")]
+    starts = [Variant(begin.declared, (placed,)) for placed in all_candidates(twin.setting, remembering)]
+    needed = np.max([twin.settled(v, commands) for v in starts], axis=0) if starts else np.zeros(len(lengths))
+    allowed = np.minimum(LEAD, LEAD_SHARE * lengths)
+    return np.maximum(twin.settled(begin.variant, commands), np.minimum(needed, allowed)).astype(int)
+
+
+def short_windows(setting: Setting, log: Trajectories, since: np.ndarray | None = None) -> Windows:
     """Return short windows, spread over a log, in which forces may be left free.
+
+    Args:
+        setting: the model and its columns.
+        log: the log.
+        since: logged step of each episode at which its first window starts, ``(E,)``.
 
     Raises:
         InputError: a log with too few of them.
     """
-    windows = spread(cut_windows(log, setting.observation, LENGTH), SHORT)
+    windows = spread(cut_windows(log, setting.observation, LENGTH, since=since), SHORT)
     if len(windows) < 5:
         raise InputError(
             f"data: {log.source} has {len(windows)} stretches of {LENGTH} steps; expected at least 5, "
@@ -107,27 +148,33 @@ def searched(scene: Scene) -> Iterator[tuple[str, Evidence]]:
     yield "", scene.evidence
     length, rough = scene.evidence.windows.length // 4, scene.evidence.rough
     if length >= LENGTHS[-1]:
-        yield "-shorter", _cut(scene.twin, scene.train, scene.noise, length, rough=rough)
+        yield "-shorter", _cut(scene.twin, scene.train, scene.noise, scene.since, length, rough=rough)
     if scene.setting.signals.contacts.any():
-        shortest = _cut(scene.twin, scene.train, scene.noise, LENGTHS[-1])
+        shortest = _cut(scene.twin, scene.train, scene.noise, scene.since, LENGTHS[-1])
         yield "-contact", replace(shortest, robust=True)
 
 
-def _choose_windows(twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray) -> Evidence:
+def _choose_windows(
+    twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray, since: np.ndarray
+) -> Evidence:
     """The longest windows in whose initial states the simulation is still nearly linear."""
     longest, touches = longest_episode(train), bool(twin.setting.signals.contacts.any())
     for length in (length for length in LENGTHS if length <= longest):
-        evidence = _cut(twin, train, noise, length, FEW)
+        evidence = _cut(twin, train, noise, since, length, FEW)
+        if not len(evidence.windows):
+            continue
         rough = evidence.linearise(begin.variant).roughness
         if rough < ROUGH and (not touches or _end_error(evidence, begin) < ASTRAY):
-            return _cut(twin, train, noise, length, rough=rough > BENT)
-    return _cut(twin, train, noise, min(LENGTHS[-1], longest))
+            return _cut(twin, train, noise, since, length, rough=rough > BENT)
+    return _cut(twin, train, noise, since, min(LENGTHS[-1], longest))
 
 
 def _cut(
-    twin: Twin, log: Trajectories, noise: np.ndarray, length: int, most: int = MOST, *, rough: bool = True
-) -> Evidence:
-    return Evidence(twin, spread(cut_windows(log, twin.setting.observation, length), most), noise, rough=rough)
+    twin: Twin, log: Trajectories, noise: np.ndarray, since: np.ndarray, length: int, most: int = MOST,
+    *, rough: bool = True,
+) -> Evidence:  # fmt: skip
+    windows = cut_windows(log, twin.setting.observation, length, since=since)
+    return Evidence(twin, spread(windows, most), noise, rough=rough)
 
 
 def _end_error(evidence: Evidence, begin: Hypothesis) -> float:

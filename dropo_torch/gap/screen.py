@@ -126,7 +126,9 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         hypothesis = focus.fitted.hypothesis.with_effects([placed])
         chosen, size = placed.effect.screened(), len(placed.values)
         moving = np.arange(size) if chosen is None else np.array(chosen, dtype=int)
-        limits, columns = limits_of(hypothesis, evidence.twin), len(hypothesis.vector) - size + moving
+        limits = limits_of(hypothesis, evidence.twin)
+        moving = moving[limits.free[len(hypothesis.vector) - size + moving]]
+        columns = len(hypothesis.vector) - size + moving
         moved, steps = beside(hypothesis, limits, columns, STEP)
         plans.append((moving, limits.of(columns), steps, slice(len(variants), len(variants) + 1 + len(moved))))
         variants += [h.variant for h in (hypothesis, *moved)]
@@ -137,16 +139,20 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         residual = evidence.project(begin, linear).ravel() * factor
         change = (found[rows][1:] - begin) / steps[:, None, None]
         slope = evidence.project_slope(change, linear).reshape(len(moving), -1) * factor
+        known = evidence.twin.knows(variants[rows.start], evidence.windows)
+        here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
+        residual, slope = np.where(here, residual, before), slope * here
         lengths = np.sqrt((slope**2).sum(1))
         dead = bool(np.linalg.norm(residual - before) < DEAD and lengths.max(initial=0.0) < DEAD)
         start = np.array(placed.values)
         columns = np.concatenate([shared, slope])
-        move = _move(columns, residual, limits, start[moving])
+        move = _move(columns * here, residual * here, limits, start[moving])
         values = start.copy()
         values[moving] += move[len(shared) :] * limits.scale
         left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
+        chi2 = float(left[known].mean() * len(left)) if known.any() else np.inf
         predicted = placed.at(placed.effect.settle(start, values))
-        yield Candidate(predicted, placed, float(left.sum()), residual, slope, dead)
+        yield Candidate(predicted, placed, chi2, residual, slope, dead)
 
 
 def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:

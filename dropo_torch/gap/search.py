@@ -2,25 +2,22 @@
 
 from __future__ import annotations
 
-import pickle
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from dropo_torch.effects.base import Placed
-from dropo_torch.errors import InputError
+from dropo_torch.effects import find_effect
+from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.accept import add, everywhere, extend, is_done, prune, swap
-from dropo_torch.gap.evidence import Evidence, caps_of
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.refit import Hypothesis, Refit
+from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import allowance, significant
 from dropo_torch.gap.ties import canonical, ties
-from dropo_torch.support.files import write_atomically
-
-#: Least ratio of a feature's residuals to the noise at which that noise stays as it is.
-QUIET = 0.97
+from dropo_torch.support.checkpoint import Checkpoint
 
 
 @dataclass(frozen=True)
@@ -52,83 +49,56 @@ class Naming:
     partial: bool = False
 
 
-@dataclass(frozen=True)
-class Checkpoint:
-    """Where a search keeps its state between rounds.
+def kept(path: Path, fingerprint: str) -> Checkpoint:
+    """Return where a search keeps its state between rounds.
 
-    Attributes:
-        path: the file; ``None`` for nowhere.
-        resume: whether to go on from it.
+    Args:
+        path: the file.
         fingerprint: identifies config, model, log and vocabulary.
     """
+    return Checkpoint(path, "gap", (fingerprint,), (State,), {Effect: find_effect})
 
-    path: Path | None
-    resume: bool
-    fingerprint: str
 
-    def load(self) -> State | None:
-        """Return the state of an interrupted search, if there is one.
+def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = None, *, resume: bool = False) -> Naming:
+    """Return what is missing, beginning from the declared parameters' values.
 
-        Raises:
-            InputError: it is of another config, model or log.
-        """
-        if self.path is None or not self.resume or not self.path.exists():
-            return None
-        try:
-            document = pickle.loads(self.path.read_bytes())
-            known, state = document["fingerprint"], document["state"]
-        except Exception:  # whatever bytes that are no checkpoint make of a pickle
-            raise InputError(f"--resume: {self.path} is no checkpoint; run without --resume") from None
-        if known != self.fingerprint:
-            raise InputError(
-                f"--resume: {self.path} is of another config, model or log; run without --resume, "
-                "or name another folder"
-            )
+    Args:
+        ground: what the search stands on.
+        begin: the declared parameters' values.
+        checkpoint: where the state is kept between rounds, ``None`` for nowhere.
+        resume: go on from there, if there is one.
+
+    Raises:
+        InputError: a checkpoint that is damaged, or of another search.
+    """
+    twin = ground.evidence.twin
+
+    def keep(state: State) -> State:
+        if checkpoint is not None:
+            checkpoint.save({"state": state, "simulated_transitions": twin.simulated_transitions})
         return state
 
-    def save(self, state: State) -> State:
-        """Write the state, whole or not at all, and return it."""
-        if self.path is not None:
-            write_atomically(self.path, pickle.dumps({"fingerprint": self.fingerprint, "state": state}))
-        return state
-
-
-def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint) -> Naming:
-    """Return what is missing, beginning from the declared parameters' values."""
-    state = checkpoint.load() or checkpoint.save(start(ground, begin))
-    ground = ground.at(state)
+    if resume and checkpoint is not None and checkpoint.path.exists():
+        content = checkpoint.load()
+        state, twin.simulated_transitions = content["state"], content["simulated_transitions"]
+    else:
+        state = keep(start(ground, begin))
     while not state.done:
-        state = checkpoint.save(step(ground, state))
-    return conclude(ground, state)
+        state = keep(step(ground.at(state), state))
+    return conclude(ground.at(state), state)
 
 
 def start(ground: Ground, begin: Hypothesis) -> State:
     """Fit the declared parameters alone, with the influence of single windows capped, and screen beside them."""
     ground.report("fitting the declared parameters", 0.0)
+    since = np.zeros(len(ground.evidence.windows.commands), dtype=int)
     base = ground.refit(begin)
-    noise = _noise(ground, base)
-    if noise is not ground.evidence.noise:
-        ground = replace(ground, evidence=replace(ground.evidence, noise=noise))
-        base = ground.refit(base.hypothesis, iterations=4)
-    caps = 1.0 if ground.evidence.robust else caps_of(base.cost.windows, base.cost.degrees)
-    ground = replace(ground, caps=caps)
-    base = ground.refit(base.hypothesis, iterations=4)
+    noise = noise_beside(ground, base)
+    ground, base = with_base(ground.on(noise, since), base.hypothesis)
     ranked, focus = ground.screened(base), ground.focus(base)
     degrees = focus.evidence.degrees(focus.fitted.linear)
     first = Screening(tuple(ranked), float((focus.residual**2).sum()), degrees)
-    return State(noise, caps, base, first, base, done=not significant(base.cost, ground.rules))
-
-
-def _noise(ground: Ground, fitted: Refit) -> np.ndarray:
-    """The noise of each feature, lower where even this hypothesis leaves less of it."""
-    noise = ground.evidence.noise
-    squares = (fitted.residual**2).reshape(len(fitted.residual), -1, len(noise))
-    known = (fitted.linear.weights > 0).reshape(squares.shape)
-    free = known.sum((0, 1)) * fitted.cost.degrees / max(float(known.sum()), 1.0)
-    ratio = np.sqrt(squares.sum((0, 1)) / np.maximum(free, 1.0))
-    if fitted.cost.reduced > ground.rules.least_reduced or (ratio > QUIET).all():
-        return noise
-    return noise * np.minimum(ratio, 1.0)
+    return State(noise, since, ground.caps, base, first, base, done=not significant(base.cost, ground.rules))
 
 
 def step(ground: Ground, state: State) -> State:
@@ -136,12 +106,17 @@ def step(ground: Ground, state: State) -> State:
     found = add(ground, state)
     if found.done:
         return found
+    found = renewed(ground, found)
+    ground, accepted = ground.at(found), found.current.hypothesis
     if ground.evidence.robust and not is_done(ground, found):
         found = everywhere(ground, found)
     elif significant(found.current.cost, ground.rules):
         found = extend(ground, found)
     if not is_done(ground, found) and len(found.current.hypothesis.placed) > 1:
         found = swap(ground, found)
+    if found.current.hypothesis != accepted:
+        found = renewed(ground, found)
+        ground = ground.at(found)
     number = state.number + 1
     return replace(found, number=number, done=is_done(ground, found) or number >= ground.rules.effects)
 

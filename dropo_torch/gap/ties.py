@@ -34,8 +34,7 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     current = state.current
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
-    ranked = ground.screened(without) if origin.placed else state.first.ranked
-    focus = ground.focus(without)
+    ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
     others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own)]
     looking = replace(state, number=ROUND)
     rivals, found = ground.refits(looking, without, others, "looking for ties", origin, most=FULLY)

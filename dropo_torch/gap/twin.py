@@ -12,9 +12,10 @@ import torch
 
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.engine import Variant, VariantEngine, parts
-from dropo_torch.effects.filters import filtered, observed_rates, placed_filters, sensed, unsensed
+from dropo_torch.effects.filters import filtered, observed_rates, placed_filters, sensed, settled_after, unsensed
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.hidden import filters_known
 
 
 @dataclass(frozen=True)
@@ -103,8 +104,7 @@ class Twin:
             the simulation can know, of the same shape.
         """
         num_k, num_w, length = len(variants), len(windows), windows.length
-        if self._standing is not None:
-            variants = [replace(v, placed=(*self._standing(np.asarray(v.declared)), *v.placed)) for v in variants]
+        variants = [self._whole(v) for v in variants]
         shown = windows.measured[:, 0] if starts is None else starts
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
@@ -125,6 +125,28 @@ class Twin:
                     out[k, rows], valid[k, rows] = self._shown(variants[k], columns, length)
         self.simulated_transitions += num_k * num_w * length
         return out, valid
+
+    def settled(self, variant: Variant, commands: np.ndarray) -> np.ndarray:
+        """Return the logged step of each episode from which on a variant's commands are known as they act, ``(E,)``.
+
+        Args:
+            variant: the hypothesis.
+            commands: commands of the episodes' logged steps, ``(E, N, nu)``.
+        """
+        filters = placed_filters(self._whole(variant).placed, "command", self.setting)
+        skip, lengths = self.setting.frame_skip, np.full(len(commands), commands.shape[1])
+        found = settled_after(commands, filters, skip, float(self.setting.model.opt.timestep))
+        return np.maximum(found, filters_known(self._engine.lead, skip, lengths))
+
+    def knows(self, variant: Variant, windows: Windows) -> np.ndarray:
+        """Return whether all commands that act in a window under a variant follow from the log, ``(W,)`` bool."""
+        return windows.steps >= self.settled(variant, windows.commands)[windows.episodes]
+
+    def _whole(self, variant: Variant) -> Variant:
+        """A variant with what every variant has."""
+        if self._standing is None:
+            return variant
+        return replace(variant, placed=(*self._standing(np.asarray(variant.declared)), *variant.placed))
 
     def _shown(self, variant: Variant, path: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         """Return what a variant's sensors show of true paths ``(W, ·, n)``, and what is known: nothing lies before."""
@@ -157,5 +179,5 @@ class Twin:
             filters = placed_filters(variant.placed, "command", self.setting)
             step = float(self.setting.model.opt.timestep)
             self._filtered[key] = filtered(np.repeat(windows.commands, skip, axis=1), filters, step)
-        at = windows.steps[:, None] * skip + np.arange(length * skip)
+        at = np.maximum(windows.steps[:, None] * skip + np.arange(-self._engine.lead, length * skip), 0)
         return self._filtered[key][windows.episodes[:, None], at]

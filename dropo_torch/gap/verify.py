@@ -50,16 +50,23 @@ def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
 
 
 def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> Held:
-    """Cut held-out data into single steps, and into stretches over which noise at the start does not take over."""
+    """Cut held-out data into single steps, and into stretches over which noise at the start does not take over.
+
+    Steps before which a hypothesis remembers commands that are not in the log are left out.
+    """
     setting = evidence.twin.setting
     observation, timestep = setting.observation, setting.signals.timestep
-    steps = spread(cut_windows(log, observation, 1, stride=1), MOST)
+    since = evidence.twin.settled(hypothesis.variant, log.commands)
+    if not len(cut_windows(log, observation, 1, since=since)):
+        since = np.zeros(len(since), dtype=int)  # nothing is known: better scores of something
+    steps = spread(cut_windows(log, observation, 1, stride=1, since=since), MOST)
     positions = position_features(setting)
     largest = GROWTH * _rms(feature_sizes(setting, steps.measured[:, 0])[positions])
     chosen, seconds = steps, timestep
     for wanted in SECONDS:
         length = min(max(1, round(wanted / timestep)), longest_episode(log))
-        windows = spread(cut_windows(log, observation, length, stride=max(1, length // 3)), MOST_ROLLOUTS)
+        stride = max(1, length // 3)
+        windows = spread(cut_windows(log, observation, length, stride=stride, since=since), MOST_ROLLOUTS)
         if len(windows):
             chosen, seconds = windows, length * timestep
             if _rms(rollout_floor(evidence.on(windows), hypothesis)[positions]) < largest:

@@ -67,11 +67,13 @@ def read_spec(source: str | Path) -> mujoco.MjSpec:
 
 
 def write_inertials(spec: mujoco.MjSpec) -> None:
-    """Give every body the inertial that it compiles to, explicitly."""
+    """Give every body the inertial that it compiles to, explicitly, and let the compiler change none of them again."""
     compiled = spec.compile()
     for body in spec.bodies[1:]:
         body.explicitinertial = True
         body.fullinertia = np.full(6, np.nan)
         body.mass, body.inertia = compiled.body_mass[body.id], compiled.body_inertia[body.id]
         body.ipos, body.iquat = compiled.body_ipos[body.id], compiled.body_iquat[body.id]
-    spec.compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    compiler = spec.compiler
+    compiler.inertiafromgeom = mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    compiler.settotalmass, compiler.boundmass, compiler.boundinertia, compiler.balanceinertia = -1.0, 0.0, 0.0, False

@@ -7,8 +7,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import mujoco
+import numpy as np
 
 from dropo_torch.errors import InputError
+from dropo_torch.support.child import read_in_child
 
 
 @contextlib.contextmanager
@@ -44,17 +46,52 @@ def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> 
     path = Path(model)
     if not path.is_file():
         raise InputError(f"model: no file {path}; expected the path of an MJCF (.xml), URDF or .mjb file")
+    if path.suffix == ".mjb":  # MuJoCo trusts its sizes: a damaged file may crash it, or ask for all memory
+        read_in_child(f"{__name__}:try_binary", path, where=f"model: {path}", kind="a model of this MuJoCo")
     try:
         with quiet_mujoco():
-            if path.suffix == ".mjb":
-                return mujoco.MjModel.from_binary_path(str(path))
-            if not general:
-                return mujoco.MjModel.from_xml_path(str(path))
-            spec = mujoco.MjSpec.from_file(str(path))
-            unsimplify(spec)
-            return spec.compile()
-    except ValueError as error:
+            return checked(_loaded(path, general), f"model: {path}")
+    except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"model: MuJoCo does not compile {path}: {error}") from None
+
+
+def _loaded(path: Path, general: bool) -> mujoco.MjModel:
+    if path.suffix == ".mjb":
+        return mujoco.MjModel.from_binary_path(str(path))
+    if not general:
+        return mujoco.MjModel.from_xml_path(str(path))
+    spec = mujoco.MjSpec.from_file(str(path))
+    unsimplify(spec)
+    return spec.compile()
+
+
+def try_binary(path: str) -> bytes:
+    """Load a binary model and simulate a step of it, whatever becomes of it; return nothing.
+
+    Raises:
+        ValueError: no model, or one whose file has another size than it needs.
+    """
+    with quiet_mujoco():
+        model = mujoco.MjModel.from_binary_path(path)
+        if mujoco.mj_sizeModel(model) != Path(path).stat().st_size:
+            raise ValueError("its size is not that of its contents")
+        mujoco.mj_step(model, mujoco.MjData(model))
+    return b""
+
+
+def checked(model: mujoco.MjModel, where: str) -> mujoco.MjModel:
+    """Return a model all of whose numbers are finite, and whose step is positive.
+
+    Raises:
+        InputError: another one, naming the field.
+    """
+    for name in (n for n in dir(model) if not n.startswith("_")):
+        values = getattr(model, name)
+        if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
+            raise InputError(f"{where}: {name} has a value that is not finite")
+    if not (np.isfinite(model.opt.timestep) and model.opt.timestep > 0):
+        raise InputError(f"{where}: timestep is {model.opt.timestep:g}; expected a positive number of seconds")
+    return model
 
 
 def unsimplify(spec: mujoco.MjSpec) -> None:

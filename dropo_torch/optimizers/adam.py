@@ -46,13 +46,17 @@ class AdamOptimizer(LikelihoodOptimizer):
     σ moves by its logarithm, but Adam sees the gradient of its square, which does not vanish
     towards the floor, so that σ can leave it and reach it again.
 
+    What diverges has no gradient: where a larger share of a minibatch does than where the least did so far, the step is
+    half the way back there.
+
     Args:
         objective: its reduction and its simulator's gradients are used; it is not evaluated here.
         settings: how it steps, and the seed of minibatches and samples.
     """
 
     name = "adam"
-    STATE = ("_phi", "_first", "_second", "_basis", "_curvature", "_refreshed", "_step", "_smoothed", "_linearised")
+    STATE = ("_phi", "_first", "_second", "_basis", "_curvature", "_refreshed", "_step", "_smoothed", "_linearised",
+             "_least", "_stable")  # fmt: skip
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         if not objective.simulator.differentiable:
@@ -68,6 +72,7 @@ class AdamOptimizer(LikelihoodOptimizer):
         self._basis, self._curvature, self._refreshed = np.eye(d), np.zeros(d), -1
         self._step, self._smoothed = 0, math.nan
         self._linearised: np.ndarray | None = None
+        self._least, self._stable = math.inf, self._phi  # the least share of a minibatch that diverged, and where last
 
     def ask(self) -> Request:
         """Return a minibatch of transitions, with the gradient wanted or, at a refresh, for the Gauss-Newton matrix."""
@@ -80,14 +85,16 @@ class AdamOptimizer(LikelihoodOptimizer):
                 reduce=self._normal_equations(stage),
                 evaluations=0,
                 linearise_at=self._linearised,
+                widen=self._is_new_stage,
                 rows=None if self._is_new_stage else self._rows(),
                 is_stencil=True,
             )
         return Request(
             values=self._values(torch.from_numpy(self._phi)).numpy(),
-            reduce=self._likelihood(1) if self._is_joint else self._means_reduction(),
+            reduce=self._objective.likelihood() if self._is_joint else self._means_reduction(),
             evaluations=1,
             linearise_at=self._linearised,
+            widen=False,
             rows=self._rows(),
             gradient=True,
         )
@@ -97,6 +104,12 @@ class AdamOptimizer(LikelihoodOptimizer):
         if gradient is None:
             self._refresh(sums)
             return
+        lost = float(sums[4]) / (self._batch * len(gradient))
+        if lost > self._least:
+            self._phi, self._first = 0.5 * (self._phi + self._stable), np.zeros_like(self._first)
+            self._step += 1
+            return
+        self._least, self._stable = lost, self._phi
         phi = torch.from_numpy(self._phi.copy()).requires_grad_(True)
         (pulled,) = torch.autograd.grad(self._values(phi), phi, gradient.reshape(-1, len(self._space)))
         value = float(sums[0]) / self._batch
@@ -115,8 +128,9 @@ class AdamOptimizer(LikelihoodOptimizer):
         return Progress(stage, self._smoothed * len(self._objective), self._step / (2 * self._adam.steps))
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the last φ."""
-        return [self._box.denormalise(self._phi)]
+        """Return the last φ, and the last at which no more diverged than anywhere."""
+        last = [self._phi] if np.array_equal(self._phi, self._stable) else [self._phi, self._stable]
+        return [self._box.denormalise(phi) for phi in last]
 
     @property
     def _is_joint(self) -> bool:
@@ -193,7 +207,7 @@ class AdamOptimizer(LikelihoodOptimizer):
 
     def _means_reduction(self) -> Reduce:
         """The likelihood of one vector: of two equal ones, whose covariance is nil."""
-        pair = self._likelihood(1)
+        pair = self._objective.likelihood()
         return lambda features, measured, covariance: pair(features.expand(-1, 2, -1), measured, covariance)
 
     def _means_stage(self) -> MeansStage:

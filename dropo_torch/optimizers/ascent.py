@@ -25,7 +25,9 @@ class Ascent(abc.ABC):
         box: bounds of μ and σ in coordinates.
         mean, std: the best φ so far, ``(d,)`` each.
         candidate: the φ that is evaluated next; ``None`` for the first one.
-        sums: of the best φ: log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d² ...,)``.
+        sums: of the best φ: log-likelihood, losses, scores and Fisher matrices, ``(2 + 2d + 2d² ...,)``.
+        lost: transitions of which a simulation diverges there; no likelihood outweighs one.
+        narrows: whether a smaller σ may still lose fewer; that is tried before anything else.
         reason: why the stage has ended, in words.
     """
 
@@ -34,6 +36,8 @@ class Ascent(abc.ABC):
     std: np.ndarray
     damping: float = 1e-2
     log_likelihood: float = -np.inf
+    lost: float = np.inf
+    narrows: bool = True
     iterations: int = 0
     small_gains: int = 0
     reason: str | None = None
@@ -54,7 +58,7 @@ class Ascent(abc.ABC):
 
     @abc.abstractmethod
     def reduction(self) -> Reduce:
-        """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d² ...,)``."""
+        """Return the reduction to log-likelihood, losses, scores and Fisher matrices, ``(2 + 2d + 2d² ...,)``."""
 
     @property
     def phi(self) -> tuple[np.ndarray, np.ndarray]:
@@ -62,19 +66,23 @@ class Ascent(abc.ABC):
         return self.candidate or (self.mean, self.std)
 
     def tell(self, sums: torch.Tensor) -> None:
-        """Accept or reject the candidate by its log-likelihood, and propose the next one unless it is time to stop."""
-        value = float(sums[0])
-        if np.isfinite(value) and value > self.log_likelihood:
-            gain = value - self.log_likelihood
+        """Accept or reject the candidate, and propose the next one unless it is time to stop.
+
+        One at which fewer transitions diverge is better, whatever its log-likelihood.
+        """
+        value, lost = float(sums[0]), float(sums[1])
+        if np.isfinite(value) and (-lost, value) > (-self.lost, self.log_likelihood):
+            gain = value - self.log_likelihood if lost == self.lost else np.inf
             self.mean, self.std = self.phi
-            self.log_likelihood, self.sums = value, sums.numpy().copy()
+            self.lost, self.log_likelihood, self.sums = lost, value, sums.numpy().copy()
+            self.narrows = self.narrows and lost > 0
             self.damping = max(self.damping / 4, 1e-6)
-            self.small_gains = self.small_gains + 1 if gain < self.SMALL_GAIN else 0
+            self.small_gains = self.small_gains + 1 if gain < self.SMALL_GAIN and not self.narrows else 0
             if self.small_gains >= 2:
                 self.reason = f"two steps in a row gained less than {self.SMALL_GAIN:g} nat"
         elif self.candidate is None:
             self.reason = "no simulation succeeded at the starting point"
-        else:
+        elif not self.narrows:
             self.damping *= 8
             if self.damping > MAX_DAMPING:
                 self.reason = "no step improves the likelihood"
@@ -82,7 +90,13 @@ class Ascent(abc.ABC):
         if self.iterations >= self.MAX_ITERATIONS and self.reason is None:
             self.reason = f"{self.MAX_ITERATIONS} iterations of Fisher scoring"
         if self.reason is None and self.sums is not None:
-            self.candidate = scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
+            self.candidate = self._narrower() or scoring_step(self.mean, self.std, self.sums, self.box, self.damping)
+
+    def _narrower(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """A quarter of the σ that was tried last, down to the floor, while it may lose fewer transitions."""
+        tried = self.phi[1]
+        self.narrows = self.narrows and bool((tried > self.box.min_std).any())
+        return (self.mean, np.maximum(tried / 4, self.box.min_std)) if self.narrows else None
 
     def with_entropy(self, sums: torch.Tensor, weight: float) -> torch.Tensor:
         """Return the candidate's sums for the log-likelihood plus ``weight`` β times Σ log σ.
@@ -93,8 +107,8 @@ class Ascent(abc.ABC):
         std = self.phi[1]
         d, added = len(std), sums.clone()
         added[0] += weight * float(np.log(std).sum())
-        added[1 + d : 1 + 2 * d] += weight
-        added[1 + 2 * d + d * d : 1 + 2 * d + 2 * d * d].view(d, d).diagonal().add_(2 * weight)
+        added[2 + d : 2 + 2 * d] += weight
+        added[2 + 2 * d + d * d : 2 + 2 * d + 2 * d * d].view(d, d).diagonal().add_(2 * weight)
         return added
 
 
@@ -105,13 +119,13 @@ def scoring_step(
 
     Args:
         mean, std: φ, ``(d,)`` each.
-        sums: log-likelihood, scores and Fisher matrices of (μ, log σ), packed as ``(1 + 2d + 2d² ...,)``.
+        sums: log-likelihood, losses, scores and Fisher matrices of (μ, log σ), packed as ``(2 + 2d + 2d² ...,)``.
         box: bounds of μ and σ.
         damping: Marquardt's, on the diagonal of the Fisher matrices scaled to 1.
     """
     d = len(mean)
-    score_mean, score_log = sums[1 : 1 + d], sums[1 + d : 1 + 2 * d]
-    fisher_mean, fisher_log = sums[1 + 2 * d : 1 + 2 * d + 2 * d * d].reshape(2, d, d)
+    score_mean, score_log = sums[2 : 2 + 2 * d].reshape(2, d)
+    fisher_mean, fisher_log = sums[2 + 2 * d : 2 + 2 * d + 2 * d * d].reshape(2, d, d)
     free = ~((mean <= box.low) & (score_mean < 0)) & ~((mean >= box.high) & (score_mean > 0))
     move = np.clip(damped_step(fisher_mean, score_mean, free, damping), -0.25 * box.width, 0.25 * box.width)
     log_std, low, high = np.log(std), np.log(box.min_std), np.log(box.max_std)

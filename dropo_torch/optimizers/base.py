@@ -13,7 +13,7 @@ import torch
 from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import Distribution, SearchBox
 from dropo_torch.evaluator import ReplayReduce
-from dropo_torch.objective import Objective, Reduce, likelihood_reduction
+from dropo_torch.objective import Objective, Reduce
 from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.parameters import ParameterSpace
 
@@ -28,6 +28,8 @@ class Request:
         evaluations: how many evaluations of the objective this counts as.
         linearise_at: μ in coordinates at which the noise of initial states is propagated, or ``None``.
         linearise_std: σ that then counts as explained when windows are widened, or ``None``.
+        widen: whether windows that the noise does not explain are widened; else the noise is as given, as the
+            objective has it.
         rows: the transitions to simulate, ascending; ``None`` for all of them.
         replay: windows that are replayed open loop in place of the log's transitions; ``reduce`` is then a
             :data:`~dropo_torch.evaluator.ReplayReduce`.
@@ -40,6 +42,7 @@ class Request:
     evaluations: int
     linearise_at: np.ndarray | None = None
     linearise_std: np.ndarray | None = None
+    widen: bool = True
     rows: np.ndarray | None = None
     gradient: bool = False
     is_stencil: bool = False
@@ -79,8 +82,12 @@ class Optimizer(abc.ABC):
     name: ClassVar[str]
     #: What stands as ``method`` in ``fit.json``.
     method: ClassVar[str] = "dropo"
+    #: Whether candidates are meant to simulate the log well long before the search ends.
+    improves: ClassVar[bool] = False
     #: Names of the attributes that change.
     STATE: ClassVar[tuple[str, ...]] = ()
+    #: Dataclasses in the state: beside them it holds plain values, arrays and tensors.
+    KINDS: ClassVar[tuple[type, ...]] = ()
 
     @abc.abstractmethod
     def ask(self) -> Request:
@@ -139,6 +146,8 @@ class LikelihoodOptimizer(Optimizer):
         settings: what the fit was told.
     """
 
+    improves = True
+
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         self._objective, self._settings = objective, settings
         self._space: ParameterSpace = objective.simulator.parameters
@@ -152,7 +161,3 @@ class LikelihoodOptimizer(Optimizer):
     def bonus(self, distribution: Distribution) -> float:
         """Return the weighted entropy."""
         return self._settings.entropy * entropy_of(distribution) if self._settings.entropy else 0.0
-
-    def _likelihood(self, num_phi: int) -> Reduce:
-        """The reduction to the sampled likelihood of P φ."""
-        return likelihood_reduction(self._objective.features, num_phi)

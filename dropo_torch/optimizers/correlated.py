@@ -62,13 +62,14 @@ def random_effects(
 class CorrelatedOptimizer(FisherOptimizer):
     """Fisher scoring with independent parameters, then their full covariance; the likelier of both is the result."""
 
-    STATE = (*FisherOptimizer.STATE, "_center", "_covariance", "_rounds")
+    STATE = (*FisherOptimizer.STATE, "_center", "_covariance", "_rounds", "_stable")
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
         self._center: np.ndarray | None = None
         self._covariance: np.ndarray | None = None
         self._rounds = 0
+        self._stable: tuple[np.ndarray, float] | None = None  # the last μ, and what diverged around it
         self._gathered: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def ask(self) -> Request:
@@ -91,6 +92,11 @@ class CorrelatedOptimizer(FisherOptimizer):
         if super().stop_reason is None:
             super().tell(sums, gradient)
             return
+        lost = float(sums[0])
+        if self._stable is not None and lost > self._stable[1]:  # more diverge here than where it came from
+            self._center, self._rounds = self._stable[0], _ROUNDS
+            return
+        self._stable = (self._at, lost)
         gram, force = (torch.cat(parts) for parts in zip(*self._gathered, strict=True))
         if not len(gram):  # every simulation diverges here
             self._center, self._rounds = self._at, _ROUNDS
@@ -142,12 +148,12 @@ class CorrelatedOptimizer(FisherOptimizer):
         gathered = self._gathered
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
-            features, measured, covariance, _ = survivors(features, measured, covariance)
+            features, measured, covariance, lost = survivors(features, measured, covariance)
             base = features[:, 0]
             jacobian = (features[:, 1:] - base[:, None]) / steps[:, None]
             residual = (measured - base)[:, None]
             solved = torch.linalg.solve(covariance, torch.cat([residual, jacobian], 1).mT)
             gathered.append((jacobian @ solved[..., 1:], (jacobian @ solved[..., :1])[..., 0]))
-            return torch.zeros(1, dtype=features.dtype)
+            return lost[None]
 
         return reduce

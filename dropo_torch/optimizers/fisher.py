@@ -45,6 +45,7 @@ class FisherOptimizer(LikelihoodOptimizer):
 
     name = "fisher"
     STATE: ClassVar[tuple[str, ...]] = ("_means", "_scoring", "_round", "_linearised", "_explained", "_spread_round")
+    KINDS = (MeansStage, SigmaPointStage, SampledStage)
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)

@@ -8,15 +8,18 @@ from functools import partial
 import numpy as np
 import scipy.optimize
 import torch
+from scipy.stats import qmc
 
 from dropo_torch.distribution import SearchBox
-from dropo_torch.likelihood import DIVERGENCE_PENALTY, robust_cholesky
+from dropo_torch.likelihood import robust_cholesky
 from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.least_squares import bounded_step
 
 #: Step of the forward differences, as a share of the search width.
 DIFFERENCE_STEP = 1e-5
 MAX_ITERATIONS = 40
+#: Points spread over the box from which to begin where the first one loses transitions.
+STARTS = 16
 
 
 @dataclass
@@ -28,8 +31,9 @@ class MeansStage:
         point: the best μ so far, ``(d,)``.
         shape: transitions and columns of the log, where the residuals' own size is to tell when μ is good enough;
             by default C tells.
-        cost: ½ Σ rᵀC⁻¹r at ``point``, and a penalty for every transition that diverges there.
-        lost: how many do.
+        cost: ½ Σ rᵀC⁻¹r at ``point``, over the transitions that do not diverge there.
+        lost: how many do; no cost outweighs one.
+        starts: other points to try before any step, the next one last, ``(d,)`` each.
     """
 
     low: np.ndarray
@@ -38,7 +42,8 @@ class MeansStage:
     shape: tuple[int, int] | None = None
     damping: float = 1e-3
     cost: float = np.inf
-    lost: float = 0.0
+    lost: float = np.inf
+    starts: list[np.ndarray] = field(default_factory=list)
     iterations: int = 0
     reason: str | None = None
     candidate: np.ndarray | None = None
@@ -56,34 +61,49 @@ class MeansStage:
         return partial(normal_equations, steps=torch.from_numpy(self.steps))
 
     def tell(self, sums: torch.Tensor) -> None:
-        """Accept or reject the candidate, and propose the next one."""
+        """Accept or reject the candidate, and propose the next one.
+
+        Where transitions diverge at the first point, points spread over the box are tried before any step.
+        """
         d = len(self.low)
-        cost = float(sums[0])
+        cost, lost = float(sums[0]), float(sums[1])
         step = np.inf if self.candidate is None else float(np.max(np.abs(self._center - self.point) / self._width))
-        if np.isfinite(cost) and cost < self.cost:
-            gain = self.cost - cost
+        tries_starts = bool(self.starts)
+        if self.candidate is None:
+            self.starts = self._spread() if lost else []
+        elif tries_starts:
+            self.starts.pop()
+        if np.isfinite(cost) and (lost, cost) < (self.lost, self.cost):
+            gain = self.cost - cost if lost == self.lost else np.inf
             self.point = self._center
-            self.cost, self.lost = cost, float(sums[1])
+            self.cost, self.lost = cost, lost
             self.gradient, self.excess = sums[2 : 2 + 2 * d].numpy().reshape(2, d).copy()
             self.hessian, self.squares = sums[2 + 2 * d :].numpy().reshape(2, d, d).copy()
-            self.damping = max(self.damping / 8, 1e-12)
-            if np.isfinite(gain) and (gain < 1e-4 * self.reduced_chi2 or step < 1e-10):
+            self.damping = self.damping if tries_starts else max(self.damping / 8, 1e-12)
+            if np.isfinite(gain) and (gain < 1e-4 * self.reduced_chi2 or step < 1e-10) and not self.starts:
                 self.reason = "the means no longer improve"
         elif self.candidate is None:
             self.reason = "no simulation succeeded at the starting point"
-        elif step < 1e-9:
+        elif not tries_starts and step < 1e-9:
             self.reason = "the steps of the means have become too small"
-        else:
+        elif not tries_starts:
             self.damping *= 6
-        self.iterations += 1
+        self.iterations += not tries_starts
         if self.iterations >= MAX_ITERATIONS and self.reason is None:
             self.reason = f"{MAX_ITERATIONS} iterations of the means"
-        if self.reason is None:
+        if self.reason is None and self.starts:
+            self.candidate = self.starts[-1]
+        elif self.reason is None:
             below, above = self.low - self.point, self.high - self.point
             move = bounded_step(self.hessian, -self.gradient, below, above, self.damping)
             self.candidate = np.clip(self.point + move, self.low, self.high)
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
+
+    def _spread(self) -> list[np.ndarray]:
+        """Points that fill the box evenly, ``(d,)`` each."""
+        shares = qmc.Halton(len(self.low), scramble=False).random(STARTS + 1)[1:]  # the first is a corner
+        return list(self.low + shares * self._width)
 
     def first_std(self, box: SearchBox, significance: float = 0.0) -> np.ndarray:
         """Return a first guess of σ, ``(d,)``: the variances that explain the residuals' excess over C.
@@ -107,7 +127,7 @@ class MeansStage:
             return 1.0
         transitions, columns = self.shape
         freedom = (transitions - self.lost) * columns - len(self.low)
-        return float(2 * (self.cost - self.lost * DIVERGENCE_PENALTY) / max(1.0, freedom))
+        return float(2 * self.cost / max(1.0, freedom))
 
     @property
     def _width(self) -> np.ndarray:
@@ -153,6 +173,6 @@ def normal_equations(
     gram = jac.mT @ jac
     pulled = (jac.mT @ r[..., None])[..., 0]
     excess = (pulled.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0)
-    cost = 0.5 * r.square().sum() + lost * DIVERGENCE_PENALTY
+    cost = 0.5 * r.square().sum()
     parts = (cost, lost, gradient, excess, flat.T @ flat, gram.square().sum(0))
     return torch.cat([part.flatten() for part in parts])

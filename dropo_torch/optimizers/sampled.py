@@ -38,7 +38,7 @@ class SampledStage(Ascent):
         return self.box.draw_coordinates(self.uniforms, *map(torch.as_tensor, self.phi)).numpy()
 
     def reduction(self) -> Reduce:
-        """Return the reduction to log-likelihood, scores and Fisher matrices, ``(1 + 2d + 2d²,)``."""
+        """Return the reduction to log-likelihood, losses, scores and Fisher matrices, ``(2 + 2d + 2d²,)``."""
         mean, std = self.phi
         z = torch.from_numpy((self.points() - mean) / std)
         return partial(sampled_scores, std=torch.from_numpy(std), z=z)
@@ -52,13 +52,13 @@ class SampledStage(Ascent):
         """
         mean, std = (torch.as_tensor(x).clone().requires_grad_(True) for x in self.phi)
         by_mean, by_std = torch.autograd.grad(self.box.draw(self.uniforms, mean, std), (mean, std), gradient)
-        return torch.cat([sums[:1], by_mean, by_std * std.detach(), sums[1 + 2 * len(mean) :]])
+        return torch.cat([sums[:2], by_mean, by_std * std.detach(), sums[2 + 2 * len(mean) :]])
 
 
 def sampled_scores(
     features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, std: torch.Tensor, z: torch.Tensor
 ) -> torch.Tensor:
-    """Return sampled log-likelihood, scores and Fisher information of (μ, log σ), ``(1 + 2d + 2d²,)``.
+    """Return sampled log-likelihood, losses, scores and Fisher information of (μ, log σ), ``(2 + 2d + 2d²,)``.
 
     Args:
         features: at the samples, ``(t, K, m)``.
@@ -72,7 +72,7 @@ def sampled_scores(
     mean, sampled = sample_moments(features)
     total = sampled + covariance
     residual, centred = measured - mean, features - mean[:, None]
-    value = gaussian_log_density(residual, total).sum() + lost
+    value = gaussian_log_density(residual, total).sum()
     slope, bend = _regress(features, z)
     solved = torch.linalg.solve(total, residual[..., None])  # C⁻¹ r
     pull = torch.linalg.solve(total, centred.mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
@@ -86,7 +86,7 @@ def sampled_scores(
     v = z.var(0)
     fisher_mean = gram.sum(0) / torch.outer(std, std)
     fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0)
-    return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten()])
+    return torch.cat([p.flatten() for p in (value, lost, score_mean, score_log, fisher_mean, fisher_log)])
 
 
 def _regress(features: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:

@@ -12,6 +12,11 @@ from dropo_torch.support.given import check_keys
 OPTIMIZERS = ("fisher", "cma", "adam")
 #: Adam's first learning rate of the second stage, as a share of the first stage's.
 JOINT_RATE = 0.2
+#: The largest values of Adam's settings, whole ones of whole numbers.
+LIMITS = {
+    "steps": 10_000_000, "batch": 1_000_000, "samples": 100_000, "learning_rate": 4.0, "refresh": 10_000_000,
+    "clip": 1e9,
+}  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -39,9 +44,12 @@ class AdamSettings:
     common_random_numbers: bool = False
 
     def __post_init__(self) -> None:
-        for name, value in vars(self).items():
-            if name != "common_random_numbers" and not value > 0:
-                raise InputError(f"adam.{name}: {value} given; expected a positive number")
+        for name, most in LIMITS.items():
+            value = getattr(self, name)
+            if not 0 < value <= most:
+                raise InputError(f"adam.{name}: {value} given; expected a positive number of at most {most:g}")
+            if isinstance(most, int) and value != int(value):
+                raise InputError(f"adam.{name}: {value} given; expected a whole number")
         if self.samples < 2:
             raise InputError("adam.samples: 1 given; a covariance needs 2 or more")
 

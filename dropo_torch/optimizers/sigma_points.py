@@ -37,7 +37,7 @@ class SigmaPointStage(Ascent):
         return np.concatenate([mean[None], mean + np.diag(up), mean - np.diag(down)])
 
     def reduction(self) -> Reduce:
-        """Return the reduction to log-likelihood, scores, Fisher matrices and bending, ``(2 + 2d + 2d²,)``."""
+        """Return the reduction to log-likelihood, scores, Fisher matrices and bending, ``(3 + 2d + 2d²,)``."""
         mean, std = self.phi
         up, down = self._reach(mean, std)
         a, b = truncated_interval(*map(torch.as_tensor, (mean, std, *self.box.limits)))
@@ -48,10 +48,10 @@ class SigmaPointStage(Ascent):
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one where it promises to gain anything."""
         super().tell(sums)
-        if self.reason is None and self.sums is not None:
+        if self.reason is None and self.sums is not None and not self.narrows:
             mean, std = self.phi
             move = np.concatenate([mean - self.mean, np.log(std / self.std)])
-            if float(self.sums[1 : 1 + len(move)] @ move) < self.SMALL_GAIN:
+            if float(self.sums[2 : 2 + len(move)] @ move) < self.SMALL_GAIN:
                 self.reason = f"no step promises {self.SMALL_GAIN:g} nat"
 
     @property
@@ -77,7 +77,7 @@ def scores(
     reach: torch.Tensor,
     moments: torch.Tensor,
 ) -> torch.Tensor:
-    """Return log-likelihood, scores, Fisher information of (μ, log σ) and bending, ``(2 + 2d + 2d²,)``.
+    """Return log-likelihood, losses, scores, Fisher information of (μ, log σ) and bending, ``(3 + 2d + 2d²,)``.
 
     Derivatives treat the Jacobian of the simulation as constant.
 
@@ -100,7 +100,7 @@ def scores(
     curved = 0.5 * (fourth - second**2).clamp(min=0).sqrt() * bend
     total = covariance + spread.mT @ spread + curved.mT @ curved
     residual = measured - mean
-    value = gaussian_log_density(residual, total).sum() + lost
+    value = gaussian_log_density(residual, total).sum()
     solved = torch.linalg.solve(total, torch.cat([residual[:, None], slope], 1).mT)  # C⁻¹[r, A], (t, m, 1 + d)
     weighted = (slope @ solved[..., :1])[..., 0]  # Aᵀ C⁻¹ r
     gram = slope @ solved[..., 1:]  # Aᵀ C⁻¹ A
@@ -111,7 +111,8 @@ def scores(
     fisher_mean = gram.sum(0) / torch.outer(std, std)
     fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0) + torch.outer(shift, shift) * gram.sum(0)
     bending = (curved * torch.linalg.solve(total, curved.mT).mT).sum()
-    return torch.cat([value[None], score_mean, score_log, fisher_mean.flatten(), fisher_log.flatten(), bending[None]])
+    parts = (value, lost, score_mean, score_log, fisher_mean, fisher_log, bending)
+    return torch.cat([part.flatten() for part in parts])
 
 
 def _divided_differences(

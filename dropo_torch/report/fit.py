@@ -20,6 +20,8 @@ from dropo_torch.report.figures.drawing import BLUE, FAINT, PALETTE, Axis
 from dropo_torch.report.formatting import duration, nats, number, plain, plural, rms
 from dropo_torch.report.page import Frame, write_page
 
+#: What stands at the top of the page, by verdict.
+TAGS = {"explained": "✓ Explained", "not_explained": "! Not fully explained", "hopeless": "✗ Hopeless"}
 #: Columns with figures of their own; of more, the worst explained are shown.
 MAX_COLUMNS = 24
 #: Transitions in the traces of measured and simulated next states.
@@ -51,16 +53,16 @@ def write_fit_report(
         frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`; the
             config's ``parameters`` tell where they sit in the model.
     """
-    ok, verdict = words.verdict(fit, diagnostics)
+    judged = words.judgment(fit, diagnostics)
     nominal = np.full(len(fit.distribution), np.nan) if space is None else space.nominal
     content = {
         "title": "Fit",
         "fit": fit,
         "diagnostics": diagnostics,
         "words": words,
-        "explained": ok,
-        "tag": "Not judged" if fit.method == "udr" else "✓ Explained" if ok else "! Not fully explained",
-        "verdict": verdict,
+        "explained": judged.verdict == "explained",
+        "tag": "Not judged" if fit.method == "udr" else TAGS[judged.verdict],
+        "verdict": judged.reason[:1].upper() + judged.reason[1:],
         "findings": words.findings(fit, diagnostics),
         "notes": notes,
         "tiles": _tiles(fit, diagnostics),

@@ -14,7 +14,6 @@ from typing import Any, TypedDict
 import jinja2
 import yaml
 
-from dropo_torch.report.figures import to_svg
 from dropo_torch.report.formatting import FILTERS
 from dropo_torch.support.files import write_atomically
 
@@ -46,6 +45,8 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], fram
     environment = jinja2.Environment(
         loader=loader, autoescape=True, trim_blocks=True, lstrip_blocks=True, undefined=jinja2.StrictUndefined
     )
+    from dropo_torch.report.figures import to_svg  # heavy, and read only once a page is written
+
     environment.filters |= {f.__name__: f for f in FILTERS} | {"svg": to_svg, "yaml": config_yaml}
     page = environment.get_template(template).render(
         {"facts": (), "config": None, "versions": None, **content, **frame}

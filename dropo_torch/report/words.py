@@ -15,15 +15,13 @@ from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, SearchBox, to_coordinates, to_values
 from dropo_torch.fit import Fit
 from dropo_torch.report.formatting import MOST_NAMED, joined, number, plain, rms, signed, whole, with_unit
+from dropo_torch.verdict import THRESHOLDS, Judgment, at_floor, at_largest_std, judge, means_at_bounds
+from dropo_torch.verdict import column_rms as column_rms
+from dropo_torch.verdict import overall_rms as overall_rms
+from dropo_torch.verdict import root_mean_square as root_mean_square
+from dropo_torch.verdict import standardised_residual as standardised_residual
+from dropo_torch.verdict import unexplained_above as unexplained_above
 
-#: A mean nearer to its bound than this share of the box is at its bound.
-AT_BOUND = 2e-3
-#: A standard deviation this near to a bound of its own, as a factor, is at it.
-AT_STD_BOUND = 1.02
-#: Standardised residuals with a root mean square above this are not explained, small logs apart.
-UNEXPLAINED = 1.5
-#: ... and below this they are so small that ε or noise, not the parameters, dominates what is expected.
-DROWNED = 0.3
 #: A mean whose standard error exceeds this share of the search box is poorly identified.
 VAGUE = 0.25
 #: Share of its mean from which a standard deviation is suspect.
@@ -149,66 +147,15 @@ def headline(fit: Fit, diagnostics: Diagnostics) -> str:
     return f"{start} Mean ± standard deviation: {joined(values, len(values))}."
 
 
-def verdict(fit: Fit, diagnostics: Diagnostics) -> tuple[bool, str]:
-    """Return whether the model explains the log without reservation, and that in words."""
-    standardised, overall = column_rms(diagnostics), overall_rms(diagnostics)
-    if not np.isfinite(overall):
-        return False, "No residual is finite, so the fit cannot be judged."
-    worst = int(np.nanargmax(np.where(np.isfinite(standardised), standardised, -1)))
-    scale = (
-        f"Measured next states lie {rms(overall)} expected σ from the simulated ones (rms; 1 is ideal); "
-        f"{diagnostics.labels[worst]} is worst, at {rms(standardised[worst])}."
-    )
-    limit = unexplained_above(diagnostics)
-    if fit.method == "udr":
-        return True, f"This is a box drawn at random; the log was not used. {scale}"
-    if standardised[worst] > limit:
-        bad = int(np.sum(standardised > limit))
-        where = "" if len(standardised) == 1 else f" in {bad} of {len(standardised)} columns"
-        return False, f"The simulator does not explain the log{where}. {scale}"
-    if fit.method == "dropo" and at_largest_std(fit.distribution).any():
-        return False, (
-            f"The simulator explains the log only if parameters vary as much as the search allows (see below). {scale}"
-        )
-    return True, f"The simulator explains the log{', with margin to spare' if overall < DROWNED else ''}. {scale}"
-
-
-def column_rms(diagnostics: Diagnostics) -> np.ndarray:
-    """Return the root mean square standardised residual of each column, over finite entries; NaN where none."""
-    return root_mean_square(standardised_residual(diagnostics))
-
-
-def overall_rms(diagnostics: Diagnostics) -> float:
-    """Return the root mean square standardised residual over all columns; NaN where none is finite."""
-    return float(root_mean_square(standardised_residual(diagnostics).ravel()))
-
-
-def root_mean_square(values: np.ndarray) -> np.ndarray:
-    """Return the root mean square over the first axis of what is finite; NaN where nothing is."""
-    finite = np.isfinite(values)
-    total = np.sum(np.where(finite, values, 0.0) ** 2, axis=0)
-    return np.sqrt(np.where(finite.any(0), total / np.maximum(finite.sum(0), 1), np.nan))
-
-
-def standardised_residual(diagnostics: Diagnostics) -> np.ndarray:
-    """Return residual over expected standard deviation, ``(T, m)``."""
-    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-        return np.asarray(diagnostics.residual / diagnostics.expected)
-
-
-def unexplained_above(diagnostics: Diagnostics) -> float:
-    """Return the rms above which a column is not explained: larger for a short log, whose rms varies by chance."""
-    return UNEXPLAINED + 3 / math.sqrt(2 * max(len(diagnostics.rows), 1))
+def judgment(fit: Fit, diagnostics: Diagnostics) -> Judgment:
+    """Return the verdict of a fit: its own where it has one."""
+    share = fit.diverged / (max(len(diagnostics.rows), 1) * fit.samples)
+    return fit.judgment or judge(fit.distribution, fit.method, diagnostics, min(share, 1.0))
 
 
 def has_standard_errors(fit: Fit) -> bool:
     """Whether the means maximize the likelihood, so that its curvature gives their standard errors."""
     return fit.method not in ("bayessim", "simopt", "udr")
-
-
-def at_largest_std(distribution: Distribution) -> np.ndarray:
-    """Return which standard deviations lie at their upper bound, ``(d,)`` bool."""
-    return np.asarray(distribution.std >= SearchBox.of(distribution).max_std / AT_STD_BOUND)
 
 
 def shape(distribution: Distribution) -> str:
@@ -263,9 +210,7 @@ def strongest(diagnostics: Diagnostics) -> list[tuple[str, str, float]]:
 
 def _at_bounds(distribution: Distribution) -> dict[str, list[str]]:
     """Means at the ends of the search box, with the ends' values."""
-    box, (physical, _) = SearchBox.of(distribution), distribution.limits.T
-    share = (distribution.mean - box.low) / box.width
-    lower, upper, at_limit = share < AT_BOUND, share > 1 - AT_BOUND, distribution.low <= physical
+    (lower, upper), at_limit = means_at_bounds(distribution), distribution.low <= distribution.limits[:, 0]
     return {
         "Mean at its physical limit": _with_values(distribution, lower & at_limit, distribution.low),
         "Mean at its lower search bound": _with_values(distribution, lower & ~at_limit, distribution.low),
@@ -280,7 +225,7 @@ def _standard_deviations(distribution: Distribution) -> dict[str, list[str]]:
     return {
         "Standard deviation at its upper bound": _chosen(distribution, top),
         "Standard deviation as large as the mean": _chosen(distribution, wide),
-        "Standard deviation at its floor": _chosen(distribution, distribution.std <= box.min_std * AT_STD_BOUND),
+        "Standard deviation at its floor": _chosen(distribution, at_floor(distribution)),
     }
 
 
@@ -323,7 +268,7 @@ def _is_drowned(diagnostics: Diagnostics, column: int) -> bool:
     """Whether ε and the noise given for a column are far larger than what the simulator misses by."""
     residual, given = diagnostics.residual[:, column], diagnostics.given[:, column]
     finite = np.isfinite(residual) & np.isfinite(given)
-    return bool(finite.any() and root_mean_square(residual[finite]) < DROWNED * np.median(given[finite]))
+    return bool(finite.any() and root_mean_square(residual[finite]) < THRESHOLDS.drowned * np.median(given[finite]))
 
 
 def _chosen(distribution: Distribution, mask: np.ndarray) -> list[str]:

@@ -10,11 +10,7 @@ from typing import Any
 
 import torch
 
-from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
-from dropo_torch.support.given import reading
-
-SCHEMA = "dropo-torch/training/2"
 
 
 class Stateful:
@@ -51,24 +47,3 @@ def save_tensors(path: Path, content: Mapping[str, Any]) -> None:
 def load_tensors(path: Path) -> dict[str, Any]:
     """Return what :func:`save_tensors` has written, on the CPU; no code in the file is run."""
     return dict(torch.load(path, map_location="cpu", weights_only=True))
-
-
-def save_checkpoint(path: Path, fingerprint: str, state: Mapping[str, Any]) -> None:
-    """Write the state of the training that a fingerprint identifies, whole or not at all."""
-    save_tensors(path, {"schema": SCHEMA, "fingerprint": fingerprint, "state": state})
-
-
-def load_checkpoint(path: Path, fingerprint: str) -> dict[str, Any]:
-    """Return the state that :func:`save_checkpoint` has written.
-
-    Raises:
-        InputError: a file that is no checkpoint, or that of another training.
-    """
-    with reading(f"resume: {path}", "the checkpoint of a training", "start again without --resume"):
-        content = load_tensors(path)
-        if (content["schema"], content["fingerprint"]) != (SCHEMA, fingerprint):
-            raise InputError(
-                f"resume: {path} belongs to another task, config, distribution or algorithm; restore those, or start "
-                "again without --resume"
-            )
-        return dict(content["state"])

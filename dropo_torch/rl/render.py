@@ -47,7 +47,7 @@ def _camera(model: mujoco.MjModel) -> int | mujoco.MjvCamera:
 def main(arguments: list[str]) -> None:
     """Read the model and the states, write the picture."""
     model, states, picture, columns = arguments
-    drawn = draw(mujoco.MjModel.from_binary_path(model), np.load(states), int(columns))
+    drawn = draw(mujoco.MjModel.from_binary_path(model), np.load(states, allow_pickle=False), int(columns))
     Image.fromarray(drawn).quantize(128).save(picture, optimize=True)
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from dropo_torch.errors import InputError
-from dropo_torch.rl.checkpoint import Stateful, load_checkpoint, save_checkpoint
+from dropo_torch.rl.checkpoint import Stateful
 from dropo_torch.rl.collect import Collector, Returns, evaluate
 from dropo_torch.rl.learner import Learner
 from dropo_torch.rl.policy import Policy
@@ -21,6 +21,7 @@ from dropo_torch.rl.ppo import PPO
 from dropo_torch.rl.problem import TrainingProblem, World
 from dropo_torch.rl.sac import SAC
 from dropo_torch.rl.settings import SACSettings
+from dropo_torch.support.checkpoint import Checkpoint
 from dropo_torch.support.threads import single_thread
 
 SCHEMA = "dropo-torch/train/1"
@@ -150,9 +151,8 @@ def train(
     check_training(problem)
     with _own_random_numbers(problem.config.seed, problem.device), single_thread():
         run = _Run(problem, checkpoint)
-        if resume and checkpoint is not None and checkpoint.is_file():
-            with torch.serialization.safe_globals([TrainEntry, EvaluationPoint]):
-                run.load_state_dict(load_checkpoint(checkpoint, problem.fingerprint))
+        if resume and run.checkpoint is not None and run.checkpoint.path.is_file():
+            run.load_state_dict(run.checkpoint.load())
         if on_start is not None:
             on_start(run.history, run.evaluations)
         while not run.done:
@@ -189,7 +189,9 @@ class _Run(Stateful):
     kept = ("steps", "simulating", "learning", "history", "evaluations", "best")
 
     def __init__(self, problem: TrainingProblem, checkpoint: Path | None) -> None:
-        self.problem, settings, self.checkpoint = problem, problem.settings, checkpoint
+        self.problem, settings, kinds = problem, problem.settings, (TrainEntry, EvaluationPoint)
+        owner = (problem.fingerprint,)
+        self.checkpoint = None if checkpoint is None else Checkpoint(checkpoint, "training", owner, kinds)
         self.env = problem.env(problem.training, settings.num_envs, problem.config.seed)
         self.policy = _fresh_policy(problem)
         kind: type[Learner] = SAC if isinstance(settings, SACSettings) else PPO
@@ -267,7 +269,7 @@ class _Run(Stateful):
         """Write a checkpoint, if one is wanted, and say when the next is due."""
         if self.checkpoint is not None:
             begun = time.monotonic()
-            save_checkpoint(self.checkpoint, self.problem.fingerprint, self.state_dict())
+            self.checkpoint.save(self.state_dict())
             ended = time.monotonic()
             self.next_checkpoint = ended + max(self.problem.settings.checkpoint_seconds, (ended - begun) / SHARE)
 

@@ -33,6 +33,7 @@ def make_simulator(
     num_threads: int = 0,
     chunk_size: int = 10_000,
     device: str = "cpu",
+    history: int = 0,
 ) -> Simulator:
     """Return the simulator of a backend.
 
@@ -45,14 +46,16 @@ def make_simulator(
         num_threads: threads, 0 for all processors.
         chunk_size: simulations held in memory at once.
         device: of the ``"warp"`` backend, ``"cpu"`` or a GPU such as ``"cuda:0"``.
+        history: of the ``"mujoco"`` backend, logged steps of controls before each transition, for actuators' filters.
 
     Raises:
         InputError: an unknown backend, or a model that it does not support.
     """
     if backend == "mujoco":
         return MujocoSimulator(
-            model, parameters=parameters, frame_skip=frame_skip, num_threads=num_threads, chunk_size=chunk_size
-        )
+            model, parameters=parameters, frame_skip=frame_skip, num_threads=num_threads, chunk_size=chunk_size,
+            history=history,
+        )  # fmt: skip
     if backend == "gymnasium":
         return GymnasiumSimulator(model, parameters=parameters, frame_skip=frame_skip)
     if backend != "warp":

@@ -26,6 +26,7 @@ class Simulator(abc.ABC):
         remedy: what to do about it where it does not.
         parameters: what varies, d parameters.
         frame_skip: physics steps of one logged transition.
+        history: logged steps before each transition whose controls come with it, for what remembers them.
         num_states: width of a state, ``nq + nv`` for a MuJoCo model.
         num_controls: width of a control, ``nu``.
         timestep: seconds of one logged transition, or ``None`` if the simulator does not say.
@@ -36,6 +37,7 @@ class Simulator(abc.ABC):
     name: ClassVar[str]
     parameters: ParameterSpace
     frame_skip: int
+    history: int = 0
     num_states: int
     num_controls: int
     timestep: float | None
@@ -45,7 +47,8 @@ class Simulator(abc.ABC):
 
         Args:
             states: initial states, ``(T, num_states)``, float64.
-            controls: the controls of each transition, ``(T, lag, num_controls)``.
+            controls: the controls of each transition, after those of ``history`` steps before it,
+                ``(T, history + lag, num_controls)``.
             values: parameter vectors in their units, ``(K, d)``.
 
         Returns:
@@ -80,5 +83,6 @@ class Simulator(abc.ABC):
                 raise InputError(f"{name}: shape {tuple(array.shape)} given; expected {shape} with {width} columns")
         if len(states) != len(controls):
             raise InputError(f"controls: {len(controls)} rows given for {len(states)} states; expected one each")
-        if controls.shape[1] < 1:
-            raise InputError("controls: no logged step given; expected (T, lag, nu) with lag 1 or more")
+        if controls.shape[1] <= self.history:
+            before = f"{self.history} before each transition, and " if self.history else ""
+            raise InputError(f"controls: {controls.shape[1]} logged steps given; expected {before}lag 1 or more")

@@ -14,6 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, write_field
 from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.simulators.hidden import filters_of, prescribed_bodies
 from dropo_torch.support.usercode import user_code
 
 if TYPE_CHECKING:
@@ -59,6 +60,12 @@ class MujocoEnvAdapter:
             raise InputError(
                 f"environment: {environment} is no Gymnasium MuJoCo environment; write an adapter with "
                 "set_parameters, set_state and step, and name it as file.py:function"
+            )
+        own = self._env.model
+        if len(filters_of(own)) or prescribed_bodies(own):
+            raise InputError(
+                f"environment: {environment} has actuators with filters, or mocap bodies, whose state an environment "
+                "cannot be put into; simulate its model with backend: mujoco"
             )
         self._env.reset(seed=0)
         show_divergence(self._env.model)

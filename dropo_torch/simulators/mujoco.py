@@ -14,6 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.models.load import load_model, quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.simulators.hidden import POSE, filters_of, prescribed_bodies
 
 
 class MujocoSimulator(Simulator):
@@ -30,6 +31,11 @@ class MujocoSimulator(Simulator):
         frame_skip: physics steps of one logged transition.
         num_threads: threads, 0 for all processors.
         chunk_size: rows that are simulated at once.
+        history: logged steps before each transition whose controls come with it, ``(T, history + lag, ·)``: first-order
+            filters of actuators are replayed over them. Without history, filters start settled at the first control.
+
+    Controls of a model with mocap bodies that act on something are its ``nu`` controls and then the pose of each such
+    body, position and quaternion ``(w, x, y, z)``, held throughout the transition.
 
     Raises:
         InputError: a model whose actuators have a hidden state that no log holds.
@@ -45,6 +51,7 @@ class MujocoSimulator(Simulator):
         frame_skip: int = 1,
         num_threads: int = 0,
         chunk_size: int = 10_000,
+        history: int = 0,
     ) -> None:
         model = load_model(model)
         if frame_skip < 1 or chunk_size < 1:
@@ -54,11 +61,13 @@ class MujocoSimulator(Simulator):
         self.parameters = parameters
         self.frame_skip = int(frame_skip)
         self.num_states = model.nq + model.nv
-        self.num_controls = model.nu
+        self._mocap = model.body_mocapid[prescribed_bodies(model)]
+        self.num_controls = model.nu + POSE * len(self._mocap)
+        self.history = int(history)
         self.timestep = float(model.opt.timestep) * self.frame_skip
         self._num_threads = num_threads
         self._chunk_size = int(chunk_size)
-        self._filters = filter_activations(model)
+        self._filters = filters_of(model)
         self._row = default_row(self.model)
         self._batch: mujoco.batch.Batch | None = None
         self._tiled: tuple[np.ndarray, int] | None = None  # the values that the batch's fields hold, and their repeats
@@ -74,7 +83,7 @@ class MujocoSimulator(Simulator):
 
     def _run(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, kept: slice) -> torch.Tensor:
         start, control, vectors = self.arrays(states, controls, values)
-        num_t, num_k, lag = len(start), len(vectors), control.shape[1]
+        num_t, num_k, lag = len(start), len(vectors), control.shape[1] - self.history
         out = np.empty((num_t, num_k, len(range(lag)[kept]), self.num_states))
         for k in range(0, num_k, self._chunk_size):
             part = vectors[k : k + self._chunk_size]
@@ -118,7 +127,7 @@ class MujocoSimulator(Simulator):
         """Simulate ``len(start)`` transitions under each of the ``num_k`` parameter vectors that the batch holds."""
         batch = self._batch
         assert batch is not None
-        model, num_rows, lag = self.model, len(start) * num_k, control.shape[1]
+        model, num_rows, lag = self.model, len(start) * num_k, control.shape[1] - self.history
 
         def field(name: str) -> np.ndarray:
             return batch.bind(name)[:num_rows]
@@ -128,14 +137,18 @@ class MujocoSimulator(Simulator):
         qpos, qvel, ctrl = field("qpos"), field("qvel"), field("ctrl")
         qpos[:] = np.repeat(start[:, : model.nq], num_k, axis=0)
         qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
-        if self._filters:
-            activation, source = (list(x) for x in zip(*self._filters, strict=True))
-            settled = np.clip(control[:, 0], *control_range(model))[:, source]
-            field("act")[:, activation] = np.repeat(settled, num_k, axis=0)
+        if len(self._filters):
+            field("act")[:, self._filters.activations] = self._activations(control, num_k)
+        control = control[:, self.history :]
         out = np.empty((num_rows, lag, self.num_states))
         failed = np.zeros(num_rows, dtype=bool)
         for step in range(lag):
-            ctrl[:] = np.repeat(control[:, step], num_k, axis=0)
+            now = np.repeat(control[:, step], num_k, axis=0)
+            ctrl[:] = now[:, : model.nu]
+            if len(self._mocap):
+                poses = now[:, model.nu :].reshape(num_rows, -1, POSE)
+                field("mocap_pos").reshape(num_rows, -1, 3)[:, self._mocap] = poses[..., :3]
+                field("mocap_quat").reshape(num_rows, -1, 4)[:, self._mocap] = poses[..., 3:]
             try:
                 with quiet_mujoco():
                     batch.step(ids, nstep=self.frame_skip)
@@ -145,6 +158,22 @@ class MujocoSimulator(Simulator):
         failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
         out[failed] = np.nan
         return out.reshape(len(start), num_k, *out.shape[1:])
+
+    def _activations(self, control: np.ndarray, num_k: int) -> np.ndarray:
+        """Return the filters' activations before the controls of the transitions, ``(rows, F)``."""
+        filters = self._filters
+        if not self.history:
+            return np.repeat(filters.settled(self.model, control[:, 0]), num_k, axis=0)
+        assert self._batch is not None
+        own = self._batch.expanded("actuator_dynprm")
+        constants = self.model.actuator_dynprm[filters.actuators, 0]
+        if own is not None:
+            constants = own[: len(control) * num_k].reshape(-1, *self.model.actuator_dynprm.shape)[
+                :, filters.actuators, 0
+            ]
+        repeated = np.repeat(control[:, : self.history], num_k if own is not None else 1, axis=0)
+        found = filters.replayed(self.model, repeated, self.frame_skip, constants)
+        return found if own is not None else np.repeat(found, num_k, axis=0)
 
 
 def _own_values(batch: mujoco.batch.Batch) -> dict[str, np.ndarray]:
@@ -159,32 +188,3 @@ def default_row(model: mujoco.MjModel) -> np.ndarray:
     row = np.empty(mujoco.mj_stateSize(model, spec))
     mujoco.mj_getState(model, mujoco.MjData(model), row, spec)
     return row
-
-
-def control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Lowest and highest control that acts, ``(nu,)`` each."""
-    limited = model.actuator_ctrllimited.astype(bool) & ~bool(
-        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-    )
-    low, high = model.actuator_ctrlrange.T
-    return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
-
-
-def filter_activations(model: mujoco.MjModel) -> list[tuple[int, int]]:
-    """Activations of first-order filters and the controls they follow: each starts settled at its control.
-
-    Any other hidden state (integrators, muscles, delays) is not in a log of positions and velocities.
-    """
-    pairs, hidden = [], []
-    for i in range(model.nactuator):
-        kind = int(model.actuator_dyntype[i])  # a numpy integer equals no enum on the left
-        if kind in (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT):
-            pairs.append((int(model.actuator_actadr[i]), int(model.actuator_ctrladr[i])))
-        elif model.actuator_actnum[i] > 0 or model.actuator_delay[i] > 0:
-            hidden.append(model.actuator(i).name or f"actuator{i}")
-    if hidden:
-        raise InputError(
-            f"model: actuators {', '.join(hidden)} keep a hidden state (integrator, muscle or delay) which a log of "
-            "positions and velocities does not hold; model them as motors, servos or first-order filters"
-        )
-    return pairs

@@ -131,7 +131,7 @@ def _record(method: str, seed: int, fit: Fit, objective: Objective) -> dict[str,
     likelihood = {}
     for i in picked.tolist():
         mean, std = history[i].mean, np.maximum(history[i].std, objective.box.min_std)
-        found = objective.evaluate(mean[None], std[None], uniforms, objective.initial_noise(mean))[0]
+        found = objective.evaluate(mean[None], std[None], uniforms, objective.initial_noise(mean, widen=False))[0]
         likelihood[str(i)] = found.log_likelihood
     summary = fit.distribution.summary()
     centers = [type(fit.distribution).over(objective.simulator.parameters, h.mean, h.std).center for h in history]

@@ -17,9 +17,7 @@ import numpy as np
 from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
-from dropo_torch.objective import robust_log_likelihood as student_log_likelihood
 from dropo_torch.studies.study import Store
-from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/sweep/1"
 #: An error within this share of the smallest one counts as no larger.
@@ -49,11 +47,11 @@ class SweepPoint:
     robust_log_likelihood: float | None = None
 
     @classmethod
-    def of(cls, epsilon: float, fit: Fit, robust_log_likelihood: float | None = None) -> SweepPoint:
+    def of(cls, epsilon: float, fit: Fit, *, noisy_starts: bool = False) -> SweepPoint:
         """Return what a sweep keeps of a fit."""
         summary = fit.distribution.summary()
         mean, std = ({name: entry[key] for name, entry in summary.items()} for key in ("mean", "std"))
-        return cls(epsilon, fit.mse, fit.log_likelihood, mean, std, robust_log_likelihood)
+        return cls(epsilon, fit.mse, fit.log_likelihood, mean, std, fit.log_likelihood if noisy_starts else None)
 
 
 @dataclass(frozen=True)
@@ -152,12 +150,6 @@ def noise_keys(objective: Objective, variance: float) -> dict[str, Any]:
     """Return the config's ``noise`` and ``epsilon`` for a variance of every measurement, in compared features."""
     noise = objective.noise_of(variance)
     return {"noise": noise[0] if len(set(noise)) == 1 else noise, "epsilon": NEGLIGIBLE * variance}
-
-
-def robust_log_likelihood(objective: Objective, fit: Fit) -> float:
-    """Return a fit's log-likelihood that may be compared between noises, in nats."""
-    uniforms = draw_uniforms(fit.samples, len(fit.distribution.names), fit.seed, 0)
-    return student_log_likelihood(objective, fit.distribution.mean, fit.distribution.rsample(uniforms))
 
 
 def default_epsilons(measured: np.ndarray) -> list[float]:

@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Write a file whole or not at all, whatever interrupts it."""
+def write_atomically(path: Path, *parts: bytes) -> None:
+    """Write a file of some parts whole or not at all, whatever interrupts it."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with open(temporary, "wb") as stream:
-            stream.write(content)
+            stream.writelines(parts)
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-import pickle
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,13 +14,14 @@ import numpy as np
 import torch
 
 from dropo_torch.data.observation import parse_observation
-from dropo_torch.effects.base import VOCABULARY, Effect, Kind, Method, Quantity, Setting
+from dropo_torch.effects.base import VOCABULARY, Effect, Kind, Method, Quantity, Setting, find_effect
 from dropo_torch.effects.filters import observed_rates
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.mujoco import MujocoSimulator
+from dropo_torch.support.checkpoint import dumps, loads
 from dropo_torch.support.extras import MissingExtra
 from dropo_torch.testing.laws import Broken, NotApplicable, Report, require, require_same, try_laws
 
@@ -199,11 +199,11 @@ class EffectCase:
         def make(model: mujoco.MjModel, skip: int, space: ParameterSpace) -> MujocoSimulator:
             return MujocoSimulator(model, parameters=space, frame_skip=skip, num_threads=1)
 
-        simulator, history = effect_simulator(
+        simulator = effect_simulator(
             "mujoco", self.placed(target, values), ParameterSpace.empty(self.setting.model), make,
             timestep=self.step * self.setting.frame_skip, longest=1000, num_threads=1,
         )  # fmt: skip
-        before = self.controls[:, :1].expand(-1, history, -1)
+        before = self.controls[:, :1].expand(-1, simulator.history, -1)
         return simulator.rollout(states, torch.cat([before, self.controls], 1), _NO_VALUES)[:, 0]
 
     def trained(self, target: str | None, values: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:
@@ -306,11 +306,12 @@ def _searches_begin_within_the_bounds(case: EffectCase) -> None:
     require(moved is None or set(moved) <= set(range(count)), f"screened {moved}", f"some of the {count} numbers")
 
 
-def _it_pickles_by_name(case: EffectCase) -> None:
+def _it_is_kept_by_its_name(case: EffectCase) -> None:
     if VOCABULARY.get(case.effect.name) is not case.effect:
         raise NotApplicable("the effect is not registered")
-    found = pickle.loads(pickle.dumps(case.effect))
-    require(found is case.effect, f"{found!r} after pickling", "the registered effect itself")
+    kept = b"".join(dumps("gap", (), case.effect, named={Effect: find_effect}))
+    for found in (loads(kept, named={Effect: find_effect})[2], copy.deepcopy(case.effect)):
+        require(found is case.effect, f"{found!r} after it was kept or copied", "the registered effect itself")
 
 
 def _the_same_numbers_do_the_same_and_nothing_given_is_changed(case: EffectCase) -> None:
@@ -520,7 +521,7 @@ LAWS: Sequence[Callable[[EffectCase], None]] = (
     _it_has_places,
     _its_numbers_are_consistent,
     _searches_begin_within_the_bounds,
-    _it_pickles_by_name,
+    _it_is_kept_by_its_name,
     _the_same_numbers_do_the_same_and_nothing_given_is_changed,
     _rows_do_not_depend_on_each_other,
     _commands_in_pieces_are_those_in_one,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import pickle
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
@@ -14,10 +13,11 @@ import torch
 
 from dropo_torch.distribution import DRAWN_STD, Distribution, SearchBox
 from dropo_torch.errors import InputError
-from dropo_torch.fit import answer
+from dropo_torch.fit import answer, noise_of
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.checkpoint import dumps, loads
 from dropo_torch.testing.laws import NotApplicable, Report, require, require_same, try_laws
 from dropo_torch.testing.linear import LinearSimulator, linear_objective
 
@@ -151,8 +151,7 @@ class OptimizerCase:
 
 def told(objective: Objective, request: Request) -> tuple[torch.Tensor, torch.Tensor | None]:
     """Return what ``tell`` takes for a request."""
-    at = request.linearise_at
-    sums = answer(objective, request, None if at is None else objective.initial_noise(at, request.linearise_std))
+    sums = answer(objective, request, noise_of(objective, request))
     return sums.total, sums.gradient
 
 
@@ -162,12 +161,17 @@ def run_search(make: MakeOptimizer, objective: Objective, seed: int) -> Search:
     steps: list[Step] = []
     while optimizer.stop_reason is None:
         require(len(steps) < _ENDLESS, f"a search that goes on after {_ENDLESS} batches", "a stop_reason in the end")
-        before = pickle.dumps(optimizer.state())
+        before = _kept(optimizer)
         request = optimizer.ask()
-        between = pickle.dumps(optimizer.state())
+        between = _kept(optimizer)
         optimizer.tell(*told(objective, request))
         steps.append(Step(before, between, request, optimizer.progress, optimizer.candidates()))
     return Search(objective, optimizer, steps)
+
+
+def _kept(optimizer: Optimizer) -> bytes:
+    """The optimizer's state as a checkpoint holds it."""
+    return b"".join(dumps("fit", (), optimizer.state(), optimizer.KINDS))
 
 
 def _flat(candidates: list[tuple[np.ndarray, np.ndarray]]) -> torch.Tensor:
@@ -270,7 +274,7 @@ def _it_goes_on_from_any_state_as_if_never_interrupted(case: OptimizerCase) -> N
         objective = case.problem.objective()
         other = used if number == 1 else case.make(objective, case.seed)
         step = whole.steps[at]
-        other.restore(pickle.loads(step.between if number % 2 else step.before))
+        other.restore(loads(step.between if number % 2 else step.before, other.KINDS)[2])
         for i in range(at, len(whole.steps)):
             request = other.ask()
             _require_same_request(request, whole.steps[i].request, f"request {i} after going on from {at}", "the first")
@@ -352,7 +356,7 @@ def _it_finds_the_standard_deviations(case: OptimizerCase) -> None:
 
 def _require_same_request(found: Request, expected: Request, what: str, like: str) -> None:
     require_same(torch.from_numpy(found.values), torch.from_numpy(expected.values), f"{what}, values,", like)
-    for name in ("linearise_at", "linearise_std", "rows"):
+    for name in ("linearise_at", "linearise_std", "widen", "rows"):
         one, other = getattr(found, name), getattr(expected, name)
         require(np.array_equal(one, other), f"{what}: {name} {one}", f"{other}, as in {like}")
     for name in ("evaluations", "gradient", "is_stencil"):

@@ -14,7 +14,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
-from dropo_torch.simulators.mujoco import control_range, filter_activations
+from dropo_torch.simulators.hidden import control_range, filters_of
 from dropo_torch.testing.laws import Broken, NotApplicable, Report, require, require_same, try_laws
 
 #: ``reference(states (T, n), controls (T, lag, nu), values (K, d)) -> (T, K, lag, n)``
@@ -116,8 +116,8 @@ def stepped(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, fram
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
     first = np.clip(controls[0], *control_range(model))
-    for activation, control in filter_activations(model):
-        data.act[activation] = first[control]
+    filters = filters_of(model)
+    data.act[filters.activations] = first[filters.controls]
     states = []
     for control in controls:
         data.ctrl[:] = control

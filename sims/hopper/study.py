@@ -20,7 +20,7 @@ from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.studies.study import run_cells
-from dropo_torch.studies.sweep import NEGLIGIBLE, robust_log_likelihood
+from dropo_torch.studies.sweep import NEGLIGIBLE
 from dropo_torch.support.extras import require
 
 from . import LINKS, SIM
@@ -210,7 +210,7 @@ def run_cell(cell: Cell, *, plan: Plan, logs: Path, threads: int = 0) -> dict[st
         "cell": asdict(cell),
         "truth": {name: {"mean": mean, "std": std} for name, (mean, std) in truth.items()},
         "mse_at_truth": mse_at(problem, {name: mean for name, (mean, _) in truth.items()}),
-        **({"robust_log_likelihood": robust_log_likelihood(problem.objective, fit)} if cell.noisy_starts else {}),
+        **({"robust_log_likelihood": fit.log_likelihood} if cell.noisy_starts else {}),
         "transitions": len(log.actions),
         "wall_seconds": round(seconds, 3),
         "fit": fit.document(),

@@ -1,0 +1,373 @@
+"""Commands: of another row, of another actuator, with another sign or in another unit.
+
+The model need not be right for that: what commands do to the velocities within a row is simulated, and regressed on
+what the velocities did, each degree of freedom with terms of its own for whatever depends on where it is and how fast.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import mujoco
+import numpy as np
+
+from dropo_torch.data.examination.finding import Finding, confidence
+from dropo_torch.data.examination.prediction import chosen_rows, simulate
+from dropo_torch.data.examination.record import Record
+from dropo_torch.data.examination.rules import Rules
+
+#: Rows by which commands are shifted.
+REACH = 2
+#: Positions and velocities that may explain accelerations besides commands, at most so many each.
+TERMS = 8
+#: Rows below which commands are not examined: they would be as few as what may explain them.
+LEAST_ROWS = 100
+#: Blocks over which readings are compared.
+BLOCKS = 20
+DEGREE = float(np.pi / 180)
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Which command acts at each actuator, and how many rows further on in the log it stands."""
+
+    order: tuple[int, ...]
+    shift: int = 0
+
+
+@dataclass(frozen=True)
+class Explained:
+    """How a reading explains the accelerations.
+
+    Attributes:
+        gains: factor of each actuator's effect, ``(nu,)``; 1 where model and log agree.
+        errors: standard errors of these.
+        misfit: robust misfit of each block of rows, ``(B,)``.
+        share: share of what terms without commands leave that commands explain.
+        shares: share that each command explains beside the others, ``(nu,)``.
+    """
+
+    gains: np.ndarray
+    errors: np.ndarray
+    misfit: np.ndarray
+    share: float
+    shares: np.ndarray
+
+
+def commands(record: Record, rules: Rules) -> list[Finding]:
+    """Return what is wrong with the commands, as far as the accelerations tell."""
+    effects = _Effects.of(record)
+    if effects is None:
+        return []
+    own = tuple(range(effects.controls))
+    plain = effects.explained(Reading(own))
+    if plain is None:
+        return []
+    inferred = _inferred(record)
+    found = _exchanged(record, effects, plain, rules) or _negated(record, plain, rules)
+    if not found and not inferred:
+        found = _units(record, plain, rules) + _late(record, effects, plain, rules)
+    return found
+
+
+def _inferred(record: Record) -> bool:
+    """Whether the commands were taken from what was measured after the row, as preprocessing does it."""
+    return all(
+        (record.after == action[:, None]).all(axis=0).any() for action in record.log.actions.T
+    )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Effects:
+    """What rows and commands do to velocities.
+
+    Attributes:
+        change: changes of velocity that no command made, if the model is right, ``(T, v)``.
+        response: changes per unit of each command, ``(T, v, nu)``.
+        logged: logged commands so many rows further on, by shift, each ``(T, nu)``.
+        terms: an orthonormal basis of what may explain changes besides, ``(T, p)``.
+        scale: standard deviation of each column of what is left, ``(v,)``.
+    """
+
+    change: np.ndarray
+    response: np.ndarray
+    logged: dict[int, np.ndarray]
+    terms: np.ndarray
+    scale: np.ndarray
+
+    @property
+    def controls(self) -> int:
+        """Number of commands."""
+        return int(self.response.shape[2])
+
+    @classmethod
+    def of(cls, record: Record) -> _Effects | None:
+        """Simulate some rows of a record; ``None`` where commands or velocities are missing or do not vary."""
+        model, log = record.model, record.log
+        columns = np.asarray(record.observation.columns)
+        if model is None or model.nu == 0 or model.na or log.actions.shape[1] != model.nu:
+            return None
+        seen = np.flatnonzero(columns >= model.nq)
+        if seen.size == 0 or not (log.actions.std(axis=0) > 0).any():
+            return None
+        rows = chosen_rows(record, model.nu + 1, reach=REACH)
+        if len(rows) < LEAST_ROWS:
+            return None
+        predicted, response = _responses(record, rows, seen)
+        predicted = predicted - np.einsum("tvu,tu->tv", response, log.actions[rows])
+        change = (record.after - record.before)[rows][:, seen] - predicted
+        good = np.isfinite(change).all(axis=1) & np.isfinite(response).all(axis=(1, 2))
+        rows, change, response = rows[good], change[good], response[good]
+        moved = np.abs(response).max(axis=(0, 2), initial=0.0) > 0
+        if len(rows) < LEAST_ROWS or not moved.any():
+            return None
+        logged = {s: log.actions[rows + s] for s in range(-REACH, REACH + 1)}
+        terms = _terms(record, rows, predicted[good])
+        change, response = change[:, moved], response[:, moved]
+        rest = change - terms @ (terms.T @ change)
+        scale = np.maximum(1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0), 1e-9)
+        return cls(change, response, logged, terms, scale).rescaled()
+
+    def rescaled(self) -> _Effects:
+        """Return these with the scale of what the best simple reading leaves."""
+        own = tuple(range(self.controls))
+        best, least = self.scale, np.inf
+        for shift in self.logged:
+            fitted = self._fit(Reading(own, shift))
+            if fitted is not None:
+                scale = np.maximum(1.4826 * np.median(np.abs(fitted[1]), axis=0), 1e-9 * self.scale)
+                size = float(np.log(scale).sum())
+                if size < least:
+                    best, least = scale, size
+        return _Effects(self.change, self.response, self.logged, self.terms, np.maximum(best, 1e-6 * self.scale))
+
+    def _columns(self, reading: Reading) -> np.ndarray:
+        """Changes that each command makes under a reading, without what other terms explain, ``(T, v, nu)``."""
+        acting = self.logged[reading.shift][:, list(reading.order)]
+        made = self.response * acting[:, None, :]
+        flat = made.reshape(len(made), -1)
+        return np.asarray((flat - self.terms @ (self.terms.T @ flat)).reshape(made.shape))
+
+    def _fit(self, reading: Reading) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+        """Gains, residuals ``(T, v)``, whitened columns and the inverse of their normal matrix."""
+        made = self._columns(reading)
+        target = self.change - self.terms @ (self.terms.T @ self.change)
+        count, width, controls = made.shape
+        weight = np.ones(count)
+        matrix = (made / self.scale[:, None]).reshape(count * width, controls)
+        wanted = (target / self.scale).reshape(-1)
+        gains, normal = np.zeros(controls), np.eye(controls)
+        for _ in range(3):  # rows that fit far worse than the others, as at impacts, count less
+            rows = np.repeat(np.sqrt(weight), width)
+            weighted = matrix * rows[:, None]
+            normal = weighted.T @ weighted
+            if not np.isfinite(normal).all() or np.trace(normal) == 0:
+                return None
+            inverse = np.linalg.pinv(normal, rcond=1e-8)
+            gains = inverse @ (weighted.T @ (wanted * rows))
+            off = ((wanted - matrix @ gains).reshape(count, width) ** 2).mean(axis=1)
+            typical = max(float(np.median(off)), 1e-12)
+            weight = np.minimum(1.0, 9 * typical / np.maximum(off, 1e-300))
+        rest = (wanted - matrix @ gains).reshape(count, width)
+        return gains, rest * self.scale, matrix * np.repeat(np.sqrt(weight), width)[:, None], inverse
+
+    def explained(self, reading: Reading) -> Explained | None:
+        """Return how a reading explains the changes; ``None`` where its commands make none."""
+        fitted = self._fit(reading)
+        if fitted is None:
+            return None
+        gains, rest, matrix, inverse = fitted
+        count, width = rest.shape
+        whitened = rest / self.scale
+        losses = np.minimum(whitened**2, 25.0).mean(axis=1)
+        blocks = np.array_split(np.arange(count), BLOCKS)
+        scores = (matrix * whitened.reshape(-1, 1)).reshape(count, width, -1).sum(axis=1)
+        sums = np.stack([scores[b].sum(axis=0) for b in blocks])
+        errors = np.sqrt(np.maximum(np.diag(inverse @ (sums.T @ sums) @ inverse), 1e-300))
+        target = (self.change - self.terms @ (self.terms.T @ self.change)) / self.scale
+        kept = np.sqrt((whitened**2).mean(axis=1))
+        kept = kept <= np.quantile(kept, 0.95)
+        whole = float((target[kept] ** 2).sum())
+        left = float((whitened[kept] ** 2).sum())
+        size = (matrix.reshape(count, width, -1)[kept] ** 2).sum(axis=(0, 1)) * gains**2
+        return Explained(
+            gains, errors, np.array([losses[b].sum() for b in blocks]), 1 - left / max(whole, 1e-300),
+            size / (size + max(left, 1e-300)),
+        )  # fmt: skip
+
+
+def _responses(record: Record, rows: np.ndarray, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Simulated changes of the observed velocities ``(T, v)``, and their derivatives by the commands ``(T, v, nu)``."""
+    model, log = record.model, record.log
+    assert model is not None
+    columns = np.asarray(record.observation.columns)[seen]
+    states = record.observation.states(log.observations[rows])
+    actions = log.actions[rows]
+    low, high = np.where(
+        model.actuator_ctrllimited.astype(bool)[:, None], model.actuator_ctrlrange, [[-np.inf, np.inf]]
+    ).T
+    base = np.clip(actions, low, high)
+    ends = simulate(model, states, base, record.frame_skip)[:, columns]
+    response = np.empty((len(rows), len(columns), model.nu))
+    for j in range(model.nu):
+        size = 0.1 * max(float(actions[:, j].std()), 1e-6)
+        moved = base.copy()
+        moved[:, j] += np.where(base[:, j] + size > high[j], -size, size)
+        change = simulate(model, states, moved, record.frame_skip)[:, columns] - ends
+        response[:, :, j] = change / (moved[:, j] - base[:, j])[:, None]
+    return ends - states[:, columns], response
+
+
+def _terms(record: Record, rows: np.ndarray, predicted: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what may explain changes besides commands in some rows, ``(T, p)``.
+
+    That is a constant, positions, velocities and their signs, as springs and friction need them, sines and cosines of
+    angles, as weights do, and the changes that the model predicts without commands, as wrong masses do.
+    """
+    model = record.model
+    assert model is not None
+    columns = np.asarray(record.observation.columns)
+    positions = np.flatnonzero(columns < model.nq)[:TERMS]
+    speeds = np.flatnonzero(columns >= model.nq)[:TERMS]
+    values = record.before[rows]
+    angles = [c.position for c in record.coordinates if c.angle and c.position is not None][:TERMS]
+    fast = np.maximum(0.1 * values[:, speeds].std(axis=0), 1e-12)
+    parts = [
+        np.ones((len(rows), 1)), values[:, positions], values[:, speeds], np.tanh(values[:, speeds] / fast),
+        np.sin(values[:, angles]), np.cos(values[:, angles]), predicted[:, :TERMS],
+    ]  # fmt: skip
+    table = np.concatenate(parts, axis=1)
+    table = table / np.maximum(np.abs(table).max(axis=0), 1e-12)
+    basis, size, _ = np.linalg.svd(table, full_matrices=False)
+    return np.asarray(basis[:, size > 1e-8 * size[0]])
+
+
+def beats(first: Explained, second: Explained) -> float:
+    """Return by how many paired standard errors over blocks the first reading leaves less than the second."""
+    change = second.misfit - first.misfit
+    error = float(change.std(ddof=1)) * np.sqrt(len(change))
+    return float(change.sum()) / max(error, 1e-12)
+
+
+def _exchanged(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> list[Finding]:
+    """Commands that act at each other's actuators."""
+    count = effects.controls
+    if count < 2 or count > 12:
+        return []
+    best: tuple[float, Reading, Explained] | None = None
+    for i, j in itertools.combinations(range(count), 2):
+        order = list(range(count))
+        order[i], order[j] = j, i
+        found = effects.explained(Reading(tuple(order)))
+        if found is not None and (best is None or found.misfit.sum() < best[0]):
+            best = float(found.misfit.sum()), Reading(tuple(order)), found
+    if best is None:
+        return []
+    _, reading, found = best
+    better = beats(found, plain)
+    pair = [i for i, j in enumerate(reading.order) if i != j]
+    right = found.gains[pair]
+    if better < rules.significance or not (np.abs(np.log(np.maximum(right, 1e-9))) < np.log(rules.gain)).all():
+        return []
+    if (right < 5 * found.errors[pair]).any() or found.share < plain.share:
+        return []
+    remains = (1 - found.share) / max(1 - plain.share, 1e-12)
+    sure = better > rules.sure_significance and remains < 1 - rules.command_share
+    names = [record.command(j) for j in reading.order]
+    first, second = (record.command(i) for i in pair)
+    what = (
+        f"the accelerations follow if {first} and {second} are exchanged: {found.share:.0%} of what commands can "
+        f"explain, {plain.share:.0%} as they stand"
+    )
+    return [Finding(
+        "action_order", (first, second), what, confidence(sure),
+        evidence={"standard_errors": better, "share": found.share, "share_as_logged": plain.share},
+        cure={"data": {"actions": names}},
+    )]  # fmt: skip
+
+
+def _negated(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
+    """Commands that act with the opposite sign."""
+    told = plain.gains + rules.significance * plain.errors < 0
+    told &= np.abs(np.log(np.maximum(-plain.gains, 1e-9))) < np.log(rules.gain)
+    told &= plain.shares > 0.02
+    if not told.any():
+        return []
+    columns = np.flatnonzero(told)
+    sure = bool(
+        (plain.gains[columns] + rules.sure_significance * plain.errors[columns] < 0).all()
+        and (plain.shares[columns] > rules.command_share).all()
+    )
+    names = [record.command(int(j)) for j in columns]
+    what = (
+        f"{', '.join(names)} act against the sign that the model gives them (factor "
+        f"{', '.join(f'{plain.gains[j]:.2f}' for j in columns)})"
+    )
+    return [Finding(
+        "action_sign", tuple(names), what, confidence(sure),
+        evidence={n: float(plain.gains[j]) for n, j in zip(names, columns, strict=True)},
+        cure={"data": {"scale": dict.fromkeys(names, -1.0)}},
+        advice="or the joint's positions and velocities are negated, or the model's gear",
+    )]  # fmt: skip
+
+
+def _units(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
+    """Commands whose effect is another one by far than the model's."""
+    found = []
+    for j, (gain, error, share) in enumerate(zip(plain.gains, plain.errors, plain.shares, strict=True)):
+        clear = gain > rules.sure_significance * error and share > rules.command_share
+        if not clear or abs(np.log(gain)) < np.log(rules.gain):
+            continue
+        degrees = abs(np.log(gain / DEGREE)) < 0.3 and _is_servo(record, j)
+        unit = "in degrees" if degrees else "in another unit"
+        factor = DEGREE if degrees else float(f"{gain:.3g}")
+        what = f"{record.command(j)} acts {gain:.3g} times as strongly as the model says: it is {unit}"
+        found.append(Finding(
+            "action_unit", (record.command(j),), what, confidence(degrees),
+            evidence={"gain": float(gain), "error": float(error), "share": float(share)},
+            cure={"data": {"scale": {record.command(j): factor}}},
+        ))  # fmt: skip
+    return found
+
+
+def _is_servo(record: Record, actuator: int) -> bool:
+    """Whether an actuator's command is the target of a joint."""
+    model = record.model
+    assert model is not None
+    joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)
+    return bool(joint and model.actuator_biasprm[actuator, 1] != 0)
+
+
+def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> list[Finding]:
+    """Commands that act in other rows than theirs."""
+    own = tuple(range(effects.controls))
+    others = {s: effects.explained(Reading(own, s)) for s in effects.logged if s != 0}
+    known = {s: found for s, found in others.items() if found is not None}
+    if not known:
+        return []
+    shift = min(known, key=lambda s: known[s].misfit.sum())
+    best = known[shift]
+    better = beats(best, plain)
+    left = (1 - best.share) / max(1 - plain.share, 1e-12)
+    acting = best.shares > 0.02
+    in_range = np.abs(np.log(np.maximum(best.gains[acting], 1e-9))) < np.log(rules.gain)
+    if better < rules.significance or left > 0.9 or not acting.any() or not in_range.all():
+        return []
+    rows = f"{abs(shift)} {'row' if abs(shift) == 1 else 'rows'}"
+    evidence = {"rows": float(shift), "standard_errors": better, "left": left, "share": best.share}
+    names = tuple(record.command(j) for j in own)
+    cure = {"data": {"shift": shift}}
+    if shift > 0:
+        what = (
+            f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands "
+            "than those that act, or the observations come late"
+        )
+        sure = better > rules.sure_significance and left < rules.earlier
+        return [Finding("action_shift", names, what, confidence(sure), evidence=evidence, cure=cure)]
+    what = (
+        f"the accelerations of a row follow from the commands logged {rows} before: rows carry later commands than "
+        "those that act, or the actuators answer with a delay"
+    )
+    advice = "leave a true delay to the model: dropo gap names it (actuator_delay, actuator_lag)"
+    return [Finding("action_shift", names, what, "doubtful", evidence=evidence, cure=cure, advice=advice)]

@@ -1,0 +1,106 @@
+"""One transition at a time, simulated: what the model says that the logged commands do."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import mujoco
+import numpy as np
+from mujoco import rollout
+
+from dropo_torch.data.examination.record import Record
+from dropo_torch.models.load import quiet_mujoco
+
+#: Microseconds of simulation that one prediction may take, about, and the most rows that are simulated.
+BUDGET, MOST_ROWS = 1.5e5, 1200
+
+
+def chosen_rows(record: Record, runs: int, block: int = 40, reach: int = 0) -> np.ndarray:
+    """Return rows in blocks spread over the log, so few that simulating each ``runs`` times takes no time.
+
+    ``reach`` rows before and after each must follow one another.
+    """
+    model = record.model
+    assert model is not None
+    cost = (3 + 0.15 * model.nv**2) * (2 if model.npair or _touching(model) else 1) * record.frame_skip * max(runs, 1)
+    most = int(np.clip(BUDGET / cost, 80, MOST_ROWS))
+    usable = ~record.cut
+    number = record.runs
+    for shift in range(1, reach + 1):
+        usable[shift:] &= number[shift:] == number[:-shift]
+        usable[:-shift] &= number[:-shift] == number[shift:]
+        usable[:shift] = usable[-shift:] = False
+    rows = np.flatnonzero(usable)
+    if len(rows) <= most:
+        return rows
+    blocks = np.array_split(rows, max(1, len(rows) // block))
+    picked = np.unique(np.linspace(0, len(blocks) - 1, max(1, most // block)).astype(int))
+    return np.concatenate([blocks[i] for i in picked])
+
+
+def _touching(model: mujoco.MjModel) -> bool:
+    """Whether geoms may touch."""
+    return bool((model.geom_contype[:, None] & model.geom_conaffinity[None]).any())
+
+
+def simulate(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray, steps: int) -> np.ndarray:
+    """Return the states ``(T, nq + nv)`` after ``steps`` physics steps under ``controls (T, nu)``; NaN if diverged."""
+    data = mujoco.MjData(model)
+    kind = int(mujoco.mjtState.mjSTATE_FULLPHYSICS)
+    start = np.empty((len(states), mujoco.mj_stateSize(model, kind)))
+    own = np.empty(start.shape[1])
+    mujoco.mj_getState(model, data, own, kind)
+    start[:] = own
+    first = mujoco.mj_stateSize(model, int(mujoco.mjtState.mjSTATE_TIME))
+    start[:, first : first + model.nq + model.nv] = states
+    control = np.repeat(controls[:, None], steps, axis=1)
+    with quiet_mujoco():
+        out, _ = rollout.rollout(model, [data], start, control, nstep=steps)
+    ends = np.array(out[:, -1, first : first + model.nq + model.nv])
+    with np.errstate(invalid="ignore"):
+        bad = ~(np.abs(ends) < 1e8).all(axis=1) | (out[:, -1, 0] < start[:, 0] + 0.5 * steps * model.opt.timestep)
+    ends[bad] = np.nan
+    return ends
+
+
+def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
+    """Return which share of the changes of velocity the model explains: as logged, and with columns scaled.
+
+    Each is the median over degrees of freedom of 1 minus the unexplained over the whole, both cut at outliers. Without
+    a model whose velocities are observed, both are 0.
+    """
+    model = record.model
+    columns = np.asarray(record.observation.columns)
+    if model is None or record.log.actions.shape[1] != model.nu or model.na or not (columns >= model.nq).any():
+        return 0.0, 0.0
+    rows = chosen_rows(record, 2)
+    scale = np.ones(len(columns))
+    scale[list(factors)] = list(factors.values())
+    found = []
+    for factor in (np.ones(len(columns)), scale):
+        full = np.ones(record.observation.log_width)
+        full[list(record.observation.log_columns)] = factor
+        try:
+            states = record.observation.states(record.log.observations[rows] * full)
+        except ValueError:  # a zero quaternion
+            return 0.0, 0.0
+        ends = simulate(model, states, record.log.actions[rows], record.frame_skip)[:, columns]
+        measured, start = record.after[rows] * factor, record.before[rows] * factor
+        shares = [
+            _explained(measured[:, i] - start[:, i], ends[:, i] - start[:, i])
+            for i in range(len(columns))
+            if columns[i] >= model.nq and np.ptp(start[:, i]) > 0
+        ]
+        found.append(float(np.median(shares)) if shares else 0.0)
+    return found[0], found[1]
+
+
+def _explained(measured: np.ndarray, predicted: np.ndarray) -> float:
+    """Share of a signal that a prediction explains, without the tenth of the rows that it explains worst."""
+    good = np.isfinite(predicted)
+    if good.mean() < 0.9:
+        return 0.0
+    measured, off = measured[good], (measured - predicted)[good] ** 2
+    kept = off <= np.quantile(off, 0.9)
+    whole = float((measured[kept] ** 2).sum())
+    return 1 - min(1.0, float(off[kept].sum()) / whole) if whole > 0 else 0.0

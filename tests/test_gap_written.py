@@ -1,0 +1,224 @@
+"""What a search writes is what it found: its model and config simulate the same, in fits, in trainings, in MuJoCo."""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+import torch
+import yaml
+
+from dropo_torch.config import load_config
+from dropo_torch.data.features import Features
+from dropo_torch.data.observation import parse_observation
+from dropo_torch.effects import VOCABULARY, Placed, find_effect
+from dropo_torch.effects.base import Setting
+from dropo_torch.effects.engine import Variant
+from dropo_torch.effects.placing import plain_setting
+from dropo_torch.gap import Gap, add
+from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.log import cut_windows, make_setting
+from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.result import NamedEffect, Score, Strength
+from dropo_torch.gap.twin import Twin, Windows
+from dropo_torch.gap.verify import Held, score
+from dropo_torch.likelihood import gaussian_log_density
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.testing.effects import RIG
+
+SKIP, STEP = 4, 0.005
+EPISODES, ROWS = 2, 40
+MASS = {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.5], "unit": "kg"}
+LIGHT = 0.75
+#: Measurement noise of positions and velocities.
+NOISE = (1e-5, 1e-4)
+FINER = Placed(find_effect("integration"), None, (STEP / 8,))
+#: Numbers at which an effect acts on the rig, beside those from which a search begins.
+NUMBERS = {"joint_limit": {"lower": 0.4, "upper": -0.4}, "actuator_saturation": {"limit": 0.3}}
+TASK = """
+import mujoco, torch
+from pathlib import Path
+from dropo_torch.rl import Task
+
+class Rig(Task):
+    name, frame_skip, max_episode_steps, num_observations = "rig", 4, 20, 9
+    action_low, action_high = -torch.ones(3).numpy(), torch.ones(3).numpy()
+    def __init__(self):
+        self.model = mujoco.MjModel.from_xml_path(str(Path(__file__).with_name("rig.xml")))
+    def initial_states(self, count, generator):
+        rest = torch.from_numpy(self.model.qpos0)
+        return torch.cat([rest, torch.zeros(self.model.nv, dtype=torch.float64)]).repeat(count, 1)
+    def observe(self, states):
+        return states[:, -9:]
+    def reward(self, states, actions, next_states):
+        return next_states[:, 0]
+    def terminated(self, next_states):
+        return torch.zeros(len(next_states), dtype=torch.bool)
+"""
+
+
+@functools.cache
+def plain() -> Setting:
+    spec = mujoco.MjSpec.from_string(RIG)
+    for body in spec.bodies[1:]:
+        body.simple = 0
+    model = spec.compile()
+    return plain_setting(model, parse_observation(model, None), SKIP, 0.3)
+
+
+def acting(name: str) -> Placed:
+    """An effect at the first place where it acts, with numbers that matter there."""
+    effect, setting = find_effect(name), plain()
+    targets = [t for t in effect.targets(setting) if t not in ("upper", "cart", "root.position[x]")]
+    target = targets[0]
+    values = np.array(effect.starts(setting, target)[-1], dtype=np.float64)
+    for i, q in enumerate(effect.quantities(setting, target)):
+        if values[i] == q.neutral:
+            values[i] = np.clip(q.neutral + 0.3 * q.scale, q.low, q.high)
+        values[i] = NUMBERS.get(name, {}).get(q.name, values[i])
+    return Placed(effect, target, tuple(values.tolist()))
+
+
+def log_of(placed: tuple[Placed, ...]) -> dict[str, Any]:
+    """A log of the rig with effects in it, as the search's own simulation has them."""
+    setting, rng = plain(), np.random.default_rng(0)
+    model, chart = setting.model, Features.of(setting.observation)
+    space = ParameterSpace(model, {"mass": MASS})
+    starts = np.tile(np.concatenate([model.qpos0, np.zeros(model.nv)]), (EPISODES, 1))
+    starts[:, [0, 1, 9]] += rng.uniform(-0.5, 0.5, (EPISODES, 3))
+    starts[:, model.nq :] += rng.normal(0, 0.5, (EPISODES, model.nv))
+    time = np.arange(ROWS + 1) * SKIP * STEP
+    phase = rng.uniform(0, 6, (EPISODES, 1, model.nu))
+    commands = np.sin(2 * np.pi * 1.5 * time[None, :, None] + phase)
+    commands[:, :6] = commands[:, 6:7]  # at rest before the motion
+    windows = Windows(
+        np.repeat(starts[:, None], ROWS + 1, 1), np.zeros_like(starts), np.arange(EPISODES),
+        np.zeros(EPISODES, dtype=int), commands,
+    )  # fmt: skip
+    shown, _ = Twin(setting, space, num_threads=1).predict([Variant((LIGHT,), placed)], windows)
+    columns = np.array([NOISE[c >= model.nq] for c in range(model.nq + model.nv)])
+    noise = chart.feature_noise(columns)
+    measured = chart.move(shown[0], noise * rng.standard_normal((EPISODES, ROWS + 1, chart.size)))
+    ends = np.zeros((EPISODES, ROWS), dtype=bool)
+    ends[:, -1] = True
+    rows = {"observations": measured[:, :-1], "next_observations": measured[:, 1:], "actions": commands[:, :-1]}
+    flat = {k: v.reshape(EPISODES * ROWS, -1) for k, v in rows.items()}
+    return {**flat, "terminals": ends.ravel(), "dt": SKIP * STEP}
+
+
+def problem_of(folder: Path, placed: tuple[Placed, ...], xml: str = RIG, **changes: Any) -> Problem:
+    (folder / "rig.xml").write_text(xml)
+    (folder / "rig_task.py").write_text(TASK)
+    np.savez(folder / "log.npz", **log_of(placed))
+    document = {
+        "model": "rig.xml", "data": "log.npz", "frame_skip": SKIP, "parameters": {"mass": MASS}, "threads": 1,
+        "task": "rig_task.py:Rig", "train": {"num_envs": 2}, **changes,
+    }  # fmt: skip
+    (folder / "config.yaml").write_text(yaml.safe_dump({k: v for k, v in document.items() if v is not ...}))
+    return make_problem(load_config(folder / "config.yaml"), general=True)
+
+
+def gap_of(problem: Problem, hypothesis: Hypothesis) -> Gap:
+    """What a search would say that has found a hypothesis."""
+    setting = make_setting(problem, problem.trajectories)
+    columns = np.array([NOISE[c >= setting.model.nq] for c in setting.observation.columns])
+    nothing, effects = Score(0, 0, 0), []
+    for p in hypothesis.placed:
+        quantities = p.effect.quantities(setting, p.target)
+        strengths = {
+            q.name: Strength(v, v - 0.02 * q.scale, v + 0.02 * q.scale, q.unit)
+            for q, v in zip(quantities, p.values, strict=False)
+        }
+        effects.append(NamedEffect(*p.key, strengths, 0.5))
+    names = problem.space.names
+    features = Features.of(problem.observation)
+    return Gap(
+        (), tuple(effects), nothing, nothing, nothing, None, True,
+        {n: (v, v, v) for n, v in zip(names, hypothesis.declared, strict=True)},
+        tuple(features.feature_noise(columns)), features.labels, features.units, (10.0, 1.0),
+    )  # fmt: skip
+
+
+def vector(problem: Problem, hypothesis: Hypothesis, setting: Setting, model: mujoco.MjModel | None) -> np.ndarray:
+    """The numbers of a hypothesis in the parameters of a written config."""
+    numbers = {(p.effect.name, p.target): p.summary(setting) for p in hypothesis.placed}
+    found = []
+    for parameter in problem.space.parameters:
+        if parameter.name == "mass":
+            found.append(hypothesis.declared[0])
+        elif parameter.effect:
+            own = numbers[parameter.effect, next(iter(parameter.objects), None)]
+            found.append(own[parameter.quantity] if parameter.quantity else next(iter(own.values())))
+        else:
+            found.append(parameter.nominal(model))
+    return np.array(found)
+
+
+def likelihood(problem: Problem, values: np.ndarray) -> np.ndarray:
+    """The objective of a fit at one parameter vector, of each row, with the noise as it is given, ``(T,)``."""
+    objective = problem.objective
+    initial = objective.initial_noise(values, widen=lambda residual, _: torch.ones(len(residual), dtype=residual.dtype))
+    out: list[torch.Tensor] = []
+
+    def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+        out.append(gaussian_log_density(measured - features[:, 0], covariance))
+        return torch.zeros(1)
+
+    objective.map(values[None], reduce, initial=initial)
+    return torch.cat(out).numpy()
+
+
+CASES = [(n,) for n in VOCABULARY] + [(n, "integration") for n in VOCABULARY if n != "integration"]
+
+
+@pytest.mark.parametrize("names", CASES, ids="+".join)
+def test_what_is_written_is_what_was_found(names: tuple[str, ...], tmp_path: Path) -> None:
+    placed = tuple(FINER if n == "integration" else acting(n) for n in names)
+    problem = problem_of(tmp_path, placed)
+    hypothesis, out = Hypothesis((LIGHT,), placed), tmp_path / "out"
+    out.mkdir()
+    gap = gap_of(problem, hypothesis)
+    notes = add(problem, gap, out)
+    setting = make_setting(problem, problem.trajectories)
+    twin = Twin(setting, problem.space, num_threads=1)
+    windows = cut_windows(problem.trajectories, problem.observation, 1, stride=1)
+    evidence = Evidence(twin, windows, np.array(gap.noise), rough=False)
+    # a fit
+    written = make_problem(load_config(out / "config.yaml"))
+    values = vector(written, hypothesis, setting, written.space.model)
+    assert (values >= written.space.low).all()
+    assert (values <= written.space.high).all()
+    assert "timestep" not in " ".join(written.space.names)
+    after = score(evidence, Held(windows, windows, 0.0), hypothesis).log_likelihood
+    found = likelihood(written, values)
+    assert len(found) == len(windows)
+    assert abs(found.sum() - after) <= len(found) / 100, notes
+    # a training
+    from dropo_torch.rl.problem import make_training
+
+    training = make_training(load_config(out / "config.yaml"))
+    env = training.env(training.training, 2, 0)
+    after_step = env.step(env.reset().set("action", torch.full((2, 3), 0.1)))
+    assert env.num_diverged == 0
+    assert torch.isfinite(after_step["next", "observation"]).all()
+    assert env.task.timestep == pytest.approx(SKIP * STEP)
+    # MuJoCo
+    if all(p.effect.native for p in placed):
+        model = mujoco.MjModel.from_xml_path(str(out / "model.xml"))
+        data, steps = mujoco.MjData(model), round(SKIP * STEP / model.opt.timestep)
+        ours, _ = twin.predict([hypothesis.variant], windows)
+        theirs = []
+        for window in range(len(windows)):
+            mujoco.mj_resetData(model, data)
+            data.qpos[:], data.qvel[:] = np.split(windows.measured[window, 0], [model.nq])
+            data.ctrl[:] = windows.commands[windows.episodes[window], windows.steps[window]]
+            mujoco.mj_step(model, data, nstep=steps)
+            theirs.append(np.concatenate([data.qpos, data.qvel]))
+        size = ours[0, :, 1].std(0)
+        assert (np.median(np.abs(np.array(theirs) - ours[0, :, 1]), axis=0) <= 1e-4 * np.maximum(size, 1e-2)).all()
+        assert (steps > SKIP) == ("integration" in names)
