@@ -20,7 +20,7 @@ from arm import Folder
 
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
-from benchmarks.hidden.systems import CART_POLE, TORQUE_ARM
+from benchmarks.hidden.systems import CART_POLE, SERVO_ARM, TORQUE_ARM, System, coarse
 from benchmarks.hidden.truths import Before, Case, Effect, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
@@ -31,7 +31,7 @@ from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Linearisation, cost_o
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit, limits_of, refit, standard_errors
+from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
 from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
@@ -178,6 +178,39 @@ def test_held_out_scores_fall_to_noise(names: tuple[str, ...]) -> None:
     assert gap.before.log_likelihood < gap.after.log_likelihood
     assert gap.after.log_likelihood == pytest.approx(gap.noise_floor.log_likelihood, rel=0.05)
     assert gap.after.rollout_rmse < 0.1 * gap.before.rollout_rmse
+
+
+PUSHED = Effect("external_force", "cart", {"x": 3.0, "y": 0.0, "z": 0.0})
+BIASED = Effect("actuator_bias", "push", {"force": 0.3})
+COARSE = Effect("integration", None, {"timestep": 0.01})
+ON_AXIS = Effect("payload", "hand", {"mass": 0.15, "x": 0.1, "y": 0.0, "z": 0.0})
+PUSHES = ("joint_stiffness", "external_force", "integration", "gravity_tilt", "actuator_bias", "actuator_gain")
+
+
+@pytest.mark.parametrize(
+    ("system", "effects", "known", "named", "tied"),
+    [
+        (CART_POLE, [PUSHED], PUSHES, ("actuator_bias", "push"), ("external_force", "cart")),
+        (CART_POLE, [BIASED], PUSHES, ("actuator_bias", "push"), ("external_force", "cart")),
+        (coarse(CART_POLE, 0.01), [COARSE, PUSHED], PUSHES, ("actuator_bias", "push"), ("external_force", "cart")),
+        (
+            CART_POLE, [Effect("actuator_damping", "push", {"damping": 0.005})],
+            ("joint_damping", "joint_friction", "fluid_drag", "actuator_damping"),
+            ("joint_damping", "rail"), ("actuator_damping", "push"),
+        ),
+        (SERVO_ARM, [ON_AXIS], ("payload", "center_of_mass", "inertia"), ("payload", "fore"), ("payload", "hand")),
+    ],
+    ids=["force", "bias", "coarse", "damping", "payload"],
+)  # fmt: skip
+def test_whatever_explains_a_log_as_well_is_told(
+    system: System, effects: list[Effect], known: tuple[str, ...], named: tuple[str, str], tied: tuple[str, str]
+) -> None:
+    """With more numbers or fewer, also once ``integration`` is named."""
+    gap = search(simulate_truth(system, effects, 3, **SIZE), known)
+    assert len(gap.effects) == len(effects)
+    (told,) = [e for e in gap.effects if e.effect != "integration"]
+    assert (told.effect, told.target) == named
+    assert told.indistinguishable_from == (tied,)
 
 
 def test_what_the_vocabulary_lacks_has_no_name() -> None:
@@ -503,6 +536,37 @@ def test_intervals_cover_as_often_as_they_say(shared: float) -> None:
     fits = [linear_fit(rng, shared) for _ in range(300)]
     inside = [np.abs(f.hypothesis.vector) < 1.6449 * standard_errors(f, blocks) for f in fits]
     assert 0.84 < np.mean(inside) < 0.97
+
+
+@functools.cache
+def sharp() -> tuple[Case, Evidence]:
+    """Dry friction, measured well, with the windows of its log."""
+    case = simulate_truth(CART_POLE, [FRICTION], 3, noise=0.2, **SIZE)
+    return case, dataclasses.replace(prepare(load(case)).evidence, noise=np.array(case.noise))
+
+
+def test_numbers_are_not_those_of_the_step() -> None:
+    """Dry friction is resolved by the model's step only so well, which biases it by more than the noise."""
+    case, evidence = sharp()
+    own = refit(evidence, true(case))
+    last, truth = resolved(evidence, own), true(case).vector
+    half = half_widths(last)
+    assert own.cost.reduced > 3
+    assert (np.abs(own.hypothesis.vector - truth) > 3 * half).any()
+    assert (np.abs(last.fit.hypothesis.vector - truth) < half).all()
+    assert (half < 1e-3 * truth).all()
+    assert last.fit.cost.reduced < 1.2
+
+
+def test_log_of_the_own_step_stays_with_it() -> None:
+    case, evidence = sharp()
+    path, _ = evidence.twin.predict([true(case).variant], evidence.windows)
+    measured = path[0] + evidence.noise * np.random.default_rng(0).standard_normal(path[0].shape)
+    here = dataclasses.replace(evidence, windows=dataclasses.replace(evidence.windows, measured=measured))
+    own = refit(here, true(case))
+    last = resolved(here, own)
+    assert last.fit is own
+    assert not last.error.any()
 
 
 def test_number_without_influence_is_not_known() -> None:

@@ -145,12 +145,14 @@ class Effect(abc.ABC):
         kind: what its target is.
         sentence: what it is, to a person; ``{target}`` stands for the target.
         shares: the values, in scales of its only quantity, from which a search begins; none for the neutral value.
+        contains: names of effects that are special cases of it, at the same target.
     """
 
     name: ClassVar[str]
     kind: ClassVar[Kind]
     sentence: ClassVar[str]
     shares: ClassVar[tuple[float, ...]] = ()
+    contains: ClassVar[tuple[str, ...]] = ()
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""

@@ -119,6 +119,7 @@ class JointStribeck(JointEffect):
     """
 
     name = "joint_stribeck"
+    contains = (JointFriction.name,)
     sentence = "dry friction in {target} that is larger at rest than in motion (Stribeck)"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:

@@ -160,7 +160,7 @@ class Ground:
 
     def refits(
         self, state: State, beside: Refit, groups: Sequence[Sequence[Placed]], stage: str,
-        origin: Hypothesis | None = None,
+        origin: Hypothesis | None = None, most: int = 3,
     ) -> tuple[list[Refit], State]:  # fmt: skip
         """Refit a hypothesis with each group of effects more; the best first, and the state with these attempts.
 
@@ -172,6 +172,7 @@ class Ground:
             groups: the effects to add.
             stage: what to report.
             origin: the hypothesis from which the fits begin; by default the fitted one.
+            most: how many are fitted in full.
         """
         if not groups:
             return [], state
@@ -187,7 +188,7 @@ class Ground:
             self.report(stage, number / (len(groups) + 2))
             found.append(rough((origin or beside.hypothesis).with_effects(group), 2))
         found.sort(key=lambda r: r.cost.excess)
-        found[:4] = [rough(r.hypothesis, 5) for r in found[:4]]
+        found[: most + 1] = [rough(r.hypothesis, 5) for r in found[: most + 1]]
         found.sort(key=lambda r: r.cost.excess)
         left = [(p, max(r.cost.excess, 0.0) / max(before, 1e-12)) for r in found for p in r.hypothesis.placed[known:]]
         attempts = [Ranked(*p.key, p.summary(self.setting), share, state.number) for p, share in left]
@@ -195,8 +196,8 @@ class Ground:
         tried = self.rules.tried
         near = tried.worse * max(best.excess, 0.0) + self.rules.least * before + tried.sigmas * best.sigma
         full = []
-        for number, fitted in enumerate(r for r in found[:3] if r.cost.excess <= near):
-            self.report(stage, (len(groups) + number / 4) / (len(groups) + 2))
+        for number, fitted in enumerate(r for r in found[:most] if r.cost.excess <= near):
+            self.report(stage, (len(groups) + number / (most + 1)) / (len(groups) + 2))
             full.append(self.refit(fitted.hypothesis))
         full.sort(key=lambda r: r.cost.excess)
         return full, replace(state, attempts=(*state.attempts, *attempts))

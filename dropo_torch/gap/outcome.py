@@ -13,7 +13,7 @@ from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
-from dropo_torch.gap.refit import Z90, Hypothesis, Refit, refit, standard_errors, step_errors
+from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Remaining, Score, Strength
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
@@ -23,6 +23,8 @@ from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, score
 
+#: Last fits, at most, each with the weights that the one before suggests.
+ROUNDS = 4
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -37,11 +39,8 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     """
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
     rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
-    final, weighted = (
-        _last_fit(evidence, naming.final.hypothesis, rules.sound.model_error)
-        if naming.named
-        else (naming.final, evidence)
-    )
+    last = _last_fit(evidence, naming.final.hypothesis, rules.sound.model_error) if naming.named else None
+    final = naming.final if last is None else last.fit
     held = cut_held(evidence, scene.held, final.hypothesis)
     given, constant = score(evidence, held, base), constant_velocity(evidence, held)
     after_score = score(evidence, held, final.hypothesis) if naming.named else given
@@ -53,7 +52,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
-        shown = _named(setting, naming, final, weighted) if naming.named else (_unnamed(setting, before),)
+        shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
     remaining = _remaining(setting, naming, after, rules) if naming.named else None
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)
     return Gap(
@@ -85,23 +84,23 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     )
 
 
-def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) -> tuple[Refit, Evidence]:
-    """Fit the named effects on all windows; return with it the evidence as it was weighted.
+def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) -> Resolved:
+    """Fit the named effects on all windows; the evidence is as it was weighted, and as finely stepped.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
     error of a real model grows with the lead, and differs between columns.
     """
-    final = refit(evidence, hypothesis, iterations=6)
-    for _ in range(3):
-        if final.cost.reduced < model_error:
+    for _ in range(ROUNDS):
+        own = refit(evidence, hypothesis, iterations=6)
+        final = resolved(evidence, own)
+        if final.fit.cost.reduced < model_error:
             break
-        size = np.sqrt(np.median(final.residual**2, axis=0) / MEDIAN) * evidence.model_error
+        size = np.sqrt(np.median(final.fit.residual**2, axis=0) / MEDIAN) * evidence.model_error
         lead = size.reshape(-1, evidence.chart.size)
         smooth = np.maximum(np.maximum.accumulate(lead, axis=0), 1.0)
         smooth[0] = 1.0
-        evidence = replace(evidence, model_error=smooth.ravel())
-        final = refit(evidence, final.hypothesis, iterations=6)
-    return final, evidence
+        evidence, hypothesis = replace(evidence, model_error=smooth.ravel()), own.hypothesis
+    return final
 
 
 def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
@@ -148,9 +147,9 @@ def _unnamed(setting: Setting, free: FreeForces) -> NamedEffect:
     return NamedEffect("unnamed", name, {"force": strength}, 1.0, (), text)
 
 
-def _named(setting: Setting, naming: Naming, final: Refit, evidence: Evidence) -> tuple[NamedEffect, ...]:
+def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffect, ...]:
     """The named effects, the strongest first."""
-    halves = Z90 * standard_errors(final, evidence.windows.episodes) + step_errors(evidence, final)
+    final, halves = last.fit, half_widths(last)
     own, found = iter(halves[len(final.hypothesis.declared) :]), []
     for placed, tied, excess in zip(final.hypothesis.placed, naming.ties, naming.shares, strict=True):
         quantities = placed.effect.quantities(setting, placed.target)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from dropo_torch.effects import find_effect
-from dropo_torch.effects.base import Placed
+from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, robust_factors, robust_loss
 from dropo_torch.gap.log import blocks_of
@@ -26,10 +26,8 @@ RIDGE, LONGEST = 1e-12, 5.0
 FAR = 0.03
 #: Half-width of a 90 % interval in standard errors.
 Z90 = 1.6449
-#: χ² per degree of freedom from which on the simulation's own step may bias a fit.
-BIASED = 1.2
-#: An error of first order at a step is twice what halving the step changes.
-FIRST_ORDER = 2.0
+#: Simulations with a finer step in which numbers settle there.
+MOVES = 4
 
 
 @dataclass(frozen=True)
@@ -169,19 +167,14 @@ def refit(
     relinearise = linear is None
     variant = hypothesis.variant
     linear = evidence.linearise(variant) if linear is None else evidence.counting(linear, variant)
-    tail = evidence.tail(linear)
 
     def at(vector: np.ndarray) -> Refit:
         there = hypothesis.at(np.clip(vector, limits.low, limits.high))
         moved, steps = beside(there, limits, np.flatnonzero(limits.free), STEP)
         found, _ = evidence.residuals([h.variant for h in (there, *moved)])
-        residual = evidence.project(found[0], linear)
-        slope = np.zeros((len(vector), *residual.shape))  # none by discrete numbers
+        slope = np.zeros((len(vector), *found.shape[1:]))  # none by discrete numbers
         slope[limits.free] = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
-        chi2 = ((residual * np.reshape(evidence.caps, (-1, 1))) ** 2).sum(-1)
-        loss, factor = float(robust_loss(chi2, tail).sum()), robust_factors(chi2, tail)
-        cost = evidence.cost(residual, linear, len(vector))
-        return Refit(there, cost, residual, slope, linear, limits.scale, factor, loss)
+        return _fitted(evidence, there, found[0], slope, linear, limits.scale)
 
     def distance(vector: np.ndarray, other: Hypothesis) -> float:
         return float(np.abs((vector - other.vector) / limits.scale).max(initial=0.0))
@@ -206,6 +199,18 @@ def refit(
         again = evidence.linearise(here.hypothesis.variant)
         return refit(evidence, here.hypothesis, linear=again, iterations=4)
     return here
+
+
+def _fitted(
+    evidence: Evidence, hypothesis: Hypothesis, residuals: np.ndarray, slope: np.ndarray, linear: Linearisation,
+    scale: np.ndarray,
+) -> Refit:  # fmt: skip
+    """A hypothesis with its whitened residuals ``(W, N)`` and its projected derivatives."""
+    residual, tail = evidence.project(residuals, linear), evidence.tail(linear)
+    chi2 = ((residual * np.reshape(evidence.caps, (-1, 1))) ** 2).sum(-1)
+    loss, factor = float(robust_loss(chi2, tail).sum()), robust_factors(chi2, tail)
+    cost = evidence.cost(residual, linear, len(scale))
+    return Refit(hypothesis, cost, residual, slope, linear, scale, factor, loss)
 
 
 def _move(here: Refit, limits: Limits, factor: np.ndarray, damping: float) -> np.ndarray:
@@ -251,19 +256,65 @@ def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
     return np.where(known, np.maximum(plain, clustered) if inflated else plain, np.inf) * fitted.scale
 
 
-def step_errors(evidence: Evidence, fitted: Refit) -> np.ndarray:
-    """Return by how much the simulation's own step may bias each number ``(q,)``, in their units.
+@dataclass(frozen=True)
+class Resolved:
+    """A fit of which the simulation's own step is no part any more.
 
-    The fit is repeated with half the step, on the windows and weights of the fit. Dry friction, ripples and stops are
-    resolved by the step only so well, and with little noise that is more than the standard errors. Zero where the fit
-    leaves no more than noise.
+    Attributes:
+        fit: the fit; its residuals are those under the step that is best.
+        evidence: that under this step.
+        error: half-width ``(q,)`` of what the step leaves uncertain, in the numbers' units.
     """
-    vector = fitted.hypothesis.vector
-    finer = find_effect("integration")
-    as_noise = fitted.cost.reduced < BIASED and not np.any(evidence.model_error > 1)
-    if as_noise or any(p.effect is finer for p in fitted.hypothesis.placed):
-        return np.zeros(len(vector))
-    step = float(evidence.twin.setting.model.opt.timestep)
-    other = replace(evidence, twin=evidence.twin.also(Placed(finer, None, (step / 2,))))
-    again = refit(other, fitted.hypothesis, linear=fitted.linear, iterations=3)
-    return FIRST_ORDER * np.abs(again.hypothesis.vector - vector)
+
+    fit: Refit
+    evidence: Evidence
+    error: np.ndarray
+
+
+def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
+    """Return a fit as it would be under an endlessly fine step, where a finer one explains the log better.
+
+    Dry friction, ripples and stops are resolved by a step only to first order in it, which with little noise is more
+    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated; half of
+    what this adds stays uncertain. A log that was simulated with the model's own step stays with it.
+
+    Args:
+        evidence: the windows, with the weights of the fit.
+        fitted: the fit under the model's own step. Its derivatives serve for the finer ones, too.
+    """
+    effect, vector = find_effect("integration"), fitted.hypothesis.vector
+    own = Resolved(fitted, evidence, np.zeros(len(vector)))
+    if any(p.effect is effect for p in fitted.hypothesis.placed):
+        return own
+    finest = effect.quantities(evidence.twin.setting, None)[0].low
+    finer, coarser = (_stepped(evidence, fitted, effect, step) for step in (finest, 2 * finest))
+    fine, limits = finer.fit, limits_of(fitted.hypothesis, evidence.twin)
+    if fine.loss >= fitted.loss:
+        return own
+    change = fine.hypothesis.vector - coarser.fit.hypothesis.vector
+    there = fine.hypothesis.at(np.clip(fine.hypothesis.vector + change, limits.low, limits.high))
+    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change) / 2)
+
+
+def half_widths(last: Resolved) -> np.ndarray:
+    """Return half-widths of the 90 % intervals of all numbers ``(q,)``, in their units."""
+    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes), last.error)
+
+
+def _stepped(evidence: Evidence, fitted: Refit, effect: Effect, step: float) -> Resolved:
+    """A fit moved to where it is best under another step, by the derivatives that it has."""
+    twin = evidence.twin.also(Placed(effect, None, (step,)))
+    finer, limits = replace(evidence, twin=twin), limits_of(fitted.hypothesis, evidence.twin)
+    best, trial = None, fitted.hypothesis
+    for _ in range(MOVES):
+        found, _ = finer.residuals([trial.variant])
+        there = _fitted(finer, trial, found[0], fitted.slope, fitted.linear, fitted.scale)
+        if best is not None and there.loss >= best.loss:
+            break
+        best = there
+        move = _move(best, limits, finer.caps * best.factor, LEAST_DAMPING)
+        if np.abs(move).max(initial=0.0) < LEAST_MOVE:
+            break
+        trial = trial.at(np.clip(trial.vector + move * limits.scale, limits.low, limits.high))
+    assert best is not None
+    return Resolved(best, finer, np.zeros(len(fitted.scale)))

@@ -43,8 +43,8 @@ class Alike:
         excess: share of the excess, and
         sigmas: standard deviations of χ², by one of which a rival may be worse at all, however unsure that is; the
             search prefers fewer numbers among hypotheses within it.
-        cosine: of two candidates' derivatives from which on they are the same thing on this log, to first order.
-        most: candidates that are tried as ties of one effect.
+        promising: share of what a named effect explains that a candidate may leave, to first order, to be tried.
+        roughly, fully: candidates that are tried as ties of one effect, at most, by a rough refit and by a full one.
     """
 
     chi2: float = 4.0
@@ -52,8 +52,9 @@ class Alike:
     error: float = 0.05
     excess: float = 0.3
     sigmas: float = 4.0
-    cosine: float = 0.9999
-    most: int = 5
+    promising: float = 0.3
+    roughly: int = 16
+    fully: int = 8
 
 
 @dataclass(frozen=True)

@@ -67,6 +67,7 @@ class Candidate:
 
     Attributes:
         placed: the effect with the predicted numbers.
+        start: the effect where the prediction began.
         chi2: predicted χ² on the screened windows.
         residual: projected residuals at the candidate's start, ``(W·N,)``.
         slope: projected derivatives by its numbers, ``(p, W·N)``.
@@ -74,6 +75,7 @@ class Candidate:
     """
 
     placed: Placed
+    start: Placed
     chi2: float
     residual: np.ndarray
     slope: np.ndarray
@@ -152,7 +154,8 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         values[moving] += move[len(shared) :] * limits.scale
         left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
         chi2 = float(left[known].mean() * len(left)) if known.any() else np.inf
-        yield Candidate(placed.at(placed.effect.settle(start, values)), chi2, residual, slope, dead)
+        predicted = placed.at(placed.effect.settle(start, values))
+        yield Candidate(predicted, placed, chi2, residual, slope, dead)
 
 
 def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:
@@ -192,11 +195,11 @@ def promising_pairs(focus: Focus, candidates: Sequence[Candidate], tried: Tried)
 
 def _best(focus: Focus, groups: Iterable[Sequence[Candidate]]) -> list[tuple[float, Sequence[Candidate]]]:
     """Groups of candidates with the χ² that they leave together, the best first."""
-    return sorted(((_left(focus, members), members) for members in groups), key=lambda item: item[0])
+    return sorted(((left_by(focus, members), members) for members in groups), key=lambda item: item[0])
 
 
-def _left(focus: Focus, members: Sequence[Candidate]) -> float:
-    """χ² that is left beside the shared numbers, the members' numbers, and the steps to the members' starts."""
+def left_by(focus: Focus, members: Sequence[Candidate]) -> float:
+    """Return the χ² that is left beside the shared numbers, the members' numbers, and the steps to their starts."""
     before = focus.residual
     columns = np.stack([*focus.slope, *(s for c in members for s in c.slope), *(c.residual - before for c in members)])
     norm = np.sqrt((columns**2).sum(1))

@@ -9,7 +9,7 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
-from dropo_torch.gap.accept import add, canonical, everywhere, extend, is_done, prune, swap, ties
+from dropo_torch.gap.accept import add, everywhere, extend, is_done, prune, swap
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -17,6 +17,7 @@ from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, significant
 from dropo_torch.gap.sound import absurd
+from dropo_torch.gap.ties import canonical, ties
 from dropo_torch.support.checkpoint import Checkpoint
 
 #: Why what a log is too short for has no name.

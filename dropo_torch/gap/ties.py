@@ -1,0 +1,80 @@
+"""Which candidates explain a log as well as a named effect does, with more numbers or fewer."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+from dropo_torch.effects.base import Placed
+from dropo_torch.gap.ground import Ground, State
+from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.rules import Alike
+from dropo_torch.gap.screen import Candidate, Focus, left_by
+
+#: The round of attempts that only look for ties.
+ROUND = -1
+
+
+def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
+    """Return candidates that tie with a named effect, the excess that it accounts for, and the state with attempts.
+
+    First by linear algebra, of all candidates: what the effect explains must lie in the span of a candidate's
+    derivatives and of those of all other numbers. A refit then confirms it, or not.
+
+    Args:
+        ground: what the search stands on.
+        state: where it stands.
+        index: of the effect among those that are named.
+    """
+    current = state.current
+    own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
+    without = ground.refit(origin) if origin.placed else state.base
+    ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
+    others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own, ground.rules.alike)]
+    looking = replace(state, number=ROUND)
+    rivals, found = ground.refits(looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully)
+    tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
+    return tied, without.cost.excess - current.cost.excess, replace(state, attempts=found.attempts)
+
+
+def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Alike) -> list[Candidate]:
+    """Return candidates that explain, to first order, most of what is left without an effect; the best first."""
+    degrees = focus.evidence.degrees(focus.fitted.linear) - len(focus.slope)
+    before = max(float(focus.residual @ focus.residual) - degrees, 1e-12)
+    share = {c.key: (left_by(focus, [c]) - degrees) / before for c in ranked if not c.dead}
+    most = max(rules.promising, 2 * share.get(own.key, 0.0))
+    found = [c for c in ranked if not c.dead and c.key != own.key and share[c.key] < most]
+    found = [c for c in found if not (own.effect.name in c.placed.effect.contains and c.placed.target == own.target)]
+    return sorted(found, key=lambda c: share[c.key])[: rules.roughly]
+
+
+def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
+    """Return a candidate with the numbers, predicted or begun with, that explain more beside a hypothesis."""
+
+    def loss(placed: Placed) -> float:
+        hypothesis = origin.with_effects([placed])
+        return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0).loss
+
+    return min((candidate.placed, candidate.start), key=loss)
+
+
+def as_good(ground: Ground, state: State, rival: Refit) -> bool:
+    """Return whether a rival hypothesis explains the log as well as the one that was found."""
+    current = state.current
+    as_clear = ground.clears(state.base, rival) or not ground.clears(state.base, current)
+    return as_clear and ground.as_good(rival, current)
+
+
+def canonical(
+    ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]
+) -> tuple[State, tuple[tuple[Placed, ...], ...]]:
+    """Among exact ties name the one with the fewest numbers that the vocabulary lists first."""
+    order = {effect.name: i for i, effect in enumerate(ground.effects)}
+    told = list(tied)
+    for index, rivals in enumerate(told):
+        own = state.current.hypothesis.placed[index]
+        first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name]))
+        if first is not own:
+            state = replace(state, current=ground.refit(state.current.hypothesis.instead(index, first)))
+            told[index] = tuple(own if p is first else p for p in rivals)
+    return state, tuple(told)
