@@ -47,6 +47,7 @@ WHOLE = {
     "test_fit.py": ("test_a_fit_killed_at_any_moment_resumes_to_the_same_result",),
     "test_gap.py": ("",),
     "test_optimizers.py": ("test_optimizers_keep_their_laws",),
+    "test_gap_written.py": ("test_of_every_effect_what_is_written_is_what_was_found",),
     "test_parallel.py": ("",),
     "test_rl_train.py": ("",),
     "test_sweep.py": ("test_the_noise_of_every_measurement_is_found",),

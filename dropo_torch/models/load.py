@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -45,7 +46,7 @@ def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> 
     if not path.is_file():
         raise InputError(f"model: no file {path}; expected the path of an MJCF (.xml), URDF or .mjb file")
     try:
-        with quiet_mujoco():
+        with quiet_mujoco(), warnings.catch_warnings(action="ignore"):  # of attributes that will be gone some day
             if path.suffix == ".mjb":
                 return mujoco.MjModel.from_binary_path(str(path))
             if not general:
