@@ -89,6 +89,8 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
             "(data: preprocess), and name them in observation"
         )
     train, held = hold_out(problem.trajectories)
+    if not np.ptp(train.observations, axis=0).any():
+        raise InputError(f"data: nothing moves in {train.source}: no observed column ever changes")
     setting = make_setting(problem, train)
     twin = Twin(
         setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",
