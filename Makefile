@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: demo check test coverage study-reduced test-slow lint format benchmarks clean
+.PHONY: demo check test coverage study-reduced test-slow fuzz lint format benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/dropo demo --out out/demo
@@ -30,6 +30,11 @@ study-reduced: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --durations=20
+
+# Ten minutes on two processors; SEED=N for other mutations.
+SEED ?= 0
+fuzz: $(STAMP)
+	$(BIN)/python tests/fuzz.py --mutations 10500 --workers $(WORKERS) --seed $(SEED)
 
 lint: $(STAMP)
 	$(BIN)/ruff check .

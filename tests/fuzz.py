@@ -285,11 +285,14 @@ def targets(folder: Path) -> dict[str, Target]:
         return folder / name
 
     found = [
-        log_target(w.__name__.removeprefix("write_"), w, fresh(w.__name__), share=0.5) for w in test_readers.WRITERS
+        log_target(
+            w.__name__.removeprefix("write_"), w, fresh(w.__name__), share=0.3 if w.__name__[6:] == "mat" else 0.8
+        )
+        for w in test_readers.WRITERS
     ]
     found += [
-        log_target("mat4", write_mat4, fresh("mat4")),
-        log_target("compressed_mat", write_compressed_mat, fresh("cmat")),
+        log_target("mat4", write_mat4, fresh("mat4"), share=0.3),
+        log_target("compressed_mat", write_compressed_mat, fresh("cmat"), share=0.3),
         log_target("npz_compressed", write_big_npz, fresh("znpz"), share=0.5),
     ]
     inner = fresh("inner")
@@ -323,7 +326,7 @@ def targets(folder: Path) -> dict[str, Target]:
     (models / "hopper.xml").write_bytes(test_hopper().read_bytes())
     for name in ("arm", "hopper"):
         mujoco.mj_saveModel(mujoco.MjModel.from_xml_path(str(models / f"{name}.xml")), str(models / f"{name}.mjb"))
-        for kind, share in (("xml", 2), ("mjb", 2)):
+        for kind, share in (("xml", 2), ("mjb", 0.5)):
             path = models / f"{name}.{kind}"
             found.append(Target(f"{name}_{kind}", (path,), lambda path=path: model_numbers(path), share=share))
     kept = Checkpoint(folder / "checkpoint.bin", "fit", ("mine",), (HistoryEntry, *FisherOptimizer.KINDS))

@@ -20,10 +20,10 @@ from dropo_torch.data.observation import generic_observation, parse_observation
 from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
 from dropo_torch.effects.actuator import ActuatorDeadband
-from dropo_torch.effects.base import Setting
+from dropo_torch.effects.base import Quantity, Setting
 from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.export import write_model
-from dropo_torch.effects.filters import Filter, extended, filtered, observed_rates, sensed
+from dropo_torch.effects.filters import Filter, extended, filtered, observed_rates, sensed, settled_after
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import lowest, place_effects, plain_setting
 from dropo_torch.effects.sensor import SensorScale
@@ -572,6 +572,82 @@ def test_a_fit_recovers_a_hidden_delay_and_friction(tmp_path: Path, backend: str
     mean = fit(problem.objective, FitSettings(samples=20)).distribution.summary()
     assert mean["delay"]["mean"] == pytest.approx(0.03, abs=1e-5)
     assert backend == "warp" or mean["friction"]["mean"] == pytest.approx(0.15, abs=1e-4)
+
+
+REMEMBERING = [
+    ("actuator_delay", "bend", {"delay": 0.033}), ("actuator_lag", "bend", {"time_constant": 0.02}),
+    ("actuator_backlash", "bend", {"width": 0.5}), ("sensor_delay", "elbow.velocity", {"delay": 0.013}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "target", "numbers"), REMEMBERING, ids=[e[0] for e in REMEMBERING])
+@pytest.mark.parametrize("varies", [False, True])
+def test_what_was_commanded_before_the_log_does_not_matter(
+    tmp_path: Path, name: str, target: str, numbers: dict[str, float], varies: bool
+) -> None:
+    """The end of a recording is compared as it is within the whole of it."""
+    base, whole = record_arm(tmp_path, friction=0.15), np.load(tmp_path / "log.npz")
+    np.savez(tmp_path / "end.npz", **{k: whole[k][43:] for k in whole.files})
+    ((key, value),) = numbers.items()
+    quantity = {"effect": name, "name": target, "index": key, "bounds": [0.5 * value, value], "unit": "s"}
+    mass = {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0]}
+    document = {**base, "parameters": {"mass": mass}, "effects": [{"effect": name, "target": target, **numbers}]}
+    if varies:
+        document = {**base, "parameters": {"x": quantity}}
+    problems = [make_problem(make_config({**document, "data": str(tmp_path / f)})) for f in ("log.npz", "end.npz")]
+    vector = np.array([[0.9 * value if varies else 0.7]])
+    known, end = (p.objective.simulated(vector)[:, 0].numpy() for p in problems)
+    rows = [p.objective.transitions.rows for p in problems]
+    assert 0 < problems[1].left_out < 40
+    np.testing.assert_array_equal(rows[1], np.arange(problems[1].left_out, 150 - 43))
+    np.testing.assert_allclose(end, known[np.searchsorted(rows[0], rows[1] + 43)], atol=5e-4)
+
+
+class Alternating(Effect):
+    """A user's filter that remembers the sign of the last large command."""
+
+    name, kind, sentence = "alternating", "actuator", "{target} sticks to a side"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return list(setting.names("actuator"))
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("size", "-", 0.0, 0.0, 1.0, 1.0),)
+
+    def command(
+        self, signal: torch.Tensor, values: torch.Tensor, step: float, state: torch.Tensor
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        out, side = [], state.sign()
+        for c in signal.T[..., None]:
+            side = torch.where(c.abs() > 0.8, c.sign(), side)
+            out.append(c + values[:, :1] * side)
+        return torch.cat(out, 1), side
+
+
+def test_any_filter_tells_from_when_on_the_past_does_not_matter() -> None:
+    ramp = np.tile(0.1 * np.array([0, 1, 2, 3, 4, 5, 4, 3, 2, -1, -9, -1, 0, 9, 0.0]), (2, 1))[..., None]
+    ramp[1] *= 0.5
+
+    def after(effect: Effect, *values: float, skip: int = 1) -> list[int]:
+        own = Filter(effect, 0, torch.tensor([values], dtype=torch.float64))
+        return settled_after(ramp, [own], skip, 0.01 / skip).tolist()
+
+    late = find_effect("actuator_delay")
+    assert [after(late, t)[0] for t in (0.0, 0.02, 0.021, 0.03)] == [0, 2, 3, 3]
+    assert after(late, 0.021, skip=4) == [3, 3]
+    assert after(late, 0.0201, skip=4) == [3, 3]
+    assert after(find_effect("actuator_deadband"), 0.1) == [0, 0]
+    assert after(find_effect("actuator_backlash"), 1.6) == [13, 15]  # where the play was crossed both ways, if ever
+    assert after(Alternating(), 0.3) == [10, 15]
+    lag = after(find_effect("actuator_lag"), 0.01)
+    assert lag == [7, 7]  # e⁻⁷ is the thousandth of the range that passes for the same
+
+
+def test_a_log_of_which_nothing_is_known_is_refused(tmp_path: Path) -> None:
+    width = {"effect": "actuator_backlash", "target": "bend", "width": 50.0}
+    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0]}}
+    with pytest.raises(InputError, match="longer episodes"):
+        make_problem(make_config({**record_arm(tmp_path), "parameters": mass, "effects": [width]}))
 
 
 def test_fixed_native_effects_become_part_of_the_model_and_keep_gradients(tmp_path: Path) -> None:

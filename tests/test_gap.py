@@ -21,7 +21,7 @@ from arm import Folder
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
 from benchmarks.hidden.systems import CART_POLE, SERVO_ARM, TORQUE_ARM, System, coarse
-from benchmarks.hidden.truths import Case, Effect, simulate_truth
+from benchmarks.hidden.truths import Before, Case, Effect, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
@@ -270,7 +270,8 @@ def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
 
 NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
-    "schema": str, "where": list, "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
+    "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
+    "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
 }  # fmt: skip
@@ -305,13 +306,24 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
     assert set(document["declared"]["pole_mass"]) == {"given", "alone", "with_effects"}
     assert list(document["noise"]) == ["rail.position", "hinge.position", "rail.velocity", "hinge.velocity"]
     assert set(document["chi2_per_degree"]) == {"before", "after"}
+    assert document["verdict"] == {0: "no gap", 1: "unnamed", 2: "explained"}[len(document["effects"])]
+    assert document["verdict_reason"]
+    assert document["remaining"] is None
 
 
 def test_every_key_of_gap_json_is_documented() -> None:
     text = (Path(__file__).parents[1] / "docs" / "gap.md").read_text()
     assert not [key for key in CONTRACT if f"`{key}`" not in text]
     assert not [name for name in FILES if f"`{name}`" not in text]
-    assert not [f.name for f in dataclasses.fields(Rules) if f"`{f.name}`" not in text]
+    assert not [f"{g}{f.name}" for g, f in thresholds() if f"`{g}{f.name}`" not in text]
+
+
+def thresholds() -> list[tuple[str, dataclasses.Field]]:
+    """Every threshold, after the name of its group and a dot."""
+    groups = {f.name: getattr(Rules(), f.name) for f in dataclasses.fields(Rules)}
+    nested = {g: v for g, v in groups.items() if dataclasses.is_dataclass(v)}
+    own = [("", f) for f in dataclasses.fields(Rules) if f.name not in nested]
+    return own + [(f"{g}.", f) for g, v in nested.items() for f in dataclasses.fields(v)]
 
 
 @pytest.mark.parametrize("threads", [1, 2])
@@ -336,6 +348,41 @@ def test_windows_share_no_measurement_and_cross_no_end() -> None:
         assert np.array_equal(measured[:-1], observed[row : row + length])
         assert np.array_equal(measured[-1], ends[row + length - 1])
     assert len(cut_windows(log, problem.observation, 101)) == 0
+
+
+REMEMBERING = [
+    Effect("actuator_delay", "push", {"delay": 0.025}), Effect("actuator_lag", "push", {"time_constant": 0.03}),
+    Effect("actuator_backlash", "push", {"width": 0.6}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("truth", REMEMBERING, ids=lambda e: e.name)
+def test_what_was_commanded_before_the_log_is_no_gap(truth: Effect) -> None:
+    """A log that begins in motion: until then the commands were zero, and are not in it."""
+    case = simulate_truth(CART_POLE, [truth], 4, before=Before(quiet=True), **SIZE)
+    gap = search(case, (*FEW, "actuator_backlash"))
+    assert [(e.effect, e.target) for e in gap.effects] == [(truth.name, truth.target)]
+    ((number, value),) = truth.parameters.items()
+    told = gap.effects[0].parameters[number]
+    half = 0.5 * (told.high - told.low)
+    assert told.low - half <= value <= told.high + half
+    assert half < 0.01 * value
+    assert gap.reduced[1] == pytest.approx(1, abs=0.15)
+    assert gap.after.log_likelihood == pytest.approx(gap.noise_floor.log_likelihood, rel=0.02)
+
+
+@pytest.mark.parametrize("truth", REMEMBERING, ids=lambda e: e.name)
+def test_windows_whose_commands_are_known_are_predicted_as_in_the_whole_log(truth: Effect) -> None:
+    scene, hypothesis = scene_of(), true(dataclasses.replace(hidden(), effects=(truth,)))
+    whole = cut_windows(scene.train, scene.setting.observation, 4, stride=1)
+    late = whole.select((whole.steps >= 37) & (whole.episodes == 0))
+    cut = dataclasses.replace(late, steps=late.steps - 37, commands=late.commands[:1, 37:], episodes=0 * late.episodes)
+    known = scene.twin.knows(hypothesis.variant, cut)
+    assert 0 < np.argmax(known) < 40
+    assert known[np.argmax(known) :].all()
+    (in_whole,), (in_cut,) = (scene.twin.predict([hypothesis.variant], w)[0] for w in (late, cut))
+    np.testing.assert_allclose(in_cut[known], in_whole[known], atol=1e-4)
+    assert np.abs(in_cut[0] - in_whole[0]).max() > 1e-3
 
 
 # --- the noise ------------------------------------------------------------------------------------------------
@@ -426,7 +473,7 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     scene, (truth,) = scene_of(name), hidden(name).effects
     base = refit(scene.evidence, scene.begin)
     candidates = list(all_candidates(scene.setting, [VOCABULARY[e] for e in FEW]))
-    ranked = screen(Focus(scene.evidence, base), candidates)
+    ranked = screen(Focus(scene.evidence, base), candidates, Rules().tried)
     assert (truth.name, truth.target) in [c.key for c in ranked[:rank]]
     assert len({c.key for c in ranked}) == len(ranked)
 
@@ -461,9 +508,9 @@ def test_robust_factors_are_the_slope_of_the_robust_loss() -> None:
 
 def test_what_is_better_everywhere_and_right_nowhere_clears_nothing() -> None:
     base = spoilt(100.0, 1.0)
-    assert clears(base, spoilt(1000.0, 0.4))  # right in six of ten windows, worse in the others
-    assert not clears(base, spoilt(3.0, 1.0))  # imitates it everywhere
-    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0))  # was right in most windows before
+    assert clears(base, spoilt(1000.0, 0.4), Rules())  # right in six of ten windows, worse in the others
+    assert not clears(base, spoilt(3.0, 1.0), Rules())  # imitates it everywhere
+    assert not clears(spoilt(1000.0, 0.4), spoilt(1.0, 0.0), Rules())  # was right in most windows before
 
 
 # --- intervals ------------------------------------------------------------------------------------------------
@@ -718,7 +765,7 @@ def test_config_is_one_that_a_fit_accepts(cart: Path, tmp_path: Path) -> None:
     fitted = json.loads((tmp_path / "fit" / "fit.json").read_text())["parameters"]
     means = {name: entry["mean"] for name, entry in fitted.items()}
     assert means.pop("pole_mass") == pytest.approx(hidden("joint_damping").declared["pole_mass"], rel=0.05)
-    assert means == {"hinge_damping": pytest.approx(0.01 + 0.02, rel=1e-3)}  # the model's own and what was missing
+    assert means == {"hinge_damping": pytest.approx(0.01 + 0.02, rel=3e-3)}  # the model's own and what was missing
 
 
 @pytest.mark.usefixtures("one_effect")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Ranked, Residuals, Score, Strength
+from dropo_torch.gap.result import Gap, NamedEffect, Place, Ranked, Remaining, Residuals, Score, Strength
 from dropo_torch.report import gap_words, write_gap_report
 from dropo_torch.report.figures.gap import running_median
 
@@ -253,11 +253,35 @@ def test_unnamed(tmp_path: Path) -> None:
     assert text.count("<svg") == 3 + 1
 
 
-def test_part_has_a_name(tmp_path: Path) -> None:
-    text = page(tmp_path, replace(single(), effects=(FRICTION, unnamed().effects[0])))
-    assert headline(text) == "Your model lacks two things:"
-    assert "Partly unexplained" in text
-    assert f"something that none of the {len(VOCABULARY)} known effects explains" in text
+LEFT = Remaining(1354.7, 0.0075, 0.83, "wrist", "when wrist accelerates")
+
+
+@pytest.mark.parametrize("effects", [(FRICTION,), (FRICTION, replace(FRICTION, target="wrist"))])
+def test_what_remains_is_said_in_the_first_sentence(tmp_path: Path, effects: tuple[NamedEffect, ...]) -> None:
+    gap = replace(single(), effects=effects, remaining=LEFT)
+    text = page(tmp_path, gap)
+    for part in (
+        "not explain everything",
+        "1,350 times what noise would leave",
+        "mostly at wrist, when wrist accelerates",
+    ):
+        assert part in headline(text)
+    assert "Partly explained" in text
+    assert gap.document()["verdict"] == "partly explained"
+    assert gap.document()["remaining"]["where"] == "wrist"
+    assert "1.35e+03" in gap.document()["verdict_reason"]
+    assert "everything" not in headline(page(tmp_path, replace(gap, remaining=None)))
+
+
+def test_what_was_refused_a_name_is_said_in_the_first_sentence(tmp_path: Path) -> None:
+    gap = replace(unnamed(), refused="inertia of hand fits best at the bound of what is physical (factor of 30)")
+    text = page(tmp_path, gap)
+    assert headline(text).startswith(
+        "Something is missing that has no name yet: inertia of hand fits best at the bound"
+    )
+    assert "Inertia of hand fits best" in text_of(text)
+    document = gap.document()
+    assert (document["verdict"], document["verdict_reason"]) == ("unnamed", gap.refused)
 
 
 def test_what_is_not_known(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from dropo_torch.effects.base import Placed
@@ -9,12 +10,25 @@ from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit
 from dropo_torch.gap.rules import significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
+from dropo_torch.gap.sound import absurd
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
-    """Return whether a hypothesis removes most of another's excess, or less of it all over the log."""
+    """Return whether a hypothesis removes most of another's excess, or so much that the search goes on with it."""
     most = better.cost.excess < (1 - ground.rules.most) * worse.cost.excess
-    return most or ground.advantage(better, worse) >= ground.rules.significance
+    return most or ground.chance(better, worse) <= ground.rules.chance.explore
+
+
+def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
+    """Return whether an effect may have a name: it removes enough, and chance among all candidates does not."""
+    rules = ground.rules
+    enough = without.cost.excess - whole.cost.excess >= rules.least * state.base.cost.excess
+    return enough and ground.chance(whole, without) * ground.comparisons <= rules.chance.error
+
+
+def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
+    """Return those hypotheses whose numbers are no nonsense."""
+    return [r for r in fitted if not any(absurd(ground.part, r, ground.rules.sound))]
 
 
 def is_done(ground: Ground, state: State) -> bool:
@@ -30,17 +44,21 @@ def add(ground: Ground, state: State) -> State:
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
     alive = [c for c in ranked if not c.dead]
-    singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.refits]], "refitting")
+    singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.tried.refits]], "refitting")
+    singles = sound(ground, singles)
     if not singles:
         return replace(state, done=True)
-    best = simplest(singles)
+    best = simplest(singles, rules)
     if best.cost.excess / current.cost.excess > 1 - rules.most:
         focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
-        pairs = promising_pairs(focus, screen(focus, [c.placed for c in alive[:16]]))
-        families = promising_families(ground.focus(current), alive)
+        pairs = promising_pairs(
+            focus, screen(focus, [c.placed for c in alive[: rules.tried.paired]], rules.tried), rules.tried
+        )
+        families = promising_families(ground.focus(current), alive, rules.tried)
         for words, groups in (("pairs", pairs), ("families", families)):
             tried, state = ground.refits(state, current, groups, f"refitting {words}")
-            if tried and tried[0].cost.excess < 0.5 * best.cost.excess:
+            tried = sound(ground, tried)
+            if tried and tried[0].cost.excess < rules.tried.clearer * best.cost.excess:
                 best = tried[0]
     gained = current.cost.excess - best.cost.excess
     hopeless = best.cost.excess > rules.hopeless * current.cost.excess or gained < rules.least * state.base.cost.excess
@@ -51,6 +69,7 @@ def add(ground: Ground, state: State) -> State:
 
 def swap(ground: Ground, state: State) -> State:
     """Try to put another effect in the place of each accepted one."""
+    tried = ground.rules.tried
     for _ in range(2):
         before = state.current
         for index in range(len(before.hypothesis.placed)):
@@ -58,9 +77,11 @@ def swap(ground: Ground, state: State) -> State:
             focus = ground.focus(without)
             here = refit(focus.evidence, state.current.hypothesis, iterations=0).cost.chi2
             alive = [c for c in ground.screened(without) if not c.dead]
-            rivals = [(c.placed,) for c in alive[:3] if c.chi2 < 0.8 * here]  # that promise to explain more
+            rivals = [
+                (c.placed,) for c in alive[: tried.rivals] if c.chi2 < tried.promises * here
+            ]  # that promise to explain more
             found, state = ground.refits(state, without, rivals, "swapping")
-            better = [r for r in found[:1] if r.cost.excess < state.current.cost.excess]
+            better = [r for r in sound(ground, found[:1]) if r.cost.excess < state.current.cost.excess]
             if better and beats(ground, better[0], state.current):
                 state = replace(state, current=better[0])
         if state.current is before:
@@ -105,11 +126,11 @@ def everywhere(ground: Ground, state: State) -> State:
 def prune(ground: Ground, state: State) -> State:
     """Drop effects that are not needed, the least needed first."""
     current = state.current
-    while len(current.hypothesis.placed) > 1:
-        without = [ground.refit(current.hypothesis.without(i)) for i in range(len(current.hypothesis.placed))]
-        least = min(without, key=lambda r: r.cost.excess)
-        needed = least.cost.excess - current.cost.excess
-        if needed >= ground.rules.least * state.base.cost.excess and beats(ground, current, least):
+    while current.hypothesis.placed:
+        placed = current.hypothesis.placed
+        without = [ground.refit(current.hypothesis.without(i)) for i in range(len(placed))]
+        idle = [r for r in without if not is_needed(ground, state, current, r)]
+        if not idle:
             break
-        current = least
+        current = min(idle, key=lambda r: r.cost.excess)
     return replace(state, current=current)

@@ -26,6 +26,7 @@ from dropo_torch.effects.simulator import overlap
 from dropo_torch.errors import InputError
 from dropo_torch.gap.log import make_setting
 from dropo_torch.gap.result import FAMILY, Gap
+from dropo_torch.gap.verify import below
 from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.parameters import ParameterSpace, Target, object_names, read_field
 from dropo_torch.problem import Problem
@@ -39,8 +40,6 @@ _Specifications = dict[str, dict[str, Any]]
 
 #: Half widths of a number's interval that its search box reaches, and the box's least half width, relative.
 REACH, LEAST = 4.0, 0.2
-#: ε of a config that had none, relative to the smallest variance of the measurement.
-EPSILON = 1e-3
 
 
 def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, float]]]:
@@ -116,9 +115,7 @@ def _with_noise(problem: Problem, noise: np.ndarray) -> Config:
     if config.noise is None:
         changes["noise"] = [float(f"{v:.3g}") for v in columns]
     if "epsilon" not in config.model_fields_set:
-        compared = problem.objective.features.feature_noise(columns)
-        if (compared > 0).any():
-            changes["epsilon"] = float(f"{EPSILON * compared[compared > 0].min() ** 2:.2g}")
+        changes["epsilon"] = float(f"{below(problem.objective.features.feature_noise(columns)):.2g}")
     return config.model_copy(update=changes)
 
 
@@ -189,8 +186,9 @@ def search_box(value: float, interval: tuple[float, float], quantity: Quantity) 
     """Return the bounds of a number that was found in an interval: several half widths to either side."""
     half = 0.5 * abs(interval[1] - interval[0])
     reach = max(REACH * half, LEAST * abs(value), 1e-3 * quantity.scale)
-    low, high = max(value - reach, quantity.low), min(value + reach, quantity.high)
-    return (float(f"{low:.4g}"), float(f"{high:.4g}")) if low < high else (value - reach, value + reach)
+    low, high = (float(f"{end:.4g}") for end in (value - reach, value + reach))
+    low, high = max(low, quantity.low), min(high, quantity.high)
+    return (low, high) if low < high else (value - reach, value + reach)
 
 
 def _document(config: Config, folder: Path) -> dict[str, Any]:

@@ -196,7 +196,7 @@ class Cost:
     Attributes:
         windows: of each window, ``(W,)``.
         penalty: 2 Σ log of the inflation of each window's noise, ``(W,)``.
-        degrees: degrees of freedom.
+        degrees: degrees of freedom; those of capped windows count as much as their χ².
     """
 
     windows: np.ndarray
@@ -241,6 +241,7 @@ def cost_of(
     """
     weights = np.where(linear.weights > 0, linear.weights, 1.0)
     chi2, penalty = (projected**2).sum(-1) * caps**2, -2 * np.log(weights).sum(-1) * caps**2
+    degrees *= float(np.mean(np.square(caps)))  # as χ² itself: what is left is noise or not, however windows are capped
     if tail is not None:
         chi2 = robust_loss(chi2, tail) / (TAIL * np.log1p(1 / TAIL))
     counted = linear.counted

@@ -10,10 +10,10 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import blocks_of, since_known, spread
+from dropo_torch.gap.log import parts_of, since_known, spread
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Ranked
-from dropo_torch.gap.rules import Rules, clears, paired
+from dropo_torch.gap.rules import Rules, as_good, chance_of, clears
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, screen
 from dropo_torch.gap.twin import Windows
 
@@ -121,7 +121,7 @@ class Ground:
 
     def clears(self, base: Refit, current: Refit) -> bool:
         """Return whether effects are right although something else remains in some windows; only if these may part."""
-        return self.evidence.robust and clears(base, current)
+        return self.evidence.robust and clears(base, current, self.rules)
 
     def focus(self, fitted: Refit, count: int = FEWER) -> Focus:
         """Return a fitted hypothesis on the windows that it fits worst and on a spread of the others."""
@@ -138,11 +138,25 @@ class Ground:
     def screened(self, fitted: Refit) -> list[Candidate]:
         """Return what all candidates promise beside a fitted hypothesis."""
         stage = f"screening {len(self.candidates)} candidates"
-        return screen(self.focus(fitted), self.candidates, lambda share: self.report(stage, share))
+        return screen(self.focus(fitted), self.candidates, self.rules.tried, lambda share: self.report(stage, share))
 
-    def advantage(self, better: Refit, worse: Refit) -> float:
-        """Return by how many standard errors, over blocks of the log, one hypothesis is nearer to it than another."""
-        return paired(worse.cost, better.cost, blocks_of(self.part.windows.episodes, 5))
+    @property
+    def comparisons(self) -> int:
+        """Candidates among which each name is chosen."""
+        return len({placed.key for placed in self.candidates})
+
+    @cached_property
+    def blocks(self) -> np.ndarray:
+        """Blocks of the refitted windows that count as independent, ``(W,)``."""
+        return parts_of(self.part.windows.episodes, self.rules.chance.blocks)
+
+    def chance(self, better: Refit, worse: Refit) -> float:
+        """Return how likely one hypothesis is as much nearer to the log than another by chance."""
+        return chance_of(better, worse, self.blocks)
+
+    def as_good(self, rival: Refit, own: Refit) -> bool:
+        """Return whether one hypothesis explains the log as well as another."""
+        return as_good(rival.cost, own.cost, self.blocks, self.rules)
 
     def refits(
         self, state: State, beside: Refit, groups: Sequence[Sequence[Placed]], stage: str,
@@ -179,7 +193,8 @@ class Ground:
         left = [(p, max(r.cost.excess, 0.0) / max(before, 1e-12)) for r in found for p in r.hypothesis.placed[known:]]
         attempts = [Ranked(*p.key, p.summary(self.setting), share, state.number) for p, share in left]
         best = found[0].cost
-        near = 3 * max(best.excess, 0.0) + self.rules.least * before + 10 * best.sigma
+        tried = self.rules.tried
+        near = tried.worse * max(best.excess, 0.0) + self.rules.least * before + tried.sigmas * best.sigma
         full = []
         for number, fitted in enumerate(r for r in found[:most] if r.cost.excess <= near):
             self.report(stage, (len(groups) + number / (most + 1)) / (len(groups) + 2))

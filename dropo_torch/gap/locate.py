@@ -15,12 +15,11 @@ from dropo_torch.gap.ground import Screening
 from dropo_torch.gap.log import blocks_of
 from dropo_torch.gap.noise import FreeForces
 from dropo_torch.gap.result import Place, Residuals
+from dropo_torch.gap.rules import Shown
 from dropo_torch.gap.twin import Windows
 
-#: Places that explain less of the gap than this are not listed; at most this many are.
-LEAST_SHARE, MOST_PLACES = 0.05, 8
-#: p-value, over trajectories, from which on a regime is told.
-P_VALUE = 0.01
+#: Thresholds of what is told of where and when.
+SHOWN = Shown()
 
 
 @dataclass(frozen=True)
@@ -99,7 +98,7 @@ def regressors(setting: Setting, windows: Windows, dof: int) -> list[Regressor]:
     return found
 
 
-def regime(setting: Setting, free: FreeForces, dof: int) -> Regressor:
+def regime(setting: Setting, free: FreeForces, dof: int, rules: Shown = SHOWN) -> Regressor:
     """Return what the missing force of a degree of freedom goes with; the velocity without words if with nothing.
 
     Each explanation is a regression over the windows of one trajectory; a t-test over trajectories says whether its
@@ -107,22 +106,23 @@ def regime(setting: Setting, free: FreeForces, dof: int) -> Regressor:
     """
     found = regressors(setting, free.windows, dof)
     best, most = replace(found[1], words=""), 0.0
+    more, factor = rules.better
     known = np.isfinite(free.forces[:, dof])
     force, episodes = free.forces[known, dof], free.windows.episodes[known]
     total = float(np.var(force)) if known.any() else 0.0
     if total <= 0:
         return best
     mean, error = float(force.mean()), float(np.sqrt(total / known.sum()))
-    if mean**2 / (mean**2 + total) > 0.5 and abs(mean) > 5 * error:
+    if mean**2 / (mean**2 + total) > rules.constant and abs(mean) > rules.sure * error:
         return replace(best, words="always, and always the same way")
     for regressor in found:
         values = regressor.values[known]
         if not np.isfinite(values).all() or np.std(values) < 1e-12:
             continue
         share = stats.spearmanr(values, force).statistic ** 2
-        if share > most * 1.05 + 0.02 and _p_value(values, force, episodes) < P_VALUE:
+        if share > most * factor + more and _p_value(values, force, episodes) < rules.regime:
             best, most = regressor, float(share)
-    return best if most > 0.05 else replace(found[1], words="")
+    return best if most > rules.correlation else replace(found[1], words="")
 
 
 def _p_value(values: np.ndarray, force: np.ndarray, episodes: np.ndarray) -> float:
@@ -136,13 +136,14 @@ def _p_value(values: np.ndarray, force: np.ndarray, episodes: np.ndarray) -> flo
     return float(stats.ttest_1samp(slopes, 0.0).pvalue) if len(slopes) > 2 else 1.0
 
 
-def places(setting: Setting, free: FreeForces, screening: Screening) -> tuple[Place, ...]:
+def places(setting: Setting, free: FreeForces, screening: Screening, rules: Shown = SHOWN) -> tuple[Place, ...]:
     """Return where a change could explain the gap, the largest share first.
 
     Args:
         setting: the model and its columns.
         free: forces that were missing.
         screening: what the candidates promise.
+        rules: thresholds.
     """
     shares: dict[tuple[str, str | None], float] = {}
     before = max(screening.chi2 - screening.degrees, 1e-12)
@@ -152,10 +153,10 @@ def places(setting: Setting, free: FreeForces, screening: Screening) -> tuple[Pl
             share = 1 - max(candidate.chi2 - screening.degrees, 0.0) / before
             shares[key] = max(shares.get(key, 0.0), min(max(share, 0.0), 1.0))
     found = []
-    for (kind, name), share in sorted(shares.items(), key=lambda item: -item[1])[:MOST_PLACES]:
-        if share >= LEAST_SHARE:
+    for (kind, name), share in sorted(shares.items(), key=lambda item: -item[1])[: rules.places]:
+        if share >= rules.place:
             dof = _dof_of(setting, kind, name)
-            when = "" if dof is None else regime(setting, free, dof).words
+            when = "" if dof is None else regime(setting, free, dof, rules).words
             found.append(Place("contact" if kind == "geom" else kind, name, share, when))
     return tuple(found)
 

@@ -85,6 +85,23 @@ def blocks_of(episodes: np.ndarray, least: int) -> np.ndarray:
     return episodes if len(np.unique(episodes)) >= least else np.arange(len(episodes)) * 10 // max(len(episodes), 1)
 
 
+def parts_of(episodes: np.ndarray, least: int) -> np.ndarray:
+    """Return blocks of windows ``(W,)``: episodes, or where these are few, runs of windows of one.
+
+    Windows share no measurement and have initial states of their own.
+
+    Args:
+        episodes: episode of each window, in the log's order, ``(W,)``.
+        least: blocks that are wanted; of fewer windows each is one.
+    """
+    names, begins, own = np.unique(episodes, return_index=True, return_inverse=True)
+    if len(names) >= least:
+        return own
+    size = max(1, len(episodes) // least)
+    run = (np.arange(len(episodes)) - begins[own]) // size
+    return own * len(episodes) + run
+
+
 def make_setting(problem: Problem, log: Trajectories) -> Setting:
     """Return where effects are looked for: the model, its columns, and the sizes of the log."""
     model, observation = copy.copy(problem.space.model), problem.observation

@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import stats
 
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.evidence import Evidence
@@ -22,8 +23,12 @@ LENGTH, ORDER = 6, 3
 TRIAL = 0.05
 #: First guess of the noise, and its floor, relative to a feature's standard deviation.
 GUESS, FLOOR = 1e-3, 1e-9
-#: Times that the noise is estimated anew, each feature weighted by the noise before.
-ROUNDS = 8
+#: Times that the noise is estimated anew, each feature weighted by the noise before: of the quietest windows, of all.
+QUIET_ROUNDS, ROUNDS = 8, 16
+#: Share of windows that are quiet; and of windows without anything but noise that pass for such.
+QUIET, CALM = 0.25, 0.98
+#: Least degrees of freedom that a feature is taken to have in a window.
+LEAST_DEGREES = 0.3
 
 
 @dataclass(frozen=True)
@@ -32,12 +37,14 @@ class FreeForces:
 
     Attributes:
         noise: standard deviation of each feature's measurement, ``(m,)``.
+        unsure: its relative standard error, ``(m,)``; zero where the noise is known.
         forces: mean free force in each window, ``(W, nv)``.
         errors: their standard errors at that noise, ``(W, nv)``.
         windows: the short windows.
     """
 
     noise: np.ndarray
+    unsure: np.ndarray
     forces: np.ndarray
     errors: np.ndarray
     windows: Windows
@@ -65,28 +72,50 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     found, _ = evidence.residuals([variant] * len(pushes), moved, pushes)
     usable = np.isfinite(found).all((0, 2)) & twin.knows(variant, windows)
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
-    relative = _relative_noise(residual, slope, m) if noise is None else np.ones(m)
+    relative, unsure = _relative_noise(residual, slope, m) if noise is None else (np.ones(m), np.zeros(m))
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)
     forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))
-    return FreeForces(np.maximum(evidence.noise * relative, FLOOR * sizes), forces, standard_errors, windows)
+    return FreeForces(np.maximum(evidence.noise * relative, FLOOR * sizes), unsure, forces, standard_errors, windows)
 
 
-def _relative_noise(residual: np.ndarray, slope: np.ndarray, m: int) -> np.ndarray:
-    """The noise of each feature relative to the guess ``(m,)``, by reweighted least squares of all windows."""
-    repeats, relative = residual.shape[1] // m, np.ones(m)
-    for _ in range(ROUNDS):
+def _relative_noise(residual: np.ndarray, slope: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """The noise of each feature relative to the guess ``(m,)``, and the relative standard errors, ``(m,)``.
+
+    By reweighted least squares, each feature weighted by the noise before. Windows in which a force changes too fast,
+    at contacts and where dry friction reverses, stand out: the noise begins with that of the quietest windows, and
+    takes in whatever is then no more than chance.
+    """
+    repeats, relative, error = residual.shape[1] // m, np.ones(m), np.zeros(m)
+    for turn in range(QUIET_ROUNDS + ROUNDS):
         factor = np.tile(1 / relative, repeats)
         basis, _ = np.linalg.qr(slope * factor[:, None])
         weighted = residual * factor
         left = weighted - np.einsum("wnq,wq->wn", basis, np.einsum("wnq,wn->wq", basis, weighted))
         chi2 = (left**2).reshape(-1, repeats, m).sum(1)
-        degrees = (1 - (basis**2).sum(-1)).reshape(-1, repeats, m).sum(1)
-        # the median of χ² of ν degrees is nearly ν (1 − 2/9ν)³
-        median = np.maximum(1 - 2 / (9 * np.maximum(degrees.mean(0), 1e-9)), 0.1) ** 3
-        relative = relative * np.sqrt(np.maximum(np.median(chi2 / np.maximum(degrees, 1e-9), 0) / median, 1e-16))
-        relative = np.clip(relative, 1e-6, 1e4)
-    return relative
+        degrees = np.maximum((1 - (basis**2).sum(-1)).reshape(-1, repeats, m).sum(1), 1e-6)
+        if turn < QUIET_ROUNDS:
+            typical = np.maximum(degrees.mean(0), LEAST_DEGREES)
+            ratio = np.quantile(chi2 / degrees, QUIET, axis=0) / (stats.chi2.ppf(QUIET, typical) / typical)
+        else:
+            ratio, error = _of_calm_windows(chi2, degrees)
+        relative = np.clip(relative * np.sqrt(np.maximum(ratio, 1e-16)), 1e-6, 1e4)
+    return relative, error
+
+
+def _of_calm_windows(chi2: np.ndarray, degrees: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Variances ``(m,)`` from χ² of features in windows ``(W, m)`` that chance allows, relative to the ones before.
+
+    With them come the relative standard errors of standard deviations, ``(m,)``.
+    """
+    typical = np.maximum(degrees.mean(0), LEAST_DEGREES)
+    largest = stats.chi2.ppf(CALM, typical)
+    reduced = chi2 / degrees
+    calm = reduced * typical < largest
+    count = np.maximum(calm.sum(0), 1)
+    mean = np.where(calm, reduced, 0.0).sum(0) / count
+    share = stats.chi2.cdf(largest, typical + 2) / stats.chi2.cdf(largest, typical)  # of the mean that is left of it
+    return np.where(calm.any(0), mean / share, 1.0), np.sqrt(0.5 / (typical * count))
 
 
 def _solve(residual: np.ndarray, slope: np.ndarray, factor: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

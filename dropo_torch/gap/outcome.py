@@ -14,16 +14,15 @@ from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
-from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Score, Strength
-from dropo_torch.gap.rules import WRONG
+from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Remaining, Score, Strength
+from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
+from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, score
 
-#: χ² per degree of freedom from which on the last fit weighs residuals by their own sizes.
-MODEL_ERROR = 3.0
 #: Last fits, at most, each with the weights that the one before suggests.
 ROUNDS = 4
 #: Median of χ² of one degree of freedom.
@@ -39,25 +38,29 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         started: when it began, by ``time.perf_counter``.
     """
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
-    noise = evidence.noise
-    last = _last_fit(evidence, naming.final.hypothesis) if naming.named else None
+    rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
+    last = _last_fit(evidence, naming.final.hypothesis, rules.sound.model_error) if naming.named else None
     final = naming.final if last is None else last.fit
-    short, base, best = scene.short, naming.base.hypothesis, final.hypothesis
+    held = cut_held(evidence, scene.held, final.hypothesis)
+    given, constant = score(evidence, held, base), constant_velocity(evidence, held)
+    after_score = score(evidence, held, final.hypothesis) if naming.named else given
+    floor = floor_score(evidence, held, final.hypothesis)
+    if naming.named and not has_skill(after_score, floor, constant, rules.sound):
+        return make_result(scene, _without_names(naming, after_score, constant), started)
+    short, best = scene.short, final.hypothesis
     before = free_forces(twin, short, base.variant, noise)
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
-    held = cut_held(evidence, scene.held, best)
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
         shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
-    given, after_score = score(evidence, held, base), score(evidence, held, best)
-    constant = constant_velocity(evidence, held)
+    remaining = _remaining(setting, naming, after, rules) if naming.named else None
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)
     return Gap(
-        where=places(setting, before, naming.first) if naming.gap else (),
+        where=places(setting, before, naming.first, rules.shown) if naming.gap else (),
         effects=shown,
         before=given,
         after=after_score,
-        noise_floor=floor_score(evidence, held, best),
+        noise_floor=floor,
         next_experiment=_next_experiment(naming, final),
         found=naming.gap,
         declared=dict(zip(problem.space.names, declared, strict=True)),
@@ -74,12 +77,14 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
-        notes=tuple(_notes(setting, naming, final, after, after_score, constant)),
+        notes=tuple(_notes(setting, naming, has_skill(given, floor, constant, rules.sound))),
+        remaining=remaining,
+        refused=naming.refused,
         symbolic=describe(setting, before, guilty(before)) if naming.gap and not naming.named else "",
     )
 
 
-def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Resolved:
+def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) -> Resolved:
     """Fit the named effects on all windows; the evidence is as it was weighted, and as finely stepped.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
@@ -88,7 +93,7 @@ def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Resolved:
     for _ in range(ROUNDS):
         own = refit(evidence, hypothesis, iterations=6)
         final = resolved(evidence, own)
-        if final.fit.cost.reduced < MODEL_ERROR:
+        if final.fit.cost.reduced < model_error:
             break
         size = np.sqrt(np.median(final.fit.residual**2, axis=0) / MEDIAN) * evidence.model_error
         lead = size.reshape(-1, evidence.chart.size)
@@ -98,26 +103,38 @@ def _last_fit(evidence: Evidence, hypothesis: Hypothesis) -> Resolved:
     return final
 
 
-def _notes(
-    setting: Setting, naming: Naming, final: Refit, after: FreeForces, simulated: Score, constant: float
-) -> Iterator[str]:
-    """What a person should know before trusting the result."""
+def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
+    """What was found, without names: with them the model still predicts no better than constant velocity."""
+    placed = naming.final.hypothesis.placed
+    names = " and ".join(p.effect.name.replace("_", " ") + (f" of {p.target}" if p.target else "") for p in placed)
+    reason = (
+        f"with {names}, which would account for most of the misfit, the model still predicts unseen data no better "
+        f"than constant velocity does (open loop {after.rollout_rmse:.3g} against {constant:.3g})"
+    )
+    return replace(naming, final=naming.base, named=False, ties=(), shares=(), partial=False, refused=reason)
+
+
+def _remaining(setting: Setting, naming: Naming, after: FreeForces, rules: Rules) -> Remaining | None:
+    """What the named effects leave, if it is more than noise."""
+    cost, typical = naming.final.cost, naming.final.typical
+    if not naming.partial and not remains(cost, rules):
+        return None
+    dof = guilty(after)
+    share = float(np.clip(max(cost.excess, 0.0) / naming.base.cost.excess, 0, 1))
+    off = float(np.mean(typical > rules.sound.rest))
+    return Remaining(
+        cost.reduced, share, off, dof_names(setting.model)[dof], regime(setting, after, dof, rules.shown).words
+    )
+
+
+def _notes(setting: Setting, naming: Naming, skill: bool) -> Iterator[str]:
+    """What a person should know besides; ``skill`` is that of the model as it is."""
     names = dof_names(setting.model)
-    if naming.partial:
-        share = 100 * float(np.mean(final.typical > WRONG))
-        yield (
-            f"This leaves no more than noise in most of the log; in {share:.0f} % of the windows something else "
-            f"remains, which none of the known effects explains, mostly at {names[guilty(after)]}."
-        )
     still = [name for name, speed in zip(names, setting.signals.speed, strict=True) if speed <= 0]
     if still:
         yield f"No velocity of {', '.join(still)} is in this log: effects there cannot be judged."
-    if simulated.rollout_rmse > constant:
-        yield (
-            "The model predicts worse than constant velocity does "
-            f"(open loop {simulated.rollout_rmse:.3g} against {constant:.3g}): "
-            "it has no skill on this log, and names should not be trusted."
-        )
+    if naming.gap and not naming.named and not skill:
+        yield "The model predicts unseen data no better than constant velocity does: it has no skill on this log."
 
 
 def _unnamed(setting: Setting, free: FreeForces) -> NamedEffect:

@@ -17,6 +17,12 @@ from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit
 
+#: Standard errors by which what long windows leave may exceed what short ones with free forces say.
+AGREE = 2.5
+#: Weight from which on a residual counts as one that noise on the initial state does not bend, and the least of them.
+SHARP, LEAST_ROWS = 0.999, 60
+#: Times that the variance components are weighted anew.
+COMPONENTS = 8
 #: Relative change of a feature's noise from which on everything is compared again.
 MOVED = 0.03
 
@@ -56,8 +62,41 @@ def known_since(ground: Ground, hypothesis: Hypothesis, since: np.ndarray) -> np
 
 
 def noise_beside(ground: Ground, fitted: Refit) -> np.ndarray:
-    """Return the noise of each feature ``(m,)`` as it is beside a fitted hypothesis."""
-    noise = ground.evidence.noise
+    """Return the noise of each feature ``(m,)`` as it is beside a fitted hypothesis.
+
+    Free forces in short windows tell it whether or not the hypothesis is right; what that leaves in the long windows
+    tells it more precisely where it is, and it is never larger. A larger one is believed only as far as the short
+    windows leave it open, so that what is missing does not pass for noise.
+    """
+    noise, left = ground.evidence.noise, noise_left(fitted, ground.evidence.noise)
     if ground.short is None:
-        return noise
-    return free_forces(ground.evidence.twin, ground.short, fitted.hypothesis.variant).noise
+        return np.minimum(noise, left)
+    free = free_forces(ground.evidence.twin, ground.short, fitted.hypothesis.variant)
+    return np.where(left < free.noise * (1 + AGREE * free.unsure), left, free.noise)
+
+
+def noise_left(fitted: Refit, noise: np.ndarray) -> np.ndarray:
+    """Return the noise of each feature ``(m,)`` by what a fit leaves in its windows; infinite where nothing tells.
+
+    The variance components of the residuals beside their windows' initial states, each feature weighted by its own.
+
+    Args:
+        fitted: the fit.
+        noise: the noise under which it was made, ``(m,)``.
+    """
+    m, rows = len(noise), fitted.residual.shape[1]
+    sharp = (fitted.linear.weights > SHARP) & fitted.linear.counted[:, None]
+    usable = sharp & np.isfinite(fitted.residual)
+    count = usable.reshape(-1, rows // m, m).sum((0, 1))
+    fitted_share = len(fitted.hypothesis.vector) / max(float(usable.sum()), 1.0)
+    relative = np.ones(m)
+    for _ in range(COMPONENTS):
+        factor = np.tile(1 / relative, rows // m)
+        basis, _ = np.linalg.qr(fitted.linear.basis * factor[:, None])
+        weighted = fitted.residual * factor
+        along = np.einsum("wnk,wn->wk", basis, weighted)
+        squares = np.where(usable, weighted - np.einsum("wnk,wk->wn", basis, along), 0.0) ** 2
+        free = np.where(usable, 1 - (basis**2).sum(-1) - fitted_share, 0.0)
+        sums, degrees = (x.reshape(-1, rows // m, m).sum((0, 1)) for x in (squares, free))
+        relative = relative * np.sqrt(np.maximum(sums / np.maximum(degrees, 1e-9), 1e-12))
+    return np.where((count >= LEAST_ROWS) & (degrees >= LEAST_ROWS / 2), noise * relative, np.inf)

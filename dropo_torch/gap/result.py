@@ -112,6 +112,25 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class Remaining:
+    """What named effects leave, where it is more than noise.
+
+    Attributes:
+        chi2_per_degree: χ² per degree of freedom; noise alone makes 1.
+        share: share of the gap's misfit that is left, in [0, 1].
+        windows: share of the log's stretches in which it shows.
+        where: joint whose missing force stands out most.
+        when: the regime in which that shows, in words, or empty.
+    """
+
+    chi2_per_degree: float
+    share: float
+    windows: float
+    where: str
+    when: str
+
+
+@dataclass(frozen=True)
 class Gap:
     """The result of ``dropo gap``.
 
@@ -133,6 +152,8 @@ class Gap:
         simulated_transitions, seconds, backend, seed: what it took.
         notes: remarks for a person.
         symbolic: a sparse formula for a force that has no name, or empty.
+        remaining: what the named effects leave, if that is more than noise.
+        refused: why what would account for the misfit has no name, or empty.
     """
 
     where: tuple[Place, ...]
@@ -158,11 +179,25 @@ class Gap:
     seed: int = 0
     notes: tuple[str, ...] = ()
     symbolic: str = ""
+    remaining: Remaining | None = None
+    refused: str = ""
+
+    @property
+    def verdict(self) -> str:
+        """What was found: ``no gap``, ``explained``, ``partly explained`` or ``unnamed``."""
+        if not self.found:
+            return "no gap"
+        if all(e.effect == "unnamed" for e in self.effects):
+            return "unnamed"
+        return "explained" if self.remaining is None else "partly explained"
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``gap.json``."""
         return plain_numbers({
             "schema": SCHEMA,
+            "verdict": self.verdict,
+            "verdict_reason": reason(self),
+            "remaining": None if self.remaining is None else asdict(self.remaining),
             "where": [asdict(place) for place in self.where],
             "effects": [_effect(e) for e in self.effects],
             "gap": {
@@ -185,6 +220,22 @@ class Gap:
             "seconds": self.seconds,
             "seed": self.seed,
         })  # fmt: skip
+
+
+def reason(gap: Gap) -> str:
+    """Return in words what a verdict stands on."""
+    if not gap.found:
+        return "what remains is no more than noise"
+    if gap.verdict == "unnamed":
+        return gap.refused or "no known effect, and no few of them together, account for the misfit"
+    if gap.remaining is None:
+        return "the named effects leave no more than noise"
+    left = gap.remaining
+    when = f", {left.when}" if left.when else ""
+    return (
+        f"what the named effects leave is more than noise: χ² per degree of freedom is {left.chi2_per_degree:.3g} "
+        f"(1 is noise alone), in {100 * left.windows:.0f} % of the log's stretches, mostly at {left.where}{when}"
+    )
 
 
 def _pair(placed: tuple[str, str | None]) -> dict[str, str | None]:

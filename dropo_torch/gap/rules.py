@@ -1,17 +1,155 @@
-"""What decides in the search for names: thresholds in units of the noise, and comparisons of hypotheses."""
+"""What decides in the search for names: every threshold, and comparisons of hypotheses by them."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dropo_torch.gap.evidence import Cost
-from dropo_torch.gap.refit import Hypothesis, Refit
+from dropo_torch.gap.chance import least_surplus, p_of_gain
 
-#: χ² per degree of freedom from which on a window is wrong, and below which it is right.
-WRONG, RIGHT = 20.0, 1.5
+if TYPE_CHECKING:
+    from dropo_torch.gap.evidence import Cost
+    from dropo_torch.gap.refit import Hypothesis, Refit
+
+
+@dataclass(frozen=True)
+class Chance:
+    """How often chance may decide.
+
+    Attributes:
+        error: share of logs in which an effect that has nothing to do with the gap may get a name: the level of each
+            named effect's test against what is left without it, over all candidates together (Bonferroni).
+        explore: level at which the search goes on with an effect; it only costs time, for the test above decides.
+        blocks: stretches of the log that count as independent, at least, where it has as many windows: of fewer than
+            about 15, no ranks are sure enough among hundreds of candidates.
+    """
+
+    error: float = 0.01
+    explore: float = 0.05
+    blocks: int = 20
+
+
+@dataclass(frozen=True)
+class Alike:
+    """When two hypotheses explain a log alike: unless one is surely worse by more than what matters.
+
+    Attributes:
+        chi2: χ² that does not matter, however sure it is: odds of e² to one.
+        share: share of the excess that does not matter, where the model's own error and not the noise decides.
+        error: how often a true tie may be missed.
+        excess: share of the excess, and
+        sigmas: standard deviations of χ², by one of which a rival may be worse at all, however unsure that is; the
+            search prefers fewer numbers among hypotheses within it.
+        promising: share of what a named effect explains that a candidate may leave, to first order, to be tried.
+        roughly, fully: candidates that are tried as ties of one effect, at most, by a rough refit and by a full one.
+    """
+
+    chi2: float = 4.0
+    share: float = 0.01
+    error: float = 0.05
+    excess: float = 0.3
+    sigmas: float = 4.0
+    promising: float = 0.3
+    roughly: int = 16
+    fully: int = 8
+
+
+@dataclass(frozen=True)
+class Tried:
+    """What the search tries. These cost time or miss a name; they give none.
+
+    Attributes:
+        refits: candidates that are refitted in a round.
+        paired: candidates of which pairs are tried, where no single one removes most.
+        pairs, families: of these, how many are refitted.
+        clearer: share of what the best single one leaves below which a pair or a family takes its place.
+        promises: share of the misfit that a rival for an accepted effect promises to leave, to be refitted;
+        rivals: how many are.
+        worse: excess of a rough fit, relative to the best one's, up to which it is fitted in full, and
+        sigmas: standard deviations of χ² that it may have besides.
+        dead: standard deviations of the noise by which a candidate must move the screened windows to be judged.
+    """
+
+    refits: int = 7
+    paired: int = 16
+    pairs: int = 5
+    families: int = 2
+    clearer: float = 0.5
+    promises: float = 0.8
+    rivals: int = 3
+    worse: float = 3.0
+    sigmas: float = 10.0
+    dead: float = 1.5
+
+
+@dataclass(frozen=True)
+class Sound:
+    """What may have a name, and what is said of the rest.
+
+    Attributes:
+        pushes: standard errors by which the fit would pass a bound of physics, were it none: then the number is absurd.
+        edge: distance from a bound, relative to the number's scale, within which it is at it.
+        floor: open-loop error, relative to what noise alone makes, up to which a model has skill although constant
+            velocity predicts as well: where nothing accelerates, a perfect model is no better.
+        rest: χ² per degree of freedom from which on what remains beside the named effects is said in the first
+            sentence. An estimate of the noise that is a fifth too low makes as much.
+        model_error: χ² per degree of freedom from which on the last fit weighs residuals by their own sizes, since the
+            model's own error decides.
+        wrong, right: χ² per degree of freedom from which on a window is wrong, and below which it is right.
+    """
+
+    pushes: float = 3.0
+    edge: float = 1e-3
+    floor: float = 1.5
+    rest: float = 1.5
+    model_error: float = 3.0
+    wrong: float = 20.0
+    right: float = 1.5
+
+
+@dataclass(frozen=True)
+class Cut:
+    """How long windows are: as long as their initial states act nearly linearly.
+
+    Attributes:
+        lengths: logged steps of a window that are tried, the longest first.
+        rough: share of residuals whose variance, over noise on the initial states, stays unexplained, up to which a
+            length will do.
+        bent: the share from which on windows are linearised statistically.
+        astray: typical error at a window's end, relative to the motion, from which on contacts come at other times than
+            measured.
+    """
+
+    lengths: tuple[int, ...] = (30, 15, 8, 4)
+    rough: float = 0.03
+    bent: float = 0.001
+    astray: float = 0.08
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What is told of where and when a gap shows; none of it gives a name.
+
+    Attributes:
+        place: share of the gap from which on a place is listed.
+        places: places that are listed at most.
+        regime: p-value, over blocks of the log, below which a regime is told.
+        correlation: squared rank correlation of the missing force from which on a regime is told, and
+        better: by how much a less plain one must exceed a plainer one's, absolute and relative.
+        constant: share of the force's mean square in its mean, and
+        sure: standard errors of the mean, from which on the force is always the same.
+    """
+
+    place: float = 0.05
+    places: int = 8
+    regime: float = 0.01
+    correlation: float = 0.05
+    better: tuple[float, float] = (0.02, 1.05)
+    constant: float = 0.5
+    sure: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -21,16 +159,14 @@ class Rules:
     Attributes:
         gate: excess in standard deviations of χ² from which on something is missing.
         least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
-        most: share of the excess that an effect removes without further question.
+        most: share of the excess that an effect removes without that pairs or families are tried in its place.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         free: numbers of the named effects beyond which each halves what they may leave, for many numbers together
             imitate what none of them is.
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         least: share of the first excess below which an effect is not named.
-        significance: paired standard errors, over blocks of the log, by which one hypothesis beats another.
-        tie: paired standard errors within which two hypotheses tie.
-        refits: candidates that are refitted in a round.
         effects: the most effects that are named.
+        chance, alike, tried, sound, cut, shown: see there.
     """
 
     gate: float = 5.0
@@ -40,10 +176,13 @@ class Rules:
     free: int = 3
     hopeless: float = 0.8
     least: float = 3e-3
-    significance: float = 3.0
-    tie: float = 2.0
-    refits: int = 7
     effects: int = 4
+    chance: Chance = field(default_factory=Chance)
+    alike: Alike = field(default_factory=Alike)
+    tried: Tried = field(default_factory=Tried)
+    sound: Sound = field(default_factory=Sound)
+    cut: Cut = field(default_factory=Cut)
+    shown: Shown = field(default_factory=Shown)
 
 
 def significant(cost: Cost, rules: Rules) -> bool:
@@ -51,9 +190,14 @@ def significant(cost: Cost, rules: Rules) -> bool:
     return cost.excess > rules.gate * cost.sigma and cost.reduced > rules.least_reduced
 
 
-def near(cost: Cost) -> float:
+def remains(cost: Cost, rules: Rules) -> bool:
+    """Return whether what named effects leave is so much more than noise that it must be said."""
+    return significant(cost, rules) and cost.reduced > rules.sound.rest
+
+
+def near(cost: Cost, rules: Rules) -> float:
     """Return how much more excess a hypothesis may have that is about as good."""
-    return max(0.3 * max(cost.excess, 0.0), 4 * cost.sigma)
+    return max(rules.alike.excess * max(cost.excess, 0.0), rules.alike.sigmas * cost.sigma)
 
 
 def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
@@ -64,27 +208,40 @@ def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
     return (1 - rules.accounted) * 0.5 ** max(0, sum(sizes.values()) - rules.free)
 
 
-def clears(base: Refit, current: Refit) -> bool:
+def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
+    """Return whether named effects remove as much of the excess as they must."""
+    return max(named.cost.excess, 0.0) <= allowance(named.hypothesis, rules) * base.cost.excess
+
+
+def clears(base: Refit, current: Refit, rules: Rules) -> bool:
     """Return whether effects leave no more than noise in most windows of a log of which most were wrong.
 
     What only imitates the truth makes all windows better and none of them right.
     """
-    return bool(np.median(base.typical) > WRONG and np.median(current.typical) < RIGHT)
+    return bool(np.median(base.typical) > rules.sound.wrong and np.median(current.typical) < rules.sound.right)
 
 
-def paired(first: Cost, second: Cost, blocks: np.ndarray) -> float:
-    """Return by how many standard errors the first misfit is above the second, over blocks of the log ``(W,)``."""
-    change = (first.windows + first.penalty) - (second.windows + second.penalty)
-    names = np.unique(blocks)
-    sums = np.array([change[blocks == b].sum() for b in names])
-    if len(sums) < 2:
-        return float(np.sign(sums.sum()) * np.inf)
-    error = sums.std(ddof=1) * np.sqrt(len(sums))
-    return float(sums.sum() / max(error, 1e-12))
+def chance_of(better: Refit, worse: Refit, blocks: np.ndarray) -> float:
+    """Return how likely a hypothesis is as much better by chance, over blocks of the log ``(W,)``."""
+    numbers = max(1, len(better.hypothesis.vector) - len(worse.hypothesis.vector))
+    return p_of_gain(_excesses(worse.cost, blocks), _excesses(better.cost, blocks), numbers)
 
 
-def simplest(fitted: Sequence[Refit]) -> Refit:
+def as_good(rival: Cost, own: Cost, blocks: np.ndarray, rules: Rules) -> bool:
+    """Return whether a rival explains a log as well: it is not surely worse by more than what matters."""
+    surplus, alike = _excesses(rival, blocks) - _excesses(own, blocks), rules.alike
+    margin = max(alike.chi2, alike.share * own.excess)
+    return surplus.sum() < near(own, rules) and least_surplus(surplus, alike.error) <= margin
+
+
+def _excesses(cost: Cost, blocks: np.ndarray) -> np.ndarray:
+    """The excess of each block ``(B,)``."""
+    windows = cost.windows + cost.penalty - cost.degrees / len(cost.windows)
+    return np.bincount(np.unique(blocks, return_inverse=True)[1], windows)
+
+
+def simplest(fitted: Sequence[Refit], rules: Rules) -> Refit:
     """Return, of hypotheses that are about as good as the best, the one with the fewest numbers."""
     best = fitted[0].cost
-    good = (r for r in fitted if r.cost.excess <= best.excess + near(best))
+    good = (r for r in fitted if r.cost.excess <= best.excess + near(best, rules))
     return min(good, key=lambda r: (len(r.hypothesis.vector), r.cost.excess))

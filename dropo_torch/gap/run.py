@@ -29,13 +29,16 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
     Args:
         scene: of :func:`prepare`.
         effects: the vocabulary; all of the package's by default.
-        rules: thresholds.
+        rules: thresholds; the scene's by default.
     """
     state = start(_ground(scene, effects, rules), scene.begin)
     if state.done:
         return ()
     return places(
-        scene.setting, free_forces(scene.twin, scene.short, state.base.hypothesis.variant, state.noise), state.first
+        scene.setting,
+        free_forces(scene.twin, scene.short, state.base.hypothesis.variant, state.noise),
+        state.first,
+        scene.rules.shown,
     )
 
 
@@ -87,10 +90,10 @@ def find_gap(
     """
     started = time.perf_counter()
     report("preparing", 0.0)
-    scene = scene or prepare(problem)
+    scene = scene or prepare(problem, rules)
     naming = _name(scene, replace(_ground(scene, effects, rules), report=report), checkpoint, resume)
     report("verifying", 0.0)
-    return make_result(scene, naming, started)
+    return make_result(scene if rules is None else replace(scene, rules=rules), naming, started)
 
 
 def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False) -> Naming:
@@ -102,10 +105,12 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
         found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume))
         if found[-1].named or not found[0].gap:
             break
-    return found[-1] if found[-1].named else found[0]
+    if found[-1].named:
+        return found[-1]
+    return replace(found[0], refused=next((n.refused for n in found if n.refused), ""))
 
 
 def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None) -> Ground:
-    """What a search stands on, by default with the whole vocabulary and the package's thresholds."""
+    """What a search stands on, by default with the whole vocabulary and the scene's thresholds."""
     short = None if scene.problem.objective.noise is not None else scene.short
-    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or Rules(), short=short)
+    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or scene.rules, short=short)

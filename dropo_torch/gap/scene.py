@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -25,18 +25,12 @@ from dropo_torch.gap.log import (
 )
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.rules import Cut, Rules
 from dropo_torch.gap.screen import all_candidates
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
 
-#: Logged steps of a window that are tried, the longest first, and the roughness that ends the search.
-LENGTHS = (30, 15, 8, 4)
-ROUGH = 0.03
-#: Roughness from which on windows are linearised statistically.
-BENT = 0.001
-#: Typical error at a window's end, relative to the motion, from which on contacts come at other times than measured.
-ASTRAY = 0.08
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
 #: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
@@ -56,6 +50,7 @@ class Scene:
         noise: standard deviation of each feature, ``(m,)``.
         evidence: all windows of the training part.
         begin: the declared parameters as given.
+        rules: thresholds.
     """
 
     problem: Problem
@@ -67,6 +62,7 @@ class Scene:
     noise: np.ndarray
     evidence: Evidence
     begin: Hypothesis
+    rules: Rules = field(default_factory=Rules)
 
     @property
     def short(self) -> Windows:
@@ -74,8 +70,12 @@ class Scene:
         return short_windows(self.setting, self.train, self.since)
 
 
-def prepare(problem: Problem) -> Scene:
+def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     """Cut the log, estimate its noise, and choose windows.
+
+    Args:
+        problem: the model, its declared parameters, and the log.
+        rules: thresholds.
 
     Raises:
         InputError: a simulator without a MuJoCo model; a log too short to judge anything, or one with a position whose
@@ -100,8 +100,9 @@ def prepare(problem: Problem) -> Scene:
         noise = free_forces(twin, short_windows(setting, train, since), begin.variant).noise
     else:
         noise = Features.of(problem.observation).feature_noise(given.numpy())
-    evidence = _choose_windows(twin, train, begin, noise, since)
-    return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
+    rules = rules or Rules()
+    evidence = _choose_windows(twin, train, begin, noise, since, rules.cut)
+    return Scene(problem, setting, twin, train, held, since, noise, evidence, begin, rules)
 
 
 def first_steps(twin: Twin, log: Trajectories, begin: Hypothesis) -> np.ndarray:
@@ -147,26 +148,26 @@ def searched(scene: Scene) -> Iterator[tuple[str, Evidence]]:
     """
     yield "", scene.evidence
     length, rough = scene.evidence.windows.length // 4, scene.evidence.rough
-    if length >= LENGTHS[-1]:
+    if length >= scene.rules.cut.lengths[-1]:
         yield "-shorter", _cut(scene.twin, scene.train, scene.noise, scene.since, length, rough=rough)
     if scene.setting.signals.contacts.any():
-        shortest = _cut(scene.twin, scene.train, scene.noise, scene.since, LENGTHS[-1])
+        shortest = _cut(scene.twin, scene.train, scene.noise, scene.since, scene.rules.cut.lengths[-1])
         yield "-contact", replace(shortest, robust=True)
 
 
 def _choose_windows(
-    twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray, since: np.ndarray
+    twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray, since: np.ndarray, rules: Cut
 ) -> Evidence:
     """The longest windows in whose initial states the simulation is still nearly linear."""
     longest, touches = longest_episode(train), bool(twin.setting.signals.contacts.any())
-    for length in (length for length in LENGTHS if length <= longest):
+    for length in (length for length in rules.lengths if length <= longest):
         evidence = _cut(twin, train, noise, since, length, FEW)
         if not len(evidence.windows):
             continue
         rough = evidence.linearise(begin.variant).roughness
-        if rough < ROUGH and (not touches or _end_error(evidence, begin) < ASTRAY):
-            return _cut(twin, train, noise, since, length, rough=rough > BENT)
-    return _cut(twin, train, noise, since, min(LENGTHS[-1], longest))
+        if rough < rules.rough and (not touches or _end_error(evidence, begin) < rules.astray):
+            return _cut(twin, train, noise, since, length, rough=rough > rules.bent)
+    return _cut(twin, train, noise, since, min(rules.lengths[-1], longest))
 
 
 def _cut(

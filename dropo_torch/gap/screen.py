@@ -18,11 +18,10 @@ from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant, parts
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
+from dropo_torch.gap.rules import Tried
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
-#: A candidate that moves the screened windows by fewer standard deviations of the noise cannot be judged by them.
-DEAD = 1.5
 #: Damping and ridge of the predicted moves; ridge, of columns of length 1, where only χ² is predicted.
 DAMPING, RIDGE, FAINT = 1e-6, 1e-10, 1e-9
 #: Candidates that one batch of simulations holds.
@@ -54,7 +53,7 @@ class Focus:
     @cached_property
     def slope(self) -> np.ndarray:
         """Their derivatives by its numbers, ``(q, W·N)``."""
-        return self.fitted.slope.reshape(len(self.fitted.slope), -1) * self.factor
+        return self.fitted.slope.reshape(len(self.fitted.slope), self.factor.size) * self.factor
 
     @property
     def excess(self) -> float:
@@ -97,19 +96,23 @@ def all_candidates(setting: Setting, effects: Sequence[Effect]) -> Iterator[Plac
 
 
 def screen(
-    focus: Focus, candidates: Sequence[Placed], on_progress: Callable[[float], None] = lambda share: None
+    focus: Focus,
+    candidates: Sequence[Placed],
+    tried: Tried,
+    on_progress: Callable[[float], None] = lambda share: None,
 ) -> list[Candidate]:
     """Return each candidate from its best start, the most promising first.
 
     Args:
         focus: the fitted hypothesis so far, on the windows to screen on.
         candidates: effects at their starts.
+        tried: thresholds.
         on_progress: called with the share of candidates that is done.
     """
     taken = {p.key for p in focus.fitted.hypothesis.placed}
     waiting, found = [c for c in candidates if c.key not in taken], list[Candidate]()
     for rows in parts(len(waiting), BATCH):
-        found += _predict(focus, waiting[rows])
+        found += _predict(focus, waiting[rows], tried.dead)
         on_progress(rows.stop / len(candidates))
     best: dict[tuple[str, str | None], Candidate] = {}
     for candidate in sorted(found, key=lambda c: (c.dead, c.chi2)):
@@ -117,7 +120,7 @@ def screen(
     return list(best.values())
 
 
-def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
+def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Candidate]:
     """Simulate candidates at their starts and beside them, in one batch, and predict."""
     evidence, linear, factor = focus.evidence, focus.fitted.linear, focus.factor
     variants: list[Variant] = []
@@ -138,12 +141,12 @@ def _predict(focus: Focus, part: Sequence[Placed]) -> Iterator[Candidate]:
         begin = found[rows][0]
         residual = evidence.project(begin, linear).ravel() * factor
         change = (found[rows][1:] - begin) / steps[:, None, None]
-        slope = evidence.project_slope(change, linear).reshape(len(moving), -1) * factor
+        slope = evidence.project_slope(change, linear).reshape(len(moving), factor.size) * factor
         known = evidence.twin.knows(variants[rows.start], evidence.windows)
         here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
         residual, slope = np.where(here, residual, before), slope * here
         lengths = np.sqrt((slope**2).sum(1))
-        dead = bool(np.linalg.norm(residual - before) < DEAD and lengths.max(initial=0.0) < DEAD)
+        dead = bool(np.linalg.norm(residual - before) < least and lengths.max(initial=0.0) < least)
         start = np.array(placed.values)
         columns = np.concatenate([shared, slope])
         move = _move(columns * here, residual * here, limits, start[moving])
@@ -169,10 +172,10 @@ def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.
     return move
 
 
-def promising_families(focus: Focus, candidates: Sequence[Candidate]) -> list[list[Placed]]:
-    """Return the effects of one number that, at all their targets together, predict the least χ²; two at most.
+def promising_families(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:
+    """Return the effects of one number that, at all their targets together, predict the least χ².
 
-    Friction or damping is seldom missing in one joint only. A family is offered where it promises less than half of
+    Friction or damping is seldom missing in one joint only. A family is offered where it promises much less than
     what its best single member leaves.
     """
     families: dict[str, list[Candidate]] = {}
@@ -180,14 +183,14 @@ def promising_families(focus: Focus, candidates: Sequence[Candidate]) -> list[li
         if not c.dead and len(c.placed.values) == 1:
             families.setdefault(c.placed.effect.name, []).append(c)
     best = _best(focus, [members for members in families.values() if len(members) > 1])
-    clear = (members for left, members in best if left < 0.5 * min(c.chi2 for c in members))
-    return [[c.placed for c in members] for members in clear][:2]
+    clear = (members for left, members in best if left < tried.clearer * min(c.chi2 for c in members))
+    return [[c.placed for c in members] for members in clear][: tried.families]
 
 
-def promising_pairs(focus: Focus, candidates: Sequence[Candidate]) -> list[list[Placed]]:
-    """Return the five pairs of candidates that together predict the least χ², the best first."""
+def promising_pairs(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:
+    """Return the pairs of candidates that together predict the least χ², the best first."""
     pairs = combinations([c for c in candidates if not c.dead], 2)
-    return [[c.placed for c in pair] for _, pair in _best(focus, pairs)[:5]]
+    return [[c.placed for c in pair] for _, pair in _best(focus, pairs)[: tried.pairs]]
 
 
 def _best(focus: Focus, groups: Iterable[Sequence[Candidate]]) -> list[tuple[float, Sequence[Candidate]]]:

@@ -15,9 +15,13 @@ from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
-from dropo_torch.gap.rules import allowance, significant
+from dropo_torch.gap.rules import accounts, significant
+from dropo_torch.gap.sound import absurd
 from dropo_torch.gap.ties import canonical, ties
 from dropo_torch.support.checkpoint import Checkpoint
+
+#: Why what a log is too short for has no name.
+UNSURE = "what explains most of it may do so by chance, for this log has too few stretches that show it"
 
 
 @dataclass(frozen=True)
@@ -35,6 +39,7 @@ class Naming:
         shares: excess that comes back when each named effect alone is left out.
         attempts: what was refitted, in order.
         partial: whether they leave nothing in most of the log, but something else remains in the rest.
+        refused: why what was found has no name.
     """
 
     evidence: Evidence
@@ -47,6 +52,7 @@ class Naming:
     shares: tuple[float, ...] = ()
     attempts: tuple[Ranked, ...] = ()
     partial: bool = False
+    refused: str = ""
 
 
 def kept(path: Path, fingerprint: str) -> Checkpoint:
@@ -127,12 +133,13 @@ def conclude(ground: Ground, state: State) -> Naming:
     unnamed = Naming(ground.evidence, base, state.first, base, gap=significant(base.cost, rules))
     if not unnamed.gap:
         return unnamed
-    state = prune(ground, state)
-    placed = state.current.hypothesis.placed
-    left = max(state.current.cost.excess, 0.0) / base.cost.excess
-    partial = ground.clears(base, state.current)
-    if not placed or not (partial or left <= allowance(state.current.hypothesis, rules)):
-        return replace(unnamed, attempts=state.attempts)
+    found, state = state.current, prune(ground, state)
+    unnamed = replace(unnamed, attempts=state.attempts)
+    if nonsense := [reason for _, reason in absurd(ground.part, state.current, rules.sound)]:
+        return replace(unnamed, refused=nonsense[0])
+    placed, partial = state.current.hypothesis.placed, ground.clears(base, state.current)
+    if not placed or not (partial or accounts(state.current, base, rules)):
+        return replace(unnamed, refused=UNSURE if found.hypothesis.placed and accounts(found, base, rules) else "")
     tied, shares = [], []
     for index in range(len(placed)):
         rivals, share, state = ties(ground, state, index)

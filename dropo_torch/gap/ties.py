@@ -8,16 +8,11 @@ from dataclasses import replace
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.rules import near
+from dropo_torch.gap.rules import Alike
 from dropo_torch.gap.screen import Candidate, Focus, left_by
 
 #: The round of attempts that only look for ties.
 ROUND = -1
-#: Share of what a named effect explains that a candidate may leave, to first order, to be refitted; and the most of
-#: them that are refitted roughly, and in full.
-PROMISING, ROUGHLY, FULLY = 0.3, 16, 8
-#: χ² by which two hypotheses may differ, however surely they do, and still explain a log alike.
-SAME = 4.0
 
 
 def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
@@ -35,22 +30,22 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
     ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
-    others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own)]
+    others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own, ground.rules.alike)]
     looking = replace(state, number=ROUND)
-    rivals, found = ground.refits(looking, without, others, "looking for ties", origin, most=FULLY)
+    rivals, found = ground.refits(looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully)
     tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
     return tied, without.cost.excess - current.cost.excess, replace(state, attempts=found.attempts)
 
 
-def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed) -> list[Candidate]:
+def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Alike) -> list[Candidate]:
     """Return candidates that explain, to first order, most of what is left without an effect; the best first."""
     degrees = focus.evidence.degrees(focus.fitted.linear) - len(focus.slope)
     before = max(float(focus.residual @ focus.residual) - degrees, 1e-12)
     share = {c.key: (left_by(focus, [c]) - degrees) / before for c in ranked if not c.dead}
-    most = max(PROMISING, 2 * share.get(own.key, 0.0))
+    most = max(rules.promising, 2 * share.get(own.key, 0.0))
     found = [c for c in ranked if not c.dead and c.key != own.key and share[c.key] < most]
     found = [c for c in found if not (own.effect.name in c.placed.effect.contains and c.placed.target == own.target)]
-    return sorted(found, key=lambda c: share[c.key])[:ROUGHLY]
+    return sorted(found, key=lambda c: share[c.key])[: rules.roughly]
 
 
 def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
@@ -66,10 +61,8 @@ def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
 def as_good(ground: Ground, state: State, rival: Refit) -> bool:
     """Return whether a rival hypothesis explains the log as well as the one that was found."""
     current = state.current
-    worse = rival.cost.excess - current.cost.excess
     as_clear = ground.clears(state.base, rival) or not ground.clears(state.base, current)
-    alike = worse < SAME or ground.advantage(current, rival) < ground.rules.tie
-    return as_clear and worse < near(current.cost) and alike
+    return as_clear and ground.as_good(rival, current)
 
 
 def canonical(

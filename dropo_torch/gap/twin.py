@@ -71,6 +71,7 @@ class Twin:
         warp: bool = False, standing: Callable[[np.ndarray], tuple[Placed, ...]] | None = None,
     ) -> None:  # fmt: skip
         self.setting, self.space, self._standing, self._chunk = setting, space, standing, chunk_size
+        self.num_threads = num_threads
         self._engine = VariantEngine(setting, space, num_threads=num_threads, warp=warp)
         self.rates = np.array(observed_rates(setting))
         self._commands: np.ndarray | None = None
@@ -82,6 +83,11 @@ class Twin:
         before, twin = self._standing, copy.copy(self)
         twin._standing = lambda declared: (*(before(declared) if before is not None else ()), placed)
         return twin
+
+    def effects(self, variant: Variant) -> tuple[Placed, ...]:
+        """Return all effects of a variant, those that every variant has among them."""
+        standing = () if self._standing is None else self._standing(np.asarray(variant.declared))
+        return (*standing, *variant.placed)
 
     def predict(
         self,
@@ -104,7 +110,7 @@ class Twin:
             the simulation can know, of the same shape.
         """
         num_k, num_w, length = len(variants), len(windows), windows.length
-        variants = [self._whole(v) for v in variants]
+        variants = [replace(v, placed=self.effects(v)) for v in variants]
         shown = windows.measured[:, 0] if starts is None else starts
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
@@ -133,7 +139,7 @@ class Twin:
             variant: the hypothesis.
             commands: commands of the episodes' logged steps, ``(E, N, nu)``.
         """
-        filters = placed_filters(self._whole(variant).placed, "command", self.setting)
+        filters = placed_filters(self.effects(variant), "command", self.setting)
         skip, lengths = self.setting.frame_skip, np.full(len(commands), commands.shape[1])
         found = settled_after(commands, filters, skip, float(self.setting.model.opt.timestep))
         return np.maximum(found, filters_known(self._engine.lead, skip, lengths))
@@ -141,12 +147,6 @@ class Twin:
     def knows(self, variant: Variant, windows: Windows) -> np.ndarray:
         """Return whether all commands that act in a window under a variant follow from the log, ``(W,)`` bool."""
         return windows.steps >= self.settled(variant, windows.commands)[windows.episodes]
-
-    def _whole(self, variant: Variant) -> Variant:
-        """A variant with what every variant has."""
-        if self._standing is None:
-            return variant
-        return replace(variant, placed=(*self._standing(np.asarray(variant.declared)), *variant.placed))
 
     def _shown(self, variant: Variant, path: np.ndarray, length: int) -> tuple[np.ndarray, np.ndarray]:
         """Return what a variant's sensors show of true paths ``(W, ·, n)``, and what is known: nothing lies before."""

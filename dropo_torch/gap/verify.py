@@ -2,18 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
+import mujoco
 import numpy as np
+import torch
 
 from dropo_torch.data.features import Features
-from dropo_torch.data.trajectory import Trajectories
+from dropo_torch.data.trajectory import Trajectories, make_transitions
+from dropo_torch.distribution import to_coordinates
 from dropo_torch.effects.base import Setting
+from dropo_torch.effects.placing import EffectSet, Entry
+from dropo_torch.effects.simulator import effect_simulator
 from dropo_torch.gap.evidence import LOST, Evidence
 from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, spread
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Score
 from dropo_torch.gap.twin import Windows
+from dropo_torch.objective import Objective
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.hidden import filter_memory
+from dropo_torch.simulators.mujoco import MujocoSimulator
 
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)
@@ -21,6 +32,8 @@ SECONDS = (3.0, 1.0, 0.3, 0.1)
 GROWTH = 0.1
 #: Simulations from which the error that noise alone makes is estimated, at least, and their seed.
 DRAWS, SEED = 150, 5
+#: ε relative to the smallest variance of the measurement.
+BELOW = 1e-3
 #: Most windows that are scored: single steps, and open-loop stretches.
 MOST, MOST_ROLLOUTS = 600, 60
 
@@ -30,12 +43,14 @@ class Held:
     """Held-out data, cut for the scores.
 
     Attributes:
-        steps: single logged steps.
+        log: the data.
+        rows: those of its transitions that are scored as single steps.
         rollouts: open-loop stretches.
         seconds: length of a stretch.
     """
 
-    steps: Windows
+    log: Trajectories
+    rows: np.ndarray
     rollouts: Windows
     seconds: float
 
@@ -57,12 +72,14 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
     setting = evidence.twin.setting
     observation, timestep = setting.observation, setting.signals.timestep
     since = evidence.twin.settled(hypothesis.variant, log.commands)
-    if not len(cut_windows(log, observation, 1, since=since)):
-        since = np.zeros(len(since), dtype=int)  # nothing is known: better scores of something
-    steps = spread(cut_windows(log, observation, 1, stride=1, since=since), MOST)
+    begins = np.flatnonzero(np.append(True, log.terminals[:-1]))
+    known = np.flatnonzero(np.arange(len(log)) >= (begins + since)[log.episodes])
+    if not len(known):  # better scores of something
+        since, known = np.zeros_like(since), np.arange(len(log))
+    rows = known[np.unique(np.linspace(0, len(known) - 1, MOST).astype(int))]
     positions = position_features(setting)
-    largest = GROWTH * _rms(feature_sizes(setting, steps.measured[:, 0])[positions])
-    chosen, seconds = steps, timestep
+    largest = GROWTH * _rms(feature_sizes(setting, observation.observed(log.observations[rows]))[positions])
+    chosen, seconds = spread(cut_windows(log, observation, 1, stride=1, since=since), MOST), timestep
     for wanted in SECONDS:
         length = min(max(1, round(wanted / timestep)), longest_episode(log))
         stride = max(1, length // 3)
@@ -71,7 +88,7 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
             chosen, seconds = windows, length * timestep
             if _rms(rollout_floor(evidence.on(windows), hypothesis)[positions]) < largest:
                 break
-    return Held(steps, chosen, seconds)
+    return Held(log, rows, chosen, seconds)
 
 
 def position_features(setting: Setting) -> np.ndarray:
@@ -81,8 +98,11 @@ def position_features(setting: Setting) -> np.ndarray:
 
 
 def score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
-    """Return the scores of a hypothesis on held-out data."""
-    error, covariance = _one_step(evidence.on(held.steps), hypothesis)
+    """Return the scores of a hypothesis on held-out data.
+
+    Single steps are those of a fit: the same simulator, the same covariance by the noise of start and end.
+    """
+    error, covariance = _one_step(evidence, held, hypothesis)
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     likelihood = _log_likelihood(covariance, (error * solved).sum(1))
     return _score(evidence, float(np.mean(error**2)), likelihood, _rollout(evidence.on(held.rollouts), hypothesis))
@@ -90,7 +110,7 @@ def score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
 
 def floor_score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
     """Return the scores that a perfect model would have, by the noise of start and end alone."""
-    _, covariance = _one_step(evidence.on(held.steps), hypothesis)
+    _, covariance = _one_step(evidence, held, hypothesis)
     mse = float(np.mean(np.einsum("tmm->tm", covariance)))
     likelihood = _log_likelihood(covariance, covariance.shape[-1])
     return _score(evidence, mse, likelihood, rollout_floor(evidence.on(held.rollouts), hypothesis))
@@ -110,15 +130,54 @@ def _log_likelihood(covariance: np.ndarray, distance: np.ndarray | int) -> float
     return float(-0.5 * np.sum(m * np.log(2 * np.pi) + logdet + distance))
 
 
-def _one_step(evidence: Evidence, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
+def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
     """Errors of single steps ``(T, m)``, and their covariance by the noise ``(T, m, m)``."""
-    m, noise = evidence.chart.size, evidence.noise
-    moved = np.concatenate([np.zeros((1, m)), np.eye(m), -np.eye(m)])[:, None]
-    found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)
-    end = found[:, :, -m:] * noise
-    end = np.where(np.isfinite(end), end, LOST * noise)
-    slope = np.moveaxis((end[1 : 1 + m] - end[1 + m :]) / 2, 0, -1)
-    return end[0], slope @ np.swapaxes(slope, 1, 2) + np.diag(noise**2)
+    twin, values = evidence.twin, np.array(hypothesis.declared)
+    objective = one_step_objective(evidence, held, hypothesis)
+    initial = objective.initial_noise(to_coordinates(values, twin.space.is_log), widen=False)
+    parts: list[tuple[torch.Tensor, ...]] = []
+
+    def collect(simulated: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:
+        parts.append((measured - simulated[:, 0], covariance))
+        return torch.zeros(1)
+
+    sums = objective.map(values[None], collect, initial=initial)
+    twin.simulated_transitions += sums.simulated_transitions + (initial.simulated_transitions if initial else 0)
+    error, covariance = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
+    lost = LOST * np.sqrt(np.einsum("tmm->tm", covariance))
+    return np.where(np.isfinite(error), error, lost), covariance
+
+
+def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Objective:
+    """Return the likelihood that a fit would have of held-out data, with a hypothesis in its simulator."""
+    twin = evidence.twin
+    setting, space, threads = twin.setting, twin.space, twin.num_threads
+    placed = twin.effects(hypothesis.variant)
+
+    def make(model: mujoco.MjModel, frame_skip: int, parameters: ParameterSpace) -> Simulator:
+        history = math.ceil(filter_memory(parameters) / frame_skip)
+        return MujocoSimulator(
+            model, parameters=parameters, frame_skip=frame_skip, num_threads=threads, history=history
+        )
+
+    if placed:
+        entries = tuple(Entry(p.effect, p.target, p.values, (-1,) * len(p.values)) for p in placed)
+        simulator = effect_simulator(
+            "mujoco", EffectSet(entries, setting), space, make, timestep=setting.signals.timestep,
+            longest=longest_episode(held.log), num_threads=threads,
+        )  # fmt: skip
+    else:
+        simulator = make(setting.model, setting.frame_skip, space)
+    transitions = make_transitions(held.log, setting.observation, history=simulator.history).select(held.rows)
+    noise = Features.of(setting.observation).column_noise(evidence.noise)
+    mask = [setting.observation.labels[c] for c in sorted(setting.masked)]
+    given = {"epsilon": below(noise), "noise": noise.tolist(), "mask": mask}
+    return Objective(simulator, transitions, setting.observation, **given)
+
+
+def below(noise: np.ndarray) -> float:
+    """Return an ε that adds next to nothing to the variance of noise ``(n,)``."""
+    return BELOW * float(noise[noise > 0].min(initial=1.0)) ** 2
 
 
 def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:

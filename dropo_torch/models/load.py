@@ -85,11 +85,12 @@ def checked(model: mujoco.MjModel, where: str) -> mujoco.MjModel:
     Raises:
         InputError: another one, naming the field.
     """
-    for name in (n for n in dir(model) if not n.startswith("_")):
-        values = getattr(model, name)
-        if isinstance(values, np.ndarray) and values.dtype.kind == "f" and not np.isfinite(values).all():
-            raise InputError(f"{where}: {name} has a value that is not finite")
-    if not (np.isfinite(model.opt.timestep) and model.opt.timestep > 0):
+    for part in (model, model.opt, model.stat):
+        for name in (n for n in dir(part) if not n.startswith("_")):
+            values = getattr(part, name)
+            if isinstance(values, np.ndarray | float) and not np.isfinite(values).all():
+                raise InputError(f"{where}: {name} has a value that is not finite")
+    if model.opt.timestep <= 0:
         raise InputError(f"{where}: timestep is {model.opt.timestep:g}; expected a positive number of seconds")
     return model
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Strength
+from dropo_torch.gap.result import Gap, NamedEffect, Place, Remaining, Strength
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
 UNNAMED = "unnamed"
@@ -159,18 +159,27 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     if not gap.found:
         return "Nothing is missing: what remains is measurement noise.", []
     if not named:
+        if gap.refused:
+            return f"Something is missing that has no name yet: {gap.refused}; {shows(gap)}.", []
         return f"Something is missing that {unexplained}; {shows(gap)}.", []
-    if len(named) == 1 and len(gap.effects) == 1:
-        return f"{_clause(named[0])}: {numbers(named[0].parameters)}.", []
+    if len(named) == 1:
+        rest = "" if gap.remaining is None else f", but this does not explain everything: {left(gap.remaining)}"
+        return f"{_clause(named[0])}: {numbers(named[0].parameters)}{rest}.", []
     items = [
         f"{noun(e.effect, e.target)}: {'too much in the model, ' if _too_much(e) else ''}{numbers(e.parameters)}"
         for e in named
     ]
-    if len(named) < len(gap.effects):
-        items.append(f"something that {unexplained}")
     count = _COUNTS[len(items)] if len(items) < len(_COUNTS) else str(len(items))
     differ = any(_too_much(e) or e.effect in _CLAUSES for e in named)
-    return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things:", items
+    rest = "" if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
+    return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
+
+
+def left(remaining: Remaining) -> str:
+    """Return what named effects leave, and where and when it shows."""
+    size = f"what remains is {short(remaining.chi2_per_degree)} times what noise would leave (χ² per degree of freedom)"
+    when = f", {remaining.when}" if remaining.when else ""
+    return f"{size}, mostly at {remaining.where}{when}"
 
 
 def shows(gap: Gap) -> str:

@@ -17,12 +17,13 @@ def stuck(record: Record, rules: Rules) -> list[Finding]:
     """Return columns that stand still while their position or velocity says that they move."""
     found = []
     step = record.step or 1.0
+    usual = float(np.median([np.ptp(record.before[:, c.position]) for c in record.pairs])) if record.pairs else 0.0
     for c in record.pairs:
         position, speed = record.before[:, c.position], record.before[:, c.velocity]
-        moved, told = float(np.ptp(position)), float(np.abs(speed).max() * step)
+        moved, told = float(np.ptp(position)), float(np.abs(np.cumsum(speed)).max() * step)
         if np.ptp(speed) == 0 and moved > 0 and np.median(np.abs(record.steps[:, c.position])) > 0:
             found.append(_constant(record, c, c.velocity, moved))
-        elif moved == 0 and np.ptp(speed) > 0 and told > 0:
+        elif moved == 0 and np.ptp(speed) > 0 and told > max(rules.frozen_travel * usual, 0.0):
             found.append(_constant(record, c, c.position, told))
         else:
             found += _frozen(record, c, step, rules)
@@ -145,9 +146,10 @@ def units(record: Record, rules: Rules) -> list[Finding]:
     evidence = {"turns": reach, "outside": float(len(outside)), "skill": as_is, "skill_in_degrees": degrees}
     decided = degrees - as_is > rules.skill
     scale = {record.signal(i): DEGREE for i in columns}
-    if (len(fits) > 0 and len(fits) == len(outside)) or decided or reach > rules.many_turns:
+    within = len(fits) > 0 and len(fits) == len(outside)
+    if decided or ((within or reach > rules.many_turns) and as_is < 2 * rules.skill):
         named = [c.position for c in (outside or angles) if c.position is not None]
-        sure = decided or (len(fits) > 0 and len(fits) == len(outside) and as_is < rules.skill)
+        sure = decided or (within and as_is < rules.skill)
         what = f"{record.named(named)} reach {reach:.3g} turns if they are radians: the angles are in degrees"
         if outside:
             what += f"; they leave the ranges of {', '.join(c.name for c in outside)}, and in degrees lie within"

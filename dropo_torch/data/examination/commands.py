@@ -7,13 +7,13 @@ what the velocities did, each degree of freedom with terms of its own for whatev
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 
 import mujoco
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence
-from dropo_torch.data.examination.prediction import chosen_rows, simulate
+from dropo_torch.data.examination.prediction import chosen_rows, response_steps, simulate
 from dropo_torch.data.examination.record import Record
 from dropo_torch.data.examination.rules import Rules
 
@@ -64,11 +64,11 @@ def commands(record: Record, rules: Rules) -> list[Finding]:
     plain = effects.explained(Reading(own))
     if plain is None:
         return []
-    inferred = _inferred(record)
-    found = _exchanged(record, effects, plain, rules) or _negated(record, plain, rules)
-    if not found and not inferred:
-        found = _units(record, plain, rules) + _late(record, effects, plain, rules)
-    return found
+    late = [] if _inferred(record) else _late(record, effects, plain, rules)
+    return (
+        late or _exchanged(record, effects, plain, rules) or _negated(record, plain, rules)
+        or ([] if _inferred(record) else _units(record, plain, rules))
+    )  # fmt: skip
 
 
 def _inferred(record: Record) -> bool:
@@ -88,6 +88,8 @@ class _Effects:
         logged: logged commands so many rows further on, by shift, each ``(T, nu)``.
         terms: an orthonormal basis of what may explain changes besides, ``(T, p)``.
         scale: standard deviation of each column of what is left, ``(v,)``.
+        made: what commands make where they act, without what other terms explain, by shift, actuator and command:
+            computed when first asked for.
     """
 
     change: np.ndarray
@@ -95,6 +97,7 @@ class _Effects:
     logged: dict[int, np.ndarray]
     terms: np.ndarray
     scale: np.ndarray
+    made: dict[tuple[int, int, int], np.ndarray] = field(default_factory=dict)
 
     @property
     def controls(self) -> int:
@@ -111,7 +114,7 @@ class _Effects:
         seen = np.flatnonzero(columns >= model.nq)
         if seen.size == 0 or not (log.actions.std(axis=0) > 0).any():
             return None
-        rows = chosen_rows(record, model.nu + 1, reach=REACH)
+        rows = chosen_rows(record, record.frame_skip + model.nu * response_steps(record), reach=REACH)
         if len(rows) < LEAST_ROWS:
             return None
         predicted, response = _responses(record, rows, seen)
@@ -125,9 +128,10 @@ class _Effects:
         logged = {s: log.actions[rows + s] for s in range(-REACH, REACH + 1)}
         terms = _terms(record, rows, predicted[good])
         change, response = change[:, moved], response[:, moved]
-        rest = change - terms @ (terms.T @ change)
-        scale = np.maximum(1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0), 1e-9)
-        return cls(change, response, logged, terms, scale).rescaled()
+        found = cls(change, response, logged, terms, np.ones(change.shape[1]))
+        rest = found._rest(change)
+        scale = 1.4826 * np.median(np.abs(rest - np.median(rest, axis=0)), axis=0)
+        return replace(found, scale=np.maximum(scale, 1e-9)).rescaled()
 
     def rescaled(self) -> _Effects:
         """Return these with the scale of what the best simple reading leaves."""
@@ -140,19 +144,27 @@ class _Effects:
                 size = float(np.log(scale).sum())
                 if size < least:
                     best, least = scale, size
-        return _Effects(self.change, self.response, self.logged, self.terms, np.maximum(best, 1e-6 * self.scale))
+        return replace(self, scale=np.maximum(best, 1e-6 * self.scale))
 
     def _columns(self, reading: Reading) -> np.ndarray:
         """Changes that each command makes under a reading, without what other terms explain, ``(T, v, nu)``."""
-        acting = self.logged[reading.shift][:, list(reading.order)]
-        made = self.response * acting[:, None, :]
-        flat = made.reshape(len(made), -1)
-        return np.asarray((flat - self.terms @ (self.terms.T @ flat)).reshape(made.shape))
+        parts = []
+        for actuator, command in enumerate(reading.order):
+            key = reading.shift, actuator, command
+            if key not in self.made:
+                acting = self.logged[reading.shift][:, command, None]
+                self.made[key] = self._rest(self.response[:, :, actuator] * acting)
+            parts.append(self.made[key])
+        return np.stack(parts, axis=2)
+
+    def _rest(self, changes: np.ndarray) -> np.ndarray:
+        """What the other terms leave of changes ``(T, v)``; sums this small take longest where they are shared out."""
+        return np.asarray(changes - np.einsum("tp,pv->tv", self.terms, np.einsum("tp,tv->pv", self.terms, changes)))
 
     def _fit(self, reading: Reading) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
         """Gains, residuals ``(T, v)``, whitened columns and the inverse of their normal matrix."""
         made = self._columns(reading)
-        target = self.change - self.terms @ (self.terms.T @ self.change)
+        target = self._rest(self.change)
         count, width, controls = made.shape
         weight = np.ones(count)
         matrix = (made / self.scale[:, None]).reshape(count * width, controls)
@@ -185,7 +197,7 @@ class _Effects:
         scores = (matrix * whitened.reshape(-1, 1)).reshape(count, width, -1).sum(axis=1)
         sums = np.stack([scores[b].sum(axis=0) for b in blocks])
         errors = np.sqrt(np.maximum(np.diag(inverse @ (sums.T @ sums) @ inverse), 1e-300))
-        target = (self.change - self.terms @ (self.terms.T @ self.change)) / self.scale
+        target = self._rest(self.change) / self.scale
         kept = np.sqrt((whitened**2).mean(axis=1))
         kept = kept <= np.quantile(kept, 0.95)
         whole = float((target[kept] ** 2).sum())
@@ -209,13 +221,16 @@ def _responses(record: Record, rows: np.ndarray, seen: np.ndarray) -> tuple[np.n
     ).T
     base = np.clip(actions, low, high)
     ends = simulate(model, states, base, record.frame_skip)[:, columns]
+    steps = response_steps(record)
+    short = ends if steps == record.frame_skip else simulate(model, states, base, steps)[:, columns]
     response = np.empty((len(rows), len(columns), model.nu))
-    for j in range(model.nu):
-        size = 0.1 * max(float(actions[:, j].std()), 1e-6)
+    for j in range(model.nu):  # over so large a change that stops and contacts do not hide what a command does
+        size = 0.5 * max(float(actions[:, j].std()), 1e-6)
         moved = base.copy()
-        moved[:, j] += np.where(base[:, j] + size > high[j], -size, size)
-        change = simulate(model, states, moved, record.frame_skip)[:, columns] - ends
-        response[:, :, j] = change / (moved[:, j] - base[:, j])[:, None]
+        moved[:, j] = np.clip(np.where(np.abs(base[:, j]) > size, -1, 0) * base[:, j], low[j], high[j])
+        moved[:, j] += np.where(moved[:, j] != base[:, j], 0.0, np.where(base[:, j] + size > high[j], -size, size))
+        change = simulate(model, states, moved, steps)[:, columns] - short
+        response[:, :, j] = change / (moved[:, j] - base[:, j])[:, None] * (record.frame_skip / steps)
     return ends - states[:, columns], response
 
 

@@ -29,21 +29,32 @@ def _misplaced(record: Record, rules: Rules) -> tuple[Record, list[Finding]]:
     other = _other_row(record)
     if other is not None:
         return record, [other]
+    if _unordered(record):
+        what = (
+            "what was observed after a row is not the next row, anywhere: the rows are in no order. A fit of single "
+            "transitions takes them; whatever looks at longer stretches does not"
+        )
+        advice = "terminals that are true in every row say so"
+        every = np.ones(len(record.log), dtype=bool)
+        found = Finding("unordered", (), what, "doubtful", advice=advice)
+        return record.with_breaks(~every, every), [found]
     off = _unlike(record.before[1:], record.after[:-1], rules) & ~record.log.terminals[:-1]
-    inside = int((~record.log.terminals[:-1]).sum())
-    if not off.any():
-        return record, []
     rows = np.flatnonzero(off)
+    if rows.size == 0:
+        return record, []
     record = record.with_breaks(np.zeros(len(record.log), dtype=bool), np.append(off, True))
-    share = len(rows) / max(inside, 1)
-    if share < 0.5:
-        return record, [_breaks(record, rows, rows + 1, True, "what was observed after a row is not the next row")]
-    what = (
-        f"in {share:.0%} of the rows the next row does not follow: the rows are in no order. A fit of single "
-        "transitions takes them; whatever looks at longer stretches does not"
-    )
-    advice = "terminals that are true in every row say so"
-    return record, [Finding("unordered", (), what, "doubtful", evidence={"share": share}, advice=advice)]
+    return record, [_breaks(record, rows, rows + 1, True, "what was observed after a row is not the next row")]
+
+
+def _unordered(record: Record) -> bool:
+    """Whether from one row to the next there is far more than what a transition changes."""
+    inside = ~record.log.terminals[:-1]
+    if inside.sum() < 10:
+        return False
+    between = np.median(np.abs(record.before[1:] - record.after[:-1])[inside], axis=0)
+    within = np.median(np.abs(record.after - record.before), axis=0)
+    moving = within > 0
+    return bool(moving.any() and np.median(between[moving] / within[moving]) > 3)
 
 
 def _other_row(record: Record) -> Finding | None:

@@ -127,6 +127,8 @@ def _matched(
     for a, b in zip(*np.nonzero(_alike(record, pool) > 0.5), strict=True):
         found = likeness(record, pool[a], pool[b])
         slopes[a, b], table[a, b] = found.slope, found.share if found.slope > 0 else 0.0
+    if not any(_far_better(table, pool, c, own[c], rules) for c in group):
+        return None
     chosen = _pairing(table, pool, group)
     if chosen is None:
         return None
@@ -137,12 +139,24 @@ def _matched(
     if not moved:
         return None
     for c, a, b in moved:
-        before = own[c].share if own[c].slope > 0 else 0.0
         if table[a, b] < rules.like or not (1 / rules.sure_slope < slopes[a, b] / step < rules.sure_slope):
             return None
-        if (1 - before) < rules.better * (1 - table[a, b]):
+        if not _beats(table[a, b], own[c], rules):
             return None
     return [(c, pool[a], pool[b]) for c, a, b in moved]
+
+
+def _far_better(table: np.ndarray, pool: Sequence[int], c: Pair, own: Likeness, rules: Rules) -> bool:
+    """Whether other columns are like a coordinate's position or velocity, and its own are not."""
+    place = pool.index(c.position), pool.index(c.velocity)
+    others = [float(table[a, b]) for a, b in np.ndindex(*table.shape) if (a, b) != place and {a, b} & set(place)]
+    best = max(others, default=0.0)
+    return bool(best > rules.like and _beats(best, own, rules))
+
+
+def _beats(share: float, own: Likeness, rules: Rules) -> bool:
+    """Whether an r² leaves far less than the columns as they stand."""
+    return (1 - (own.share if own.slope > 0 else 0.0)) >= rules.better * (1 - share)
 
 
 def _alike(record: Record, pool: Sequence[int]) -> np.ndarray:
@@ -220,13 +234,14 @@ def _slopes(record: Record, pairs: Sequence[Pair], own: dict[Pair, Likeness], ru
     if united:
         found.append(_units(record, united, size, rules))
         off = [c for c in off if c not in united]
-    values = np.array([size[c] for c in off])
-    common = len(off) > 0 and len(off) == len(pairs) and values.max() < values.min() * (1 + rules.common)
-    if common:
-        found += _time_step(record, off, float(np.median(values)))
-    elif off:
-        found += [_scale(record, c, size[c], rules) for c in off]
-    return found
+    if not off:
+        return found
+    values = np.array([size[c] for c in pairs if c not in united])
+    typical = float(np.median(values))
+    near = np.abs(np.log(values / typical)) < np.log(1 + rules.common)
+    if near.mean() >= 0.75 and abs(np.log(typical)) > np.log(1 + rules.common):
+        return found + _time_step(record, off, typical)
+    return found + _scales(record, off, size, rules)
 
 
 def _sign(record: Record, pairs: Sequence[Pair], ratio: dict[Pair, float]) -> Finding:
@@ -243,7 +258,7 @@ def _unit(c: Pair, ratio: float, rules: Rules) -> tuple[bool, float, str] | None
     """Whether the position is the one in another unit, the factor to the model's, and the unit."""
     for factor, name in UNITS[c.angle].items():
         for of_position, expected in ((True, 1 / factor), (False, factor)):
-            if abs(np.log(ratio / expected)) < rules.unit * (1 if expected < 10 else 2):
+            if abs(np.log(ratio / expected)) < rules.unit:
                 return of_position, factor, name
     return None
 
@@ -284,17 +299,22 @@ def _time_step(record: Record, pairs: Sequence[Pair], ratio: float) -> list[Find
     )]  # fmt: skip
 
 
-def _scale(record: Record, c: Pair, ratio: float, rules: Rules) -> Finding:
-    what = (
-        f"{record.named([c.position])} changes by {ratio:.4g} times what {record.named([c.velocity])} says: one of "
-        "both is in another unit or has another gain"
-    )
-    sure = not 1 / rules.sure_slope < ratio < rules.sure_slope
-    return Finding(
-        "units", (record.label(c.position), record.label(c.velocity)), what, confidence(sure), evidence={c.name: ratio},
-        cure={"data": {"scale": {record.signal(c.velocity): float(f"{ratio:.4g}")}}},
-        advice=f"or the position's: {record.signal(c.position)}: {1 / ratio:.4g}",
-    )  # fmt: skip
+def _scales(record: Record, pairs: Sequence[Pair], size: dict[Pair, float], rules: Rules) -> list[Finding]:
+    """Columns by themselves in a unit of no name, or with a gain: the sure ones, and the doubtful ones."""
+    found = []
+    far = [c for c in pairs if not 1 / rules.sure_slope < size[c] < rules.sure_slope]
+    for group, sure in ((far, True), ([c for c in pairs if c not in far], False)):
+        if not group:
+            continue
+        ratios = ", ".join(f"{record.named([c.position])} by {size[c]:.4g} times" for c in group)
+        what = f"positions change more or less than their velocities say: {ratios}; a unit or a gain"
+        found.append(Finding(
+            "units", tuple(record.label(i) for c in group for i in (c.position, c.velocity)), what, confidence(sure),
+            evidence={c.name: size[c] for c in group},
+            cure={"data": {"scale": {record.signal(c.velocity): float(f"{size[c]:.4g}") for c in group}}},
+            advice="or the inverse of the positions', where those are wrong",
+        ))  # fmt: skip
+    return found
 
 
 def _delays(record: Record, pairs: Sequence[Pair], rules: Rules) -> list[Finding]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 
 import mujoco
@@ -11,19 +12,19 @@ from mujoco import rollout
 from dropo_torch.data.examination.record import Record
 from dropo_torch.models.load import quiet_mujoco
 
-#: Microseconds of simulation that one prediction may take, about, and the most rows that are simulated.
-BUDGET, MOST_ROWS = 1.5e5, 1200
+#: Microseconds of simulation that an examination may take, about, and the fewest and most rows that are simulated.
+BUDGET, LEAST_ROWS, MOST_ROWS = 2e5, 200, 800
+#: Threads of a simulation; results do not depend on them.
+THREADS = min(4, os.cpu_count() or 1)
 
 
-def chosen_rows(record: Record, runs: int, block: int = 40, reach: int = 0) -> np.ndarray:
-    """Return rows in blocks spread over the log, so few that simulating each ``runs`` times takes no time.
+def chosen_rows(record: Record, steps: int, block: int = 40, reach: int = 0) -> np.ndarray:
+    """Return rows in blocks spread over the log, so few that simulating ``steps`` physics steps of each takes no time.
 
     ``reach`` rows before and after each must follow one another.
     """
-    model = record.model
-    assert model is not None
-    cost = (3 + 0.15 * model.nv**2) * (2 if model.npair or _touching(model) else 1) * record.frame_skip * max(runs, 1)
-    most = int(np.clip(BUDGET / cost, 80, MOST_ROWS))
+    assert record.model is not None
+    most = int(np.clip(BUDGET / (_cost(record.model) * steps), LEAST_ROWS, MOST_ROWS))
     usable = ~record.cut
     number = record.runs
     for shift in range(1, reach + 1):
@@ -36,6 +37,19 @@ def chosen_rows(record: Record, runs: int, block: int = 40, reach: int = 0) -> n
     blocks = np.array_split(rows, max(1, len(rows) // block))
     picked = np.unique(np.linspace(0, len(blocks) - 1, max(1, most // block)).astype(int))
     return np.concatenate([blocks[i] for i in picked])
+
+
+def response_steps(record: Record) -> int:
+    """Return over how many physics steps of a row the commands' effect is simulated: all, unless that takes long."""
+    model = record.model
+    assert model is not None
+    affordable = BUDGET / (LEAST_ROWS * _cost(model) * max(model.nu, 1))
+    return int(np.clip(affordable, 1, record.frame_skip))
+
+
+def _cost(model: mujoco.MjModel) -> float:
+    """Microseconds of a physics step, about."""
+    return float((3 + 0.15 * model.nv**2) * (2 if model.npair or _touching(model) else 1))
 
 
 def _touching(model: mujoco.MjModel) -> bool:
@@ -55,7 +69,7 @@ def simulate(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray, st
     start[:, first : first + model.nq + model.nv] = states
     control = np.repeat(controls[:, None], steps, axis=1)
     with quiet_mujoco():
-        out, _ = rollout.rollout(model, [data], start, control, nstep=steps)
+        out, _ = rollout.rollout(model, [mujoco.MjData(model) for _ in range(THREADS)], start, control, nstep=steps)
     ends = np.array(out[:, -1, first : first + model.nq + model.nv])
     with np.errstate(invalid="ignore"):
         bad = ~(np.abs(ends) < 1e8).all(axis=1) | (out[:, -1, 0] < start[:, 0] + 0.5 * steps * model.opt.timestep)
@@ -73,7 +87,7 @@ def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
     columns = np.asarray(record.observation.columns)
     if model is None or record.log.actions.shape[1] != model.nu or model.na or not (columns >= model.nq).any():
         return 0.0, 0.0
-    rows = chosen_rows(record, 2)
+    rows = chosen_rows(record, 2 * record.frame_skip)
     scale = np.ones(len(columns))
     scale[list(factors)] = list(factors.values())
     found = []

@@ -29,10 +29,10 @@ class Rules:
         like: r² that a column must reach to be called another one's derivative.
         unlike: r² that the column in its place must then stay below.
         better: factor by which the unexplained part must fall for columns to be called exchanged.
-        slope: relative error of the slope that is told: integrators and filters make a few percent.
+        slope: relative error of the slope that is told: large steps make a fifth.
         sure_slope: factor of the slope that no faulty sensor has, so that the unit is wrong.
         unit: relative distance from a unit's factor within which the unit is named.
-        common: relative spread of slopes that count as one: then it is the time step.
+        common: relative spread of the slopes of most columns that count as one: then it is the time step.
         late: what the best shift of a velocity leaves of the misfit without one, doubtful; filters do this.
         sure_late: the same, sure: a shift by a whole row and little else.
         hold: share of rows in which a moving column stands still that is told; polled buses repeat some.
@@ -67,19 +67,19 @@ class Rules:
     like: float = 0.9
     unlike: float = 0.8
     better: float = 5.0
-    slope: float = 0.15
+    slope: float = 0.3
     sure_slope: float = 3.0
-    unit: float = 0.05
-    common: float = 0.1
+    unit: float = 0.25
+    common: float = 0.25
     late: float = 0.7
     sure_late: float = 0.25
     hold: float = 0.03
     sure_hold: float = 0.3
     frozen: int = 10
-    frozen_travel: float = 0.1
+    frozen_travel: float = 0.05
     quantum: float = 0.5
     jitter: float = 0.05
-    gap: float = 1.5
+    gap: float = 1.75
     norm: float = 0.02
     sure_norm: float = 0.2
     turned: float = 0.3

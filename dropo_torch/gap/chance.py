@@ -1,0 +1,60 @@
+"""What chance alone does: p-values of one hypothesis over another, and whether two explain a log alike.
+
+All are over blocks of the log. The misfit of a wrong model is no noise: over a window it nearly has one shape, of
+another size and sign from window to window. So a block counts as one draw, whatever it holds, and its gain is only as
+sure as its sign is, which the size of a gain says little about: true effects gain in every block, by sizes that differ
+by decades.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy import stats
+
+
+def p_of_ranks(gains: np.ndarray) -> float:
+    """Return how likely gains of blocks ``(B,)`` are as large, by Wilcoxon's signed ranks, where either sign is.
+
+    It is at least 2^−B: blocks that are few prove nothing, however much each gains.
+    """
+    gains = gains[gains != 0]
+    return float(stats.wilcoxon(gains, alternative="greater").pvalue) if len(gains) else 1.0
+
+
+def p_of_share(before: np.ndarray, after: np.ndarray, numbers: int) -> float:
+    """Return how likely an effect that has nothing to do with a misfit removes as large a share of it.
+
+    The squared correlation of a misfit of n independent sizes with p directions drawn at random is a beta variable with
+    p/2 and (n − p)/2; n is the number of blocks, weighted by what each has of the misfit.
+
+    Args:
+        before, after: excess χ² of each block without and with the effect, ``(B,)``.
+        numbers: p, those that the effect has.
+    """
+    sizes, whole = np.maximum(before, 0.0), float(before.sum())
+    if whole <= 0:
+        return 1.0
+    count = float(sizes.sum() ** 2 / (sizes**2).sum())
+    share = 1 - max(float(after.sum()), 0.0) / whole
+    if count <= numbers or share <= 0:
+        return 1.0
+    return float(stats.beta.sf(share, 0.5 * numbers, 0.5 * (count - numbers)))
+
+
+def p_of_gain(before: np.ndarray, after: np.ndarray, numbers: int) -> float:
+    """Return how likely chance makes a hypothesis as much better, by either test; see :func:`p_of_share`."""
+    return min(1.0, 2 * min(p_of_ranks(before - after), p_of_share(before, after, numbers)))
+
+
+def least_surplus(surplus: np.ndarray, error: float) -> float:
+    """Return by how much a hypothesis is worse, of blocks ``(B,)`` together, at least: Student's lower limit.
+
+    Args:
+        surplus: by how much the χ² of each block is larger.
+        error: how often the true surplus is below the limit.
+    """
+    count = len(surplus)
+    if count < 2:
+        return -np.inf
+    spread = float(surplus.std(ddof=1)) * np.sqrt(count)
+    return float(surplus.sum()) - float(stats.t.isf(error, count - 1)) * spread
