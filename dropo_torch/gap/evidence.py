@@ -47,6 +47,11 @@ class Linearisation:
     roughness: float
 
     @property
+    def num_features(self) -> int:
+        """Features m of which the windows have measurements."""
+        return int(self.basis.shape[-1])
+
+    @property
     def counted(self) -> np.ndarray:
         """Which windows count at all, ``(W,)`` bool."""
         return np.asarray((self.weights > 0).any(-1))

@@ -39,7 +39,9 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     """
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
     rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
-    last = _last_fit(evidence, naming.final.hypothesis, rules.sound.model_error) if naming.named else None
+    last, rest = None, naming.final
+    if naming.named:
+        last, rest = _last_fit(evidence, naming.final.hypothesis, rules.sound.model_error)
     final = naming.final if last is None else last.fit
     held = cut_held(evidence, scene.held, final.hypothesis)
     given, constant = score(evidence, held, base), constant_velocity(evidence, held)
@@ -53,7 +55,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
         shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
-    remaining = _remaining(setting, naming, after, rules) if naming.named else None
+    remaining = _remaining(setting, naming, rest, after, rules) if naming.named else None
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)
     return Gap(
         where=places(setting, before, naming.first, rules.shown) if naming.gap else (),
@@ -67,7 +69,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         noise=tuple(noise.tolist()),
         labels=evidence.chart.labels,
         units=evidence.chart.units,
-        reduced=(naming.base.cost.reduced, naming.final.cost.reduced),
+        reduced=(naming.base.cost.reduced, rest.cost.reduced),
         ranking=_ranking(naming.attempts),
         residuals=residual_pictures(setting, before, after, 2 if naming.gap else 0),
         cannot_judge=tuple(p.key for p in naming.first.silent),
@@ -77,22 +79,24 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
-        notes=tuple(_notes(setting, naming, has_skill(given, floor, constant, rules.sound))),
+        notes=tuple(_notes(setting, naming, rest, rules, has_skill(given, floor, constant, rules.sound))),
         remaining=remaining,
         refused=naming.refused,
         symbolic=describe(setting, before, guilty(before)) if naming.gap and not naming.named else "",
     )
 
 
-def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) -> Resolved:
-    """Fit the named effects on all windows; the evidence is as it was weighted, and as finely stepped.
+def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) -> tuple[Resolved, Refit]:
+    """Fit the named effects on all windows, as they are weighted and stepped in the end; and beside it as noise weighs.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
     error of a real model grows with the lead, and differs between columns.
     """
+    rest = None
     for _ in range(ROUNDS):
         own = refit(evidence, hypothesis, iterations=6)
         final = resolved(evidence, own)
+        rest = rest or final.fit
         if final.fit.cost.reduced < model_error:
             break
         size = np.sqrt(np.median(final.fit.residual**2, axis=0) / MEDIAN) * evidence.model_error
@@ -100,7 +104,8 @@ def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) ->
         smooth = np.maximum(np.maximum.accumulate(lead, axis=0), 1.0)
         smooth[0] = 1.0
         evidence, hypothesis = replace(evidence, model_error=smooth.ravel()), own.hypothesis
-    return final
+    assert rest is not None
+    return final, rest
 
 
 def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
@@ -114,25 +119,32 @@ def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
     return replace(naming, final=naming.base, named=False, ties=(), shares=(), partial=False, refused=reason)
 
 
-def _remaining(setting: Setting, naming: Naming, after: FreeForces, rules: Rules) -> Remaining | None:
-    """What the named effects leave, if it is more than noise."""
-    cost, typical = naming.final.cost, naming.final.typical
+def _remaining(setting: Setting, naming: Naming, rest: Refit, after: FreeForces, rules: Rules) -> Remaining | None:
+    """What the named effects leave, if it is more than noise; what only the step of the model leaves is no part."""
+    cost, typical = rest.cost, rest.typical
     if not naming.partial and not remains(cost, rules):
         return None
+    base = naming.base.cost
     dof = guilty(after)
-    share = float(np.clip(max(cost.excess, 0.0) / naming.base.cost.excess, 0, 1))
+    share = float(np.clip(cost.excess / cost.degrees / (base.excess / base.degrees), 0, 1))
     off = float(np.mean(typical > rules.sound.rest))
     return Remaining(
         cost.reduced, share, off, dof_names(setting.model)[dof], regime(setting, after, dof, rules.shown).words
     )
 
 
-def _notes(setting: Setting, naming: Naming, skill: bool) -> Iterator[str]:
+def _notes(setting: Setting, naming: Naming, rest: Refit, rules: Rules, skill: bool) -> Iterator[str]:
     """What a person should know besides; ``skill`` is that of the model as it is."""
     names = dof_names(setting.model)
     still = [name for name, speed in zip(names, setting.signals.speed, strict=True) if speed <= 0]
     if still:
         yield f"No velocity of {', '.join(still)} is in this log: effects there cannot be judged."
+    own = naming.final.cost
+    if naming.named and remains(own, rules) and not remains(rest.cost, rules):
+        yield (
+            f"The model's own step resolves this only so well: χ² per degree of freedom is {own.reduced:.3g} with it, "
+            f"and {rest.cost.reduced:.3g} with a finer one. The numbers are those of an endlessly fine step."
+        )
     if naming.gap and not naming.named and not skill:
         yield "The model predicts unseen data no better than constant velocity does: it has no skill on this log."
 

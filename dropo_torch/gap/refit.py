@@ -26,6 +26,8 @@ RIDGE, LONGEST = 1e-12, 5.0
 FAR = 0.03
 #: Half-width of a 90 % interval in standard errors.
 Z90 = 1.6449
+#: χ² per degree of freedom from which on residuals are more than noise; degrees of freedom that show a variance.
+LACKING, FEW = 1.5, 30.0
 #: Simulations with a finer step in which numbers settle there.
 MOVES = 4
 
@@ -223,15 +225,17 @@ def _move(here: Refit, limits: Limits, factor: np.ndarray, damping: float) -> np
     return np.clip(step, -LONGEST, LONGEST)
 
 
-def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
+def standard_errors(fitted: Refit, episodes: np.ndarray, *, lacking: bool = False) -> np.ndarray:
     """Return standard errors of all numbers of a fit ``(q,)``, in their units; infinite for those without influence.
 
-    The larger of two: by the noise, inflated by χ² per degree of freedom; and by how much the blocks of the log
-    disagree (the sandwich of cluster-robust errors), which also counts what the model still lacks.
+    By the noise, of each feature as large as the residuals show. Where they are more than noise, the larger of this
+    and of how much the blocks of the log disagree (the sandwich of cluster-robust errors), which also counts what the
+    model still lacks.
 
     Args:
         fitted: a fit with its projected residuals and derivatives.
         episodes: trajectory of each window, ``(W,)``.
+        lacking: whether residuals are known to be more than noise, although they were weighted by their own sizes.
     """
     slope, residual = fitted.slope * fitted.factor[:, None], fitted.residual * fitted.factor[:, None]
     size = len(slope)
@@ -244,7 +248,11 @@ def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
     unit = np.outer(length, length)
     shown = np.where(np.outer(known, known), normal / unit, np.eye(size))
     inverse = np.linalg.pinv(shown, rcond=1e-12, hermitian=True) / unit
-    plain = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(1.0, fitted.cost.reduced))
+    variance = _variances(fitted, residual)
+    spread = np.tile(np.sqrt(variance), residual.shape[1] // len(variance))
+    weighted = slope * spread
+    by_noise = inverse @ np.einsum("awn,bwn->ab", weighted, weighted) @ inverse
+    plain = np.sqrt(np.maximum(np.diag(by_noise), 0.0))
     blocks = blocks_of(episodes, 4)
     names = np.unique(blocks)
     scores = np.einsum("awn,wn->wa", slope, residual)
@@ -252,8 +260,16 @@ def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
     middle = sums.T @ sums * len(names) / max(len(names) - 1, 1)
     factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / Z90
     clustered = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)) * factor
-    inflated = fitted.cost.reduced > 1.5
-    return np.where(known, np.maximum(plain, clustered) if inflated else plain, np.inf) * fitted.scale
+    lacking = lacking or fitted.cost.reduced > LACKING
+    return np.where(known, np.maximum(plain, clustered) if lacking else plain, np.inf) * fitted.scale
+
+
+def _variances(fitted: Refit, residual: np.ndarray) -> np.ndarray:
+    """Variance of each feature's weighted residuals ``(m,)`` per degree of freedom that the initial states leave it."""
+    linear, m = fitted.linear, max(fitted.linear.num_features, 1)
+    free = ((linear.weights > 0) * (1 - (linear.basis**2).sum(-1))).reshape(-1, m).sum(0)
+    variance = (residual**2).reshape(-1, m).sum(0) / np.maximum(free, 1.0)
+    return np.where(free > FEW, variance * free.sum() / max(free.sum() - len(fitted.scale), 1.0), 1.0)
 
 
 @dataclass(frozen=True)
@@ -298,7 +314,8 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
 
 def half_widths(last: Resolved) -> np.ndarray:
     """Return half-widths of the 90 % intervals of all numbers ``(q,)``, in their units."""
-    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes), last.error)
+    lacking = bool(np.any(last.evidence.model_error > 1))
+    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes, lacking=lacking), last.error)
 
 
 def _stepped(evidence: Evidence, fitted: Refit, effect: Effect, step: float) -> Resolved:
