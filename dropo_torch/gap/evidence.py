@@ -49,7 +49,7 @@ class Linearisation:
     @property
     def counted(self) -> np.ndarray:
         """Which windows count at all, ``(W,)`` bool."""
-        return (self.weights > 0).any(-1)
+        return np.asarray((self.weights > 0).any(-1))
 
     def select(self, rows: np.ndarray) -> Linearisation:
         """Return that of some of the windows."""
