@@ -369,7 +369,7 @@ def test_what_was_commanded_before_the_log_is_no_gap(truth: Effect) -> None:
     assert told.low - half <= value <= told.high + half
     assert half < 0.01 * value
     assert gap.reduced[1] == pytest.approx(1, abs=0.15)
-    assert gap.after.log_likelihood == pytest.approx(gap.noise_floor.log_likelihood, abs=25)
+    assert gap.after.log_likelihood > gap.noise_floor.log_likelihood - 25
 
 
 @pytest.mark.parametrize("truth", REMEMBERING, ids=lambda e: e.name)
