@@ -89,11 +89,13 @@ def diagnose(
     values = distribution.rsample(draw_uniforms(samples, len(distribution), seed, 3))
     mean, variance, center, jacobian, lost = _simulate(objective, distribution, values, initial)
     covariance = objective.base_covariance(slice(None), initial)
-    error, correlation, std_error = _standard_errors(objective, distribution, covariance, jacobian)
     base = torch.diagonal(covariance, dim1=-2, dim2=-1)
     widened = torch.ones(1, dtype=torch.float64) if initial is None else initial.widening[:, None]
     log = objective.transitions
     follows = np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
+    together = None if initial is None else initial.carried[1:] * torch.from_numpy(follows[:-1, None, None])
+    residual = objective.target(slice(None), initial) - mean
+    error, correlation, std_error = _standard_errors(objective, distribution, covariance, jacobian, residual, together)
     started, columns = objective.evaluator.columns_at_start, objective.evaluator.columns
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
@@ -122,18 +124,27 @@ def diagnose(
 
 
 def _standard_errors(
-    objective: Objective, distribution: Distribution, covariance: torch.Tensor, jacobian: torch.Tensor
+    objective: Objective,
+    distribution: Distribution,
+    covariance: torch.Tensor,
+    jacobian: torch.Tensor,
+    residual: torch.Tensor,
+    together: torch.Tensor | None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Standard errors of μ and their correlations, and standard errors of σ, in coordinates.
 
     They are the Fisher information's of N(s̄(μ), A Σ_ξ Aᵀ + C), with C of ε and noise: AᵀΣ⁻¹A for μ, and
-    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ.
+    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ. Those of μ are the jackknife's, which leaves out one window after the other, where
+    that is larger: where the windows pull harder than Σ expects. A measurement that ends a window and begins the next
+    pulls in both: what this adds or takes is counted, too.
 
     Args:
         objective: gives the floor of σ.
         distribution: the fit.
         covariance: C, ``(T, m, m)``.
         jacobian: A, ``(T, d, m)``.
+        residual: of the mean next states, ``(T, m)``.
+        together: minus the covariance of each residual with the next window's, ``(T − 1, m, m)``; ``None`` for none.
     """
     limits = coordinate_limits(distribution.limits, distribution.is_log)
     a, b = truncated_interval(*map(torch.as_tensor, (distribution.mean, distribution.std, *limits)))
@@ -142,13 +153,27 @@ def _standard_errors(
     shared = torch.eye(len(drawn)) if distribution.correlation is None else torch.as_tensor(distribution.correlation)
     spread = shared * torch.outer(drawn, drawn)
     total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
-    gram = jacobian @ torch.linalg.solve(total, jacobian.mT)
-    error, correlation = estimates(gram.sum(0).numpy())
+    pull = torch.linalg.solve(total, jacobian.mT)  # Σ⁻¹ Aᵀ, (T, m, d)
+    gram = jacobian @ pull
+    information = gram.sum(0)
+    error, correlation = estimates(information.numpy())
+    bounded = np.minimum(error, 1e100)
+    inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))
+    score = torch.nan_to_num((pull.mT @ residual[..., None])[..., 0])
+    without = torch.eye(len(drawn), dtype=torch.float64) - gram @ inverse  # share that the other windows know
+    left = torch.linalg.lstsq(without, score[..., None], driver="gelsd").solution[..., 0]
+    shared_pull = torch.zeros_like(information)
+    if together is not None:
+        half = (pull[:-1].mT @ together @ pull[1:]).sum(0)
+        shared_pull = half + half.T
+    ways = [inverse @ (scatter - shared_pull) @ inverse for scatter in (information, left.T @ left)]
+    variance, least = torch.stack([torch.diagonal(way) for way in ways]).amax(0), torch.diagonal(inverse)
+    error = torch.where(variance > 1e-4 * least, variance, least).sqrt().numpy()
     std_error = np.full(len(drawn), np.nan)
     free = distribution.std > 2 * objective.box.min_std
     if distribution.correlation is None and free.any():
-        information = (2 * torch.outer(drawn, drawn).square() * gram.square().sum(0)).numpy()[np.ix_(free, free)]
-        std_error[free] = distribution.std[free] * estimates(information)[0]
+        of_std = (2 * torch.outer(drawn, drawn).square() * gram.square().sum(0)).numpy()[np.ix_(free, free)]
+        std_error[free] = distribution.std[free] * estimates(of_std)[0]
     return error, correlation, std_error
 
 

@@ -30,6 +30,8 @@ class InitialStateNoise:
         covariance: of the features, by the noise of initial and measured next states, widened, ``(T, m, m)``.
         widening: factor of each window's covariance, ``(T,)``; 1 where the noise is as given.
         is_widened: whether windows that it does not explain were widened at all.
+        carried: covariance of the noise of each initial state's features with what it does to the next state's,
+            ``(T, m, m)``: where a window's initial state is the measured end of the one before, both err together.
         simulated_transitions: logged steps that were simulated for it.
     """
 
@@ -39,6 +41,7 @@ class InitialStateNoise:
     covariance: torch.Tensor
     widening: torch.Tensor
     is_widened: bool
+    carried: torch.Tensor
     simulated_transitions: int
 
     def is_at(self, mean: np.ndarray, std: np.ndarray | None, widen: bool = True) -> bool:
@@ -86,21 +89,24 @@ def propagate_noise(
     draws = torch.cat([torch.zeros(1, len(noisy), dtype=torch.float64), half, -half])
     moves = torch.zeros(len(draws), every.size, dtype=torch.float64)
     moves[:, noisy] = size[noisy] * draws
+    own = evaluator.features
+    same = np.array([[ours == every.labels[j] for j in noisy] for ours in own.labels])
+    sizes = torch.from_numpy(same / own.scale[:, None]) * size[noisy]  # of each draw, in compared features, (m, c)
     parts = []
     with single_thread():
         for block in evaluator.blocks(len(draws)):
             states = _perturbed(evaluator, block, every, moves)
             outcomes = evaluator.after(block, values, states).reshape(-1, len(draws), evaluator.features.size)
-            shift, covariance = propagate(outcomes, draws)
+            shift, covariance, gain = propagate(outcomes, draws)
             total = covariance + fixed
             spread = 0.0 if std is None else parameter_covariance(evaluator, box, block, mean, std)
             residual = evaluator.measured[block] - torch.nan_to_num(outcomes[:, 0]) - shift
             factor = widening(residual, total + spread) if widen else torch.ones_like(residual[:, 0])
-            parts.append((shift, total * factor[:, None, None] - torch.diag(epsilon), factor))
-    shift, covariance, factor = (torch.cat(part) for part in zip(*parts, strict=True))
+            parts.append((shift, total * factor[:, None, None] - torch.diag(epsilon), factor, sizes @ gain.mT))
+    shift, covariance, factor, carried = (torch.cat(part) for part in zip(*parts, strict=True))
     simulations = len(draws) + (0 if std is None else 2 * len(std))
     cost = len(evaluator) * simulations * evaluator.transitions.lag
-    return InitialStateNoise(mean, std, shift, covariance, factor, widen, cost)
+    return InitialStateNoise(mean, std, shift, covariance, factor, widen, carried, cost)
 
 
 def _perturbed(evaluator: Evaluator, block: slice, every: Features, moves: torch.Tensor) -> torch.Tensor:

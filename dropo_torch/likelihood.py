@@ -106,8 +106,8 @@ def survivors(
     return features[alive], measured[alive], covariance[alive], (~alive).sum().to(features.dtype)
 
 
-def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return shift ``(t, m)`` and covariance ``(t, m, m)`` of outcomes of noisy initial states.
+def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Return shift ``(t, m)``, covariance ``(t, m, m)`` and G √ν ``(t, m, c)`` of outcomes of noisy initial states.
 
     Args:
         outcomes: the undisturbed one, then those of antithetic draws, ``(t, 1 + M, m)``.
@@ -119,7 +119,7 @@ def propagate(outcomes: torch.Tensor, draws: torch.Tensor) -> tuple[torch.Tensor
     left = spread - draws[1:] @ gain.mT
     variance = left.square().sum(1) / (len(draws) - 1 - draws.shape[1])
     shift = outcomes[:, 1:].mean(1) - outcomes[:, 0]
-    return shift, gain @ gain.mT + torch.diag_embed(variance)
+    return shift, gain @ gain.mT + torch.diag_embed(variance), gain
 
 
 def widening(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:

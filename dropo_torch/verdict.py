@@ -161,9 +161,9 @@ def _without_skill(
 
 
 def _skill(residual: np.ndarray, change: np.ndarray, given: np.ndarray, expected: np.ndarray) -> float:
-    """Share of a column's change that is predicted, where it moves; all, if expected; NaN where it hardly does."""
+    """Share of a column's change that is predicted, where it moves: all if expected; NaN where it hardly moves."""
     t = THRESHOLDS
-    moves = (np.abs(change) > t.far * given) & np.isfinite(residual)
+    moves = (np.abs(change) > t.far * given) & np.isfinite(residual) & (expected > 0)
     if moves.sum() < t.fewest:
         return math.nan
     error = np.abs(residual[moves])

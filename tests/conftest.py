@@ -55,6 +55,7 @@ WHOLE = {
                      "test_epsilon_may_be_as_small_or_large_as_its_limits_say"),
     "test_gap.py": ("",),
     "test_optimizers.py": ("test_optimizers_keep_their_laws",),
+    "test_gap_written.py": ("test_of_every_effect_what_is_written_is_what_was_found",),
     "test_parallel.py": ("",),
     "test_rl_train.py": ("",),
     "test_sweep.py": ("test_the_noise_of_every_measurement_is_found",),

@@ -458,21 +458,27 @@ class Worker:
 
 def fuzz(
     mutations: int, seed: int, *, workers: int = 1, only: Sequence[str] = (), numbers: Sequence[int] = (),
+    seconds: float = math.inf,
     log: Callable[[str], None] = lambda line: None,
 ) -> tuple[dict[str, Counter[str]], list[tuple[str, int, str, str]]]:  # fmt: skip
-    """Return how often each outcome came for each target, and every wrong one: target, number, outcome, words."""
+    """Return how often each outcome came for each target, and every wrong one: target, number, outcome, words.
+
+    After some seconds no more are begun, of whichever target.
+    """
     with tempfile.TemporaryDirectory(dir="/dev/shm" if Path("/dev/shm").is_dir() else None) as folder:
         crew = [Worker(seed, folder) for _ in range(workers)]
         shares = {n: s for n, (s, _) in crew[0].shares.items() if not only or n in only}
         total = sum(shares.values())
         tasks = [(n, i) for n, s in shares.items() for i in (numbers or range(max(1, round(mutations * s / total))))]
+        random.Random(seed).shuffle(tasks)
+        end = time.monotonic() + seconds
         counts: dict[str, Counter[str]] = {name: Counter() for name in shares}
         wrong: list[tuple[str, int, str, str]] = []
         waiting, busy = iter(tasks), []
         idle = list(crew)
         while True:
             for worker in idle:
-                task = next(waiting, None)
+                task = next(waiting, None) if time.monotonic() < end else None
                 if task is not None:
                     worker.give(task)
                     busy.append(worker)
@@ -512,12 +518,14 @@ def main() -> int:
     parser.add_argument("--mutations", type=int, default=12_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--seconds", type=float, default=math.inf, help="after which no more are begun")
     parser.add_argument("--only", action="append", default=[])
     parser.add_argument("--number", type=int, action="append", default=[])
     given = parser.parse_args()
     begun = time.monotonic()
     counts, wrong = fuzz(
         given.mutations, given.seed, workers=given.workers, only=given.only, numbers=given.number,
+        seconds=given.seconds,
         log=lambda line: print(line, flush=True),
     )  # fmt: skip
     print(table(counts))

@@ -411,7 +411,7 @@ def test_paths_may_hold_spaces_brackets_and_any_script(tmp_path: Path) -> None:
     assert main(["fit", str(out / "fitted_config.yaml"), "--out", str(tmp_path / "again")]) == 0
 
 
-def test_simulations_that_diverge_are_counted_and_penalised(
+def test_simulations_that_diverge_are_counted_and_a_lost_window_leaves_no_likelihood(
     folder: Folder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "mine.py"
@@ -422,7 +422,7 @@ def test_simulations_that_diverge_are_counted_and_penalised(
     found = json.loads((tmp_path / "out" / "fit.json").read_text())
     lost = int((record()["actions"][:, 0] > 0.9).sum())
     assert found["diverged_simulations"] == 20 * lost > 0
-    assert found["log_likelihood"] < -1e4 * lost + 60 * 20
+    assert found["log_likelihood"] is None
     assert "diverged" in capsys.readouterr().out
 
 

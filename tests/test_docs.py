@@ -24,10 +24,11 @@ import scipy.io
 import yaml
 
 from dropo_torch.commands import cli
-from dropo_torch.config import _Loader, make_config, parse_overrides
+from dropo_torch.config import make_config, parse_overrides
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
 from dropo_torch.rl.policy import Policy
+from dropo_torch.support.yaml_text import load_yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -194,7 +195,7 @@ def test_yaml_is_a_config_that_a_fit_accepts(
 ) -> None:
     if "minari:" in text:
         write_minari(robot, monkeypatch)
-    document = completed(yaml.load(text, Loader=_Loader))
+    document = completed(load_yaml(text, "docs"))
     problem = make_problem(make_config(document, base=robot))
     assert len(problem.objective) > 20
     refuse_dead_parameters(problem.objective)
@@ -362,4 +363,4 @@ def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
 
 def test_authors_hopper_is_a_config() -> None:
     text = (ROOT / "examples" / "authors_hopper.yaml").read_text()
-    make_config({**yaml.load(text, Loader=_Loader), "data": "hopper10000"})
+    make_config({**load_yaml(text, "docs"), "data": "hopper10000"})

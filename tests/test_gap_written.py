@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import re
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +19,19 @@ from dropo_torch.data.features import Features
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.effects.base import Setting
-from dropo_torch.effects.engine import Variant, VariantEngine
+from dropo_torch.effects.engine import ModelRefused, Variant, VariantEngine
+from dropo_torch.effects.export import write_model
 from dropo_torch.effects.placing import plain_setting
-from dropo_torch.gap import Gap, add
+from dropo_torch.errors import InputError
+from dropo_torch.gap import Gap, add, find_gap, prepare
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import cut_windows, make_setting
-from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.refit import Hypothesis, refit
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import Held, score
 from dropo_torch.likelihood import gaussian_log_density
+from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.testing.effects import RIG
@@ -40,6 +45,16 @@ NOISE = (2e-5, 5e-4)
 FINER = Placed(find_effect("integration"), None, (STEP / 8,))
 #: Numbers at which an effect acts on the rig, beside those from which a search begins.
 NUMBERS = {"joint_limit": {"lower": 0.4, "upper": -0.4}, "actuator_saturation": {"limit": 0.3}}
+PENDULUM = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="rod" pos="0 0 1">
+      <joint name="swing" type="hinge" axis="0 1 0"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1"/>
+    </body>
+  </worldbody>
+</mujoco>"""
 TASK = """
 import mujoco, torch
 from pathlib import Path
@@ -173,11 +188,23 @@ def likelihood(problem: Problem, values: np.ndarray) -> np.ndarray:
     return torch.cat(out).numpy()
 
 
-CASES = [(n,) for n in VOCABULARY] + [(n, "integration") for n in VOCABULARY if n != "integration"]
+#: Those that are tried always: the model's own numbers, forces, commands, sensors, and the step.
+QUICK = (("payload",), ("joint_stribeck", "integration"), ("actuator_delay", "integration"), ("sensor_bias",))
+EVERY = [(n,) for n in VOCABULARY] + [(n, "integration") for n in VOCABULARY if n != "integration"]
 
 
-@pytest.mark.parametrize("names", CASES, ids="+".join)
+@pytest.mark.parametrize("names", QUICK, ids="+".join)
 def test_what_is_written_is_what_was_found(names: tuple[str, ...], tmp_path: Path) -> None:
+    require_same_everywhere(names, tmp_path)
+
+
+@pytest.mark.parametrize("names", [n for n in EVERY if n not in QUICK], ids="+".join)
+def test_of_every_effect_what_is_written_is_what_was_found(names: tuple[str, ...], tmp_path: Path) -> None:
+    require_same_everywhere(names, tmp_path)
+
+
+def require_same_everywhere(names: tuple[str, ...], tmp_path: Path) -> None:
+    """The law: what was found gives a fit's likelihood, steps in training, and MuJoCo's next states."""
     placed = tuple(FINER if n == "integration" else acting(n) for n in names)
     problem = problem_of(tmp_path, placed)
     hypothesis, out = Hypothesis((LIGHT,), placed), tmp_path / "out"
@@ -223,3 +250,90 @@ def test_what_is_written_is_what_was_found(names: tuple[str, ...], tmp_path: Pat
         size = ours[0, :, 1].std(0)
         assert (np.median(np.abs(np.array(theirs) - ours[0, :, 1]), axis=0) <= 1e-4 * np.maximum(size, 1e-2)).all()
         assert (steps > SKIP) == ("integration" in names)
+
+
+@pytest.mark.parametrize("passive", [False, True])
+@pytest.mark.parametrize(
+    "flags", ['settotalmass="5"', 'boundmass="2" boundinertia="0.05"', 'settotalmass="5" balanceinertia="true"']
+)
+def test_a_model_that_the_compiler_rescales_is_written_as_it_is(flags: str, passive: bool, tmp_path: Path) -> None:
+    xml = RIG.replace("<mujoco>", f"<mujoco><compiler {flags}/>")
+    if passive:
+        xml = re.sub("<actuator>.*</actuator>", "", xml, flags=re.DOTALL)
+    (tmp_path / "rig.xml").write_text(xml)
+    added = Placed(find_effect("payload"), "lower", (0.2, 0.05, 0.0, -0.1))
+    assert write_model(tmp_path / "rig.xml", [added], tmp_path / "model.xml") == []
+    before, after = (load_model(tmp_path / f"{n}.xml") for n in ("rig", "model"))
+    grown = np.where(np.array(plain().names("body")) == "lower", 0.2, 0.0)
+    np.testing.assert_allclose(after.body_mass, before.body_mass + grown, rtol=1e-5)
+
+
+def test_a_step_is_never_a_parameter(tmp_path: Path) -> None:
+    step = {"effect": "integration", "bounds": [STEP / 8, STEP]}
+    with pytest.raises(InputError, match=r"parameters.step: timestep of integration is a choice.*give it in effects"):
+        problem_of(tmp_path, (), parameters={"mass": MASS, "step": step})
+
+
+@pytest.mark.parametrize("ratio", [1.5, 6.5])
+def test_steps_that_do_not_fill_the_models_are_refused(ratio: float) -> None:
+    setting = plain()
+    engine = VariantEngine(setting, ParameterSpace(setting.model, {"mass": MASS}))
+    with pytest.raises(ModelRefused, match="no whole number"):
+        engine.model(Variant((LIGHT,), (Placed(find_effect("integration"), None, (STEP / ratio,)),)))
+
+
+def test_a_fit_of_the_search_leaves_the_step_where_it_is(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, (FINER,))
+    setting = make_setting(problem, problem.trajectories)
+    windows = cut_windows(problem.trajectories, problem.observation, 8)
+    noise = Features.of(problem.observation).feature_noise(np.array([NOISE[c >= 10] for c in range(19)]))
+    evidence = Evidence(Twin(setting, problem.space, num_threads=1), windows, noise, rough=False)
+    found = refit(evidence, Hypothesis((0.9,), (FINER,)), iterations=4).hypothesis
+    assert found.placed == (FINER,)
+    assert found.declared[0] == pytest.approx(LIGHT, rel=1e-2)
+
+
+def test_what_the_config_has_already_is_told(tmp_path: Path) -> None:
+    own = acting("joint_friction")
+    given = {"effect": "joint_friction", "target": own.target, "friction": 0.1}
+    problem = problem_of(tmp_path, (), effects=[given])
+    (tmp_path / "out").mkdir()
+    notes = add(problem, gap_of(problem, Hypothesis((LIGHT,), (own,))), tmp_path / "out")
+    assert "the config has joint_friction of shoulder already" in notes[-1]
+    assert not (tmp_path / "out" / "config.yaml").exists()
+
+
+def test_a_log_that_cannot_be_simulated_or_does_not_move_is_refused(tmp_path: Path) -> None:
+    problem = problem_of(tmp_path, ())
+    log = problem.trajectories
+    far = dataclasses.replace(log, observations=1e8 * log.observations, next_observations=1e8 * log.next_observations)
+    with pytest.raises(InputError, match=r"diverges within 6 steps from every state of the log; .* reaches"):
+        prepare(dataclasses.replace(problem, trajectories=far))
+    still = np.tile(log.observations[:1], (len(log), 1))
+    with pytest.raises(InputError, match="nothing moves"):
+        prepare(dataclasses.replace(problem, trajectories=dataclasses.replace(log, observations=still)))
+
+
+def test_a_passive_system_is_searched(tmp_path: Path) -> None:
+    """No actuator, one episode: what is missing is found, and what is written fits."""
+    rng, space = np.random.default_rng(2), {"damping": {"field": "dof_damping", "name": "swing", "bounds": [0.0, 0.2]}}
+    model = mujoco.MjModel.from_xml_string(PENDULUM)
+    data, rows = mujoco.MjData(model), []
+    model.dof_frictionloss[:] = 0.05
+    data.qvel[0] = 3.0
+    for _ in range(161):
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+        mujoco.mj_step(model, data, nstep=4)
+    states = np.array(rows) + rng.standard_normal((161, 2)) * NOISE
+    ends = np.arange(160) == 159
+    log = {"observations": states[:-1], "next_observations": states[1:], "actions": np.zeros((160, 0))}
+    np.savez(tmp_path / "log.npz", **log, terminals=ends, dt=SKIP * STEP)
+    (tmp_path / "pendulum.xml").write_text(PENDULUM)
+    document = {"model": "pendulum.xml", "data": "log.npz", "frame_skip": SKIP, "parameters": space, "threads": 1}
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
+    problem = make_problem(load_config(tmp_path / "config.yaml"), general=True)
+    gap = find_gap(problem, effects=[find_effect(n) for n in ("joint_friction", "gravity_tilt")])
+    assert ("joint_friction", "swing") in [(e.effect, e.target) for e in gap.effects]
+    (tmp_path / "out").mkdir()
+    assert add(problem, gap, tmp_path / "out") == []
+    make_problem(load_config(tmp_path / "out" / "config.yaml"))

@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from dropo_torch.effects.engine import Variant
+from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import feature_sizes
 from dropo_torch.gap.twin import Twin, Windows
@@ -58,6 +59,9 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
         windows: short windows, spread over the log.
         variant: the hypothesis beside which the forces are free.
         noise: the noise where it is known, ``(m,)``.
+
+    Raises:
+        InputError: the simulation diverges in all windows.
     """
     sizes = np.maximum(feature_sizes(twin.setting, windows.measured), 1e-12)
     evidence = Evidence(twin, windows, GUESS * sizes if noise is None else noise, rough=False)
@@ -70,13 +74,28 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
         pushes[1 + m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
     moved = np.eye(len(pushes), m, -1)[:, None]
     found, _ = evidence.residuals([variant] * len(pushes), moved, pushes)
-    usable = np.isfinite(found).all((0, 2)) & twin.knows(variant, windows)
+    usable = np.isfinite(found).all((0, 2))
+    if not usable.any():
+        raise InputError(_lost(twin, windows))
+    if (known := usable & twin.knows(variant, windows)).any():
+        usable = known
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
     relative, unsure = _relative_noise(residual, slope, m) if noise is None else (np.ones(m), np.zeros(m))
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)
     forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))
     return FreeForces(np.maximum(evidence.noise * relative, FLOOR * sizes), unsure, forces, standard_errors, windows)
+
+
+def _lost(twin: Twin, windows: Windows) -> str:
+    """What is wrong where no window can be simulated."""
+    largest = np.abs(windows.measured).max((0, 1))
+    column = int(largest.argmax())
+    return (
+        f"data: the simulation diverges within {windows.length} steps from every state of the log; "
+        f"{twin.setting.observation.labels[column]} reaches {largest[column]:.3g} "
+        f"{twin.setting.observation.units[column]}; are all columns in these units (data: scale)?"
+    )
 
 
 def _relative_noise(residual: np.ndarray, slope: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:

@@ -18,7 +18,7 @@ from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit
 
 #: Standard errors by which what long windows leave may exceed what short ones with free forces say.
-AGREE = 2.5
+AGREE = 4.0
 #: Weight from which on a residual counts as one that noise on the initial state does not bend, and the least of them.
 SHARP, LEAST_ROWS = 0.999, 60
 #: Times that the variance components are weighted anew.

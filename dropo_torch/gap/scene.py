@@ -35,6 +35,8 @@ from dropo_torch.problem import Problem
 MOST, FEW, SHORT = 120, 24, 160
 #: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
 LEAD, LEAD_SHARE = 20, 0.1
+#: Windows of an episode from which on one of them is not missed.
+MANY = 6
 
 
 @dataclass(frozen=True)
@@ -89,6 +91,8 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
             "(data: preprocess), and name them in observation"
         )
     train, held = hold_out(problem.trajectories)
+    if not np.ptp(train.observations, axis=0).any():
+        raise InputError(f"data: nothing moves in {train.source}: no observed column ever changes")
     setting = make_setting(problem, train)
     twin = Twin(
         setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",
@@ -174,8 +178,19 @@ def _cut(
     twin: Twin, log: Trajectories, noise: np.ndarray, since: np.ndarray, length: int, most: int = MOST,
     *, rough: bool = True,
 ) -> Evidence:  # fmt: skip
-    windows = cut_windows(log, twin.setting.observation, length, since=since)
+    windows = cut_windows(log, twin.setting.observation, length, since=spared(log, length, since))
     return Evidence(twin, spread(windows, most), noise, rough=rough)
+
+
+def spared(log: Trajectories, length: int, since: np.ndarray) -> np.ndarray:
+    """Return the logged step of each episode at which its first window starts ``(E,)``, where it has few of them.
+
+    Then no later than costs a window; hypotheses that do not know its commands go without it themselves.
+    """
+    episodes = np.array([b - a for a, b in episode_bounds(log)])
+    count = (episodes + 1) // (length + 1)
+    rest = episodes + 1 - count * (length + 1)
+    return np.where(count < MANY, np.minimum(since, rest), since)
 
 
 def _end_error(evidence: Evidence, begin: Hypothesis) -> float:

@@ -12,7 +12,16 @@ import torch
 
 from dropo_torch.effects.base import Placed, Setting
 from dropo_torch.effects.engine import Variant, VariantEngine, parts
-from dropo_torch.effects.filters import filtered, observed_rates, placed_filters, sensed, settled_after, unsensed
+from dropo_torch.effects.filters import (
+    Filter,
+    extended,
+    filtered,
+    observed_rates,
+    placed_filters,
+    sensed,
+    settled_after,
+    unsensed,
+)
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.hidden import filters_known
@@ -165,14 +174,32 @@ class Twin:
         for f in sensors:  # what a late sensor shows later is the truth of now
             late = f.effect.memory(f.values[0].numpy())
             if late > 0:
-                rates[:, f.column] = (
-                    secants(windows.measured[:, :, f.column], late / self.setting.signals.timestep) / late
-                )
-        states = observation.full(unsensed(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy())
+                steps = late / self.setting.signals.timestep
+                rates[:, f.column] = secants(windows.measured[:, :, f.column], steps) / late
+        states = observation.full(self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy())
         for q in observation.quaternions:
             at = observation.index[list(q)]
             states[:, at] /= np.linalg.norm(states[:, at], axis=1, keepdims=True)
         return states
+
+    def _true(self, shown: torch.Tensor, rates: torch.Tensor, sensors: Sequence[Filter]) -> torch.Tensor:
+        """Return the true columns ``(W, n)`` of which sensors show ``shown``, and whose time derivatives are ``rates``.
+
+        Late ones to second order: a position's derivative is its velocity, and that changes as the log shows.
+        """
+        known = np.flatnonzero(self.rates >= 0)
+        rates, curvature = rates.clone(), torch.zeros_like(rates)
+        curvature[:, known] = rates[:, self.rates[known]]
+        rates[:, known] = shown[:, self.rates[known]]
+        true = unsensed(shown, rates, sensors)
+        late = max((f.effect.memory(f.values[0].numpy()) for f in sensors), default=0.0)
+        if not 0 < late < np.inf:
+            return true
+        step = float(self.setting.model.opt.timestep)
+        rates[:, known] = true[:, self.rates[known]]
+        past = extended(true[:, None], rates, curvature[:, None], int(np.ceil(late / step)) + 1, step)
+        there = SensedPath.of(past, 1, self.setting.frame_skip, step, tuple(self.rates))
+        return true + shown - sensed(there, sensors)[:, 0]
 
     def _signals(self, variant: Variant, windows: Windows) -> np.ndarray:
         """Return commands as they act in every physics step of every window ``(W, L·skip, nu)``."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import mujoco
@@ -68,7 +69,8 @@ def read_spec(source: str | Path) -> mujoco.MjSpec:
 
 def write_inertials(spec: mujoco.MjSpec) -> None:
     """Give every body the inertial that it compiles to, explicitly, and let the compiler change none of them again."""
-    compiled = spec.compile()
+    with warnings.catch_warnings(action="ignore"):
+        compiled = spec.compile()
     for body in spec.bodies[1:]:
         body.explicitinertial = True
         body.fullinertia = np.full(6, np.nan)

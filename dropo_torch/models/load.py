@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -49,7 +50,7 @@ def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> 
     if path.suffix == ".mjb":  # MuJoCo trusts its sizes: a damaged file may crash it, or ask for all memory
         read_in_child(f"{__name__}:try_binary", path, where=f"model: {path}", kind="a model of this MuJoCo")
     try:
-        with quiet_mujoco():
+        with quiet_mujoco(), warnings.catch_warnings(action="ignore"):  # of attributes that will be gone some day
             return checked(_loaded(path, general), f"model: {path}")
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"model: MuJoCo does not compile {path}: {error}") from None

@@ -15,7 +15,7 @@ from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.sampled import SampledStage
 from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.optimizers.sigma_points import SigmaPointStage
-from dropo_torch.support.random import draw_uniforms
+from dropo_torch.support.random import stratified_uniforms
 
 #: Refits of a log with uncertain initial states, each around their noise propagated at the last fit.
 NOISY_ROUNDS = 6
@@ -51,7 +51,7 @@ class FisherOptimizer(LikelihoodOptimizer):
         super().__init__(objective, settings)
         # the exact scores know nothing of the bonus
         self._differentiable = objective.simulator.differentiable and not settings.entropy
-        self._uniforms = draw_uniforms(settings.samples, len(self._space), settings.seed, 2)
+        self._uniforms = stratified_uniforms(settings.samples, len(self._space), settings.seed, 2)
         self._means = MeansStage(self._box.low, self._box.high, self._box.middle)
         self._scoring: SigmaPointStage | SampledStage | None = None
         self._round = 0

@@ -254,8 +254,9 @@ def _terms(record: Record, rows: np.ndarray, predicted: np.ndarray) -> np.ndarra
     ]  # fmt: skip
     table = np.concatenate(parts, axis=1)
     table = table / np.maximum(np.abs(table).max(axis=0), 1e-12)
-    basis, size, _ = np.linalg.svd(table, full_matrices=False)
-    return np.asarray(basis[:, size > 1e-8 * size[0]])
+    size, vectors = np.linalg.eigh(np.einsum("tp,tq->pq", table, table))
+    kept = size > 1e-10 * size[-1]
+    return np.asarray(np.einsum("tp,pq->tq", table, vectors[:, kept] / np.sqrt(size[kept])))
 
 
 def beats(first: Explained, second: Explained) -> float:

@@ -13,7 +13,7 @@ from dropo_torch.data.examination.record import Record
 from dropo_torch.models.load import quiet_mujoco
 
 #: Microseconds of simulation that an examination may take, about, and the fewest and most rows that are simulated.
-BUDGET, LEAST_ROWS, MOST_ROWS = 2e5, 200, 800
+BUDGET, LEAST_ROWS, MOST_ROWS = 4e5, 250, 1200
 #: Threads of a simulation; results do not depend on them.
 THREADS = min(4, os.cpu_count() or 1)
 
