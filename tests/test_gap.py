@@ -20,7 +20,7 @@ from arm import Folder
 
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
-from benchmarks.hidden.systems import CART_POLE, SERVO_ARM, TORQUE_ARM, Command, Scale, System, coarse, mass
+from benchmarks.hidden.systems import CART_POLE, FURUTA, SERVO_ARM, TORQUE_ARM, Command, Scale, System, coarse, mass
 from benchmarks.hidden.truths import Before, Case, Effect, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
@@ -38,6 +38,7 @@ from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, screen
 from dropo_torch.gap.sound import absurd, has_skill
+from dropo_torch.gap.twin import secants
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.report.gap_words import answer
@@ -681,6 +682,23 @@ def test_numbers_are_not_those_of_the_step() -> None:
     assert (np.abs(last.fit.hypothesis.vector - truth) < half).all()
     assert (half < 1e-3 * truth).all()
     assert last.fit.cost.reduced < 1.2
+
+
+def test_late_sensor_leaves_nothing_but_noise() -> None:
+    """A window starts from the truth that a late sensor shows later, however bent it is."""
+    late = Effect("sensor_delay", "swing.velocity", {"delay": 0.016})
+    case = simulate_truth(FURUTA, [late], 3, **SIZE)
+    evidence = dataclasses.replace(prepare(load(case)).evidence, noise=np.array(case.noise))
+    assert refit(evidence, true(case)).cost.reduced < 1.2
+
+
+@pytest.mark.parametrize("steps", [0.3, 1.0, 2.6, 4.0])
+def test_secant_of_a_cubic_is_exact(steps: float) -> None:
+    def cubic(t: np.ndarray | float) -> np.ndarray:
+        return np.polyval([0.3, -1.0, 2.0, 5.0], t) * np.ones(1)
+
+    path = cubic(np.arange(5.0))[None]
+    assert secants(path, steps) == pytest.approx(cubic(steps) - 5.0)
 
 
 def test_log_of_the_own_step_stays_with_it() -> None:

@@ -130,7 +130,7 @@ class Twin:
             calls = parts(len(members), max(1, self._chunk // max(1, num_w)))
             for part, rows in itertools.product([members[c] for c in calls], parts(num_w, self._chunk)):
                 chosen, given = [variants[k] for k in part], windows.select(rows)
-                states = np.stack([self._states(variants[k], shown[k, rows], given.rates) for k in part])
+                states = np.stack([self._states(variants[k], shown[k, rows], given) for k in part])
                 signals = np.stack([self._signals(v, given) for v in chosen])
                 forces = None if pushes is None else pushes[part]
                 own = [models[k] for k in part]
@@ -167,9 +167,15 @@ class Twin:
             valid[..., f.column] &= truth.known(f.effect.memory(f.values[0].numpy())).numpy()
         return sensed(truth, sensors).numpy(), valid
 
-    def _states(self, variant: Variant, shown: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    def _states(self, variant: Variant, shown: np.ndarray, windows: Windows) -> np.ndarray:
         """Return states ``(W, nq + nv)`` of which the sensors show ``shown``."""
         sensors, observation = placed_filters(variant.placed, "sense", self.setting), self.setting.observation
+        rates = windows.rates.copy()
+        for f in sensors:  # what a late sensor shows later is the truth of now
+            late = f.effect.memory(f.values[0].numpy())
+            if late > 0:
+                steps = late / self.setting.signals.timestep
+                rates[:, f.column] = secants(windows.measured[:, :, f.column], steps) / late
         states = observation.full(self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy())
         for q in observation.quaternions:
             at = observation.index[list(q)]
@@ -209,3 +215,13 @@ class Twin:
             self._filtered[key] = filtered(np.repeat(windows.commands, skip, axis=1), filters, step)
         at = np.maximum(windows.steps[:, None] * skip + np.arange(-self._engine.lead, length * skip), 0)
         return self._filtered[key][windows.episodes[:, None], at]
+
+
+def secants(path: np.ndarray, steps: float) -> np.ndarray:
+    """Return by how much paths ``(W, L + 1)`` change over some steps from their start, by a cubic, ``(W,)``."""
+    count = min(4, path.shape[1])
+    first = min(max(int(steps) - 1, 0), path.shape[1] - count)
+    nodes = np.arange(first, first + count)
+    apart = nodes[:, None] - nodes + np.eye(count)
+    weights = np.where(np.eye(count) > 0, 1.0, (steps - nodes) / apart).prod(1)
+    return path[:, nodes] @ weights - path[:, 0]
