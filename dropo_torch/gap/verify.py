@@ -72,6 +72,8 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
     setting = evidence.twin.setting
     observation, timestep = setting.observation, setting.signals.timestep
     since = evidence.twin.settled(hypothesis.variant, log.commands)
+    if any(p.effect.has("sense") and p.effect.memory(np.array(p.values)) > 0 for p in hypothesis.placed):
+        since = np.maximum(since, 1)  # a late sensor asks for the command just before
     begins = np.flatnonzero(np.append(True, log.terminals[:-1]))
     known = np.flatnonzero(np.arange(len(log)) >= (begins + since)[log.episodes])
     if not len(known):  # better scores of something
