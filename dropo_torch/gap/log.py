@@ -46,14 +46,15 @@ def cut_windows(
     found = []
     for e, (a, b) in enumerate(bounds):
         path = np.concatenate([observed[a : a + 1], following[a:b]])
-        slope = np.gradient(path, axis=0)
+        slope, before = np.gradient(path, axis=0), np.diff(path, axis=0, prepend=2 * path[:1] - path[1:2])
         starts = range(int(begin[e]), b - a - length + 1, stride or length + 1)
-        found += [(path[s : s + length + 1], slope[s], e, s) for s in starts]
-    measured, rates, episodes, steps = zip(*found, strict=True) if found else ((), (), (), ())
+        found += [(path[s : s + length + 1], slope[s], e, s, before[s]) for s in starts]
+    measured, rates, episodes, steps, past = zip(*found, strict=True) if found else ((), (), (), (), ())
     return Windows(
         np.reshape(measured, (-1, length + 1, observation.size)),
         np.reshape(rates, (-1, observation.size)) / (log.dt or 1.0),
         np.array(episodes, dtype=int), np.array(steps, dtype=int), commands,
+        np.reshape(past, (-1, observation.size)) / (log.dt or 1.0),
     )  # fmt: skip
 
 

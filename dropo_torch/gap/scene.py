@@ -90,7 +90,8 @@ def prepare(problem: Problem) -> Scene:
             f"gap: the velocity of {blind[0]} is not observed; derive velocities from positions "
             "(data: preprocess), and name them in observation"
         )
-    train, held = hold_out(problem.trajectories)
+    step = problem.simulator.frame_skip * float(problem.space.model.opt.timestep)
+    train, held = hold_out(replace(problem.trajectories, dt=step))  # a log without time stamps is sampled so, too
     setting = make_setting(problem, train)
     twin = Twin(
         setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",

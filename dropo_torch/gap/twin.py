@@ -16,6 +16,7 @@ from dropo_torch.effects.filters import (
     Filter,
     extended,
     filtered,
+    is_exact,
     observed_rates,
     placed_filters,
     sensed,
@@ -36,6 +37,7 @@ class Windows:
         episodes: episode of each window, ``(W,)``.
         steps: logged step of each window's start within its episode, ``(W,)``.
         commands: commands of every episode at every logged step, the last one repeated, ``(E, N, nu)``.
+        past: ``rates`` just before the starts, ``(W, n)``; by default the same.
     """
 
     measured: np.ndarray
@@ -43,6 +45,7 @@ class Windows:
     episodes: np.ndarray
     steps: np.ndarray
     commands: np.ndarray
+    past: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of windows."""
@@ -55,7 +58,8 @@ class Windows:
 
     def select(self, rows: np.ndarray | slice) -> Windows:
         """Return the given windows."""
-        return replace(self, **{k: getattr(self, k)[rows] for k in ("measured", "rates", "episodes", "steps")})
+        chosen = {k: getattr(self, k)[rows] for k in ("measured", "rates", "episodes", "steps")}
+        return replace(self, **chosen, past=None if self.past is None else self.past[rows])
 
 
 class Twin:
@@ -123,7 +127,7 @@ class Twin:
             calls = parts(len(members), max(1, self._chunk // max(1, num_w)))
             for part, rows in itertools.product([members[c] for c in calls], parts(num_w, self._chunk)):
                 chosen, given = [variants[k] for k in part], windows.select(rows)
-                states = np.stack([self._states(variants[k], shown[k, rows], given.rates) for k in part])
+                states = np.stack([self._states(variants[k], shown[k, rows], given) for k in part])
                 signals = np.stack([self._signals(v, given) for v in chosen])
                 forces = None if pushes is None else pushes[part]
                 own = [models[k] for k in part]
@@ -164,23 +168,24 @@ class Twin:
             valid[..., f.column] &= truth.known(f.effect.memory(f.values[0].numpy())).numpy()
         return sensed(truth, sensors).numpy(), valid
 
-    def _states(self, variant: Variant, shown: np.ndarray, rates: np.ndarray) -> np.ndarray:
+    def _states(self, variant: Variant, shown: np.ndarray, windows: Windows) -> np.ndarray:
         """Return states ``(W, nq + nv)`` of which the sensors show ``shown``."""
         sensors, observation = placed_filters(variant.placed, "sense", self.setting), self.setting.observation
-        states = observation.full(self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy())
+        states = observation.full(self._true(torch.tensor(shown), windows, sensors).numpy())
         for q in observation.quaternions:
             at = observation.index[list(q)]
             states[:, at] /= np.linalg.norm(states[:, at], axis=1, keepdims=True)
         return states
 
-    def _true(self, shown: torch.Tensor, rates: torch.Tensor, sensors: Sequence[Filter]) -> torch.Tensor:
-        """Return the true columns ``(W, n)`` of which sensors show ``shown``, and whose time derivatives are ``rates``.
+    def _true(self, shown: torch.Tensor, windows: Windows, sensors: Sequence[Filter]) -> torch.Tensor:
+        """Return the true columns ``(W, n)`` of windows' starts, of which sensors show ``shown``.
 
-        Late ones to second order: a position's derivative is its velocity, and that changes as the log shows.
+        Late ones to second order: a position's derivative is its velocity, and that has changed as the log shows.
         """
-        known = np.flatnonzero(self.rates >= 0)
-        rates, curvature = rates.clone(), torch.zeros_like(rates)
-        curvature[:, known] = rates[:, self.rates[known]]
+        known, rates = np.flatnonzero(self.rates >= 0), torch.tensor(windows.rates)
+        past = rates if windows.past is None else torch.from_numpy(windows.past)
+        curvature = torch.zeros_like(rates)
+        curvature[:, known] = past[:, self.rates[known]]
         rates[:, known] = shown[:, self.rates[known]]
         true = unsensed(shown, rates, sensors)
         late = max((f.effect.memory(f.values[0].numpy()) for f in sensors), default=0.0)
@@ -188,8 +193,9 @@ class Twin:
             return true
         step = float(self.setting.model.opt.timestep)
         rates[:, known] = true[:, self.rates[known]]
-        past = extended(true[:, None], rates, curvature[:, None], int(np.ceil(late / step)) + 1, step)
-        there = SensedPath.of(past, 1, self.setting.frame_skip, step, tuple(self.rates))
+        count, exact = int(np.ceil(late / step)) + 1, is_exact(self.setting.model)
+        path = extended(true[:, None], rates, curvature[:, None], count, step, exact=exact)
+        there = SensedPath.of(path, 1, self.setting.frame_skip, step, tuple(self.rates))
         return true + shown - sensed(there, sensors)[:, 0]
 
     def _signals(self, variant: Variant, windows: Windows) -> np.ndarray:
