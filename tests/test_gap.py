@@ -343,6 +343,7 @@ def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
 NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
+    "own_step": (list, type(None)),
     "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
