@@ -293,8 +293,8 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
     """Return a fit as it would be under an endlessly fine step, where a finer one explains the log better.
 
     Dry friction, ripples and stops are resolved by a step only to first order in it, which with little noise is more
-    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated; half of
-    what this adds stays uncertain. A log that was simulated with the model's own step stays with it.
+    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated; as much
+    as this adds stays uncertain. A log that was simulated with the model's own step stays with it.
 
     Args:
         evidence: the windows, with the weights of the fit.
@@ -312,7 +312,7 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
         return own
     change = fine.hypothesis.vector - coarser.fit.hypothesis.vector
     there = fine.hypothesis.at(np.clip(fine.hypothesis.vector + change, limits.low, limits.high))
-    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change) / 2)
+    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change))
 
 
 def half_widths(last: Resolved) -> np.ndarray:
