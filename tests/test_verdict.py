@@ -93,7 +93,7 @@ def test_a_hopeless_fit_writes_everything_and_exits_3(tmp_path: Path, capsys: py
     judged(tmp_path, in_degrees(arm_log(0)))
     (tmp_path / "config.json").write_text(json.dumps({**arm.CONFIG, "epsilon": (NOISE**2).tolist()}))
     out = tmp_path / "out"
-    assert main(["fit", str(tmp_path / "config.json"), "--out", str(out)]) == HOPELESS == 3
+    assert main(["fit", str(tmp_path / "config.json"), "--out", str(out), "--force"]) == HOPELESS == 3
     assert "verdict: hopeless: the simulator predicts" in capsys.readouterr().out
     document = json.loads((out / "fit.json").read_text())
     assert document["verdict"] == "hopeless"

@@ -102,7 +102,13 @@ def unsensed(shown: torch.Tensor, rates: torch.Tensor, sensors: Sequence[Filter]
 
 
 def extended(
-    fine: torch.Tensor, rates: torch.Tensor, curvature: torch.Tensor | float, count: int, step: float
+    fine: torch.Tensor,
+    rates: torch.Tensor,
+    curvature: torch.Tensor | float,
+    count: int,
+    step: float,
+    *,
+    exact: bool = False,
 ) -> torch.Tensor:
     """Return fine paths with ``count`` physics steps before them, as if they had moved evenly so far.
 
@@ -112,12 +118,18 @@ def extended(
         curvature: the second derivatives, ``(R, 1, n)``.
         count: physics steps of the past.
         step: seconds of a physics step.
+        exact: whether positions follow from velocities as under Runge-Kutta; otherwise as under Euler's steps.
     """
     if not count:
         return fine
     before = step * torch.arange(-count, 0, dtype=fine.dtype, device=fine.device)[:, None]
-    past = fine[:, :1] + before * rates[:, None] + 0.5 * before * (before + step) * curvature
+    past = fine[:, :1] + before * rates[:, None] + 0.5 * before * (before + (0.0 if exact else step)) * curvature
     return torch.cat([past, fine], 1)
+
+
+def is_exact(model: mujoco.MjModel) -> bool:
+    """Return whether a model's positions follow from its velocities better than by Euler's steps."""
+    return int(model.opt.integrator) == int(mujoco.mjtIntegrator.mjINT_RK4)
 
 
 def rate_columns(model: mujoco.MjModel) -> np.ndarray:

@@ -18,6 +18,7 @@ from dropo_torch.effects.filters import (
     extended,
     filtered,
     filters_of,
+    is_exact,
     observed_rates,
     placed_filters,
     rate_columns,
@@ -195,7 +196,8 @@ class EffectSimulator(Simulator):
         columns, slope, curvature = (
             torch.from_numpy(x.reshape(-1, *x.shape[2:])) for x in (fine[..., index], rates[..., index], curved)
         )
-        past = extended(columns, slope, curvature[:, None], self._late * skip, self._step)
+        exact = is_exact(self._setting.model)
+        past = extended(columns, slope, curvature[:, None], self._late * skip, self._step, exact=exact)
         instants = (fine.shape[2] - 1) // skip + 1
         path = SensedPath.of(past, instants, skip, self._step, self._observed_rates)
         return sensed(path, sensors).numpy().reshape(*fine.shape[:2], instants, len(index))

@@ -28,7 +28,12 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
     """Return those hypotheses whose numbers are no nonsense."""
-    return [r for r in fitted if not any(absurd(ground.part, r, ground.rules.sound))]
+    return [r for r in fitted if not nonsense(ground, r)]
+
+
+def nonsense(ground: Ground, fitted: Refit) -> list[str]:
+    """Return why effects of a hypothesis can have no name."""
+    return [reason for _, reason in absurd(ground.part, fitted, ground.rules.sound)]
 
 
 def is_done(ground: Ground, state: State) -> bool:
@@ -45,6 +50,7 @@ def add(ground: Ground, state: State) -> State:
     ranked = ground.screened(current) if state.number else state.first.ranked
     alive = [c for c in ranked if not c.dead]
     singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.tried.refits]], "refitting")
+    state = replace(state, refused=next((why for r in singles[:1] for why in nonsense(ground, r)), state.refused))
     singles = sound(ground, singles)
     if not singles:
         return replace(state, done=True)

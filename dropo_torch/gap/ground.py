@@ -58,6 +58,7 @@ class State:
         number: rounds done.
         done: whether no round is to follow.
         attempts: what was refitted, in order.
+        refused: why what explained the most has no name, if it has none.
     """
 
     noise: np.ndarray
@@ -69,6 +70,7 @@ class State:
     number: int = 0
     done: bool = False
     attempts: tuple[Ranked, ...] = ()
+    refused: str = ""
 
 
 @dataclass(frozen=True)

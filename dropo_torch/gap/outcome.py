@@ -79,9 +79,10 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
-        notes=tuple(_notes(setting, naming, rest, rules, has_skill(given, floor, constant, rules.sound))),
+        notes=tuple(_notes(setting, naming, has_skill(given, floor, constant, rules.sound))),
         remaining=remaining,
         refused=naming.refused,
+        own_step=_own_step(naming, rest, rules),
         symbolic=describe(setting, before, guilty(before)) if naming.gap and not naming.named else "",
     )
 
@@ -133,18 +134,19 @@ def _remaining(setting: Setting, naming: Naming, rest: Refit, after: FreeForces,
     )
 
 
-def _notes(setting: Setting, naming: Naming, rest: Refit, rules: Rules, skill: bool) -> Iterator[str]:
+def _own_step(naming: Naming, rest: Refit, rules: Rules) -> tuple[float, float] | None:
+    """χ² per degree of freedom with the model's own step and with a finer one, where that step is all that remains."""
+    own = naming.final.cost
+    only = naming.named and remains(own, rules) and not remains(rest.cost, rules)
+    return (own.reduced, rest.cost.reduced) if only else None
+
+
+def _notes(setting: Setting, naming: Naming, skill: bool) -> Iterator[str]:
     """What a person should know besides; ``skill`` is that of the model as it is."""
     names = dof_names(setting.model)
     still = [name for name, speed in zip(names, setting.signals.speed, strict=True) if speed <= 0]
     if still:
         yield f"No velocity of {', '.join(still)} is in this log: effects there cannot be judged."
-    own = naming.final.cost
-    if naming.named and remains(own, rules) and not remains(rest.cost, rules):
-        yield (
-            f"The model's own step resolves this only so well: χ² per degree of freedom is {own.reduced:.3g} with it, "
-            f"and {rest.cost.reduced:.3g} with a finer one. The numbers are those of an endlessly fine step."
-        )
     if naming.gap and not naming.named and not skill:
         yield "The model predicts unseen data no better than constant velocity does: it has no skill on this log."
 

@@ -154,6 +154,7 @@ class Gap:
         symbolic: a sparse formula for a force that has no name, or empty.
         remaining: what the named effects leave, if that is more than noise.
         refused: why what would account for the misfit has no name, or empty.
+        own_step: χ² per degree of freedom with the model's own step and with a finer one, if only that remains.
     """
 
     where: tuple[Place, ...]
@@ -181,6 +182,7 @@ class Gap:
     symbolic: str = ""
     remaining: Remaining | None = None
     refused: str = ""
+    own_step: tuple[float, float] | None = None
 
     @property
     def verdict(self) -> str:
@@ -197,6 +199,7 @@ class Gap:
             "schema": SCHEMA,
             "verdict": self.verdict,
             "verdict_reason": reason(self),
+            "own_step": self.own_step,
             "remaining": None if self.remaining is None else asdict(self.remaining),
             "where": [asdict(place) for place in self.where],
             "effects": [_effect(e) for e in self.effects],
@@ -228,6 +231,12 @@ def reason(gap: Gap) -> str:
         return "what remains is no more than noise"
     if gap.verdict == "unnamed":
         return gap.refused or "no known effect, and no few of them together, account for the misfit"
+    if gap.own_step is not None:
+        own, finer = gap.own_step
+        return (
+            f"the named effects leave no more than noise under a finer step: χ² per degree of freedom is {finer:.3g}, "
+            f"and {own:.3g} with the model's own step; their numbers are those of an endlessly fine one"
+        )
     if gap.remaining is None:
         return "the named effects leave no more than noise"
     left = gap.remaining

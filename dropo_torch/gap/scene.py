@@ -90,7 +90,8 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
             f"gap: the velocity of {blind[0]} is not observed; derive velocities from positions "
             "(data: preprocess), and name them in observation"
         )
-    train, held = hold_out(problem.trajectories)
+    log = problem.trajectories  # without time stamps, it is sampled as the simulator steps
+    train, held = hold_out(replace(log, dt=log.dt or problem.simulator.timestep))
     if not np.ptp(train.observations, axis=0).any():
         raise InputError(f"data: nothing moves in {train.source}: no observed column ever changes")
     setting = make_setting(problem, train)

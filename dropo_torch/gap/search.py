@@ -9,14 +9,13 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
-from dropo_torch.gap.accept import add, everywhere, extend, is_done, prune, swap
+from dropo_torch.gap.accept import add, everywhere, extend, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, significant
-from dropo_torch.gap.sound import absurd
 from dropo_torch.gap.ties import canonical, ties
 from dropo_torch.support.checkpoint import Checkpoint
 
@@ -134,12 +133,13 @@ def conclude(ground: Ground, state: State) -> Naming:
     if not unnamed.gap:
         return unnamed
     found, state = state.current, prune(ground, state)
-    unnamed = replace(unnamed, attempts=state.attempts)
-    if nonsense := [reason for _, reason in absurd(ground.part, state.current, rules.sound)]:
-        return replace(unnamed, refused=nonsense[0])
+    unnamed = replace(unnamed, attempts=state.attempts, refused=state.refused)
+    if reasons := nonsense(ground, state.current):
+        return replace(unnamed, refused=reasons[0])
     placed, partial = state.current.hypothesis.placed, ground.clears(base, state.current)
     if not placed or not (partial or accounts(state.current, base, rules)):
-        return replace(unnamed, refused=UNSURE if found.hypothesis.placed and accounts(found, base, rules) else "")
+        unsure = found.hypothesis.placed and accounts(found, base, rules)
+        return replace(unnamed, refused=UNSURE if unsure else state.refused)
     tied, shares = [], []
     for index in range(len(placed)):
         rivals, share, state = ties(ground, state, index)
@@ -147,6 +147,6 @@ def conclude(ground: Ground, state: State) -> Naming:
         shares.append(share)
     state, told = canonical(ground, state, tied)
     return replace(
-        unnamed, final=state.current, named=True, ties=told, shares=tuple(shares), attempts=state.attempts,
+        unnamed, refused="", final=state.current, named=True, ties=told, shares=tuple(shares), attempts=state.attempts,
         partial=partial,
     )  # fmt: skip

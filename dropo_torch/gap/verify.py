@@ -20,7 +20,7 @@ from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, spr
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Score
 from dropo_torch.gap.twin import Windows
-from dropo_torch.objective import Objective
+from dropo_torch.objective import LIMITS, Objective
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.simulators.hidden import filter_memory
@@ -72,6 +72,8 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
     setting = evidence.twin.setting
     observation, timestep = setting.observation, setting.signals.timestep
     since = evidence.twin.settled(hypothesis.variant, log.commands)
+    if any(p.effect.has("sense") and p.effect.memory(np.array(p.values)) > 0 for p in hypothesis.placed):
+        since = np.maximum(since, 1)  # a late sensor asks for the command just before
     begins = np.flatnonzero(np.append(True, log.terminals[:-1]))
     known = np.flatnonzero(np.arange(len(log)) >= (begins + since)[log.episodes])
     if not len(known):  # better scores of something
@@ -177,7 +179,7 @@ def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -
 
 def below(noise: np.ndarray) -> float:
     """Return an ε that adds next to nothing to the variance of noise ``(n,)``."""
-    return BELOW * float(noise[noise > 0].min(initial=1.0)) ** 2
+    return max(BELOW * float(noise[noise > 0].min(initial=1.0)) ** 2, LIMITS["epsilon"][0])
 
 
 def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:

@@ -162,8 +162,13 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
         if gap.refused:
             return f"Something is missing that has no name yet: {gap.refused}; {shows(gap)}.", []
         return f"Something is missing that {unexplained}; {shows(gap)}.", []
+    if gap.own_step is not None:
+        own, finer = (short(x) for x in gap.own_step)
+        step = f" (the model's own step leaves {own} times what noise would, a finer one {finer})"
+    else:
+        step = ""
     if len(named) == 1:
-        rest = "" if gap.remaining is None else f", but this does not explain everything: {left(gap.remaining)}"
+        rest = step if gap.remaining is None else f", but this does not explain everything: {left(gap.remaining)}"
         return f"{_clause(named[0])}: {numbers(named[0].parameters)}{rest}.", []
     items = [
         f"{noun(e.effect, e.target)}: {'too much in the model, ' if _too_much(e) else ''}{numbers(e.parameters)}"
@@ -171,7 +176,7 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     ]
     count = _COUNTS[len(items)] if len(items) < len(_COUNTS) else str(len(items))
     differ = any(_too_much(e) or e.effect in _CLAUSES for e in named)
-    rest = "" if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
+    rest = step if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
     return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
 
 
