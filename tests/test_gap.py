@@ -345,7 +345,8 @@ CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
     "own_step": (list, type(None)),
     "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
-    "noise": dict, "chi2_per_degree": dict, "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
+    "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)),
+    "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
 }  # fmt: skip
 

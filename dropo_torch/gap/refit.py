@@ -9,7 +9,7 @@ import numpy as np
 from scipy import stats
 
 from dropo_torch.effects import find_effect
-from dropo_torch.effects.base import Effect, Placed
+from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, robust_factors, robust_loss
 from dropo_torch.gap.log import blocks_of
@@ -28,6 +28,8 @@ FAR = 0.03
 Z90 = 1.6449
 #: χ² per degree of freedom from which on residuals are more than noise; degrees of freedom that show a variance.
 LACKING, FEW = 1.5, 30.0
+#: The model's field that is its step.
+STEP_FIELD = "opt.timestep"
 #: Simulations with a finer step in which numbers settle there.
 MOVES = 4
 
@@ -291,8 +293,8 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
     """Return a fit as it would be under an endlessly fine step, where a finer one explains the log better.
 
     Dry friction, ripples and stops are resolved by a step only to first order in it, which with little noise is more
-    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated; half of
-    what this adds stays uncertain. A log that was simulated with the model's own step stays with it.
+    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated; as much
+    as this adds stays uncertain. A log that was simulated with the model's own step stays with it.
 
     Args:
         evidence: the windows, with the weights of the fit.
@@ -300,16 +302,17 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
     """
     effect, vector = find_effect("integration"), fitted.hypothesis.vector
     own = Resolved(fitted, evidence, np.zeros(len(vector)))
-    if any(p.effect is effect for p in fitted.hypothesis.placed):
+    declared = STEP_FIELD in evidence.twin.space.fields
+    if declared or any(p.effect is effect for p in fitted.hypothesis.placed):
         return own
     finest = effect.quantities(evidence.twin.setting, None)[0].low
-    finer, coarser = (_stepped(evidence, fitted, effect, step) for step in (finest, 2 * finest))
+    finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
     fine, limits = finer.fit, limits_of(fitted.hypothesis, evidence.twin)
     if fine.loss >= fitted.loss:
         return own
     change = fine.hypothesis.vector - coarser.fit.hypothesis.vector
     there = fine.hypothesis.at(np.clip(fine.hypothesis.vector + change, limits.low, limits.high))
-    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change) / 2)
+    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change))
 
 
 def half_widths(last: Resolved) -> np.ndarray:
@@ -318,10 +321,9 @@ def half_widths(last: Resolved) -> np.ndarray:
     return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes, lacking=lacking), last.error)
 
 
-def _stepped(evidence: Evidence, fitted: Refit, effect: Effect, step: float) -> Resolved:
+def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
     """A fit moved to where it is best under another step, by the derivatives that it has."""
-    twin = evidence.twin.also(Placed(effect, None, (step,)))
-    finer, limits = replace(evidence, twin=twin), limits_of(fitted.hypothesis, evidence.twin)
+    finer, limits = replace(evidence, twin=evidence.twin.finer(step)), limits_of(fitted.hypothesis, evidence.twin)
     best, trial = None, fitted.hypothesis
     for _ in range(MOVES):
         found, _ = finer.residuals([trial.variant])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -10,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from dropo_torch.effects.base import Placed, Setting
+from dropo_torch.effects.base import Placed, Setting, applied, find_effect
 from dropo_torch.effects.engine import Variant, VariantEngine, parts
 from dropo_torch.effects.filters import (
     Filter,
@@ -87,11 +86,12 @@ class Twin:
         self._filtered: dict[tuple, np.ndarray] = {}
         self.simulated_transitions = 0
 
-    def also(self, placed: Placed) -> Twin:
-        """Return the same with one more effect in every variant."""
-        before, twin = self._standing, copy.copy(self)
-        twin._standing = lambda declared: (*(before(declared) if before is not None else ()), placed)
-        return twin
+    def finer(self, step: float) -> Twin:
+        """Return the same with another physics step, as ``integration`` has it: of filters and effects, too."""
+        model = applied(self.setting.model, [Placed(find_effect("integration"), None, (step,))])
+        ratio = round(self.setting.model.opt.timestep / step)
+        setting = replace(self.setting, model=model, frame_skip=self.setting.frame_skip * ratio)
+        return Twin(setting, self.space, num_threads=self.num_threads, chunk_size=self._chunk, standing=self._standing)
 
     def effects(self, variant: Variant) -> tuple[Placed, ...]:
         """Return all effects of a variant, those that every variant has among them."""
