@@ -343,7 +343,6 @@ def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
 NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
-    "own_step": (list, type(None)),
     "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)),
     "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
