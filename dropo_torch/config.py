@@ -44,7 +44,7 @@ class Config(pydantic.BaseModel):
         None, "how many of the log's episodes to use (the first ones), or which, counted from 0"
     )
     frame_skip: int | None = _key(None, "physics steps per logged transition", ge=1, le=1_000_000)
-    observation: list[str] | None = _key(None, "what the log's columns are, such as [qpos[1:], qvel]")
+    observation: list[str] | None = _key(None, "what the log's columns are, such as ['qpos[1:]', qvel]")
     parameters: dict[str, Entries] | None = _key(
         None, "name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
     )

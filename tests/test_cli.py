@@ -123,6 +123,7 @@ def test_a_wrong_entry_gives_one_line_that_says_what_is_right(
 
 WRONG_FILES = {
     "not YAML": (b"a: [1, 2", "no valid YAML"),
+    "slice in a flow list": (b"observation: [qpos[1:], qvel]", "quote entries with brackets"),
     "a list": (b"- 1\n- 2", "holds no keys"),
     "empty": (b"", "holds no keys"),
     "not text": (b"\xff\xfe\x00", "cannot be read as text in UTF-8"),

@@ -477,7 +477,7 @@ def test_noise_beside_what_is_named_is_that_of_the_log() -> None:
     assert {(e.effect, e.target) for e in gap.effects} == {(e.name, e.target) for e in (LATE, DAMPING)}
     assert gap.noise == pytest.approx(case.noise, rel=0.15)
     assert gap.reduced[1] == pytest.approx(1, abs=0.15)
-    assert gap.after.mse < 1.1 * gap.noise_floor.mse
+    assert gap.after.log_likelihood > gap.noise_floor.log_likelihood - 25
     assert gap.after.rollout_rmse < 1.1 * gap.noise_floor.rollout_rmse
 
 
@@ -517,7 +517,7 @@ def test_a_late_position_begins_where_it_was() -> None:
     scene = prepare(load(case, noise=list(case.noise)))
     held = cut_held(scene.evidence, scene.held, true(case))
     found, floor = (f(scene.evidence, held, true(case)) for f in (score, floor_score))
-    assert found.mse < 1.1 * floor.mse
+    assert found.log_likelihood > floor.log_likelihood - 40
 
 
 def test_given_noise_is_used() -> None:

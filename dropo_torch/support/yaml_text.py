@@ -33,7 +33,9 @@ def load_yaml(text: str, where: str) -> Any:
     except yaml.MarkedYAMLError as error:  # without the line itself, which may be long
         mark = error.problem_mark or error.context_mark
         place = f" at line {mark.line + 1}, column {mark.column + 1}" if mark else ""
-        raise InputError(f"{where} is no valid YAML: {error.problem or error.context}{place}") from None
+        quote = "; quote entries with brackets or colons in a list, such as ['qpos[1:]', qvel]"
+        remedy = quote if str(error.problem).startswith("expected ',' or ']'") else ""
+        raise InputError(f"{where} is no valid YAML: {error.problem or error.context}{place}{remedy}") from None
     except (yaml.YAMLError, ValueError) as error:
         raise InputError(f"{where} is no valid YAML: {error}") from None
 
