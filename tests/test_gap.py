@@ -542,7 +542,7 @@ def test_free_forces_are_those_that_are_missing() -> None:
 def test_true_model_leaves_the_noise_alone(names: tuple[str, ...], rough: bool) -> None:
     """χ² per degree of freedom is near 1 although every start is noisy; as measured they would dominate."""
     scene, case = scene_of(*names), hidden(*names)
-    evidence = Evidence(scene.twin, scene.evidence.windows, np.array(case.noise), rough=rough)
+    evidence = Evidence(scene.twin, scene.evidence.windows, np.array(case.noise), scene.begin.variant, rough=rough)
     starts = evidence.linearise(true(case).variant)
     residuals, _ = evidence.residuals([true(case).variant])
     cost = cost_of(evidence.project(residuals[0], starts), starts, evidence.degrees(starts))

@@ -214,7 +214,7 @@ def require_same_everywhere(names: tuple[str, ...], tmp_path: Path) -> None:
     setting = make_setting(problem, problem.trajectories)
     twin = Twin(setting, problem.space, num_threads=1)
     windows = cut_windows(problem.trajectories, problem.observation, 1, stride=1)
-    evidence = Evidence(twin, windows, np.array(gap.noise), rough=False)
+    evidence = Evidence(twin, windows, np.array(gap.noise), hypothesis.variant, rough=False)
     # a fit
     written = make_problem(load_config(out / "config.yaml"))
     values = vector(written, hypothesis, setting, VariantEngine(setting, problem.space).model(hypothesis.variant))
@@ -286,7 +286,7 @@ def test_a_fit_of_the_search_leaves_the_step_where_it_is(tmp_path: Path) -> None
     setting = make_setting(problem, problem.trajectories)
     windows = cut_windows(problem.trajectories, problem.observation, 8)
     noise = Features.of(problem.observation).feature_noise(np.array([NOISE[c >= 10] for c in range(19)]))
-    evidence = Evidence(Twin(setting, problem.space, num_threads=1), windows, noise, rough=False)
+    evidence = Evidence(Twin(setting, problem.space, num_threads=1), windows, noise, Variant((0.9,)), rough=False)
     found = refit(evidence, Hypothesis((0.9,), (FINER,)), iterations=4).hypothesis
     assert found.placed == (FINER,)
     assert found.declared[0] == pytest.approx(LIGHT, rel=1e-2)

@@ -19,15 +19,21 @@ def unit(setting: Setting, target: str | None, hinge: str, slide: str) -> str:
 
 
 class JointEffect(Effect):
-    """An effect of one hinge or slide joint."""
+    """An effect of one hinge or slide joint.
+
+    Attributes:
+        positional: whether it depends on the joint's position, which the log must then show.
+    """
 
     kind = "joint"
+    positional: ClassVar[bool] = False
 
     def targets(self, setting: Setting) -> list[str | None]:
-        """Return every hinge and slide joint that moves in the log."""
-        m = setting.model
-        moving = np.isin(m.jnt_type, (_HINGE, _SLIDE)) & (setting.signals.speed[m.jnt_dofadr] > 0)
-        return [joint_name(m, int(j)) for j in np.flatnonzero(moving)]
+        """Return every hinge and slide joint that moves in the log, and whose position is seen where that matters."""
+        m, signals = setting.model, setting.signals
+        moving = np.isin(m.jnt_type, (_HINGE, _SLIDE)) & (signals.speed[m.jnt_dofadr] > 0)
+        seen = np.isfinite(signals.position[m.jnt_qposadr]).all(-1) | (not self.positional)
+        return [joint_name(m, int(j)) for j in np.flatnonzero(moving & seen)]
 
     @staticmethod
     def dof(model: mujoco.MjModel, target: str | None) -> int:
@@ -158,6 +164,7 @@ class JointStiffness(JointEffect):
     """A spring, such as a cable harness, that pulls the joint towards a rest position."""
 
     name = "joint_stiffness"
+    positional = True
     sentence = "a spring at {target}, such as a cable harness, that pulls it towards a rest position"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
@@ -192,6 +199,7 @@ class JointCogging(JointEffect):
     """A force that ripples with the position, as of a motor's magnets or a gear's teeth."""
 
     name = "joint_cogging"
+    positional = True
     sentence = "a force at {target} that ripples with its position, as of a motor's magnets or a gear's teeth"
     #: Ripples of a turn that are tried, and how many of a slide, each half a wave more over the measured range.
     WAVES = 40
@@ -247,6 +255,7 @@ class JointLimit(JointEffect):
     """A stop that sits elsewhere than in the model."""
 
     name = "joint_limit"
+    positional = True
     sentence = "the stops of {target} sit elsewhere than in the model"
 
     def targets(self, setting: Setting) -> list[str | None]:
@@ -274,10 +283,14 @@ class JointCoupling(JointEffect):
     """A spring between a joint and the one before it in the chain, as of a tendon or a belt."""
 
     name = "joint_coupling"
+    positional = True
     sentence = "a spring between {target} and the joint before it in the chain, as of a tendon or belt"
 
     def targets(self, setting: Setting) -> list[str | None]:
-        return [t for t in super().targets(setting) if self.partner(setting, t) is not None]
+        """Return every such joint that has a partner whose position is seen, too."""
+        seen = np.isfinite(setting.signals.position[setting.model.jnt_qposadr]).all(-1)
+        partners = {t: self.partner(setting, t) for t in super().targets(setting)}
+        return [t for t, partner in partners.items() if partner is not None and seen[partner]]
 
     @staticmethod
     def partner(setting: Setting, target: str | None) -> int | None:

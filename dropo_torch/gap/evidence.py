@@ -19,7 +19,7 @@ from dropo_torch.gap.twin import Twin, Windows
 
 #: Antithetic pairs of noise on the initial states by which rough windows are linearised, and their seed.
 PAIRS, SEED = 16, 11
-#: Whitened residual of a window whose simulation diverged.
+#: Whitened residual of a window whose simulation diverged, at least.
 LOST = 1e3
 #: Largest share of all windows' χ² that one window may have.
 CAP = 0.03
@@ -69,6 +69,7 @@ class Evidence:
         twin: simulates hypotheses.
         windows: the stretches of the log.
         noise: standard deviation of the measurement of each feature, ``(m,)``.
+        begin: the model as given: where a simulation diverges, this was no worse.
         rough: linearise statistically, over draws of noise on the initial states, as contacts need it.
         model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``.
         robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost): what is named
@@ -79,6 +80,7 @@ class Evidence:
     twin: Twin
     windows: Windows
     noise: np.ndarray
+    begin: Variant
     rough: bool
     model_error: np.ndarray | float = 1.0
     robust: bool = False
@@ -102,6 +104,17 @@ class Evidence:
     def num_rows(self) -> int:
         """Residuals of a window."""
         return (self.windows.length + 1) * self.chart.size
+
+    @cached_property
+    def lost(self) -> np.ndarray:
+        """Whitened residual of each window where its simulation diverged: as large as the given model's, ``(W,)``.
+
+        No hypothesis gains by diverging where it was only far off; where the given model itself diverges, that counts
+        like the worst of the other windows.
+        """
+        found = np.abs(self.residuals([self.begin])[0][0]).max(-1)
+        seen = found[np.isfinite(found)]
+        return np.maximum(np.where(np.isfinite(found), found, seen.max(initial=0.0)), LOST)
 
     def tail(self, linear: Linearisation) -> float | None:
         """χ² of a window from which on the cost grows slowly; ``None`` where it never does."""
@@ -164,12 +177,14 @@ class Evidence:
         return Linearisation(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
 
     def project(self, residuals: np.ndarray, linear: Linearisation) -> np.ndarray:
-        """Return the part ``(..., W, N)`` of residuals that no initial states explain; lost ones count as LOST."""
-        return _beside(linear, np.where(np.isfinite(residuals), residuals + linear.shift, LOST))
+        """Return the part ``(..., W, N)`` of residuals that no initial states explain; what diverges is lost."""
+        finite = np.isfinite(residuals).all(-1, keepdims=True)
+        found = _beside(linear, np.where(finite, residuals + linear.shift, 0.0))
+        return found if finite.all() else np.where(finite, found, self.lost[:, None] * (linear.weights > 0))
 
     def project_slope(self, slope: np.ndarray, linear: Linearisation) -> np.ndarray:
-        """Return :meth:`project` of derivatives ``(..., W, N)``."""
-        return _beside(linear, np.nan_to_num(slope))
+        """Return :meth:`project` of derivatives ``(..., W, N)``; none where a window diverges."""
+        return _beside(linear, np.where(np.isfinite(slope).all(-1, keepdims=True), slope, 0.0))
 
     def degrees(self, linear: Linearisation) -> float:
         """Return the degrees of freedom that the windows have beside their initial states, as if all were counted."""

@@ -51,6 +51,10 @@ class FreeForces:
     windows: Windows
 
 
+class Diverges(InputError):
+    """No short window can be simulated."""
+
+
 def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarray | None = None) -> FreeForces:
     """Estimate the noise and the forces that are missing.
 
@@ -64,7 +68,7 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
         InputError: the simulation diverges in all windows.
     """
     sizes = np.maximum(feature_sizes(twin.setting, windows.measured), 1e-12)
-    evidence = Evidence(twin, windows, GUESS * sizes if noise is None else noise, rough=False)
+    evidence = Evidence(twin, windows, GUESS * sizes if noise is None else noise, variant, rough=False)
     m, nv, length = len(sizes), twin.setting.model.nv, windows.length
     scale = TRIAL * twin.setting.signals.force
     time = (np.arange(length) + 0.5) / length - 0.5
@@ -76,7 +80,7 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     found, _ = evidence.residuals([variant] * len(pushes), moved, pushes)
     usable = np.isfinite(found).all((0, 2))
     if not usable.any():
-        raise InputError(_lost(twin, windows))
+        raise Diverges(_lost(twin, windows))
     if (known := usable & twin.knows(variant, windows)).any():
         usable = known
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)

@@ -14,7 +14,7 @@ import numpy as np
 from dropo_torch.gap.evidence import LEAST_KNOWN, caps_of
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
-from dropo_torch.gap.noise import free_forces
+from dropo_torch.gap.noise import Diverges, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit
 
 #: Standard errors by which what long windows leave may exceed what short ones with free forces say.
@@ -71,7 +71,10 @@ def noise_beside(ground: Ground, fitted: Refit) -> np.ndarray:
     noise, left = ground.evidence.noise, noise_left(fitted, ground.evidence.noise)
     if ground.short is None:
         return np.minimum(noise, left)
-    free = free_forces(ground.evidence.twin, ground.short, fitted.hypothesis.variant)
+    try:
+        free = free_forces(ground.evidence.twin, ground.short, fitted.hypothesis.variant)
+    except Diverges:  # beside a hypothesis under which nothing can be simulated, there is nothing to see
+        return noise
     return np.where(left < free.noise * (1 + AGREE * free.unsure), left, free.noise)
 
 

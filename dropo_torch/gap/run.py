@@ -14,7 +14,7 @@ from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import make_result
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
-from dropo_torch.gap.rules import Rules
+from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, prepare, searched
 from dropo_torch.gap.search import Naming, kept, search, start
 from dropo_torch.gap.verify import cut_held, floor_score, score
@@ -97,17 +97,20 @@ def find_gap(
 
 
 def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False) -> Naming:
-    """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly."""
+    """Search; where that does not explain everything, over shorter windows, too, and robustly where there are contacts.
+
+    Long windows bend: what is most of the gap there may be an effect of the wrong kind. Names that leave nothing are
+    believed before those that leave nothing in most of the log, and these before names with a rest.
+    """
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
     found = []
     for suffix, evidence in searched(scene):
         path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
         found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume))
-        if found[-1].named or not found[0].gap:
-            break
-    if found[-1].named:
-        return found[-1]
-    return replace(found[0], refused=next((n.refused for n in found if n.refused), ""))
+        if not found[0].gap or (found[-1].named and not remains(found[-1].final.cost, ground.rules)):
+            return found[-1]
+    named = sorted((n for n in found if n.named), key=lambda n: not n.partial)
+    return named[0] if named else replace(found[0], refused=next((n.refused for n in found if n.refused), ""))
 
 
 def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None) -> Ground:

@@ -154,9 +154,9 @@ def searched(scene: Scene) -> Iterator[tuple[str, Evidence]]:
     yield "", scene.evidence
     length, rough = scene.evidence.windows.length // 4, scene.evidence.rough
     if length >= scene.rules.cut.lengths[-1]:
-        yield "-shorter", _cut(scene.twin, scene.train, scene.noise, scene.since, length, rough=rough)
+        yield "-shorter", _cut(scene.twin, scene.train, scene.begin, scene.noise, scene.since, length, rough=rough)
     if scene.setting.signals.contacts.any():
-        shortest = _cut(scene.twin, scene.train, scene.noise, scene.since, scene.rules.cut.lengths[-1])
+        shortest = _cut(scene.twin, scene.train, scene.begin, scene.noise, scene.since, scene.rules.cut.lengths[-1])
         yield "-contact", replace(shortest, robust=True)
 
 
@@ -166,21 +166,21 @@ def _choose_windows(
     """The longest windows in whose initial states the simulation is still nearly linear."""
     longest, touches = longest_episode(train), bool(twin.setting.signals.contacts.any())
     for length in (length for length in rules.lengths if length <= longest):
-        evidence = _cut(twin, train, noise, since, length, FEW)
+        evidence = _cut(twin, train, begin, noise, since, length, FEW)
         if not len(evidence.windows):
             continue
         rough = evidence.linearise(begin.variant).roughness
         if rough < rules.rough and (not touches or _end_error(evidence, begin) < rules.astray):
-            return _cut(twin, train, noise, since, length, rough=rough > rules.bent)
-    return _cut(twin, train, noise, since, min(rules.lengths[-1], longest))
+            return _cut(twin, train, begin, noise, since, length, rough=rough > rules.bent)
+    return _cut(twin, train, begin, noise, since, min(rules.lengths[-1], longest))
 
 
 def _cut(
-    twin: Twin, log: Trajectories, noise: np.ndarray, since: np.ndarray, length: int, most: int = MOST,
-    *, rough: bool = True,
+    twin: Twin, log: Trajectories, begin: Hypothesis, noise: np.ndarray, since: np.ndarray, length: int,
+    most: int = MOST, *, rough: bool = True,
 ) -> Evidence:  # fmt: skip
     windows = cut_windows(log, twin.setting.observation, length, since=spared(log, length, since))
-    return Evidence(twin, spread(windows, most), noise, rough=rough)
+    return Evidence(twin, spread(windows, most), noise, begin.variant, rough=rough)
 
 
 def spared(log: Trajectories, length: int, since: np.ndarray) -> np.ndarray:

@@ -153,7 +153,7 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         values = start.copy()
         values[moving] += move[len(shared) :] * limits.scale
         left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
-        chi2 = float(left[known].mean() * len(left)) if known.any() else np.inf
+        chi2 = promised(float(left[known].mean() * len(left)) if known.any() else np.inf)
         predicted = placed.at(placed.effect.settle(start, values))
         yield Candidate(predicted, placed, chi2, residual, slope, dead)
 
@@ -206,4 +206,9 @@ def left_by(focus: Focus, members: Sequence[Candidate]) -> float:
     columns = columns[norm > 0] / norm[norm > 0, None]
     gradient = columns @ before
     normal = columns @ columns.T + FAINT * np.eye(len(columns))
-    return float(before @ before - gradient @ np.linalg.solve(normal, gradient))
+    return promised(float(before @ before - gradient @ np.linalg.solve(normal, gradient)))
+
+
+def promised(chi2: float) -> float:
+    """Return a predicted χ² by which candidates may be sorted: infinite where it is no number."""
+    return np.inf if np.isnan(chi2) else chi2
