@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -115,6 +116,26 @@ IDLE: dict[str, tuple[str, ...]] = {
 }  # fmt: skip
 #: Numbers at which an effect acts on the rig, where those from which a search begins are too small for it.
 NUMBERS = {"joint_limit": {"lower": 0.8, "upper": -0.8}}
+
+
+@pytest.mark.parametrize("unseen", [(), ("shoulder",), ("rail", "elbow")])
+def test_every_number_of_every_candidate_is_one(unseen: tuple[str, ...]) -> None:
+    """Also where the positions of joints are not measured; what depends on them is no candidate there."""
+    setting = setting_of(general())
+    joints = [setting.joint(name) for name in unseen]
+    position = setting.signals.position.copy()
+    position[setting.model.jnt_qposadr[joints]] = np.nan
+    blind = replace(setting, signals=replace(setting.signals, position=position))
+    for effect in VOCABULARY.values():
+        for target in effect.targets(blind):
+            numbers = [[q.neutral, q.low, q.high, q.scale] for q in effect.quantities(blind, target)]
+            assert np.isfinite(np.array(numbers, dtype=float)[:, [0, 3]]).all(), (effect.name, target)
+            assert not np.isnan(numbers).any(), (effect.name, target)
+            assert np.isfinite(effect.starts(blind, target)).all(), (effect.name, target)
+    for name in ("joint_stiffness", "joint_cogging", "joint_limit", "joint_coupling"):
+        effect = find_effect(name)
+        lacking = set(effect.targets(setting)) - set(effect.targets(blind))
+        assert lacking >= set(unseen) & set(effect.targets(setting))
 
 
 @pytest.mark.parametrize("name", VOCABULARY)

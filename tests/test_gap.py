@@ -28,15 +28,17 @@ from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
 from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Linearisation, cost_of, robust_factors
+from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import cut_windows
-from dropo_torch.gap.noise import _relative_noise, free_forces
+from dropo_torch.gap.noise import Diverges, _relative_noise, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
-from dropo_torch.gap.renew import noise_left
+from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, allowance, clears
 from dropo_torch.gap.scene import short_windows
-from dropo_torch.gap.screen import Focus, all_candidates, screen
+from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
+from dropo_torch.gap.search import Naming
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.twin import secants
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
@@ -566,6 +568,75 @@ def test_diverged_windows_stay_finite() -> None:
     lost = np.full((len(evidence.windows), evidence.num_rows), np.nan)
     assert np.isfinite(evidence.project(lost, starts)).all()
     assert (evidence.project(lost, starts) ** 2).sum() > 1e6
+
+
+@pytest.mark.parametrize("robust", [False, True])
+@pytest.mark.parametrize("finer", [1.0, 1e-4, 1e-8])
+def test_no_hypothesis_gains_by_diverging(robust: bool, finer: float) -> None:
+    """However small the noise, and however far off the given model: what diverges costs as much, at least."""
+    scene = scene_of("joint_damping")
+    evidence = dataclasses.replace(scene.evidence, noise=finer * scene.noise, robust=robust)
+    diverging = scene.begin.with_effects([Placed(find_effect("joint_stiffness"), "hinge", (-1e7, 0.0))])
+    linear = evidence.linearise(scene.begin.variant)
+    begin, there = (refit(evidence, h, linear=linear, iterations=0) for h in (scene.begin, diverging))
+    assert not np.isfinite(evidence.residuals([diverging.variant])[0]).all()
+    assert there.loss >= begin.loss
+    assert there.cost.excess >= begin.cost.excess
+
+
+def test_where_the_given_model_diverges_itself_that_counts_like_its_worst_window() -> None:
+    scene = scene_of("joint_damping")
+    measured = scene.evidence.windows.measured.copy()
+    measured[0] = np.nan
+    broken = dataclasses.replace(scene.evidence, windows=dataclasses.replace(scene.evidence.windows, measured=measured))
+    assert np.isfinite(broken.lost).all()
+    assert broken.lost[0] == broken.lost.max()
+    assert broken.lost[1:] == pytest.approx(scene.evidence.lost[1:])
+
+
+def test_noise_stays_beside_a_hypothesis_under_which_nothing_can_be_simulated() -> None:
+    scene = scene_of("joint_damping")
+    ground = Ground(scene.evidence, (), scene.rules, short=scene.short)
+    fitted = ground.refit(scene.begin)
+    diverging = scene.begin.with_effects([Placed(find_effect("joint_stiffness"), "hinge", (-1e7, 0.0))])
+    with pytest.raises(Diverges, match="diverges"):
+        free_forces(scene.twin, scene.short, diverging.variant)
+    assert noise_beside(ground, dataclasses.replace(fitted, hypothesis=diverging)) == pytest.approx(scene.noise)
+
+
+def test_what_promises_no_number_comes_last() -> None:
+    assert sorted([3.0, promised(float("nan")), 1.0, promised(2.0)]) == [1.0, 2.0, 3.0, np.inf]
+
+
+def naming(scene: Scene, excess: float, *, partial: bool = False, named: bool = True) -> Naming:
+    """An answer whose rest has a number of times its degrees of freedom as χ²."""
+    base = refit(scene.evidence, scene.begin, iterations=0)
+    cost = Cost(np.array([excess * 1e3]), np.zeros(1), 1e3)
+    final = dataclasses.replace(base, cost=cost)
+    return Naming(scene.evidence, base, Screening((), 1.0, 1.0), final, gap=True, named=named, partial=partial)
+
+
+@pytest.mark.parametrize(
+    ("answers", "chosen", "asked"),
+    [
+        (((1.0, False, True), (1.0, False, True)), 0, 1),  # what explains everything needs no other
+        (((1e5, False, True), (1.0, False, True)), 1, 2),  # names that leave a rest are no answer if others leave none
+        (((1e5, False, True), (40.0, True, True)), 1, 2),  # nor if others leave none in most windows
+        (((1e5, False, True), (40.0, False, True)), 0, 2),
+        (((1e5, False, False), (40.0, False, True)), 1, 2),
+        (((1e5, False, True), (40.0, False, False)), 0, 2),
+    ],
+)
+def test_names_that_leave_nothing_are_believed_before_others(
+    answers: tuple, chosen: int, asked: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene = scene_of("joint_damping")
+    ready = [naming(scene, excess, partial=partial, named=named) for excess, partial, named in answers]
+    waiting = iter(ready)
+    monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: next(waiting))
+    monkeypatch.setattr("dropo_torch.gap.run.searched", lambda scene: ((str(n), scene.evidence) for n in range(2)))
+    assert gap_package.name(scene) is ready[chosen]
+    assert len(list(waiting)) == len(ready) - asked
 
 
 # --- fits and screening ---------------------------------------------------------------------------------------
