@@ -27,7 +27,7 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
-from dropo_torch.gap.evidence import TAIL, Cost, Evidence, Linearisation, cost_of, robust_factors
+from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import cut_windows
@@ -489,9 +489,10 @@ def test_noise_is_what_a_right_model_leaves(factor: float) -> None:
     scene, truth = scene_of(), np.array(hidden().noise)
     wrong = truth * np.array([factor, 1.0, 1.0, 1 / factor])
     fitted = refit(dataclasses.replace(scene.evidence, noise=wrong), true(hidden()), iterations=3)
-    assert noise_left(fitted, wrong) == pytest.approx(truth, rel=0.12)
+    assert noise_left(fitted, wrong, Rules()) == pytest.approx(truth, rel=0.12)
     lacking = refit(scene_of("joint_damping").evidence, scene.begin, iterations=3)
-    assert (noise_left(lacking, scene_of("joint_damping").noise) > 0.9 * np.array(hidden("joint_damping").noise)).all()
+    left, told = noise_left(lacking, scene_of("joint_damping").noise, Rules()), hidden("joint_damping").noise
+    assert (left > 0.9 * np.array(told)).all()
 
 
 def test_windows_in_which_a_force_jumps_are_no_noise() -> None:
@@ -596,7 +597,7 @@ def test_where_the_given_model_diverges_itself_that_counts_like_its_worst_window
 
 def test_noise_stays_beside_a_hypothesis_under_which_nothing_can_be_simulated() -> None:
     scene = scene_of("joint_damping")
-    ground = Ground(scene.evidence, (), scene.rules, short=scene.short)
+    ground = Ground(scene.evidence, (), short=scene.short)
     fitted = ground.refit(scene.begin)
     diverging = scene.begin.with_effects([Placed(find_effect("joint_stiffness"), "hinge", (-1e7, 0.0))])
     with pytest.raises(Diverges, match="diverges"):
@@ -684,14 +685,15 @@ def spoilt(size: float, share: float, windows: int = 40, rows: int = 12) -> Refi
     residual = np.random.default_rng(0).standard_normal((windows, rows))
     residual[: round(share * windows)] *= size
     starts = Linearisation(np.zeros((windows, rows, 0)), np.ones((windows, rows)), np.zeros((windows, rows)), 0.0)
-    cost = cost_of(residual, starts, windows * rows, tail=TAIL * rows)
+    cost = cost_of(residual, starts, windows * rows, tail=Rules().weighed.tail * rows)
     return Refit(Hypothesis(()), cost, residual, residual[None], starts, np.ones(1), np.ones(windows))
 
 
 def test_robust_cost_is_that_of_noise_for_noise_and_a_logarithm_far_off() -> None:
     rows = 12
     starts = Linearisation(np.zeros((1, rows, 0)), np.ones((1, rows)), np.zeros((1, rows)), 0.0)
-    costs = [cost_of(np.full((1, rows), a), starts, rows, tail=TAIL * rows).chi2 for a in (1.0, 1e4, 1e5, 1e6)]
+    tail = Rules().weighed.tail * rows
+    costs = [cost_of(np.full((1, rows), a), starts, rows, tail=tail).chi2 for a in (1.0, 1e4, 1e5, 1e6)]
     assert costs[0] == pytest.approx(rows)
     assert costs[3] - costs[2] == pytest.approx(costs[2] - costs[1], rel=1e-3)
     assert costs[3] < 100 * costs[0]  # of a misfit 1e12 times as large
@@ -732,7 +734,8 @@ def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
 def test_intervals_cover_as_often_as_they_say(shared: float) -> None:
     rng, blocks = np.random.default_rng(0), np.repeat(np.arange(W // 3), 3)
     fits = [linear_fit(rng, shared) for _ in range(300)]
-    inside = [np.abs(f.hypothesis.vector) < 1.6449 * standard_errors(f, blocks) for f in fits]
+    errors = [standard_errors(f, blocks, lacking=shared > 0) for f in fits]
+    inside = [np.abs(f.hypothesis.vector) < 1.6449 * e for f, e in zip(fits, errors, strict=True)]
     assert 0.84 < np.mean(inside) < 0.97
 
 

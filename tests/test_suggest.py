@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from dropo_torch.effects import Placed, find_effect
-from dropo_torch.gap.suggest import WORTH, excite, suggest
+from dropo_torch.gap.rules import Rules
+from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.testing.effects import rig
 
 FRICTION = Placed(find_effect("joint_friction"), "elbow", (0.1,))
@@ -35,6 +36,7 @@ class Evidence:
     windows: Windows
     share: float = 1.0
     diverges: bool = False
+    rules: Rules = field(default_factory=Rules)
 
     @property
     def twin(self) -> Any:
@@ -69,7 +71,7 @@ def test_the_motion_that_separates_most_is_told() -> None:
 
 
 def test_what_no_motion_tells_is_said() -> None:
-    assert "None of 6 motions that were tried would tell" in advice(share=0.9 * WORTH / 48)
+    assert "None of 6 motions that were tried would tell" in advice(share=0.9 * Rules().shown.apart / 48)
     assert advice(diverges=True) == "No motion that was tried tells joint_friction of elbow from gravity_tilt."
 
 

@@ -8,25 +8,20 @@ P = I − QQᵀ from the QR factors of ∂r/∂x₀. What is left, P r, is compa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
 
 from dropo_torch.data.features import Features
 from dropo_torch.effects.engine import Variant
+from dropo_torch.gap.rules import Rules, Weighed
 from dropo_torch.gap.twin import Twin, Windows
 
 #: Antithetic pairs of noise on the initial states by which rough windows are linearised, and their seed.
 PAIRS, SEED = 16, 11
 #: Whitened residual of a window whose simulation diverged, at least.
 LOST = 1e3
-#: Largest share of all windows' χ² that one window may have.
-CAP = 0.03
-#: Least share of the windows that a hypothesis must know the commands of, or it cannot be judged by them.
-LEAST_KNOWN = 0.25
-#: Expected χ² of a window, times this: from there on a robust cost grows with the logarithm only.
-TAIL = 3.0
 
 
 @dataclass(frozen=True)
@@ -75,6 +70,7 @@ class Evidence:
         robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost): what is named
             must then be right in most windows, and otherwise explain all of them together.
         caps: factors of the windows' residuals in fits, ``(W,)``, or 1.
+        rules: thresholds.
     """
 
     twin: Twin
@@ -85,6 +81,7 @@ class Evidence:
     model_error: np.ndarray | float = 1.0
     robust: bool = False
     caps: np.ndarray | float = 1.0
+    rules: Rules = field(default_factory=Rules)
 
     def on(self, windows: Windows) -> Evidence:
         """Return the same over other windows, none of them capped."""
@@ -118,7 +115,7 @@ class Evidence:
 
     def tail(self, linear: Linearisation) -> float | None:
         """χ² of a window from which on the cost grows slowly; ``None`` where it never does."""
-        return TAIL * self.degrees(linear) / len(self.windows) if self.robust else None
+        return self.rules.weighed.tail * self.degrees(linear) / len(self.windows) if self.robust else None
 
     def residuals(
         self, variants: Sequence[Variant], moved: np.ndarray | None = None, pushes: np.ndarray | None = None
@@ -194,7 +191,8 @@ class Evidence:
 
     def cost(self, projected: np.ndarray, linear: Linearisation, numbers: int = 0) -> Cost:
         """Return the cost of projected residuals ``(W, N)`` to which some numbers were fitted."""
-        return cost_of(projected, linear, self.degrees(linear) - numbers, self.caps, self.tail(linear))
+        degrees, tail = self.degrees(linear) - numbers, self.tail(linear)
+        return cost_of(projected, linear, degrees, self.caps, tail, self.rules.weighed)
 
 
 def _beside(linear: Linearisation, vectors: np.ndarray) -> np.ndarray:
@@ -241,7 +239,7 @@ class Cost:
 
 def cost_of(
     projected: np.ndarray, linear: Linearisation, degrees: float, caps: np.ndarray | float = 1.0,
-    tail: float | None = None,
+    tail: float | None = None, weighed: Weighed | None = None,
 ) -> Cost:  # fmt: skip
     """Return the cost of projected residuals ``(W, N)``.
 
@@ -253,15 +251,17 @@ def cost_of(
         degrees: degrees of freedom of all windows.
         caps: factors of the windows' residuals, ``(W,)``.
         tail: of :meth:`Evidence.tail`; then a window with as much as noise makes still costs its degrees of freedom.
+        weighed: thresholds; the defaults if not given.
     """
+    weighed = weighed or Weighed()
     weights = np.where(linear.weights > 0, linear.weights, 1.0)
     chi2, penalty = (projected**2).sum(-1) * caps**2, -2 * np.log(weights).sum(-1) * caps**2
     degrees *= float(np.mean(np.square(caps)))  # as χ² itself: what is left is noise or not, however windows are capped
     if tail is not None:
-        chi2 = robust_loss(chi2, tail) / (TAIL * np.log1p(1 / TAIL))
+        chi2 = robust_loss(chi2, tail) / (weighed.tail * np.log1p(1 / weighed.tail))
     counted = linear.counted
     if not counted.all():
-        judged = counted.mean() >= LEAST_KNOWN
+        judged = counted.mean() >= weighed.known
         chi2 = np.where(counted, chi2, chi2[counted].mean() if judged else LOST**2 * projected.shape[-1])
         penalty = np.where(counted, penalty, penalty[counted].mean() if judged else 0.0)
     return Cost(chi2, penalty, degrees)
@@ -277,7 +277,7 @@ def robust_factors(chi2: np.ndarray, tail: float | None) -> np.ndarray:
     return np.ones(len(chi2)) if tail is None else 1 / np.sqrt(1 + chi2 / tail)
 
 
-def caps_of(chi2: np.ndarray, degrees: float) -> np.ndarray:
-    """Return factors ``(W,)`` by which no window has more than its share of χ², however bad it is."""
-    most = max(CAP * float(chi2.sum()), 10 * degrees / len(chi2))
+def caps_of(chi2: np.ndarray, degrees: float, cap: float) -> np.ndarray:
+    """Return factors ``(W,)`` by which no window has more than its share ``cap`` of χ², however bad it is."""
+    most = max(cap * float(chi2.sum()), 10 * degrees / len(chi2))
     return np.sqrt(np.minimum(1.0, most / np.maximum(chi2, 1e-300)))

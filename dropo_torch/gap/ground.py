@@ -80,7 +80,6 @@ class Ground:
     Attributes:
         evidence: all windows of the training part.
         effects: the vocabulary.
-        rules: thresholds.
         report: called with a stage and its share done.
         caps: factors of the refitted windows' residuals, ``(W,)``, or 1.
         short: short windows from which the noise is estimated; ``None`` where it is given.
@@ -88,7 +87,6 @@ class Ground:
 
     evidence: Evidence
     effects: tuple[Effect, ...]
-    rules: Rules
     report: Report = lambda stage, share: None
     caps: np.ndarray | float = 1.0
     short: Windows | None = None
@@ -101,6 +99,11 @@ class Ground:
         """Return the ground with another noise, and without windows that start before some steps, ``(E,)``."""
         evidence = replace(self.evidence, windows=since_known(self.evidence.windows, since), noise=noise)
         return replace(self, evidence=evidence, caps=caps)
+
+    @property
+    def rules(self) -> Rules:
+        """Thresholds."""
+        return self.evidence.rules
 
     @property
     def setting(self) -> Setting:

@@ -83,7 +83,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         remaining=remaining,
         refused=naming.refused,
         own_step=_own_step(naming, rest, rules),
-        symbolic=describe(setting, before, guilty(before)) if naming.gap and not naming.named else "",
+        symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",
     )
 
 

@@ -26,8 +26,8 @@ RIDGE, LONGEST = 1e-12, 5.0
 FAR = 0.03
 #: Half-width of a 90 % interval in standard errors.
 Z90 = 1.6449
-#: χ² per degree of freedom from which on residuals are more than noise; degrees of freedom that show a variance.
-LACKING, FEW = 1.5, 30.0
+#: Degrees of freedom that show a variance.
+FEW = 30.0
 #: The model's field that is its step.
 STEP_FIELD = "opt.timestep"
 #: Simulations with a finer step in which numbers settle there.
@@ -237,7 +237,7 @@ def standard_errors(fitted: Refit, episodes: np.ndarray, *, lacking: bool = Fals
     Args:
         fitted: a fit with its projected residuals and derivatives.
         episodes: trajectory of each window, ``(W,)``.
-        lacking: whether residuals are known to be more than noise, although they were weighted by their own sizes.
+        lacking: whether residuals are more than noise.
     """
     slope, residual = fitted.slope * fitted.factor[:, None], fitted.residual * fitted.factor[:, None]
     size = len(slope)
@@ -262,7 +262,6 @@ def standard_errors(fitted: Refit, episodes: np.ndarray, *, lacking: bool = Fals
     middle = sums.T @ sums * len(names) / max(len(names) - 1, 1)
     factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / Z90
     clustered = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)) * factor
-    lacking = lacking or fitted.cost.reduced > LACKING
     return np.where(known, np.maximum(plain, clustered) if lacking else plain, np.inf) * fitted.scale
 
 
@@ -317,7 +316,8 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
 
 def half_widths(last: Resolved) -> np.ndarray:
     """Return half-widths of the 90 % intervals of all numbers ``(q,)``, in their units."""
-    lacking = bool(np.any(last.evidence.model_error > 1))
+    weighted = bool(np.any(last.evidence.model_error > 1))  # by their own sizes: then they no longer show it
+    lacking = weighted or last.fit.cost.reduced > last.evidence.rules.weighed.lacking
     return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes, lacking=lacking), last.error)
 
 

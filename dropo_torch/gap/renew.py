@@ -11,26 +11,21 @@ from dataclasses import replace
 
 import numpy as np
 
-from dropo_torch.gap.evidence import LEAST_KNOWN, caps_of
+from dropo_torch.gap.evidence import caps_of
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit
+from dropo_torch.gap.rules import Rules
 
-#: Standard errors by which what long windows leave may exceed what short ones with free forces say.
-AGREE = 4.0
-#: Weight from which on a residual counts as one that noise on the initial state does not bend, and the least of them.
-SHARP, LEAST_ROWS = 0.999, 60
 #: Times that the variance components are weighted anew.
 COMPONENTS = 8
-#: Relative change of a feature's noise from which on everything is compared again.
-MOVED = 0.03
 
 
 def renewed(ground: Ground, state: State) -> State:
     """Return a state with the noise beside its hypothesis, and on the windows whose commands that knows."""
     since, noise = known_since(ground, state.current.hypothesis, state.since), noise_beside(ground, state.current)
-    if np.array_equal(since, state.since) and not moved(noise, state.noise):
+    if np.array_equal(since, state.since) and not moved(noise, state.noise, ground.rules):
         return state
     here, base = with_base(ground.on(noise, since), state.base.hypothesis)
     current = here.refit(state.current.hypothesis, iterations=6) if state.current.hypothesis.placed else base
@@ -41,14 +36,14 @@ def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:
     """Return the declared parameters fitted alone, and the ground on which no window has more than its share of χ²."""
     base = ground.refit(hypothesis, iterations=4)
     if not ground.evidence.robust:
-        ground = replace(ground, caps=caps_of(base.cost.windows, base.cost.degrees))
+        ground = replace(ground, caps=caps_of(base.cost.windows, base.cost.degrees, ground.rules.weighed.cap))
         base = ground.refit(base.hypothesis, iterations=4)
     return ground, base
 
 
-def moved(noise: np.ndarray, before: np.ndarray) -> bool:
+def moved(noise: np.ndarray, before: np.ndarray, rules: Rules) -> bool:
     """Return whether a noise differs from another by more than matters."""
-    return bool(np.abs(np.log(noise / before)).max() > MOVED)
+    return bool(np.abs(np.log(noise / before)).max() > rules.weighed.moved)
 
 
 def known_since(ground: Ground, hypothesis: Hypothesis, since: np.ndarray) -> np.ndarray:
@@ -58,7 +53,7 @@ def known_since(ground: Ground, hypothesis: Hypothesis, since: np.ndarray) -> np
     """
     windows = ground.evidence.windows
     later = np.maximum(since, ground.evidence.twin.settled(hypothesis.variant, windows.commands))
-    return later if len(since_known(windows, later)) >= LEAST_KNOWN * len(windows) else since
+    return later if len(since_known(windows, later)) >= ground.rules.weighed.known * len(windows) else since
 
 
 def noise_beside(ground: Ground, fitted: Refit) -> np.ndarray:
@@ -68,17 +63,17 @@ def noise_beside(ground: Ground, fitted: Refit) -> np.ndarray:
     tells it more precisely where it is, and it is never larger. A larger one is believed only as far as the short
     windows leave it open, so that what is missing does not pass for noise.
     """
-    noise, left = ground.evidence.noise, noise_left(fitted, ground.evidence.noise)
+    noise, left = ground.evidence.noise, noise_left(fitted, ground.evidence.noise, ground.rules)
     if ground.short is None:
         return np.minimum(noise, left)
     try:
         free = free_forces(ground.evidence.twin, ground.short, fitted.hypothesis.variant)
     except Diverges:  # beside a hypothesis under which nothing can be simulated, there is nothing to see
         return noise
-    return np.where(left < free.noise * (1 + AGREE * free.unsure), left, free.noise)
+    return np.where(left < free.noise * (1 + ground.rules.weighed.agree * free.unsure), left, free.noise)
 
 
-def noise_left(fitted: Refit, noise: np.ndarray) -> np.ndarray:
+def noise_left(fitted: Refit, noise: np.ndarray, rules: Rules) -> np.ndarray:
     """Return the noise of each feature ``(m,)`` by what a fit leaves in its windows; infinite where nothing tells.
 
     The variance components of the residuals beside their windows' initial states, each feature weighted by its own.
@@ -86,9 +81,10 @@ def noise_left(fitted: Refit, noise: np.ndarray) -> np.ndarray:
     Args:
         fitted: the fit.
         noise: the noise under which it was made, ``(m,)``.
+        rules: thresholds.
     """
     m, rows = len(noise), fitted.residual.shape[1]
-    sharp = (fitted.linear.weights > SHARP) & fitted.linear.counted[:, None]
+    sharp = (fitted.linear.weights > rules.weighed.sharp) & fitted.linear.counted[:, None]
     usable = sharp & np.isfinite(fitted.residual)
     count = usable.reshape(-1, rows // m, m).sum((0, 1))
     fitted_share = len(fitted.hypothesis.vector) / max(float(usable.sum()), 1.0)
@@ -102,4 +98,4 @@ def noise_left(fitted: Refit, noise: np.ndarray) -> np.ndarray:
         free = np.where(usable, 1 - (basis**2).sum(-1) - fitted_share, 0.0)
         sums, degrees = (x.reshape(-1, rows // m, m).sum((0, 1)) for x in (squares, free))
         relative = relative * np.sqrt(np.maximum(sums / np.maximum(degrees, 1e-9), 1e-12))
-    return np.where((count >= LEAST_ROWS) & (degrees >= LEAST_ROWS / 2), noise * relative, np.inf)
+    return np.where((count >= rules.weighed.rows) & (degrees >= rules.weighed.rows / 2), noise * relative, np.inf)

@@ -130,6 +130,35 @@ class Cut:
 
 
 @dataclass(frozen=True)
+class Weighed:
+    """How much windows and residuals count, and which noise is believed.
+
+    Attributes:
+        cap: largest share of all windows' χ² that one window may have.
+        tail: expected χ² of a window, times this: from there on a robust cost grows with the logarithm only.
+        known: least share of the windows that a hypothesis must know the commands of, or it cannot be judged by them.
+        sharp: weight from which on a residual counts as one that noise on the initial state does not bend, and
+        rows: the least of them that show a feature's noise.
+        agree: standard errors by which the noise that long windows leave may exceed what short ones with free forces
+            say.
+        moved: relative change of a feature's noise from which on everything is compared again.
+        lacking: χ² per degree of freedom from which on standard errors count how much blocks of the log disagree.
+        growth: share of the motion's own standard deviation that noise at the start may grow to in an open-loop
+            prediction.
+    """
+
+    cap: float = 0.03
+    tail: float = 3.0
+    known: float = 0.25
+    sharp: float = 0.999
+    rows: int = 60
+    agree: float = 4.0
+    moved: float = 0.03
+    lacking: float = 1.5
+    growth: float = 0.1
+
+
+@dataclass(frozen=True)
 class Shown:
     """What is told of where and when a gap shows; none of it gives a name.
 
@@ -141,6 +170,10 @@ class Shown:
         better: by how much a less plain one must exceed a plainer one's, absolute and relative.
         constant: share of the force's mean square in its mean, and
         sure: standard errors of the mean, from which on the force is always the same.
+        term: share of an unnamed force's root mean square below which its formula has no such term.
+        formula: share of its variance below which no formula is offered, and
+        terms: the most terms that one may have.
+        apart: standard deviations of the noise by which a motion must separate two hypotheses to be proposed.
     """
 
     place: float = 0.05
@@ -150,6 +183,10 @@ class Shown:
     better: tuple[float, float] = (0.02, 1.05)
     constant: float = 0.5
     sure: float = 5.0
+    term: float = 0.15
+    formula: float = 0.5
+    terms: int = 5
+    apart: float = 5.0
 
 
 @dataclass(frozen=True)
@@ -166,7 +203,7 @@ class Rules:
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         least: share of the first excess below which an effect is not named.
         effects: the most effects that are named.
-        chance, alike, tried, sound, cut, shown: see there.
+        chance, alike, tried, sound, cut, weighed, shown: see there.
     """
 
     gate: float = 5.0
@@ -182,6 +219,7 @@ class Rules:
     tried: Tried = field(default_factory=Tried)
     sound: Sound = field(default_factory=Sound)
     cut: Cut = field(default_factory=Cut)
+    weighed: Weighed = field(default_factory=Weighed)
     shown: Shown = field(default_factory=Shown)
 
 

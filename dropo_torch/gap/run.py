@@ -31,7 +31,8 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
         effects: the vocabulary; all of the package's by default.
         rules: thresholds; the scene's by default.
     """
-    state = start(_ground(scene, effects, rules), scene.begin)
+    scene = _ruled(scene, rules)
+    state = start(_ground(scene, effects), scene.begin)
     if state.done:
         return ()
     return places(
@@ -48,9 +49,10 @@ def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules 
     Args:
         scene: of :func:`prepare`.
         effects: the vocabulary; all of the package's by default.
-        rules: thresholds.
+        rules: thresholds; the scene's by default.
     """
-    return _name(scene, _ground(scene, effects, rules))
+    scene = _ruled(scene, rules)
+    return _name(scene, _ground(scene, effects))
 
 
 def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
@@ -90,10 +92,10 @@ def find_gap(
     """
     started = time.perf_counter()
     report("preparing", 0.0)
-    scene = scene or prepare(problem, rules)
-    naming = _name(scene, replace(_ground(scene, effects, rules), report=report), checkpoint, resume)
+    scene = _ruled(scene or prepare(problem, rules), rules)
+    naming = _name(scene, replace(_ground(scene, effects), report=report), checkpoint, resume)
     report("verifying", 0.0)
-    return make_result(scene if rules is None else replace(scene, rules=rules), naming, started)
+    return make_result(scene, naming, started)
 
 
 def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False) -> Naming:
@@ -113,7 +115,12 @@ def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: 
     return named[0] if named else replace(found[0], refused=next((n.refused for n in found if n.refused), ""))
 
 
-def _ground(scene: Scene, effects: Sequence[Effect] | None, rules: Rules | None) -> Ground:
-    """What a search stands on, by default with the whole vocabulary and the scene's thresholds."""
+def _ruled(scene: Scene, rules: Rules | None) -> Scene:
+    """A scene with other thresholds, where they are given."""
+    return scene if rules is None else replace(scene, evidence=replace(scene.evidence, rules=rules))
+
+
+def _ground(scene: Scene, effects: Sequence[Effect] | None) -> Ground:
+    """What a search stands on, by default with the whole vocabulary."""
     short = None if scene.problem.objective.noise is not None else scene.short
-    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), rules or scene.rules, short=short)
+    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), short=short)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,7 +25,7 @@ from dropo_torch.gap.log import (
 )
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
-from dropo_torch.gap.rules import Cut, Rules
+from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.screen import all_candidates
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
@@ -52,7 +52,6 @@ class Scene:
         noise: standard deviation of each feature, ``(m,)``.
         evidence: all windows of the training part.
         begin: the declared parameters as given.
-        rules: thresholds.
     """
 
     problem: Problem
@@ -64,7 +63,11 @@ class Scene:
     noise: np.ndarray
     evidence: Evidence
     begin: Hypothesis
-    rules: Rules = field(default_factory=Rules)
+
+    @property
+    def rules(self) -> Rules:
+        """Thresholds."""
+        return self.evidence.rules
 
     @property
     def short(self) -> Windows:
@@ -106,8 +109,10 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     else:
         noise = Features.of(problem.observation).feature_noise(given.numpy())
     rules = rules or Rules()
-    evidence = _choose_windows(twin, train, begin, noise, since, rules.cut)
-    return Scene(problem, setting, twin, train, held, since, noise, evidence, begin, rules)
+    shortest = cut_windows(train, setting.observation, rules.cut.lengths[-1], since=since)
+    whole = Evidence(twin, shortest, noise, begin.variant, rough=True, rules=rules)
+    evidence = _choose_windows(whole, train, begin, since)
+    return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
 
 
 def first_steps(twin: Twin, log: Trajectories, begin: Hypothesis) -> np.ndarray:
@@ -152,35 +157,32 @@ def searched(scene: Scene) -> Iterator[tuple[str, Evidence]]:
     are too short; and where contacts part windows into right and wrong, the shortest ones with a robust cost.
     """
     yield "", scene.evidence
-    length, rough = scene.evidence.windows.length // 4, scene.evidence.rough
-    if length >= scene.rules.cut.lengths[-1]:
-        yield "-shorter", _cut(scene.twin, scene.train, scene.begin, scene.noise, scene.since, length, rough=rough)
+    length, shortest = scene.evidence.windows.length // 4, scene.rules.cut.lengths[-1]
+    if length >= shortest:
+        yield "-shorter", _cut(scene.evidence, scene.train, scene.since, length, rough=scene.evidence.rough)
     if scene.setting.signals.contacts.any():
-        shortest = _cut(scene.twin, scene.train, scene.begin, scene.noise, scene.since, scene.rules.cut.lengths[-1])
-        yield "-contact", replace(shortest, robust=True)
+        yield "-contact", replace(_cut(scene.evidence, scene.train, scene.since, shortest), robust=True)
 
 
-def _choose_windows(
-    twin: Twin, train: Trajectories, begin: Hypothesis, noise: np.ndarray, since: np.ndarray, rules: Cut
-) -> Evidence:
+def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, since: np.ndarray) -> Evidence:
     """The longest windows in whose initial states the simulation is still nearly linear."""
-    longest, touches = longest_episode(train), bool(twin.setting.signals.contacts.any())
-    for length in (length for length in rules.lengths if length <= longest):
-        evidence = _cut(twin, train, begin, noise, since, length, FEW)
+    cut = whole.rules.cut
+    longest, touches = longest_episode(train), bool(whole.twin.setting.signals.contacts.any())
+    for length in (length for length in cut.lengths if length <= longest):
+        evidence = _cut(whole, train, since, length, FEW)
         if not len(evidence.windows):
             continue
         rough = evidence.linearise(begin.variant).roughness
-        if rough < rules.rough and (not touches or _end_error(evidence, begin) < rules.astray):
-            return _cut(twin, train, begin, noise, since, length, rough=rough > rules.bent)
-    return _cut(twin, train, begin, noise, since, min(rules.lengths[-1], longest))
+        if rough < cut.rough and (not touches or _end_error(evidence, begin) < cut.astray):
+            return _cut(whole, train, since, length, rough=rough > cut.bent)
+    return _cut(whole, train, since, min(cut.lengths[-1], longest))
 
 
 def _cut(
-    twin: Twin, log: Trajectories, begin: Hypothesis, noise: np.ndarray, since: np.ndarray, length: int,
-    most: int = MOST, *, rough: bool = True,
-) -> Evidence:  # fmt: skip
-    windows = cut_windows(log, twin.setting.observation, length, since=spared(log, length, since))
-    return Evidence(twin, spread(windows, most), noise, begin.variant, rough=rough)
+    evidence: Evidence, log: Trajectories, since: np.ndarray, length: int, most: int = MOST, *, rough: bool = True
+) -> Evidence:
+    windows = cut_windows(log, evidence.twin.setting.observation, length, since=spared(log, length, since))
+    return replace(evidence.on(spread(windows, most)), rough=rough)
 
 
 def spared(log: Trajectories, length: int, since: np.ndarray) -> np.ndarray:

@@ -15,8 +15,6 @@ from dropo_torch.gap.twin import Windows
 
 #: Windows of a motion that is tried.
 WINDOWS = 16
-#: Separation, in standard deviations of the noise, from which on a motion is worth recording.
-WORTH = 5.0
 #: What a motion must do to show an effect, by its name or else by its kind; a body or the world just has to move more.
 MOTIONS = {
     "joint_limit": "reaches the stops",
@@ -47,7 +45,7 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     if not found:
         return f"No motion that was tried tells {names}."
     most, words = max(found)
-    if most < WORTH:
+    if most < evidence.rules.shown.apart:
         return (
             f"None of {len(found)} motions that were tried would tell {names} (at best {most:.1f} σ): "
             "on this robot they may be the same thing."

@@ -8,18 +8,23 @@ import numpy as np
 from dropo_torch.effects.base import Setting
 from dropo_torch.gap.locate import dof_names, middles
 from dropo_torch.gap.noise import FreeForces
+from dropo_torch.gap.rules import Shown
 
-#: Terms are kept whose share of the force's root mean square is at least this; ridge of the fits that drop the others.
-THRESHOLD, RIDGE = 0.15, 1e-6
-#: Share of the variance below which no formula is worth offering, and the most terms that one may have.
-WORTH, TERMS = 0.5, 5
+#: Ridge of the fits that drop terms.
+RIDGE = 1e-6
 
 
-def describe(setting: Setting, free: FreeForces, dof: int) -> str:
+def describe(setting: Setting, free: FreeForces, dof: int, shown: Shown) -> str:
     """Return a formula for the missing force at a degree of freedom, or nothing if none describes it.
 
     Sparse regression over positions, velocities, their signs
     and squares, and commands, at the middle of short windows.
+
+    Args:
+        setting: the model and its columns.
+        free: the missing forces.
+        dof: the degree of freedom.
+        shown: thresholds.
     """
     library, force = _library(setting, free, dof), free.forces[:, dof]
     table = np.stack(list(library.values()), axis=1)
@@ -29,11 +34,11 @@ def describe(setting: Setting, free: FreeForces, dof: int) -> str:
         return ""
     sizes, size = np.sqrt((table**2).mean(0)), float(np.sqrt((force**2).mean()))
     moving, weights = sizes > 1e-12, np.zeros(len(sizes))
-    weights[moving] = sparse_regression(table[:, moving] / sizes[moving], force / size)
+    weights[moving] = sparse_regression(table[:, moving] / sizes[moving], force / size, shown.term)
     coefficients = weights * size / np.where(moving, sizes, 1.0)
     explained = 1 - float(((force - table @ coefficients) ** 2).sum() / (force**2).sum())
     chosen = np.flatnonzero(weights)
-    if explained < WORTH or not 0 < len(chosen) <= TERMS:
+    if explained < shown.formula or not 0 < len(chosen) <= shown.terms:
         return ""
     names, order = list(library), chosen[np.argsort(-np.abs(weights[chosen]))]
     terms = [f"{'+' if weights[i] > 0 else '−'} {abs(coefficients[i]):.3g}·{names[i]}" for i in order]
@@ -41,7 +46,7 @@ def describe(setting: Setting, free: FreeForces, dof: int) -> str:
     return f"force at {dof_names(setting.model)[dof]} ≈ {formula} ({100 * explained:.0f} % of its variance)"
 
 
-def sparse_regression(table: np.ndarray, force: np.ndarray) -> np.ndarray:
+def sparse_regression(table: np.ndarray, force: np.ndarray, threshold: float) -> np.ndarray:
     """Return coefficients ``(p,)``, most of them zero: sequentially thresholded least squares.
 
     Terms whose coefficient is below the threshold are dropped and the others fitted anew, until none is dropped
@@ -51,11 +56,12 @@ def sparse_regression(table: np.ndarray, force: np.ndarray) -> np.ndarray:
     Args:
         table: the terms, of root mean square 1, ``(W, p)``.
         force: of root mean square 1, ``(W,)``.
+        threshold: least coefficient of a term.
     """
     kept = np.arange(table.shape[1])
     while True:
         part = table[:, kept]
-        large = np.abs(np.linalg.solve(part.T @ part + RIDGE * np.eye(len(kept)), part.T @ force)) >= THRESHOLD
+        large = np.abs(np.linalg.solve(part.T @ part + RIDGE * np.eye(len(kept)), part.T @ force)) >= threshold
         if large.all():
             break
         kept = kept[large]

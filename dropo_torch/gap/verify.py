@@ -28,8 +28,6 @@ from dropo_torch.simulators.mujoco import MujocoSimulator
 
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)
-#: Share of the motion's own standard deviation that noise at the start may grow to in an open-loop prediction.
-GROWTH = 0.1
 #: Simulations from which the error that noise alone makes is estimated, at least, and their seed.
 DRAWS, SEED = 150, 5
 #: ε relative to the smallest variance of the measurement.
@@ -80,7 +78,7 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
         since, known = np.zeros_like(since), np.arange(len(log))
     rows = known[np.unique(np.linspace(0, len(known) - 1, MOST).astype(int))]
     positions = position_features(setting)
-    largest = GROWTH * _rms(feature_sizes(setting, observation.observed(log.observations[rows]))[positions])
+    size = _rms(feature_sizes(setting, observation.observed(log.observations[rows]))[positions])
     chosen, seconds = spread(cut_windows(log, observation, 1, stride=1, since=since), MOST), timestep
     for wanted in SECONDS:
         length = min(max(1, round(wanted / timestep)), longest_episode(log))
@@ -88,7 +86,8 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
         windows = spread(cut_windows(log, observation, length, stride=stride, since=since), MOST_ROLLOUTS)
         if len(windows):
             chosen, seconds = windows, length * timestep
-            if _rms(rollout_floor(evidence.on(windows), hypothesis)[positions]) < largest:
+            floor = _rms(rollout_floor(evidence.on(windows), hypothesis)[positions])
+            if floor < evidence.rules.weighed.growth * size:
                 break
     return Held(log, rows, chosen, seconds)
 
