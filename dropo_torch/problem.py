@@ -77,7 +77,8 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
 
     Args:
         config: the config.
-        general: compile free bodies so that their mass and its centre may change in any way, as effects need it.
+        general: as the search for missing effects needs it: free bodies are compiled so that their mass and its centre
+            may change in any way, and a config may name no parameters.
 
     Raises:
         InputError: anything that does not fit, by key.
@@ -85,10 +86,10 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
     given, config = config, completed(config)
     load_effects(config.own_effects, config.path)
     if config.backend == "gymnasium":
-        model_path, space, source = _gymnasium_source(config)
+        model_path, space, source = _gymnasium_source(config, general)
     else:
         model_path = config.path(str(config.model))
-        space = _space(load_model(model_path, general=general or config.moves_centres), config)
+        space = _space(load_model(model_path, general=general or config.moves_centres), config, general)
         source = space.model
     trajectories = log_of(config, space.model)
     frame_skip = frame_skip_of(config, space.model, trajectories)
@@ -147,7 +148,9 @@ def _with_effects(
     )  # fmt: skip
 
 
-def _space(model: mujoco.MjModel | None, config: Config) -> ParameterSpace:
+def _space(model: mujoco.MjModel | None, config: Config, general: bool) -> ParameterSpace:
+    if not config.parameters and general and model is not None:
+        return ParameterSpace.empty(model)
     if config.parameters is None:
         raise InputError(
             "config: no parameters given; expected name: {field: body_mass, name: BODY, bounds: [low, high]}"
@@ -155,7 +158,7 @@ def _space(model: mujoco.MjModel | None, config: Config) -> ParameterSpace:
     return ParameterSpace(model, config.parameters)
 
 
-def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]:
+def _gymnasium_source(config: Config, general: bool) -> tuple[Path | None, ParameterSpace, Any]:
     """The parameter space and the adapter (or its maker) of a Gymnasium environment or of the user's own."""
     name = config.environment
     if name is None:
@@ -170,14 +173,14 @@ def _gymnasium_source(config: Config) -> tuple[Path | None, ParameterSpace, Any]
                 environment = gymnasium.make(name)
         except Exception as error:  # whatever the maker of a registered environment raises
             raise InputError(f"environment: Gymnasium cannot make {name!r}: {error}") from None
-        space = _space(getattr(environment.unwrapped, "model", None), config)
+        space = _space(getattr(environment.unwrapped, "model", None), config, general)
         return None, space, MujocoEnvAdapter(environment, space)
     maker = load_callable(
         "environment", name, path=config.path, what="function {} that makes an adapter",
         example="an id such as Hopper-v5, or file.py:function of an adapter",
     )  # fmt: skip
     path = None if config.model is None else config.path(config.model)
-    space = _space(None if path is None else load_model(path), config)
+    space = _space(None if path is None else load_model(path), config, general)
     with user_code("environment", name):
         adapter = maker(space)
     return path, space, CheckedAdapter(adapter, name)

@@ -969,6 +969,21 @@ def test_command_writes_its_files(cart: Path) -> None:
     assert "hinge" in (cart / "out" / "report.html").read_text()
 
 
+def test_model_is_taken_as_it_is_where_no_parameters_are_given(
+    tmp_path: Path, one_effect: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given = scene_of().problem.space.nominal[0]
+    monkeypatch.setattr("benchmarks.hidden.truths.true_declared", lambda *_: {"pole_mass": float(given)})
+    case = simulate_truth(CART_POLE, [DAMPING], 3, **SIZE)
+    config = {k: v for k, v in case.config.items() if k != "parameters"}
+    path = dataclasses.replace(case, config=config).write(tmp_path)
+    assert run("gap", path, "--out", tmp_path / "out") == 0
+    (told,) = json.loads((tmp_path / "out" / "gap.json").read_text())["effects"]
+    assert (told["effect"], told["target"]) == ("joint_damping", "hinge")
+    assert told["parameters"]["damping"]["value"] == pytest.approx(DAMPING.parameters["damping"], rel=0.02)
+    assert list(load_config(tmp_path / "out" / "config.yaml").parameters or ()) == ["hinge_damping"]
+
+
 def test_model_has_the_effect(cart: Path) -> None:
     model = mujoco.MjModel.from_xml_path(str(cart / "out" / "model.xml"))
     assert model.dof_damping[1] == pytest.approx(0.01 + 0.02, rel=0.02)
