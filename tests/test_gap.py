@@ -8,8 +8,10 @@ import dataclasses
 import functools
 import json
 import tempfile
+import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -346,7 +348,7 @@ NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
     "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
-    "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)),
+    "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)), "unfinished": (str, type(None)),
     "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
 }  # fmt: skip
@@ -636,7 +638,7 @@ def test_names_that_leave_nothing_are_believed_before_others(
     waiting = iter(ready)
     monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: next(waiting))
     monkeypatch.setattr("dropo_torch.gap.run.searched", lambda scene: ((str(n), scene.evidence) for n in range(2)))
-    assert gap_package.name(scene) is ready[chosen]
+    assert gap_package.name(scene).final is ready[chosen].final
     assert len(list(waiting)) == len(ready) - asked
 
 
@@ -895,6 +897,44 @@ def test_second_search_over_shorter_windows_goes_on_too(tmp_path: Path) -> None:
     assert lasting(gap) == lasting(plain)
     assert gap.simulated_transitions == plain.simulated_transitions
     assert set(stages) <= {"preparing", "verifying"}
+
+
+def late_after(monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
+    """Let the time for searches be over once it was asked for some times."""
+    asked = iter(range(10**6))
+    clock = SimpleNamespace(monotonic=lambda: 0.0 if next(asked) < calls else 1e9, perf_counter=time.perf_counter)
+    for module in ("limit", "run"):
+        monkeypatch.setattr(f"dropo_torch.gap.{module}.time", clock)
+
+
+@pytest.mark.parametrize("calls", [5, 9, 13, 10**6])
+def test_answer_so_far_is_given_when_the_time_is_over(
+    calls: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was found until then, what was not tried, and ``--resume`` goes on to the answer of a search without end."""
+    store = tmp_path / "gap-progress.bin"
+    late_after(monkeypatch, calls)
+    gap = search(hidden(*TWO), FEW, checkpoint=store, time_limit=1e3)
+    names = {e.effect for e in gap.effects}
+    whole = {e.effect for e in found(TWO).effects}
+    assert names <= whole | {"unnamed"}
+    if calls == 10**6:
+        assert lasting(gap) == lasting(found(TWO))
+        return
+    assert gap.unfinished
+    assert gap.document()["unfinished"] == gap.unfinished
+    assert any("not everything was tried" in note for note in gap.notes)
+    assert "none of the" not in answer(gap)[0]
+    monkeypatch.undo()
+    on = search(hidden(*TWO), FEW, checkpoint=store, resume=True)
+    assert lasting(on) == lasting(found(TWO))
+
+
+@pytest.mark.parametrize("given", ["0", "-3", "nan", "inf", "soon"])
+def test_time_limit_that_is_none_is_refused(given: str, tmp_path: Path, refused: Callable[..., str]) -> None:
+    hidden().write(tmp_path)
+    line = refused("gap", tmp_path / "config.yaml", "--out", tmp_path / "out", f"--time-limit={given}")
+    assert "expected seconds, above 0" in line
 
 
 def test_checkpoint_of_another_problem_is_refused(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from dropo_torch.commands.check import add_force, check_first
 from dropo_torch.commands.folder import prepare_folder, provenance
-from dropo_torch.commands.options import add_config
+from dropo_torch.commands.options import add_config, seconds
 from dropo_torch.commands.progress import StageProgress
 from dropo_torch.config import load_config
 from dropo_torch.errors import InputError
@@ -23,10 +23,18 @@ if TYPE_CHECKING:
     from dropo_torch.gap import Gap
 
 
+#: Seconds of a search, unless told otherwise.
+LIMIT = 600.0
+
+
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo gap``."""
     add_config(parser)
     add_force(parser)
+    parser.add_argument(
+        "--time-limit", type=seconds, default=LIMIT, metavar="SECONDS",
+        help=f"after which no more effects are looked for, and the best answer so far is given ({LIMIT:g})",
+    )  # fmt: skip
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
@@ -50,7 +58,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         progress.show("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside
         prepare_folder(out, problem.model_path, resume=given.resume and store.exists())
-        gap = find_gap(problem, checkpoint=store, resume=given.resume, report=progress.show, scene=scene)
+        options = {"checkpoint": store, "resume": given.resume, "time_limit": given.time_limit}
+        gap = find_gap(problem, report=progress.show, scene=scene, **options)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
     write_json(out / "gap.json", gap.document())

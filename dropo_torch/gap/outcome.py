@@ -82,6 +82,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         notes=tuple(_notes(setting, naming, has_skill(given, floor, constant, rules.sound))),
         remaining=remaining,
         refused=naming.refused,
+        unfinished=naming.unfinished,
         own_step=_own_step(naming, rest, rules),
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",
     )
@@ -145,6 +146,11 @@ def _notes(setting: Setting, naming: Naming, skill: bool) -> Iterator[str]:
     """What a person should know besides; ``skill`` is that of the model as it is."""
     names = dof_names(setting.model)
     still = [name for name, speed in zip(names, setting.signals.speed, strict=True) if speed <= 0]
+    if naming.unfinished:
+        yield (
+            f"The time for the search was over ({naming.unfinished}): not everything was tried. "
+            "--resume with a longer --time-limit goes on."
+        )
     if still:
         yield f"No velocity of {', '.join(still)} is in this log: effects there cannot be judged."
     if naming.gap and not naming.named and not skill:

@@ -154,6 +154,7 @@ class Gap:
         symbolic: a sparse formula for a force that has no name, or empty.
         remaining: what the named effects leave, if that is more than noise.
         refused: why what would account for the misfit has no name, or empty.
+        unfinished: where the search was when its time was over, or empty.
         own_step: χ² per degree of freedom with the model's own step and with a finer one, if only that remains.
     """
 
@@ -182,6 +183,7 @@ class Gap:
     symbolic: str = ""
     remaining: Remaining | None = None
     refused: str = ""
+    unfinished: str = ""
     own_step: tuple[float, float] | None = None
 
     @property
@@ -199,6 +201,7 @@ class Gap:
             "schema": SCHEMA,
             "verdict": self.verdict,
             "verdict_reason": reason(self),
+            "unfinished": self.unfinished or None,
             "own_step": self.own_step,
             "remaining": None if self.remaining is None else asdict(self.remaining),
             "where": [asdict(place) for place in self.where],
@@ -230,6 +233,8 @@ def reason(gap: Gap) -> str:
     if not gap.found:
         return "what remains is no more than noise"
     if gap.verdict == "unnamed":
+        if gap.unfinished and not gap.refused:
+            return f"the time for the search was over ({gap.unfinished})"
         return gap.refused or "no known effect, and no few of them together, account for the misfit"
     if gap.own_step is not None:
         own, finer = gap.own_step

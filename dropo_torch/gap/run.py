@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,6 +10,7 @@ from pathlib import Path
 
 from dropo_torch.effects import VOCABULARY, Effect
 from dropo_torch.gap.ground import Ground, Report
+from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.locate import places
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import make_result
@@ -75,6 +77,7 @@ def find_gap(
     resume: bool = False,
     report: Report = lambda stage, share: None,
     scene: Scene | None = None,
+    time_limit: float = math.inf,
 ) -> Gap:
     """Find where simulation and log disagree, name the missing effects, and verify them on held-out data.
 
@@ -86,6 +89,8 @@ def find_gap(
         resume: go on from it.
         report: called with a stage and its share done.
         scene: what :func:`prepare` made of the problem; made here by default.
+        time_limit: seconds after which no more effects are looked for. What was found until then is judged, and
+            ``unfinished`` says what was not tried; it depends on how fast the machine is.
 
     Raises:
         InputError: a log or simulator in which nothing can be looked for.
@@ -93,26 +98,35 @@ def find_gap(
     started = time.perf_counter()
     report("preparing", 0.0)
     scene = _ruled(scene or prepare(problem, rules), rules)
-    naming = _name(scene, replace(_ground(scene, effects), report=report), checkpoint, resume)
+    ground, end = replace(_ground(scene, effects), report=report), time.monotonic() + time_limit
+    naming = _name(scene, ground, checkpoint, resume, end)
     report("verifying", 0.0)
     return make_result(scene, naming, started)
 
 
-def _name(scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False) -> Naming:
+def _name(
+    scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False, end: float = math.inf
+) -> Naming:
     """Search; where that does not explain everything, over shorter windows, too, and robustly where there are contacts.
 
     Long windows bend: what is most of the gap there may be an effect of the wrong kind. Names that leave nothing are
     believed before those that leave nothing in most of the log, and these before names with a rest.
     """
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
-    found = []
-    for suffix, evidence in searched(scene):
+    found, waiting = list[Naming](), list(searched(scene))
+    while waiting and (not found or time.monotonic() < end):
+        suffix, evidence = waiting.pop(0)
         path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
-        found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume))
+        ends = share_of(end, len(waiting))
+        found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume, end=ends))
         if not found[0].gap or (found[-1].named and not remains(found[-1].final.cost, ground.rules)):
             return found[-1]
-    named = sorted((n for n in found if n.named), key=lambda n: not n.partial)
-    return named[0] if named else replace(found[0], refused=next((n.refused for n in found if n.refused), ""))
+    best = min(found, key=lambda n: (not n.named, not n.partial))
+    late = next((n.unfinished for n in found if n.unfinished), "")
+    if waiting:
+        late = late or f"{len(waiting)} more searches over shorter windows were waiting"
+    refused = best.refused or next((n.refused for n in found if n.refused), "")
+    return replace(best, refused="" if best.named else refused, unfinished=late)
 
 
 def _ruled(scene: Scene, rules: Rules | None) -> Scene:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.accept import add, everywhere, extend, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, Screening, State
+from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
@@ -39,6 +41,7 @@ class Naming:
         attempts: what was refitted, in order.
         partial: whether they leave nothing in most of the log, but something else remains in the rest.
         refused: why what was found has no name.
+        unfinished: the stage in which the time for the search was over, or empty.
     """
 
     evidence: Evidence
@@ -52,6 +55,7 @@ class Naming:
     attempts: tuple[Ranked, ...] = ()
     partial: bool = False
     refused: str = ""
+    unfinished: str = ""
 
 
 def kept(path: Path, fingerprint: str) -> Checkpoint:
@@ -64,7 +68,10 @@ def kept(path: Path, fingerprint: str) -> Checkpoint:
     return Checkpoint(path, "gap", (fingerprint,), (State,), {Effect: find_effect})
 
 
-def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = None, *, resume: bool = False) -> Naming:
+def search(
+    ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = None, *, resume: bool = False,
+    end: float = math.inf,
+) -> Naming:  # fmt: skip
     """Return what is missing, beginning from the declared parameters' values.
 
     Args:
@@ -72,6 +79,7 @@ def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = No
         begin: the declared parameters' values.
         checkpoint: where the state is kept between rounds, ``None`` for nowhere.
         resume: go on from there, if there is one.
+        end: when no more effects are looked for, by ``time.monotonic``; what was found until then is judged.
 
     Raises:
         InputError: a checkpoint that is damaged, or of another search.
@@ -88,9 +96,13 @@ def search(ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = No
         state, twin.simulated_transitions = content["state"], content["simulated_transitions"]
     else:
         state = keep(start(ground, begin))
-    while not state.done:
-        state = keep(step(ground.at(state), state))
-    return conclude(ground.at(state), state)
+    hurried, unfinished = replace(ground, report=until(ground.report, end)), ""
+    try:
+        while not state.done:
+            state = keep(step(hurried.at(state), state))
+    except OutOfTime as error:
+        unfinished = f"{error}, with {len(state.current.hypothesis.placed)} effects accepted"
+    return replace(conclude(ground.at(state), state), unfinished=unfinished)
 
 
 def start(ground: Ground, begin: Hypothesis) -> State:

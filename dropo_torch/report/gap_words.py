@@ -161,6 +161,8 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     if not named:
         if gap.refused:
             return f"Something is missing that has no name yet: {gap.refused}; {shows(gap)}.", []
+        if gap.unfinished:
+            return f"Something is missing, and the time for the search was over before it had a name; {shows(gap)}.", []
         return f"Something is missing that {unexplained}; {shows(gap)}.", []
     if gap.own_step is not None:
         own, finer = (short(x) for x in gap.own_step)
