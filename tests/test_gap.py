@@ -388,6 +388,20 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
     assert document["remaining"] is None
 
 
+def test_body_that_only_turns_is_no_body_at_rest() -> None:
+    """The first link of an arm turns about its own centre: what changes its inertia shows, a force on it does not."""
+    case = simulate_truth(TORQUE_ARM, [Effect("armature", "yaw", {"armature": 0.008})], 3, **SIZE)
+    setting = prepare(load(case)).setting
+    assert {e for e in VOCABULARY if "turret" in VOCABULARY[e].targets(setting)} == {
+        "payload", "center_of_mass", "inertia",
+    }  # fmt: skip
+    gap = search(case, ("armature", "joint_friction", "inertia", "payload"))
+    (told,) = gap.effects
+    assert {(told.effect, told.target), *told.indistinguishable_from} >= {
+        ("armature", "yaw"), ("inertia", "turret"), ("payload", "turret"),
+    }  # fmt: skip
+
+
 def test_every_key_of_gap_json_is_documented() -> None:
     text = (Path(__file__).parents[1] / "docs" / "gap.md").read_text()
     assert not [key for key in CONTRACT if f"`{key}`" not in text]

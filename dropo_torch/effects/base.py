@@ -59,6 +59,7 @@ class Signals:
         command: largest absolute command, ``(nu,)``.
         column: standard deviation of each observed column, ``(n,)``.
         linear_speed: root mean square speed of each body's centre, ``(nbody,)``.
+        angular_speed: root mean square angular velocity of each body, ``(nbody,)``.
         contacts: geoms that touch something somewhere in the log, ``(ngeom,)`` bool.
     """
 
@@ -70,6 +71,7 @@ class Signals:
     command: np.ndarray
     column: np.ndarray
     linear_speed: np.ndarray
+    angular_speed: np.ndarray
     contacts: np.ndarray
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import mujoco
 import numpy as np
 
@@ -14,13 +16,20 @@ def body_number(model: mujoco.MjModel, target: str | None) -> int:
 
 
 class BodyEffect(Effect):
-    """An effect of one moving body."""
+    """An effect of one moving body.
+
+    Attributes:
+        turning: whether it also shows in a body that only turns about its centre.
+    """
 
     kind = "body"
+    turning: ClassVar[bool] = True
 
     def targets(self, setting: Setting) -> list[str | None]:
         """Return every body with mass that moves in the log."""
-        moving = (setting.model.body_mass > 0) & (setting.signals.linear_speed > 0)
+        signals = setting.signals
+        speed = signals.linear_speed + (signals.angular_speed if self.turning else 0.0)
+        moving = (setting.model.body_mass > 0) & (speed > 0)
         return [n for n, moves in zip(setting.names("body")[1:], moving[1:], strict=True) if moves]
 
     @staticmethod
@@ -146,6 +155,7 @@ class ExternalForce(BodyEffect):
     """A constant force on a body, in the world's directions: a hanging cable, a counterweight."""
 
     name = "external_force"
+    turning = False
     sentence = "a constant force on {target} from outside, such as a hanging cable"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
@@ -169,6 +179,7 @@ class FluidDrag(BodyEffect):
     """
 
     name = "fluid_drag"
+    turning = False
     sentence = "drag of air or water on {target}, with the square of its speed"
 
     def targets(self, setting: Setting) -> list[str | None]:

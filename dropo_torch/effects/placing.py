@@ -114,7 +114,8 @@ def plain_setting(model: mujoco.MjModel, observation: Observation, frame_skip: i
     signals = Signals(
         timestep=frame_skip * float(model.opt.timestep), position=np.tile([-size, size], (model.nq, 1)),
         speed=ones[: model.nv], force=ones[: model.nv], inertia=ones[: model.nv], command=ones[: model.nu],
-        column=ones[: observation.size], linear_speed=ones[: model.nbody], contacts=np.ones(model.ngeom, dtype=bool),
+        column=ones[: observation.size], linear_speed=ones[: model.nbody],
+        angular_speed=ones[: model.nbody], contacts=np.ones(model.ngeom, dtype=bool),
     )  # fmt: skip
     return Setting(model, observation, signals, frame_skip)
 

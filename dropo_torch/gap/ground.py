@@ -165,7 +165,7 @@ class Ground:
 
     def refits(
         self, state: State, beside: Refit, groups: Sequence[Sequence[Placed]], stage: str,
-        origin: Hypothesis | None = None, most: int = 3,
+        origin: Hypothesis | None = None, most: int = 3, iterations: tuple[int, int] = (2, 5),
     ) -> tuple[list[Refit], State]:  # fmt: skip
         """Refit a hypothesis with each group of effects more; the best first, and the state with these attempts.
 
@@ -178,22 +178,22 @@ class Ground:
             stage: what to report.
             origin: the hypothesis from which the fits begin; by default the fitted one.
             most: how many are fitted in full.
+            iterations: of the fits on few windows: of all, and of the best ones.
         """
         if not groups:
             return [], state
         focus = self.focus(beside, 2 * FEWER)
         before, known = focus.excess, len(beside.hypothesis.placed)
 
-        def rough(hypothesis: Hypothesis, iterations: int) -> Refit:
-            linear = focus.fitted.linear
-            return refit(focus.evidence, hypothesis, linear=linear, iterations=iterations)
+        def rough(hypothesis: Hypothesis, most: int) -> Refit:
+            return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=most)
 
         found = []
         for number, group in enumerate(groups):
             self.report(stage, number / (len(groups) + 2))
-            found.append(rough((origin or beside.hypothesis).with_effects(group), 2))
+            found.append(rough((origin or beside.hypothesis).with_effects(group), iterations[0]))
         found.sort(key=lambda r: r.cost.excess)
-        found[: most + 1] = [rough(r.hypothesis, 5) for r in found[: most + 1]]
+        found[: most + 1] = [rough(r.hypothesis, iterations[1]) for r in found[: most + 1]]
         found.sort(key=lambda r: r.cost.excess)
         left = [(p, max(r.cost.excess, 0.0) / max(before, 1e-12)) for r in found for p in r.hypothesis.placed[known:]]
         attempts = [Ranked(*p.key, p.summary(self.setting), share, state.number) for p, share in left]

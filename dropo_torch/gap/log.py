@@ -111,7 +111,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     frame_skip = round(step / physics)  # steps of the given model, whatever the simulator makes of them
     states, after = observation.states(log.observations), observation.states(log.next_observations)
     rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
-    inertia, force, speed, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.nbody), np.zeros(model.ngeom, bool)
+    inertia, force, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.ngeom, bool)
+    squares = np.zeros((model.nbody, 2))  # of angular and linear velocity
     data, dense, velocity = mujoco.MjData(model), np.zeros((nv, nv)), np.empty(6)
     for row in rows:
         data.qpos[:], data.qvel[:] = states[row, :nq], states[row, nq:]
@@ -123,10 +124,10 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
         force += np.abs(dense @ acceleration) + np.abs(data.qfrc_bias) + np.abs(data.qfrc_actuator)
         for b in range(model.nbody):
             mujoco.mj_objectVelocity(model, data, int(mujoco.mjtObj.mjOBJ_BODY), b, velocity, 0)
-            speed[b] += float(np.sum(velocity[3:] ** 2))
+            squares[b] += (velocity**2).reshape(2, 3).sum(1)
         for contact in data.contact[: data.ncon]:
             touches[contact.geom[contact.geom >= 0]] = True
-    seen = np.isin(np.arange(nq), observation.columns)
+    seen, speeds = np.isin(np.arange(nq), observation.columns), np.sqrt(squares / len(rows))
     signals = Signals(
         timestep=step,
         position=np.where(seen[:, None], np.percentile(states[:, :nq], [1, 99], axis=0).T, np.nan),
@@ -135,7 +136,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
         inertia=inertia / len(rows),
         command=np.abs(log.actions).max(0),
         column=observation.observed(log.observations).std(0),
-        linear_speed=np.sqrt(speed / len(rows)),
+        linear_speed=speeds[:, 1],
+        angular_speed=speeds[:, 0],
         contacts=touches,
     )
     masked = masked_columns(observation, problem.config.mask)

@@ -5,12 +5,18 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import Alike
 from dropo_torch.gap.screen import Candidate, Focus, left_by
 
+#: Shares of the way from where a candidate begins to where it is predicted that are tried, too.
+ALONG = (0.75, 0.5, 0.25, 0.125)
+#: Iterations of their fits on few windows: a tie with more numbers than needed settles slowly.
+ITERATIONS = (6, 12)
 #: The round of attempts that only look for ties.
 ROUND = -1
 
@@ -32,7 +38,9 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
     others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own, ground.rules.alike)]
     looking = replace(state, number=ROUND)
-    rivals, found = ground.refits(looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully)
+    rivals, found = ground.refits(
+        looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully, iterations=ITERATIONS
+    )
     tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
     return tied, without.cost.excess - current.cost.excess, replace(state, attempts=found.attempts)
 
@@ -49,13 +57,18 @@ def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Ali
 
 
 def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
-    """Return a candidate with the numbers, predicted or begun with, that explain more beside a hypothesis."""
+    """Return a candidate with the numbers, from those begun with to the predicted, that explain most.
+
+    A prediction goes too far where numbers act by their product, as the mass and the place of a payload do.
+    """
+    begin, end = np.array(candidate.start.values), np.array(candidate.placed.values)
+    between = [candidate.placed.at(begin + share * (end - begin)) for share in ALONG]
 
     def loss(placed: Placed) -> float:
         hypothesis = origin.with_effects([placed])
         return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0).loss
 
-    return min((candidate.placed, candidate.start), key=loss)
+    return min((candidate.placed, candidate.start, *between), key=loss)
 
 
 def as_good(ground: Ground, state: State, rival: Refit) -> bool:
