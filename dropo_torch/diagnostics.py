@@ -136,7 +136,9 @@ def _standard_errors(
     They are the Fisher information's of N(s̄(μ), A Σ_ξ Aᵀ + C), with C of ε and noise: AᵀΣ⁻¹A for μ, and
     ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ. Those of μ are the jackknife's, which leaves out one window after the other, where
     that is larger: where the windows pull harder than Σ expects. A measurement that ends a window and begins the next
-    pulls in both: what this adds or takes is counted, too.
+    pulls in both: what this adds or takes is counted, too. Where no measurement is shared, they are at least those
+    under variances of the parameters one standard error above the fitted ones, for these are estimates, too: where σ
+    came out too small, μ would seem too sure.
 
     Args:
         objective: gives the floor of σ.
@@ -152,6 +154,26 @@ def _standard_errors(
     drawn = torch.as_tensor(distribution.std) * (second - first**2).clamp(min=0).sqrt()
     shared = torch.eye(len(drawn)) if distribution.correlation is None else torch.as_tensor(distribution.correlation)
     spread = shared * torch.outer(drawn, drawn)
+    variance, correlation, gram = _of_means(covariance, jacobian, spread, residual, together)
+    if together is None:
+        most = torch.maximum(torch.as_tensor(objective.box.max_std), drawn)
+        unsure = torch.from_numpy(estimates(0.5 * gram.square().sum(0).numpy())[0])
+        wider = (drawn.square() + unsure).sqrt().minimum(most)
+        above, _, _ = _of_means(covariance, jacobian, shared * torch.outer(wider, wider), residual, None)
+        variance = torch.maximum(variance, above)
+    std_error = np.full(len(drawn), np.nan)
+    free = distribution.std > 2 * objective.box.min_std
+    if distribution.correlation is None and free.any():
+        of_std = (2 * torch.outer(drawn, drawn).square() * gram.square().sum(0)).numpy()[np.ix_(free, free)]
+        std_error[free] = distribution.std[free] * estimates(of_std)[0]
+    return variance.sqrt().numpy(), correlation, std_error
+
+
+def _of_means(
+    covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tensor, residual: torch.Tensor,
+    together: torch.Tensor | None,
+) -> tuple[torch.Tensor, np.ndarray, torch.Tensor]:  # fmt: skip
+    """Variances of μ ``(d,)`` and their correlations under a covariance of the parameters, and AΣ⁻¹Aᵀ ``(T, d, d)``."""
     total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
     pull = torch.linalg.solve(total, jacobian.mT)  # Σ⁻¹ Aᵀ, (T, m, d)
     gram = jacobian @ pull
@@ -160,7 +182,7 @@ def _standard_errors(
     bounded = np.minimum(error, 1e100)
     inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))
     score = torch.nan_to_num((pull.mT @ residual[..., None])[..., 0])
-    without = torch.eye(len(drawn), dtype=torch.float64) - gram @ inverse  # share that the other windows know
+    without = torch.eye(len(spread), dtype=torch.float64) - gram @ inverse  # share that the other windows know
     left = torch.linalg.lstsq(without, score[..., None], driver="gelsd").solution[..., 0]
     shared_pull = torch.zeros_like(information)
     if together is not None:
@@ -168,13 +190,7 @@ def _standard_errors(
         shared_pull = half + half.T
     ways = [inverse @ (scatter - shared_pull) @ inverse for scatter in (information, left.T @ left)]
     variance, least = torch.stack([torch.diagonal(way) for way in ways]).amax(0), torch.diagonal(inverse)
-    error = torch.where(variance > 1e-4 * least, variance, least).sqrt().numpy()
-    std_error = np.full(len(drawn), np.nan)
-    free = distribution.std > 2 * objective.box.min_std
-    if distribution.correlation is None and free.any():
-        of_std = (2 * torch.outer(drawn, drawn).square() * gram.square().sum(0)).numpy()[np.ix_(free, free)]
-        std_error[free] = distribution.std[free] * estimates(of_std)[0]
-    return error, correlation, std_error
+    return torch.where(variance > 1e-4 * least, variance, least), correlation, gram
 
 
 def _simulate(
