@@ -696,6 +696,16 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
 # --- outliers -------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.parametrize("poles", [9, 13])
+def test_ripple_between_those_that_are_tried_is_ranked_first(poles: int) -> None:
+    """On a joint whose inertia is small beside its load: what is tried must be small enough to be linear."""
+    ripple = Effect("joint_cogging", "elbow", {"amplitude": 0.1, "poles": poles, "phase": 2.2})
+    scene = prepare(load(simulate_truth(TORQUE_ARM, [ripple], 4, episodes=6, transitions=200)))
+    names = ("joint_cogging", "joint_stiffness", "center_of_mass", "external_force", "actuator_bias")
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in names))
+    assert ground.screened(ground.refit(scene.begin))[0].key == ("joint_cogging", "elbow")
+
+
 def spoilt(size: float, share: float, windows: int = 40, rows: int = 12) -> Refit:
     """A fit that leaves noise in its windows, and residuals of ``size`` in a share of them."""
     residual = np.random.default_rng(0).standard_normal((windows, rows))

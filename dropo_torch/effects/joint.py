@@ -204,6 +204,8 @@ class JointCogging(JointEffect):
     #: Ripples of a turn that are tried, and how many of a slide, each half a wave more over the measured range.
     WAVES = 40
     POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
+    #: Amplitude to begin with, relative to its scale: a large one bends what the screening takes for a line.
+    SMALL = 0.01
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         scale = float(setting.signals.force[setting.dof(target)])
@@ -215,7 +217,7 @@ class JointCogging(JointEffect):
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         low, high = setting.signals.position[setting.coordinate(target)]
-        amplitude = 0.1 * self.quantities(setting, target)[0].scale
+        amplitude = self.SMALL * self.quantities(setting, target)[0].scale
         if setting.is_slide(target):  # so dense that no ripple is half a wave off over the whole range
             poles = [float(np.pi * n / max(high - low, 1e-9)) for n in range(2, 2 + self.WAVES)]
         else:
