@@ -37,7 +37,7 @@ from dropo_torch.gap.noise import Diverges, _relative_noise, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
-from dropo_torch.gap.rules import Rules, allowance, clears
+from dropo_torch.gap.rules import Rules, accounts, allowance, clears
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Naming
@@ -132,6 +132,30 @@ def test_many_numbers_may_leave_less_of_the_gap() -> None:
     assert left == pytest.approx([0.03, 0.03, 0.0075])
     family = tuple(placed("joint_friction", 0.1, target=j) for j in ("rail", "hinge", "a", "b", "c"))
     assert allowance(Hypothesis((), family), rules) == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize(
+    ("names", "reduced", "enough"),
+    [(("joint_friction",), 100.0, True), (("joint_cogging", "joint_stiffness"), 1.1, True),
+     (("joint_cogging", "joint_stiffness"), 100.0, False)],
+)  # fmt: skip
+def test_many_numbers_account_for_nothing_while_much_remains(
+    names: tuple[str, ...], reduced: float, enough: bool
+) -> None:
+    """A far spring is imitated by a force, a coupling and a stiffness, up to a hundredth of the misfit."""
+    base = refit(scene_of().evidence, scene_of().begin, iterations=0)
+    many = tuple(placed(n, *[0.1] * len(find_effect(n).quantities(scene_of().setting, "rail"))) for n in names)
+    named = dataclasses.replace(
+        base, hypothesis=Hypothesis((), many), cost=Cost(np.array([1e3 * reduced]), np.zeros(1), 1e3)
+    )
+    wrong = dataclasses.replace(base, cost=Cost(np.array([1e9]), np.zeros(1), 1e3))
+    assert accounts(named, wrong, Rules()) == enough
+
+
+def test_coupling_of_joints_cannot_push_them_apart() -> None:
+    setting = scene_of().setting
+    effect = find_effect("joint_coupling")
+    assert all(effect.quantities(setting, t)[0].low == 0 for t in ("rail", "hinge"))
 
 
 def test_friction_that_is_larger_at_rest_is_found_from_plain_friction() -> None:

@@ -211,7 +211,8 @@ class CaseSpec:
         system, rng = SYSTEMS[self.system], np.random.default_rng([*self.seed, 1])
         effects = tuple(_drawn(system, e, rng, self.seed, self.unusual) for e in self.effects)
         recording = make_recording(system, effects, self.seed, noise=self.unusual.noise, before=self.unusual.before)
-        ratio, same = gap_ratio(system, recording), exact_ties(system, effects, recording)
+        ratio = gap_ratio(system, recording)
+        same = () if self.kind == "outside" else exact_ties(system, effects, recording)
         return make_case(
             system, effects, recording,
             name=self.name, kind=self.kind, gap_ratio=ratio, trait=self.trait, ties=same,

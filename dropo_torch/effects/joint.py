@@ -308,7 +308,7 @@ class JointCoupling(JointEffect):
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         low, high = setting.signals.position[setting.coordinate(target)]
         scale = float(setting.signals.force[setting.dof(target)] / max(high - low, 1e-9))
-        return (Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), 0.0, -30 * scale, 30 * scale, scale),)
+        return (Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), 0.0, 0.0, 30 * scale, scale),)
 
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

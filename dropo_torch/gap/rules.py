@@ -98,7 +98,8 @@ class Sound:
             sentence. An estimate of the noise that is a fifth too low makes as much.
         model_error: χ² per degree of freedom from which on the last fit weighs residuals by their own sizes, since the
             model's own error decides.
-        wrong, right: χ² per degree of freedom from which on a window is wrong, and below which it is right.
+        wrong, right: χ² per degree of freedom from which on a window is wrong, or a log with many numbers, and below
+            which a window is right.
     """
 
     pushes: float = 3.0
@@ -199,7 +200,7 @@ class Rules:
         most: share of the excess that an effect removes without that pairs or families are tried in its place.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         free: numbers of the named effects beyond which each halves what they may leave, for many numbers together
-            imitate what none of them is.
+            imitate what none of them is; what they leave must be less than ``sound.wrong`` then.
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         least: share of the first excess below which an effect is not named.
         effects: the most effects that are named.
@@ -238,16 +239,26 @@ def near(cost: Cost, rules: Rules) -> float:
     return max(rules.alike.excess * max(cost.excess, 0.0), rules.alike.sigmas * cost.sigma)
 
 
-def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
-    """Return the share of the first excess that named effects may leave; an effect at many places counts once."""
+def beyond_free(hypothesis: Hypothesis, rules: Rules) -> int:
+    """Return how many numbers named effects have more than are free; an effect at many places counts once."""
     sizes = {p.effect.name: 0 for p in hypothesis.placed}
     for p in hypothesis.placed:
         sizes[p.effect.name] = 1 if len(p.values) == 1 else sizes[p.effect.name] + len(p.values)
-    return (1 - rules.accounted) * 0.5 ** max(0, sum(sizes.values()) - rules.free)
+    return max(0, sum(sizes.values()) - rules.free)
+
+
+def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
+    """Return the share of the first excess that named effects may leave."""
+    return (1 - rules.accounted) * 0.5 ** beyond_free(hypothesis, rules)
 
 
 def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
-    """Return whether named effects remove as much of the excess as they must."""
+    """Return whether named effects remove as much of the excess as they must.
+
+    With more numbers than are free, which together imitate much, what they leave must not be wrong besides.
+    """
+    if beyond_free(named.hypothesis, rules) and named.cost.reduced > rules.sound.wrong:
+        return False
     return max(named.cost.excess, 0.0) <= allowance(named.hypothesis, rules) * base.cost.excess
 
 
