@@ -672,6 +672,8 @@ def test_names_that_leave_nothing_are_believed_before_others(
     answers: tuple, chosen: int, asked: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = scene_of("joint_damping")
+    signals = dataclasses.replace(scene.setting.signals, contacts=np.array([True]))
+    scene = dataclasses.replace(scene, setting=dataclasses.replace(scene.setting, signals=signals))
     ready = [naming(scene, excess, partial=partial, named=named) for excess, partial, named in answers]
     waiting = iter(ready)
     monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: next(waiting))

@@ -107,11 +107,13 @@ def find_gap(
 def _name(
     scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False, end: float = math.inf
 ) -> Naming:
-    """Search; where that does not explain everything, over shorter windows, too, and robustly where there are contacts.
+    """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly.
 
-    Long windows bend: what is most of the gap there may be an effect of the wrong kind. Names that leave nothing are
-    believed before those that leave nothing in most of the log, and these before names with a rest.
+    Where there are contacts, long windows bend, and what is most of the gap there may be an effect of the wrong kind:
+    names that leave a rest are then believed only if shorter windows find none that leave nothing, in most of the log
+    at least.
     """
+    touches = bool(scene.setting.signals.contacts.any())
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
     found, waiting = list[Naming](), list(searched(scene))
     while waiting and (not found or time.monotonic() < end):
@@ -119,7 +121,8 @@ def _name(
         path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
         ends = share_of(end, len(waiting))
         found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume, end=ends))
-        if not found[0].gap or (found[-1].named and not remains(found[-1].final.cost, ground.rules)):
+        doubtful = touches and remains(found[-1].final.cost, ground.rules)
+        if not found[0].gap or (found[-1].named and not doubtful):
             return found[-1]
     best = min(found, key=lambda n: (not n.named, not n.partial))
     late = next((n.unfinished for n in found if n.unfinished), "")
