@@ -32,10 +32,16 @@ PUBLISHED = {
 }
 
 
+def tell(stage: str, share: float) -> None:
+    """Say what the search does as it begins."""
+    if share == 0:
+        print(stage, file=sys.stderr, flush=True)
+
+
 def search(data: Path, backend: str) -> Gap:
     """Look for what the model lacks."""
     config = dropo.load_config(CONFIG, {"data.path": str(data.resolve()), "backend": backend})
-    return find_gap(dropo.make_problem(config, general=True), report=lambda stage, share: None)
+    return find_gap(dropo.make_problem(config, general=True), report=tell)
 
 
 def found_values(gap: Gap) -> dict[str, float]:
