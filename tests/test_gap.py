@@ -719,9 +719,6 @@ def test_screening_ranks_the_true_effect_first(name: str, rank: int) -> None:
     assert len({c.key for c in ranked}) == len(ranked)
 
 
-# --- outliers -------------------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("poles", [9, 13])
 def test_ripple_between_those_that_are_tried_is_ranked_first(poles: int) -> None:
     """On a joint whose inertia is small beside its load: what is tried must be small enough to be linear."""
@@ -730,6 +727,9 @@ def test_ripple_between_those_that_are_tried_is_ranked_first(poles: int) -> None
     names = ("joint_cogging", "joint_stiffness", "center_of_mass", "external_force", "actuator_bias")
     ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in names))
     assert ground.screened(ground.refit(scene.begin))[0].key == ("joint_cogging", "elbow")
+
+
+# --- outliers -------------------------------------------------------------------------------------------------
 
 
 def spoilt(size: float, share: float, windows: int = 40, rows: int = 12) -> Refit:
