@@ -625,6 +625,15 @@ def test_no_hypothesis_gains_by_diverging(robust: bool, finer: float) -> None:
     assert there.cost.excess >= begin.cost.excess
 
 
+def test_a_model_that_diverges_on_unseen_data_has_no_finite_error() -> None:
+    """A single step that diverges is no large number: it is worse than any."""
+    scene = scene_of("joint_damping")
+    diverging = scene.begin.with_effects([Placed(find_effect("joint_stiffness"), "hinge", (-1e7, 0.0))])
+    after, floor = gap_package.verify(scene, diverging)
+    assert (after.mse, after.log_likelihood, after.rollout_rmse) == (np.inf, -np.inf, np.inf)
+    assert not np.isnan([floor.mse, floor.log_likelihood, floor.rollout_rmse]).any()
+
+
 def test_where_the_given_model_diverges_itself_that_counts_like_its_worst_window() -> None:
     scene = scene_of("joint_damping")
     measured = scene.evidence.windows.measured.copy()

@@ -15,7 +15,7 @@ from dropo_torch.distribution import to_coordinates
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.effects.simulator import effect_simulator
-from dropo_torch.gap.evidence import LOST, Evidence
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, spread
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Score
@@ -101,12 +101,15 @@ def position_features(setting: Setting) -> np.ndarray:
 def score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
     """Return the scores of a hypothesis on held-out data.
 
-    Single steps are those of a fit: the same simulator, the same covariance by the noise of start and end.
+    Single steps are those of a fit: the same simulator, the same covariance by the noise of start and end. One that
+    diverges makes its error infinite, as it does an open-loop one: no model gains by diverging.
     """
     error, covariance = _one_step(evidence, held, hypothesis)
-    solved = np.linalg.solve(covariance, error[..., None])[..., 0]
-    likelihood = _log_likelihood(covariance, (error * solved).sum(1))
-    return _score(evidence, float(np.mean(error**2)), likelihood, _rollout(evidence.on(held.rollouts), hypothesis))
+    mse, likelihood = math.inf, -math.inf
+    if np.isfinite(error).all() and np.isfinite(covariance).all():
+        solved = np.linalg.solve(covariance, error[..., None])[..., 0]
+        mse, likelihood = float(np.mean(error**2)), _log_likelihood(covariance, (error * solved).sum(1))
+    return _score(evidence, mse, likelihood, _rollout(evidence.on(held.rollouts), hypothesis))
 
 
 def floor_score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
@@ -132,7 +135,7 @@ def _log_likelihood(covariance: np.ndarray, distance: np.ndarray | int) -> float
 
 
 def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of single steps ``(T, m)``, and their covariance by the noise ``(T, m, m)``."""
+    """Errors of single steps ``(T, m)``, not finite where one diverges, and their covariance by the noise."""
     twin, values = evidence.twin, np.array(hypothesis.declared)
     objective = one_step_objective(evidence, held, hypothesis)
     initial = objective.initial_noise(to_coordinates(values, twin.space.is_log), widen=False)
@@ -145,8 +148,7 @@ def _one_step(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[n
     sums = objective.map(values[None], collect, initial=initial)
     twin.simulated_transitions += sums.simulated_transitions + (initial.simulated_transitions if initial else 0)
     error, covariance = (torch.cat(part).numpy() for part in zip(*parts, strict=True))
-    lost = LOST * np.sqrt(np.einsum("tmm->tm", covariance))
-    return np.where(np.isfinite(error), error, lost), covariance
+    return error, covariance
 
 
 def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Objective:
@@ -205,11 +207,18 @@ def constant_velocity(evidence: Evidence, held: Held) -> float:
 
 
 def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
-    """Return the open-loop error of each feature that noise at start and end alone would make, ``(m,)``."""
+    """Return the open-loop error of each feature that noise at start and end alone would make, ``(m,)``.
+
+    Draws of the noise from which a perfect model would diverge tell no size and are left out.
+    """
     m, num_windows = evidence.chart.size, len(evidence.windows)
     count = max(4, -(-DRAWS // num_windows))
     draws = np.random.default_rng(SEED).standard_normal((count, num_windows, m))
     moved = np.concatenate([np.zeros((1, num_windows, m)), draws])
     found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)
-    change = _after(np.nan_to_num(found[1:] - found[:1], nan=LOST), evidence)
-    return np.sqrt((change**2).mean((0, 1, 2)) + 1) * evidence.noise
+    change = found[1:] - found[:1]
+    finite = np.isfinite(change).all(-1)
+    if not finite.any():
+        return np.full(m, np.inf)
+    change = change[finite].reshape(-1, evidence.windows.length + 1, m)[:, 1:]
+    return np.asarray(np.sqrt((change**2).mean((0, 1)) + 1) * evidence.noise)
