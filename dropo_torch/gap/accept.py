@@ -81,7 +81,7 @@ def swap(ground: Ground, state: State) -> State:
         for index in range(len(before.hypothesis.placed)):
             without = ground.refit(state.current.hypothesis.without(index))
             focus = ground.focus(without)
-            here = refit(focus.evidence, state.current.hypothesis, iterations=0).cost.chi2
+            here = refit(focus.evidence, state.current.hypothesis, iterations=0, slopes=False).cost.chi2
             alive = [c for c in ground.screened(without) if not c.dead]
             rivals = [
                 (c.placed,) for c in alive[: tried.rivals] if c.chi2 < tried.promises * here

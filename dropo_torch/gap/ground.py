@@ -121,8 +121,15 @@ class Ground:
         return list(all_candidates(self.setting, self.effects))
 
     def refit(self, hypothesis: Hypothesis, iterations: int = 12) -> Refit:
-        """Return a hypothesis fitted on the windows that refits use."""
-        return refit(self.part, hypothesis, iterations=iterations)
+        """Return a hypothesis fitted on the windows that refits use; the same one is fitted once."""
+        key = (hypothesis.vector.tobytes(), tuple(p.key for p in hypothesis.placed), iterations)
+        if key not in self._known:
+            self._known[key] = refit(self.part, hypothesis, iterations=iterations)
+        return self._known[key]
+
+    @cached_property
+    def _known(self) -> dict[tuple, Refit]:
+        return {}
 
     def clears(self, base: Refit, current: Refit) -> bool:
         """Return whether effects are right although something else remains in some windows; only if these may part."""
@@ -186,7 +193,7 @@ class Ground:
         before, known = focus.excess, len(beside.hypothesis.placed)
 
         def rough(hypothesis: Hypothesis, most: int) -> Refit:
-            return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=most)
+            return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=most, slopes=False)
 
         found = []
         for number, group in enumerate(groups):

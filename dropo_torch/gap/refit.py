@@ -157,52 +157,70 @@ def beside(
 
 
 def refit(
-    evidence: Evidence, hypothesis: Hypothesis, *, linear: Linearisation | None = None, iterations: int = 12
-) -> Refit:
+    evidence: Evidence, hypothesis: Hypothesis, *, linear: Linearisation | None = None, iterations: int = 12,
+    slopes: bool = True,
+) -> Refit:  # fmt: skip
     """Fit all numbers of a hypothesis by Levenberg-Marquardt on projected residuals.
+
+    Derivatives cost a simulation of all windows for each number, so they are taken only where the fit goes on.
 
     Args:
         evidence: the windows.
         hypothesis: where to begin.
         linear: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
         iterations: the most of them.
+        slopes: whether the result needs its derivatives; without them they may be zero.
     """
     limits = limits_of(hypothesis, evidence.twin)
     relinearise = linear is None
     variant = hypothesis.variant
     linear = evidence.linearise(variant) if linear is None else evidence.counting(linear, variant)
-
-    def at(vector: np.ndarray) -> Refit:
-        there = hypothesis.at(np.clip(vector, limits.low, limits.high))
-        moved, steps = beside(there, limits, np.flatnonzero(limits.free), STEP)
-        found, _ = evidence.residuals([h.variant for h in (there, *moved)])
-        slope = np.zeros((len(vector), *found.shape[1:]))  # none by discrete numbers
-        slope[limits.free] = evidence.project_slope((found[1:] - found[:1]) / steps[:, None, None], linear)
-        return _fitted(evidence, there, found[0], slope, linear, limits.scale)
-
-    def distance(vector: np.ndarray, other: Hypothesis) -> float:
-        return float(np.abs((vector - other.vector) / limits.scale).max(initial=0.0))
-
-    damping = DAMPING
-    here = begin = at(hypothesis.vector)
+    here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
+    begin, damping, sloped = here, DAMPING, False
     for _ in range(iterations):
+        if not sloped:
+            here, sloped = _sloped(evidence, here, limits, residuals), True
         trial = here.hypothesis.vector + _move(here, limits, evidence.caps * here.factor, damping) * limits.scale
         trial = np.clip(trial, limits.low, limits.high)
-        if distance(trial, here.hypothesis) < LEAST_MOVE:
+        if _distance(trial, here.hypothesis, limits) < LEAST_MOVE:
             break
-        there = at(trial)
+        there, found = _at(evidence, hypothesis, linear, limits, trial)
         if there.loss < here.loss:
-            gain, here, damping = here.loss - there.loss, there, max(damping / 8, LEAST_DAMPING)
+            gain, damping = here.loss - there.loss, max(damping / 8, LEAST_DAMPING)
+            here, residuals, sloped = there, found, False
             if gain < 1e-6 * here.loss + 0.01:
                 break
         else:
             damping *= 6
             if damping > MOST_DAMPING:
                 break
-    if relinearise and distance(here.hypothesis.vector, begin.hypothesis) > FAR:
+    if relinearise and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
         again = evidence.linearise(here.hypothesis.variant)
-        return refit(evidence, here.hypothesis, linear=again, iterations=4)
-    return here
+        return refit(evidence, here.hypothesis, linear=again, iterations=4, slopes=slopes)
+    return _sloped(evidence, here, limits, residuals) if slopes and not sloped else here
+
+
+def _distance(vector: np.ndarray, other: Hypothesis, limits: Limits) -> float:
+    return float(np.abs((vector - other.vector) / limits.scale).max(initial=0.0))
+
+
+def _at(
+    evidence: Evidence, hypothesis: Hypothesis, linear: Linearisation, limits: Limits, vector: np.ndarray
+) -> tuple[Refit, np.ndarray]:
+    """A hypothesis at other numbers, its derivatives not taken yet, and its residuals ``(W, N)`` as they are."""
+    there = hypothesis.at(np.clip(vector, limits.low, limits.high))
+    found = evidence.residuals([there.variant])[0][0]
+    return _fitted(evidence, there, found, np.zeros((len(vector), *found.shape)), linear, limits.scale), found
+
+
+def _sloped(evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarray) -> Refit:
+    """The same with its derivatives ``(q, W, N)``, none by discrete numbers, from its residuals ``(W, N)``."""
+    moved, steps = beside(here.hypothesis, limits, np.flatnonzero(limits.free), STEP)
+    slope = np.zeros_like(here.slope)
+    if moved:
+        found, _ = evidence.residuals([h.variant for h in moved])
+        slope[limits.free] = evidence.project_slope((found - residuals) / steps[:, None, None], here.linear)
+    return replace(here, slope=slope)
 
 
 def _fitted(

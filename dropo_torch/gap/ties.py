@@ -66,7 +66,7 @@ def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
 
     def loss(placed: Placed) -> float:
         hypothesis = origin.with_effects([placed])
-        return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0).loss
+        return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0, slopes=False).loss
 
     return min((candidate.placed, candidate.start, *between), key=loss)
 
