@@ -59,6 +59,7 @@ class State:
         done: whether no round is to follow.
         attempts: what was refitted, in order.
         refused: why what explained the most has no name, if it has none.
+        family: whether the hypothesis is the base family, at all joints where it is needed.
     """
 
     noise: np.ndarray
@@ -71,6 +72,7 @@ class State:
     done: bool = False
     attempts: tuple[Ranked, ...] = ()
     refused: str = ""
+    family: bool = False
 
 
 @dataclass(frozen=True)

@@ -86,6 +86,24 @@ class Tried:
 
 
 @dataclass(frozen=True)
+class Family:
+    """When the base family, at all joints together, takes the place of the first effects found.
+
+    Attributes:
+        left: share of the excess that these must leave for it to be tried.
+        clearer: share of what they leave below which it takes their place.
+        members: of it, so many must be needed at half of the joints.
+        iterations, rounds: of its fit, and how often those not needed are dropped, at most.
+    """
+
+    left: float = 3e-3
+    clearer: float = 0.2
+    members: int = 2
+    iterations: int = 24
+    rounds: int = 6
+
+
+@dataclass(frozen=True)
 class Sound:
     """What may have a name, and what is said of the rest.
 
@@ -204,7 +222,7 @@ class Rules:
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         least: share of the first excess below which an effect is not named.
         effects: the most effects that are named.
-        chance, alike, tried, sound, cut, weighed, shown: see there.
+        chance, alike, tried, family, sound, cut, weighed, shown: see there.
     """
 
     gate: float = 5.0
@@ -218,6 +236,7 @@ class Rules:
     chance: Chance = field(default_factory=Chance)
     alike: Alike = field(default_factory=Alike)
     tried: Tried = field(default_factory=Tried)
+    family: Family = field(default_factory=Family)
     sound: Sound = field(default_factory=Sound)
     cut: Cut = field(default_factory=Cut)
     weighed: Weighed = field(default_factory=Weighed)
@@ -260,6 +279,15 @@ def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
     if beyond_free(named.hypothesis, rules) and named.cost.reduced > rules.sound.wrong:
         return False
     return max(named.cost.excess, 0.0) <= allowance(named.hypothesis, rules) * base.cost.excess
+
+
+def family_accounts(named: Refit, base: Refit, rules: Rules) -> bool:
+    """Return whether a base family removes as much of the excess as it must, and leaves nothing that is wrong.
+
+    Its members are each needed by their own standard errors, so their number does not count against them.
+    """
+    enough = max(named.cost.excess, 0.0) <= (1 - rules.accounted) * base.cost.excess
+    return enough and named.cost.reduced <= rules.sound.wrong
 
 
 def clears(base: Refit, current: Refit, rules: Rules) -> bool:

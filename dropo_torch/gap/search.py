@@ -12,17 +12,20 @@ from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.accept import add, everywhere, extend, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.family import family_ties, shares_of, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
-from dropo_torch.gap.rules import accounts, significant
+from dropo_torch.gap.rules import accounts, family_accounts, significant
 from dropo_torch.gap.ties import canonical, ties
 from dropo_torch.support.checkpoint import Checkpoint
 
 #: Why what a log is too short for has no name.
 UNSURE = "what explains most of it may do so by chance, for this log has too few stretches that show it"
+#: Why a base family that leaves too much has no names.
+LEAVES = "friction, inertia, offset and delay at all joints leave too much of it"
 
 
 @dataclass(frozen=True)
@@ -121,6 +124,10 @@ def start(ground: Ground, begin: Hypothesis) -> State:
 def step(ground: Ground, state: State) -> State:
     """Accept one or two more effects, and swap those accepted before for better ones."""
     found = add(ground, state)
+    if state.number == 0:
+        found = with_family(ground, state, found)
+    if found.family:
+        return replace(renewed(ground, found), number=1)
     if found.done:
         return found
     found = renewed(ground, found)
@@ -144,6 +151,8 @@ def conclude(ground: Ground, state: State) -> Naming:
     unnamed = Naming(ground.evidence, base, state.first, base, gap=significant(base.cost, rules))
     if not unnamed.gap:
         return unnamed
+    if state.family:
+        return conclude_family(ground, state, unnamed)
     found, state = state.current, prune(ground, state)
     unnamed = replace(unnamed, attempts=state.attempts, refused=state.refused)
     if reasons := nonsense(ground, state.current):
@@ -161,4 +170,16 @@ def conclude(ground: Ground, state: State) -> Naming:
     return replace(
         unnamed, refused="", final=state.current, named=True, ties=told, shares=tuple(shares), attempts=state.attempts,
         partial=partial,
+    )  # fmt: skip
+
+
+def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
+    """Judge whether the base family accounts for the gap; its members are not exchanged one by one for others."""
+    current = state.current
+    reasons = nonsense(ground, current)
+    if reasons or not family_accounts(current, state.base, ground.rules):
+        return replace(unnamed, attempts=state.attempts, refused=reasons[0] if reasons else LEAVES)
+    return replace(
+        unnamed, final=current, named=True, ties=family_ties(ground, current), shares=shares_of(ground, current),
+        attempts=state.attempts,
     )  # fmt: skip

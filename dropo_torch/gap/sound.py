@@ -61,7 +61,7 @@ def _reason(placed: Placed, q: Quantity, end: float) -> str:
 def beyond(evidence: Evidence, fitted: Refit) -> np.ndarray:
     """Return by how many standard errors the fit would move each number ``(q,)`` if no bound held it."""
     factor = np.broadcast_to(evidence.caps * fitted.factor, len(fitted.residual))[:, None]
-    slope = (fitted.slope * factor).reshape(len(fitted.slope), -1)
+    slope = (fitted.slope * factor).reshape(len(fitted.slope), fitted.residual.size)
     normal = slope @ slope.T
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
     move = -inverse @ (slope @ (fitted.residual * factor).ravel())
