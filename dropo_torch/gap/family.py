@@ -6,21 +6,24 @@ one effect after another finds these: each alone explains next to nothing while 
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Placed, Setting, object_number
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import Hypothesis, Refit, refit, standard_errors
+from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import significant
 from dropo_torch.gap.sound import absurd
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
+
+#: What is reported.
+STAGE = "fitting friction, inertia, offset and delay of all joints"
 
 
 def base_family(setting: Setting) -> list[Placed]:
@@ -32,8 +35,8 @@ def base_family(setting: Setting) -> list[Placed]:
 def with_family(ground: Ground, state: State, found: State) -> State:
     """Put the base family in the place of the first effects found, where these leave much and it leaves far less.
 
-    At several joints several members must be needed, each by its own standard error: what sits at one joint, or is of
-    one kind, the search names one by one. What begins or ends at a bound of physics is no member.
+    At several joints several members must be needed: what sits at one joint, or is of one kind, the search names one by
+    one. What ends at a bound of physics is no member.
 
     Args:
         ground: what the search stands on.
@@ -48,50 +51,73 @@ def with_family(ground: Ground, state: State, found: State) -> State:
         return found
     if not significant(found.current.cost, ground.rules) or left < rules.left * state.base.cost.excess:
         return found
-    ground.report("fitting friction, inertia, offset and delay of all joints", 0.0)
-    whole = ground.refit(begin.with_effects(family), iterations=rules.iterations)
-    for number in range(rules.rounds):
-        idle = {p.key for p in not_needed(ground, whole)}
-        if not idle:
-            break
-        ground.report("fitting friction, inertia, offset and delay of all joints", (number + 1) / (rules.rounds + 1))
-        placed = tuple(p for p in whole.hypothesis.placed if p.key not in idle)
-        whole = ground.refit(replace(whole.hypothesis, placed=placed))
-    else:
+    whole = needed(ground, fitted_family(ground, begin))
+    if whole is None or whole.cost.excess > rules.clearer * left:
         return found
-    if whole.cost.excess > rules.clearer * left or not spread_out(setting, whole.hypothesis, rules.members):
+    if not spread_out(setting, whole.hypothesis, rules.members):
         return found
     return replace(found, current=whole, family=True, done=True, refused="")
 
 
-def not_needed(ground: Ground, whole: Refit) -> list[Placed]:
-    """Return members that are at a bound of physics, or else those that are no more than chance among so many.
+def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
+    """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest."""
+    family, iterations = base_family(ground.setting), ground.rules.family.iterations
+    ground.report(STAGE, 0.0)
+    prompt = ground.refit(begin.with_effects([p for p in family if not p.effect.is_filter]), iterations=iterations)
+    late = [p for p in family if p.effect.is_filter]
+    return ground.refit(prompt.hypothesis.with_effects(late), iterations=iterations)
 
-    The latter one after another, by the derivatives at the fit: of two that do the same, one stays.
+
+def needed(ground: Ground, whole: Refit) -> Refit | None:
+    """Return a fitted family without members that are absurd or not needed; ``None`` if that comes to no end."""
+    rules, most = ground.rules.family, math.inf
+    for number in range(rules.rounds):
+        ground.report(STAGE, 0.5 + 0.5 * number / rules.rounds)
+        idle = [placed for placed, _ in absurd(ground.part, whole, ground.rules.sound)]
+        if not idle:
+            spare = max(rules.spare * whole.cost.excess, ground.rules.alike.sigmas * whole.cost.sigma)
+            most = min(most, whole.cost.excess + spare)
+            idle = not_needed(ground, whole, most)
+        if not idle:
+            return whole
+        keys = {p.key for p in idle}
+        placed = tuple(p for p in whole.hypothesis.placed if p.key not in keys)
+        whole = ground.refit(replace(whole.hypothesis, placed=placed))
+    return None
+
+
+def not_needed(ground: Ground, whole: Refit, most: float) -> list[Placed]:
+    """Return members without which a fit stays about as good, by its derivatives.
+
+    One after another, the least needed first: of two that do the same, one stays.
+
+    Args:
+        ground: what the search stands on.
+        whole: a fit of the family.
+        most: excess up to which members are dropped.
     """
-    if bound := [placed for placed, _ in absurd(ground.part, whole, ground.rules.sound)]:
-        return bound
-    placed, first = whole.hypothesis.placed, len(whole.hypothesis.declared)
-    least = stats.norm.isf(0.5 * ground.rules.chance.error / max(len(placed), 1))
-    slope = flat_slope(ground, whole)
-    normal, move = slope @ slope.T, np.zeros(len(slope))
-    off, rows = offsets(ground.setting, whole), np.arange(len(slope))
+    first, slope = len(whole.hypothesis.declared), flat_slope(ground, whole)
+    normal, off, rows = slope @ slope.T, offsets(ground.setting, whole), np.arange(len(slope))
     while len(rows) > first:
-        errors = standard_errors(
-            replace(whole, slope=whole.slope[rows], scale=whole.scale[rows]), ground.part.windows.episodes, lacking=True
-        )
-        deviations = np.abs((off + move)[rows] * whole.scale[rows]) / np.maximum(errors, 1e-300)
-        deviations[:first] = np.inf
-        weakest = int(np.argmin(deviations))
-        if deviations[weakest] >= least:
-            break
-        rows = np.delete(rows, weakest)
         gone = np.setdiff1d(np.arange(len(slope)), rows)
-        move = np.zeros(len(slope))
-        move[gone] = -off[gone]
-        kept = np.linalg.pinv(normal[np.ix_(rows, rows)], rcond=1e-12, hermitian=True)
-        move[rows] = kept @ normal[np.ix_(rows, gone)] @ off[gone]
-    return [p for i, p in enumerate(placed, first) if i not in rows]
+        inverse = np.linalg.pinv(normal[np.ix_(rows, rows)], rcond=1e-12, hermitian=True)
+        there = off[rows] + inverse @ normal[np.ix_(rows, gone)] @ off[gone]  # what dropping the others has moved
+        costs = there**2 / np.maximum(np.diag(inverse), 1e-300)
+        weakest = first + int(np.argmin(costs[first:]))
+        rest = np.delete(rows, weakest)
+        if whole.cost.excess + _cost_without(normal, off, rest) > most:
+            break
+        rows = rest
+    return [p for i, p in enumerate(whole.hypothesis.placed, first) if i not in rows]
+
+
+def _cost_without(normal: np.ndarray, off: np.ndarray, rows: np.ndarray) -> float:
+    """Return how much χ² grows where only some numbers stay, by the normal matrix and all numbers' offsets."""
+    gone = np.setdiff1d(np.arange(len(off)), rows)
+    inverse = np.linalg.pinv(normal[np.ix_(rows, rows)], rcond=1e-12, hermitian=True)
+    across = normal[np.ix_(rows, gone)]
+    schur = normal[np.ix_(gone, gone)] - across.T @ inverse @ across
+    return float(off[gone] @ schur @ off[gone])
 
 
 def flat_slope(ground: Ground, whole: Refit) -> np.ndarray:
@@ -151,3 +177,13 @@ def joint_of(setting: Setting, placed: Placed) -> int | None:
     if placed.effect.kind == "joint":
         return setting.joint(placed.target)
     return driven_joint(setting.model, object_number(setting.model, "actuator", placed.target))
+
+
+def joint_names(setting: Setting) -> dict[str, str]:
+    """Return the joint of every place where a member of the family can sit, in the model's order."""
+    family = sorted(base_family(setting), key=lambda p: (joint_of(setting, p) is None, joint_of(setting, p) or 0))
+    names, found = setting.names("jnt"), dict[str, str]()
+    for placed in family:
+        if (joint := joint_of(setting, placed)) is not None:
+            found[str(placed.target)] = names[joint]
+    return found

@@ -11,6 +11,7 @@ import numpy as np
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
@@ -84,6 +85,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         refused=naming.refused,
         unfinished=naming.unfinished,
         own_step=_own_step(naming, rest, rules),
+        joints=joint_names(setting) if naming.family else {},
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",
     )
 

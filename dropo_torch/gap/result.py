@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
@@ -156,6 +156,8 @@ class Gap:
         refused: why what would account for the misfit has no name, or empty.
         unfinished: where the search was when its time was over, or empty.
         own_step: χ² per degree of freedom with the model's own step and with a finer one, if only that remains.
+        joints: the joint at which each effect of the base family sits: of joints and actuators by name, in the model's
+            order; empty where what was named is no such family.
     """
 
     where: tuple[Place, ...]
@@ -185,6 +187,7 @@ class Gap:
     refused: str = ""
     unfinished: str = ""
     own_step: tuple[float, float] | None = None
+    joints: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def verdict(self) -> str:

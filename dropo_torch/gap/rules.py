@@ -93,12 +93,14 @@ class Family:
         left: share of the excess that these must leave for it to be tried.
         clearer: share of what they leave below which it takes their place.
         members: of it, so many must be needed at half of the joints.
+        spare: share of the excess that it leaves by which dropping the members least needed may raise it.
         iterations, rounds: of its fit, and how often those not needed are dropped, at most.
     """
 
     left: float = 3e-3
-    clearer: float = 0.2
+    clearer: float = 0.4
     members: int = 2
+    spare: float = 0.1
     iterations: int = 24
     rounds: int = 6
 
@@ -284,7 +286,7 @@ def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
 def family_accounts(named: Refit, base: Refit, rules: Rules) -> bool:
     """Return whether a base family removes as much of the excess as it must, and leaves nothing that is wrong.
 
-    Its members are each needed by their own standard errors, so their number does not count against them.
+    Its members are each needed beside all others, so their number does not count against them.
     """
     enough = max(named.cost.excess, 0.0) <= (1 - rules.accounted) * base.cost.excess
     return enough and named.cost.reduced <= rules.sound.wrong

@@ -45,6 +45,7 @@ class Naming:
         partial: whether they leave nothing in most of the log, but something else remains in the rest.
         refused: why what was found has no name.
         unfinished: the stage in which the time for the search was over, or empty.
+        family: whether what is named is the base family.
     """
 
     evidence: Evidence
@@ -59,6 +60,7 @@ class Naming:
     partial: bool = False
     refused: str = ""
     unfinished: str = ""
+    family: bool = False
 
 
 def kept(path: Path, fingerprint: str) -> Checkpoint:
@@ -181,5 +183,5 @@ def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
         return replace(unnamed, attempts=state.attempts, refused=reasons[0] if reasons else LEAVES)
     return replace(
         unnamed, final=current, named=True, ties=family_ties(ground, current), shares=shares_of(ground, current),
-        attempts=state.attempts,
+        attempts=state.attempts, family=True,
     )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -67,6 +67,14 @@ _CLAUSES = {
 #: Effects whose first number, if negative, says that the model has too much of them.
 _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_stiffness", "armature",
            "actuator_damping", "contact_margin")  # fmt: skip
+#: Members of the base family, in a list of a joint's.
+_SHORT = {
+    "joint_friction": "dry friction",
+    "joint_damping": "viscous friction",
+    "armature": "rotor inertia",
+    "actuator_bias": "offset",
+    "actuator_delay": "delay",
+}
 _COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
 _CANNOT_RULE_OUT = "An effect that is weaker than the noise, or that this motion does not excite, cannot be ruled out."
 
@@ -169,6 +177,10 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
         step = f" (the model's own step leaves {own} times what noise would, a finer one {finer})"
     else:
         step = ""
+    if gap.joints:
+        items = by_joint(named, gap.joints)
+        rest = step if gap.remaining is None else f". They do not explain everything: {left(gap.remaining)}"
+        return f"Your model lacks what {_count(items)} joints have{rest}:", items
     if len(named) == 1:
         rest = step if gap.remaining is None else f", but this does not explain everything: {left(gap.remaining)}"
         return f"{_clause(named[0])}: {numbers(named[0].parameters)}{rest}.", []
@@ -176,10 +188,24 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
         f"{noun(e.effect, e.target)}: {'too much in the model, ' if _too_much(e) else ''}{numbers(e.parameters)}"
         for e in named
     ]
-    count = _COUNTS[len(items)] if len(items) < len(_COUNTS) else str(len(items))
+    count = _count(items)
     differ = any(_too_much(e) or e.effect in _CLAUSES for e in named)
     rest = step if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
     return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
+
+
+def _count(items: Sequence[str]) -> str:
+    return _COUNTS[len(items)] if len(items) < len(_COUNTS) else str(len(items))
+
+
+def by_joint(named: Iterable[NamedEffect], joints: Mapping[str, str]) -> list[str]:
+    """Return an item for each joint, with what it has that the model lacks."""
+    found: dict[str, list[str]] = {joint: [] for joint in joints.values()}
+    for e in sorted(named, key=lambda e: list(_SHORT).index(e.effect)):
+        members = e.parameters if e.target == "*" else {str(e.target): next(iter(e.parameters.values()))}
+        for target, given in members.items():
+            found[joints[target]].append(f"{_SHORT[e.effect]} {with_interval(given)}")
+    return [f"{joint}: {', '.join(members)}" for joint, members in found.items() if members]
 
 
 def left(remaining: Remaining) -> str:

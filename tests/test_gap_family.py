@@ -1,0 +1,135 @@
+"""Friction, inertia, offset and delay at all joints of a leg: found together, and only where several joints lack them.
+
+The log is made by plain MuJoCo: a leg with servos, of which the model given has neither friction nor rotors.
+"""
+
+from __future__ import annotations
+
+import functools
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import dropo_torch as dropo
+from dropo_torch.effects import VOCABULARY
+from dropo_torch.gap import Gap, find_gap
+from dropo_torch.gap.family import base_family, joint_of
+from dropo_torch.gap.scene import prepare
+from dropo_torch.report.gap_words import answer
+
+Triple = tuple[float, ...]
+NONE: Triple = (0.0, 0.0, 0.0)
+JOINTS = ("hip", "knee", "ankle")
+DAMPING, FRICTION, ROTOR, OFFSET = (0.3, 0.25, 0.1), (0.5, 0.4, 0.2), (0.02, 0.03, 0.01), (0.2, -0.3, 0.1)
+NOISE, STEP, ROWS = (4e-4, 1e-2), 0.0025, 1600
+
+
+def leg(damping: Triple = NONE, friction: Triple = NONE, rotor: Triple = NONE, offset: Triple = NONE) -> str:
+    """MJCF of a hanging leg of three joints with position servos."""
+    inside = ""
+    for i in (2, 1, 0):
+        inside = (
+            f'<body pos="0 0 {-0.25 if i else 0}"><joint name="{JOINTS[i]}" axis="0 1 0" damping="{damping[i]}" '
+            f'frictionloss="{friction[i]}" armature="{rotor[i]}"/>'
+            f'<geom type="capsule" size=".03" fromto="0 0 0 0 0 -.2" mass="{1.2 - 0.3 * i}"/>{inside}</body>'
+        )
+    servos = "".join(
+        f'<general name="{n}_servo" joint="{n}" biastype="affine" gainprm="25" biasprm="{offset[i]} -25 -1"/>'
+        for i, n in enumerate(JOINTS)
+    )
+    return (
+        f'<mujoco><option timestep="{STEP}" integrator="implicitfast"/>'
+        '<default><geom contype="0" conaffinity="0"/></default>'
+        f"<worldbody>{inside}</worldbody><actuator>{servos}</actuator></mujoco>"
+    )
+
+
+def record(folder: Path, seed: int, **truth: Triple) -> Path:
+    """Write a noisy log of chirps of a leg with some truth, and a config with the leg as given."""
+    rng = np.random.default_rng(seed)
+    model = mujoco.MjModel.from_xml_string(leg(**truth))
+    data = mujoco.MjData(model)
+    time = 0.005 * np.arange(ROWS + 1)
+    phase = 2 * np.pi * (0.3 * time + 0.15 * time**2)
+    targets = 0.5 * np.sin(phase[:, None] * rng.uniform(0.8, 1.2, 3) + rng.uniform(0, 6, 3))
+    rows = []
+    for target in targets:
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = target
+        mujoco.mj_step(model, data, 2)
+    observations = np.array(rows) + rng.standard_normal((len(rows), 6)) * np.repeat(NOISE, 3)
+    np.savez(folder / "leg.npz", observations=observations, actions=targets, terminals=np.arange(len(rows)) == ROWS)
+    (folder / "leg.xml").write_text(leg())
+    path = folder / "leg.yaml"
+    path.write_text("model: leg.xml\ndata: {path: leg.npz, dt: 0.005}\nobservation: ['qpos', 'qvel']\nthreads: 1\n")
+    return path
+
+
+@functools.cache
+def found(**truth: Triple) -> Gap:
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = record(Path(folder), 11, **truth)
+        return find_gap(dropo.make_problem(dropo.load_config(path), general=True))
+
+
+def everything() -> Gap:
+    return found(damping=DAMPING, friction=FRICTION, rotor=ROTOR, offset=OFFSET)
+
+
+def told(gap: Gap) -> dict[tuple[str, str], float]:
+    """The first number of each named effect, by effect and joint."""
+    numbers: dict[tuple[str, str], float] = {}
+    for e in gap.effects:
+        members = e.parameters if e.target == "*" else {str(e.target): next(iter(e.parameters.values()))}
+        numbers |= {(e.effect, t.removesuffix("_servo")): s.value for t, s in members.items()}
+    return numbers
+
+
+@pytest.mark.parametrize(
+    ("effect", "true", "within"),
+    [("joint_damping", DAMPING, 0.1), ("joint_friction", FRICTION, 0.05), ("armature", ROTOR, 0.1)],
+)
+def test_what_every_joint_lacks_is_found_at_every_joint(effect: str, true: Triple, within: float) -> None:
+    numbers = told(everything())
+    assert [numbers.get((effect, j)) for j in JOINTS] == pytest.approx(true, rel=within)
+
+
+def test_the_offsets_of_a_leg_are_found_and_no_delay_is() -> None:
+    numbers = told(everything())
+    assert [numbers.get(("actuator_bias", j)) for j in JOINTS] == pytest.approx(OFFSET, rel=0.1)
+    assert not any(effect == "actuator_delay" for effect, _ in numbers)
+
+
+def test_a_leg_with_its_base_family_predicts_nearly_as_well_as_its_sensors_allow() -> None:
+    gap = everything()
+    assert gap.after.rollout_rmse < 3 * gap.noise_floor.rollout_rmse < 0.1 * gap.before.rollout_rmse
+    assert gap.reduced[1] < 2.5 < 100 < gap.reduced[0]
+
+
+def test_what_one_joint_lacks_makes_no_family() -> None:
+    gap = found(damping=(0, 0.25, 0), friction=(0, 0.4, 0))
+    assert {joint for _, joint in told(gap)} == {"knee"}
+
+
+def test_a_leg_that_lacks_nothing_has_no_gap() -> None:
+    assert not found().found
+
+
+def test_the_answer_speaks_joint_by_joint() -> None:
+    _, items = answer(everything())
+    assert len(items) == len(JOINTS)
+    assert [item.split(":")[0] for item in items] == list(JOINTS)
+    assert all("friction" in item and "inertia" in item for item in items)
+
+
+def test_each_member_of_the_family_sits_at_a_joint(tmp_path: Path) -> None:
+    path = record(tmp_path, 3)
+    setting = prepare(dropo.make_problem(dropo.load_config(path), general=True)).setting
+    family = base_family(setting)
+    assert len(family) == 5 * len(JOINTS)
+    assert {joint_of(setting, p) for p in family} == {0, 1, 2}
+    assert all(len(p.values) == 1 and p.effect.name in VOCABULARY for p in family)
