@@ -4,7 +4,7 @@ from dropo_torch.gap.add import add
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, NamedEffect, Place, Score, Strength
 from dropo_torch.gap.rules import Rules
-from dropo_torch.gap.run import find_gap, locate, name, verify
+from dropo_torch.gap.run import find_gap, locate, name, open_loop, verify
 from dropo_torch.gap.scene import Scene, prepare
 from dropo_torch.gap.search import Naming
 
@@ -22,6 +22,7 @@ __all__ = [
     "find_gap",
     "locate",
     "name",
+    "open_loop",
     "prepare",
     "verify",
 ]

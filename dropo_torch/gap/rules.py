@@ -100,7 +100,7 @@ class Family:
     left: float = 3e-3
     clearer: float = 0.4
     members: int = 2
-    spare: float = 0.1
+    spare: float = 0.03
     iterations: int = 24
     rounds: int = 6
 

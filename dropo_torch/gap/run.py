@@ -19,7 +19,7 @@ from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, prepare, searched
 from dropo_torch.gap.search import Naming, kept, search, start
-from dropo_torch.gap.verify import cut_held, floor_score, score
+from dropo_torch.gap.verify import cut_held, floor_score, open_loop_error, score
 from dropo_torch.problem import Problem
 
 
@@ -66,6 +66,20 @@ def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
     """
     held = cut_held(scene.evidence, scene.held, hypothesis)
     return score(scene.evidence, held, hypothesis), floor_score(scene.evidence, held, hypothesis)
+
+
+def open_loop(scene: Scene, hypothesis: Hypothesis, seconds: float) -> tuple[float, float]:
+    """Return the root mean square error of open-loop positions on held-out data, and that of constant velocity.
+
+    Args:
+        scene: of :func:`prepare`.
+        hypothesis: such as ``scene.begin`` and ``name(scene).final.hypothesis``.
+        seconds: of a prediction.
+
+    Raises:
+        InputError: no held-out trajectory is that long.
+    """
+    return open_loop_error(scene.evidence, scene.held, hypothesis, seconds)
 
 
 def find_gap(

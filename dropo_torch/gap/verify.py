@@ -15,6 +15,7 @@ from dropo_torch.distribution import to_coordinates
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.effects.simulator import effect_simulator
+from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import cut_windows, feature_sizes, longest_episode, spread
 from dropo_torch.gap.refit import Hypothesis
@@ -189,6 +190,25 @@ def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     error = found * evidence.noise
     error = np.where(np.isfinite(error), error, np.inf)
     return np.sqrt((error**2 * known).sum((0, 1, 2)) / np.maximum(known.sum((0, 1, 2)), 1))
+
+
+def open_loop_error(
+    evidence: Evidence, log: Trajectories, hypothesis: Hypothesis, seconds: float
+) -> tuple[float, float]:
+    """Return the root mean square open-loop error of positions over some seconds, and constant velocity's.
+
+    Raises:
+        InputError: no trajectory is that long.
+    """
+    setting = evidence.twin.setting
+    length, longest = max(1, round(seconds / setting.signals.timestep)), longest_episode(log)
+    if length > longest:
+        most = longest * setting.signals.timestep
+        raise InputError(f"open loop: no trajectory of {log.source} lasts {seconds:g} s; at most {most:g} s")
+    windows = spread(cut_windows(log, setting.observation, length, stride=max(1, length // 3)), MOST_ROLLOUTS)
+    held = Held(log, np.zeros(0, int), windows, seconds)
+    own = _rollout(evidence.on(windows), hypothesis)
+    return _rms(own[position_features(setting)]), constant_velocity(evidence, held)
 
 
 def _after(rows: np.ndarray, evidence: Evidence) -> np.ndarray:
