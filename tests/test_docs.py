@@ -353,6 +353,21 @@ def test_emps(capsys: pytest.CaptureFixture) -> None:
     assert "open-loop error" in capsys.readouterr().out
 
 
+@pytest.mark.skipif("DROPO_DATA" not in os.environ, reason="DROPO_DATA names no folder with joint_chirps")
+def test_joint_chirps(tmp_path: Path) -> None:
+    """Published rotors and frictions predict better than none, on the model and the log as the example makes them."""
+    folder = Path(os.environ["DROPO_DATA"]) / "joint_chirps"
+    if not folder.is_dir():
+        pytest.skip("no joint_chirps in DROPO_DATA")
+    from dropo_torch.gap import open_loop, prepare
+
+    example = load_example(ROOT / "examples" / "joint_chirps" / "joint_chirps.py")
+    bare, theirs = (prepare(example.make(folder, "z1", tmp_path, published=p)) for p in (False, True))
+    assert not bare.setting.model.dof_frictionloss.any()
+    (given, still), (published, _) = (open_loop(scene, scene.begin, 0.3) for scene in (bare, theirs))
+    assert published < 0.3 * given < given < still
+
+
 def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
     log = str(ROOT / "sims" / "hopper" / "log.npz")
     load_example(ROOT / "examples" / "authors_hopper.py").main([log, "--transitions", "60"])

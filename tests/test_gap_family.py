@@ -14,7 +14,8 @@ import pytest
 
 import dropo_torch as dropo
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap import Gap, find_gap
+from dropo_torch.errors import InputError
+from dropo_torch.gap import Gap, find_gap, open_loop
 from dropo_torch.gap.family import base_family, joint_of
 from dropo_torch.gap.scene import prepare
 from dropo_torch.report.gap_words import answer
@@ -108,6 +109,15 @@ def test_a_leg_with_its_base_family_predicts_nearly_as_well_as_its_sensors_allow
     gap = everything()
     assert gap.after.rollout_rmse < 3 * gap.noise_floor.rollout_rmse < 0.1 * gap.before.rollout_rmse
     assert gap.reduced[1] < 2.5 < 100 < gap.reduced[0]
+
+
+def test_open_loop_errors_beside_those_of_constant_velocity(tmp_path: Path) -> None:
+    scene = prepare(dropo.make_problem(dropo.load_config(record(tmp_path, 5)), general=True))
+    (near, still), (far, later) = (open_loop(scene, scene.begin, seconds) for seconds in (0.1, 1.0))
+    assert near < 2e-3 < still < later
+    assert far < 0.01 * later
+    with pytest.raises(InputError, match=r"open loop: no trajectory of .* lasts 60 s; at most"):
+        open_loop(scene, scene.begin, 60)
 
 
 def test_what_one_joint_lacks_makes_no_family() -> None:
