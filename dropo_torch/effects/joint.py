@@ -247,7 +247,7 @@ class Armature(AddedToJoint):
     name = "armature"
     sentence = "a rotor's or gear's inertia at {target}, on top of the links'"
     field = "dof_armature"
-    quantity = ("armature", "kg·m²", "kg", 5.0)
+    quantity = ("armature", "kg·m²", "kg", 20.0)
 
     def scale(self, signals: Signals, dof: int) -> float:
         return float(signals.inertia[dof])

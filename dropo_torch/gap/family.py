@@ -7,6 +7,7 @@ one effect after another finds these: each alone explains next to nothing while 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -64,32 +65,46 @@ def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
     family, iterations = base_family(ground.setting), ground.rules.family.iterations
     ground.report(STAGE, 0.0)
     prompt = ground.refit(begin.with_effects([p for p in family if not p.effect.is_filter]), iterations=iterations)
-    late = [p for p in family if p.effect.is_filter]
-    return ground.refit(prompt.hypothesis.with_effects(late), iterations=iterations)
+    late = ground.refit(
+        prompt.hypothesis.with_effects([p for p in family if p.effect.is_filter]), iterations=iterations
+    )
+    return late if late.loss < prompt.loss else prompt
 
 
 def needed(ground: Ground, whole: Refit) -> Refit | None:
     """Return a fitted family without members that are absurd or not needed; ``None`` if that comes to no end."""
-    rules, most = ground.rules.family, math.inf
+    rules, most, tried = ground.rules.family, math.inf, math.inf
     for number in range(rules.rounds):
         ground.report(STAGE, 0.5 + 0.5 * number / rules.rounds)
         idle = [placed for placed, _ in absurd(ground.part, whole, ground.rules.sound)]
-        if not idle:
-            spare = max(rules.spare * whole.cost.excess, ground.rules.alike.sigmas * whole.cost.sigma)
-            most = min(most, whole.cost.excess + spare)
-            idle = not_needed(ground, whole, most)
+        if idle:
+            whole, most = _without(ground, whole, idle), math.inf
+            continue
+        spare = max(rules.spare * whole.cost.excess, ground.rules.alike.sigmas * whole.cost.sigma)
+        most = min(most, whole.cost.excess + spare)
+        idle = not_needed(ground, whole, most)
+        idle = idle[: int(min(len(idle), tried))]
         if not idle:
             return whole
-        keys = {p.key for p in idle}
-        placed = tuple(p for p in whole.hypothesis.placed if p.key not in keys)
-        whole = ground.refit(replace(whole.hypothesis, placed=placed))
-    return None
+        fewer = _without(ground, whole, idle)
+        if fewer.cost.excess <= most:
+            whole, tried = fewer, math.inf
+        else:  # by the derivatives it would not have mattered: half as many, the least needed
+            tried = len(idle) // 2
+    return whole if math.isfinite(most) else None
+
+
+def _without(ground: Ground, whole: Refit, idle: Sequence[Placed]) -> Refit:
+    """Return the family fitted without some members."""
+    keys = {p.key for p in idle}
+    placed = tuple(p for p in whole.hypothesis.placed if p.key not in keys)
+    return ground.refit(replace(whole.hypothesis, placed=placed))
 
 
 def not_needed(ground: Ground, whole: Refit, most: float) -> list[Placed]:
-    """Return members without which a fit stays about as good, by its derivatives.
+    """Return members without which a fit stays about as good, by its derivatives, the least needed first.
 
-    One after another, the least needed first: of two that do the same, one stays.
+    One after another: of two that do the same, one stays.
 
     Args:
         ground: what the search stands on.
@@ -98,6 +113,7 @@ def not_needed(ground: Ground, whole: Refit, most: float) -> list[Placed]:
     """
     first, slope = len(whole.hypothesis.declared), flat_slope(ground, whole)
     normal, off, rows = slope @ slope.T, offsets(ground.setting, whole), np.arange(len(slope))
+    idle: list[Placed] = []
     while len(rows) > first:
         gone = np.setdiff1d(np.arange(len(slope)), rows)
         inverse = np.linalg.pinv(normal[np.ix_(rows, rows)], rcond=1e-12, hermitian=True)
@@ -107,8 +123,9 @@ def not_needed(ground: Ground, whole: Refit, most: float) -> list[Placed]:
         rest = np.delete(rows, weakest)
         if whole.cost.excess + _cost_without(normal, off, rest) > most:
             break
+        idle.append(whole.hypothesis.placed[rows[weakest] - first])
         rows = rest
-    return [p for i, p in enumerate(whole.hypothesis.placed, first) if i not in rows]
+    return idle
 
 
 def _cost_without(normal: np.ndarray, off: np.ndarray, rows: np.ndarray) -> float:

@@ -102,7 +102,7 @@ class Family:
     members: int = 2
     spare: float = 0.03
     iterations: int = 24
-    rounds: int = 6
+    rounds: int = 8
 
 
 @dataclass(frozen=True)
