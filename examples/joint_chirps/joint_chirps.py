@@ -11,6 +11,7 @@ open-loop predictions of the last one, where the chirps are fastest.
 from __future__ import annotations
 
 import argparse
+import ast
 import re
 import sys
 from collections.abc import Sequence
@@ -21,12 +22,15 @@ import numpy as np
 import torch
 
 import dropo_torch as dropo
+from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.gap import Hypothesis, Scene, name, open_loop, prepare
 from dropo_torch.problem import Problem
 
 #: Joints of which position and velocity were measured: all but the arm's gripper.
 JOINTS = {"go2": 12, "z1": 6}
 SECONDS = (0.1, 0.3, 1.0, 3.0)
+#: Beside the log of some robots.
+LIST = "isaaclab_identified_parameters.py"
 DT, STEP = 0.005, 0.0025
 #: What the tensor file holds besides tensors; nothing else of it is run.
 PLAIN = [
@@ -83,6 +87,24 @@ def errors(scene: Scene, hypothesis: Hypothesis) -> list[float]:
     return [1e3 * open_loop(scene, hypothesis, s)[0] for s in SECONDS]
 
 
+def listed(path: Path, scene: Scene) -> Hypothesis:
+    """Return the publishers' list of joint parameters, fitted to the whole log: its offsets act against the motor."""
+    found = {
+        node.targets[0].id: ast.literal_eval(node.value)
+        for node in ast.parse(path.read_text()).body
+        if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
+    }
+    names = {"armature": ("armature", 1), "joint_damping": ("viscous_friction", 1),
+             "joint_friction": ("dynamic_friction", 1), "actuator_bias": ("bias", -1)}  # fmt: skip
+    return scene.begin.with_effects(
+        [
+            Placed(VOCABULARY[effect], target, (sign * value,))
+            for effect, (name, sign) in names.items()
+            for target, value in zip(VOCABULARY[effect].targets(scene.setting), found[name], strict=True)
+        ]
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="holds go2/ and z1/, each with traj_0.pt and an MJCF")
@@ -101,8 +123,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "constant velocity": [1e3 * open_loop(bare, bare.begin, s)[1] for s in SECONDS],
         "model as given": errors(bare, bare.begin),
         "published rotors and frictions": errors(theirs, theirs.begin),
-        "with what was found": errors(bare, naming.final.hypothesis),
     }
+    if (extra := given.folder / given.robot / LIST).is_file():
+        rows["published list, whole log"] = errors(bare, listed(extra, bare))
+    rows["with what was found"] = errors(bare, naming.final.hypothesis)
     for label, values in rows.items():
         print(f"{label:<32}" + "".join(f"{v:>9.1f}" for v in values))
 
