@@ -204,7 +204,8 @@ def by_joint(named: Iterable[NamedEffect], joints: Mapping[str, str]) -> list[st
     for e in sorted(named, key=lambda e: list(_SHORT).index(e.effect)):
         members = e.parameters if e.target == "*" else {str(e.target): next(iter(e.parameters.values()))}
         for target, given in members.items():
-            found[joints[target]].append(f"{_SHORT[e.effect]} {with_interval(given)}")
+            place = joints.get(target, target)  # an actuator that drives no single joint speaks for itself
+            found.setdefault(place, []).append(f"{_SHORT[e.effect]} {with_interval(given)}")
     return [f"{joint}: {', '.join(members)}" for joint, members in found.items() if members]
 
 
