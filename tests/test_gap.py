@@ -284,8 +284,8 @@ FLAT_ARM = System(
 
 
 def test_inertia_that_freezes_the_model_has_no_name() -> None:
-    """A motor with hardly any torque: a rotor of five times the arm's inertia leaves 1.5 % of the gap, and no skill."""
-    case = simulate_truth(FLAT_ARM, [Effect("actuator_gain", "motor", {"gain": 0.05})], 3, **SIZE)
+    """A motor with hardly any torque: a rotor of twenty times the arm's inertia leaves little, and has no skill."""
+    case = simulate_truth(FLAT_ARM, [Effect("actuator_gain", "motor", {"gain": 0.01})], 3, **SIZE)
     gap = search(case, ("armature",))
     assert [e.effect for e in gap.effects] == ["unnamed"]
     assert gap.verdict == "unnamed"

@@ -14,7 +14,7 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.actuator import driven_joint
-from dropo_torch.effects.base import Placed, Setting, object_number
+from dropo_torch.effects.base import Effect, Placed, Setting, object_number
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import significant
@@ -27,9 +27,15 @@ BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuato
 STAGE = "fitting friction, inertia, offset and delay of all joints"
 
 
-def base_family(setting: Setting) -> list[Placed]:
-    """Return the base family at every joint and actuator, each where its search begins."""
+def base_family(setting: Setting, known: Sequence[Effect] | None = None) -> list[Placed]:
+    """Return the base family at every joint and actuator, each where its search begins.
+
+    Args:
+        setting: the model and its columns.
+        known: the vocabulary to which it is confined; all of it by default.
+    """
     effects = [find_effect(name) for name in BASE]
+    effects = [e for e in effects if known is None or e in known]
     return [Placed(e, t, tuple(e.starts(setting, t)[0].tolist())) for e in effects for t in e.targets(setting)]
 
 
@@ -37,7 +43,8 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     """Put the base family in the place of the first effects found, where these leave much and it leaves far less.
 
     At several joints several members must be needed: what sits at one joint, or is of one kind, the search names one by
-    one. What ends at a bound of physics is no member.
+    one. Where the first effects are not one effect at several joints already, it must leave next to nothing of what
+    they leave. What ends at a bound of physics is no member.
 
     Args:
         ground: what the search stands on.
@@ -46,14 +53,15 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     """
     setting, rules = ground.setting, ground.rules.family
     left = max(found.current.cost.excess, 0.0)
-    family = base_family(setting)
-    begin = state.base.hypothesis
-    if setting.signals.contacts.any() or len({p.target for p in family if p.effect.kind == "joint"}) < 2:
+    begin, family = state.base.hypothesis, base_family(setting, ground.effects)
+    joints = {joint_of(setting, p) for p in family} - {None}
+    if setting.signals.contacts.any() or len(joints) < rules.joints:
         return found
     if not significant(found.current.cost, ground.rules) or left < rules.left * state.base.cost.excess:
         return found
     whole = needed(ground, fitted_family(ground, begin))
-    if whole is None or whole.cost.excess > rules.clearer * left:
+    clearer = rules.clearer[1] if one_kind(found.current.hypothesis) else rules.clearer[0]
+    if whole is None or whole.cost.excess > clearer * left:
         return found
     if not spread_out(setting, whole.hypothesis, rules.members):
         return found
@@ -62,7 +70,7 @@ def with_family(ground: Ground, state: State, found: State) -> State:
 
 def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
     """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest."""
-    family, iterations = base_family(ground.setting), ground.rules.family.iterations
+    family, iterations = base_family(ground.setting, ground.effects), ground.rules.family.iterations
     ground.report(STAGE, 0.0)
     prompt = ground.refit(begin.with_effects([p for p in family if not p.effect.is_filter]), iterations=iterations)
     late = ground.refit(
@@ -160,7 +168,7 @@ def family_ties(ground: Ground, whole: Refit) -> tuple[tuple[Placed, ...], ...]:
     """Return for each member those that could stand in its place at its joint, by the derivatives at the fit."""
     setting, hypothesis = ground.setting, whole.hypothesis
     taken = {p.key for p in hypothesis.placed}
-    idle = [p for p in base_family(setting) if p.key not in taken]
+    idle = [p for p in base_family(setting, ground.effects) if p.key not in taken]
     absent = [p.at(np.array([p.effect.quantities(setting, p.target)[0].neutral])) for p in idle]
     beside = refit(ground.part, hypothesis.with_effects(absent), linear=whole.linear, iterations=0)
     slope, first = flat_slope(ground, beside), len(hypothesis.declared)
@@ -187,6 +195,11 @@ def spread_out(setting: Setting, hypothesis: Hypothesis, members: int) -> bool:
     every = {joint_of(setting, p) for p in base_family(setting)} - {None}
     rich = sum(joints.count(j) >= members for j in every)
     return rich >= max(2, 0.5 * len(every))
+
+
+def one_kind(hypothesis: Hypothesis) -> bool:
+    """Return whether the effects are one effect at three or more places."""
+    return len(hypothesis.placed) > 2 and len({p.effect.name for p in hypothesis.placed}) == 1
 
 
 def joint_of(setting: Setting, placed: Placed) -> int | None:

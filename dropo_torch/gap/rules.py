@@ -91,14 +91,17 @@ class Family:
 
     Attributes:
         left: share of the excess that these must leave for it to be tried.
-        clearer: share of what they leave below which it takes their place.
+        clearer: share of what they leave below which it takes their place: of effects at some joints, and of one effect
+            at three or more.
+        joints: the least that the model has.
         members: of it, so many must be needed at half of the joints.
         spare: share of the excess that it leaves by which dropping the members least needed may raise it.
         iterations, rounds: of its fit, and how often those not needed are dropped, at most.
     """
 
     left: float = 3e-3
-    clearer: float = 0.4
+    clearer: tuple[float, float] = (0.05, 0.4)
+    joints: int = 3
     members: int = 2
     spare: float = 0.03
     iterations: int = 24
