@@ -5,7 +5,7 @@ They lie in the folder that DROPO_DATA names, each where docs/check.md says; tho
 
 from __future__ import annotations
 
-import re
+import runpy
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -115,41 +115,14 @@ def _double_pendulums(data: Path, folder: Path) -> Iterator[Named]:
 
 
 def _chirps(data: Path, folder: Path) -> Iterator[Named]:
-    import torch
+    import yaml
 
-    for robot in ("go2", "z1"):
-        log, model = data / "joint_chirps" / robot / "traj_0.pt", data / "joint_chirps" / robot / f"{robot}.xml"
-        if not log.is_file():
-            continue
-        arrays = torch.load(log, weights_only=False)
-        kp, kd = np.asarray(arrays["kp"]), np.asarray(arrays["kd"])
-        count = 12 if robot == "go2" else 6  # the gripper's velocity was not measured
-        _bare(model.read_text(), folder / f"{robot}.xml", kp[:count], kd[:count])
-        q, dq, target = (np.asarray(arrays[k])[:, :count] for k in ("dof_pos", "dof_vel", "des_dof_pos"))
-        ends = np.arange(len(q)) == len(q) - 1
-        np.savez(folder / f"{robot}.npz", observations=np.hstack([q, dq]), actions=target, terminals=ends)
-        source, columns = {"path": f"{robot}.npz", "dt": 0.005}, [f"qpos[:{count}]", f"qvel[:{count}]"]
-        yield f"chirps {robot}", {"model": f"{robot}.xml", "data": source, "observation": columns}, folder
-
-
-def _bare(xml: str, path: Path, kp: np.ndarray, kd: np.ndarray) -> None:
-    """Write a robot's model without meshes, on a fixed base, with servos at its first joints."""
-    import mujoco
-
-    for tag in ("mesh", "material", "texture"):
-        xml = re.sub(rf"<{tag}\b[^>]*/>", "", xml)
-    xml = re.sub(r"<geom[^>]*(mesh=|class=\"visual\")[^>]*/>", "", xml)
-    xml = re.sub(r"<(freejoint|keyframe|actuator|sensor|contact)\b[^>]*>.*?</\1>", "", xml, flags=re.S)
-    xml = re.sub(r"<freejoint[^>]*/>", "", xml)
-    spec = mujoco.MjSpec.from_string(xml)
-    spec.option.timestep = 0.0025
-    model = spec.compile()
-    names = [model.joint(j).name for j in range(model.njnt)][: len(kp)]
-    servos = "".join(
-        f'<position name="{n}_servo" joint="{n}" kp="{p}" kv="{d}"/>' for n, p, d in zip(names, kp, kd, strict=False)
-    )
-    text = spec.to_xml().replace("</mujoco>", f"<actuator>{servos}</actuator></mujoco>")
-    path.write_text(text)
+    example = runpy.run_path(str(ROOT / "examples" / "joint_chirps" / "joint_chirps.py"))
+    for robot in example["JOINTS"]:
+        if (data / "joint_chirps" / robot / "traj_0.pt").is_file():
+            (folder / robot).mkdir(exist_ok=True)
+            config = example["write"](data / "joint_chirps", robot, folder / robot, published=True)
+            yield f"chirps {robot}", yaml.safe_load(config.read_text()), folder / robot
 
 
 def _panda(data: Path, folder: Path) -> Iterator[Named]:

@@ -15,10 +15,11 @@ import pytest
 import dropo_torch as dropo
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, find_gap, open_loop
-from dropo_torch.gap.family import base_family, joint_of
+from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
+from dropo_torch.gap.family import base_family, joint_of, not_needed, shares_of
+from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.scene import prepare
-from dropo_torch.report.gap_words import answer
+from dropo_torch.report.gap_words import answer, by_joint
 
 Triple = tuple[float, ...]
 NONE: Triple = (0.0, 0.0, 0.0)
@@ -143,3 +144,21 @@ def test_each_member_of_the_family_sits_at_a_joint(tmp_path: Path) -> None:
     assert len(family) == 5 * len(JOINTS)
     assert {joint_of(setting, p) for p in family} == {0, 1, 2}
     assert all(len(p.values) == 1 and p.effect.name in VOCABULARY for p in family)
+
+
+def test_what_the_model_has_too_much_of_is_said_at_its_joint() -> None:
+    """A model with published rotors and frictions may have more of them than the robot."""
+    less = NamedEffect(
+        "armature", "*", {"hip": Strength(-0.1, -0.2, -0.05, "kg·m²"), "knee": Strength(0.1, 0, 1, "")}, 0
+    )
+    items = by_joint([less], {"hip": "hip", "knee": "knee"})
+    assert items[0].startswith("hip: rotor inertia too much in the model, −0.1")
+    assert "too much" not in items[1]
+
+
+def test_a_family_of_which_nothing_is_left_weighs_nothing(tmp_path: Path) -> None:
+    """All members at bounds of physics are dropped: then there are neither numbers nor derivatives."""
+    scene = prepare(dropo.make_problem(dropo.load_config(record(tmp_path, 3)), general=True))
+    ground = Ground(scene.evidence, tuple(VOCABULARY.values()))
+    assert not_needed(ground, ground.refit(scene.begin), np.inf) == []
+    assert shares_of(ground, ground.refit(scene.begin)) == ()

@@ -15,6 +15,7 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Effect, Placed, Setting, object_number
+from dropo_torch.gap.accept import extend
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import significant
@@ -52,16 +53,20 @@ def with_family(ground: Ground, state: State, found: State) -> State:
         found: where it stands with them.
     """
     setting, rules = ground.setting, ground.rules.family
-    left = max(found.current.cost.excess, 0.0)
-    begin, family = state.base.hypothesis, base_family(setting, ground.effects)
-    joints = {joint_of(setting, p) for p in family} - {None}
-    if setting.signals.contacts.any() or len(joints) < rules.joints:
+    joints = {joint_of(setting, p) for p in base_family(setting, ground.effects)} - {None}
+    if (
+        setting.signals.contacts.any()
+        or len(joints) < rules.joints
+        or not significant(found.current.cost, ground.rules)
+    ):
         return found
-    if not significant(found.current.cost, ground.rules) or left < rules.left * state.base.cost.excess:
+    kind = one_kind(found.current.hypothesis)
+    best = found if found.done or kind else extend(ground, found)  # what contains the first effects may be the truth
+    left = best.current.cost.excess
+    if not significant(best.current.cost, ground.rules) or left < rules.left * state.base.cost.excess:
         return found
-    whole = needed(ground, fitted_family(ground, begin))
-    clearer = rules.clearer[1] if one_kind(found.current.hypothesis) else rules.clearer[0]
-    if whole is None or whole.cost.excess > clearer * left:
+    whole = needed(ground, fitted_family(ground, state.base.hypothesis))
+    if whole is None or whole.cost.excess > rules.clearer[int(kind)] * left:
         return found
     if not spread_out(setting, whole.hypothesis, rules.members):
         return found
@@ -119,7 +124,7 @@ def not_needed(ground: Ground, whole: Refit, most: float) -> list[Placed]:
         whole: a fit of the family.
         most: excess up to which members are dropped.
     """
-    first, slope = len(whole.hypothesis.declared), flat_slope(ground, whole)
+    first, (slope, _) = len(whole.hypothesis.declared), whole.weighted(ground.part.caps)
     normal, off, rows = slope @ slope.T, offsets(ground.setting, whole), np.arange(len(slope))
     idle: list[Placed] = []
     while len(rows) > first:
@@ -145,11 +150,6 @@ def _cost_without(normal: np.ndarray, off: np.ndarray, rows: np.ndarray) -> floa
     return float(off[gone] @ schur @ off[gone])
 
 
-def flat_slope(ground: Ground, whole: Refit) -> np.ndarray:
-    """Return the derivatives of all residuals by all numbers, as the fit weighed them, ``(q, W·N)``."""
-    return (whole.slope * np.reshape(ground.part.caps * whole.factor, (-1, 1))).reshape(len(whole.slope), -1)
-
-
 def offsets(setting: Setting, whole: Refit) -> np.ndarray:
     """Return by how many scales each number differs from its neutral value ``(q,)``; declared parameters do not."""
     neutral = [p.effect.quantities(setting, p.target)[0].neutral for p in whole.hypothesis.placed]
@@ -159,7 +159,7 @@ def offsets(setting: Setting, whole: Refit) -> np.ndarray:
 
 def shares_of(ground: Ground, whole: Refit) -> tuple[float, ...]:
     """Return the χ² that would come back without each effect, by the derivatives at the fit."""
-    slope, first = flat_slope(ground, whole), len(whole.hypothesis.declared)
+    (slope, _), first = whole.weighted(ground.part.caps), len(whole.hypothesis.declared)
     variance = np.diag(np.linalg.pinv(slope @ slope.T, rcond=1e-12, hermitian=True))
     return tuple((offsets(ground.setting, whole) ** 2 / np.maximum(variance, 1e-300))[first:].tolist())
 
@@ -171,8 +171,7 @@ def family_ties(ground: Ground, whole: Refit) -> tuple[tuple[Placed, ...], ...]:
     idle = [p for p in base_family(setting, ground.effects) if p.key not in taken]
     absent = [p.at(np.array([p.effect.quantities(setting, p.target)[0].neutral])) for p in idle]
     beside = refit(ground.part, hypothesis.with_effects(absent), linear=whole.linear, iterations=0)
-    slope, first = flat_slope(ground, beside), len(hypothesis.declared)
-    residual = (beside.residual * np.reshape(ground.part.caps * whole.factor, (-1, 1))).ravel()
+    (slope, residual), first = beside.weighted(ground.part.caps), len(hypothesis.declared)
     off, own = offsets(setting, beside), np.arange(len(hypothesis.vector))
     margin = max(ground.rules.alike.chi2, ground.rules.alike.share * whole.cost.excess)
 
@@ -211,9 +210,6 @@ def joint_of(setting: Setting, placed: Placed) -> int | None:
 
 def joint_names(setting: Setting) -> dict[str, str]:
     """Return the joint of every place where a member of the family can sit, in the model's order."""
-    family = sorted(base_family(setting), key=lambda p: (joint_of(setting, p) is None, joint_of(setting, p) or 0))
-    names, found = setting.names("jnt"), dict[str, str]()
-    for placed in family:
-        if (joint := joint_of(setting, placed)) is not None:
-            found[str(placed.target)] = names[joint]
-    return found
+    names = setting.names("jnt")
+    places = {str(p.target): joint for p in base_family(setting) if (joint := joint_of(setting, p)) is not None}
+    return {target: names[joint] for target, joint in sorted(places.items(), key=lambda item: item[1])}

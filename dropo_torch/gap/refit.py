@@ -132,6 +132,11 @@ class Refit:
     factor: np.ndarray
     loss: float = 0.0
 
+    def weighted(self, caps: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
+        """Return derivatives ``(q, W·N)`` and residuals ``(W·N,)`` as the fit weighed them, by windows' ``caps``."""
+        factor = np.broadcast_to(caps * self.factor, len(self.residual))[:, None]
+        return (self.slope * factor).reshape(len(self.slope), self.residual.size), (self.residual * factor).ravel()
+
     @property
     def typical(self) -> np.ndarray:
         """χ² of each window, relative to what noise makes on average, ``(W,)``."""
@@ -180,7 +185,7 @@ def refit(
     for _ in range(iterations):
         if not sloped:
             here, sloped = _sloped(evidence, here, limits, residuals), True
-        trial = here.hypothesis.vector + _move(here, limits, evidence.caps * here.factor, damping) * limits.scale
+        trial = here.hypothesis.vector + _move(here, limits, evidence.caps, damping) * limits.scale
         trial = np.clip(trial, limits.low, limits.high)
         if _distance(trial, here.hypothesis, limits) < LEAST_MOVE:
             break
@@ -235,11 +240,11 @@ def _fitted(
     return Refit(hypothesis, cost, residual, slope, linear, scale, factor, loss)
 
 
-def _move(here: Refit, limits: Limits, factor: np.ndarray, damping: float) -> np.ndarray:
-    """The damped step in units of the scales, ``(q,)``, of residuals with factors of their windows, ``(W,)``."""
+def _move(here: Refit, limits: Limits, caps: np.ndarray | float, damping: float) -> np.ndarray:
+    """The damped step in units of the scales, ``(q,)``, of residuals with caps of their windows, ``(W,)``."""
     if not len(here.slope):
         return np.zeros(0)
-    flat, residual = ((x * factor[:, None]).reshape(*x.shape[:-2], -1) for x in (here.slope, here.residual))
+    flat, residual = here.weighted(caps)
     low, high = limits.moves(here.hypothesis.vector)
     step = bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, RIDGE, np.ones(len(flat)))
     return np.clip(step, -LONGEST, LONGEST)
@@ -349,7 +354,7 @@ def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
         if best is not None and there.loss >= best.loss:
             break
         best = there
-        move = _move(best, limits, finer.caps * best.factor, LEAST_DAMPING)
+        move = _move(best, limits, finer.caps, LEAST_DAMPING)
         if np.abs(move).max(initial=0.0) < LEAST_MOVE:
             break
         trial = trial.at(np.clip(trial.vector + move * limits.scale, limits.low, limits.high))

@@ -12,7 +12,7 @@ from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.accept import add, everywhere, extend, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.family import family_ties, one_kind, shares_of, with_family
+from dropo_torch.gap.family import family_ties, shares_of, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -126,9 +126,8 @@ def start(ground: Ground, begin: Hypothesis) -> State:
 def step(ground: Ground, state: State) -> State:
     """Accept one or two more effects, and swap those accepted before for better ones."""
     found = add(ground, state)
-    if state.number == 0 and significant(found.current.cost, ground.rules):
-        few = not found.done and not one_kind(found.current.hypothesis)
-        found = with_family(ground, state, extend(ground, found) if few else found)
+    if state.number == 0:
+        found = with_family(ground, state, found)
     if found.family:
         return replace(renewed(ground, found), number=1)
     if found.done:

@@ -60,11 +60,10 @@ def _reason(placed: Placed, q: Quantity, end: float) -> str:
 
 def beyond(evidence: Evidence, fitted: Refit) -> np.ndarray:
     """Return by how many standard errors the fit would move each number ``(q,)`` if no bound held it."""
-    factor = np.broadcast_to(evidence.caps * fitted.factor, len(fitted.residual))[:, None]
-    slope = (fitted.slope * factor).reshape(len(fitted.slope), fitted.residual.size)
+    slope, residual = fitted.weighted(evidence.caps)
     normal = slope @ slope.T
     inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    move = -inverse @ (slope @ (fitted.residual * factor).ravel())
+    move = -inverse @ (slope @ residual)
     error = np.sqrt(np.maximum(np.diag(inverse), 0.0) * max(1.0, fitted.cost.reduced))
     return np.where(error > 0, move / np.maximum(error, 1e-300), 0.0)
 

@@ -180,7 +180,7 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     if gap.joints:
         items = by_joint(named, gap.joints)
         rest = step if gap.remaining is None else f". They do not explain everything: {left(gap.remaining)}"
-        return f"Your model lacks what {_count(items)} joints have{rest}:", items
+        return f"Friction, inertia, offset or delay of {_count(items)} joints are not those of your model{rest}:", items
     if len(named) == 1:
         rest = step if gap.remaining is None else f", but this does not explain everything: {left(gap.remaining)}"
         return f"{_clause(named[0])}: {numbers(named[0].parameters)}{rest}.", []
@@ -205,7 +205,8 @@ def by_joint(named: Iterable[NamedEffect], joints: Mapping[str, str]) -> list[st
         members = e.parameters if e.target == "*" else {str(e.target): next(iter(e.parameters.values()))}
         for target, given in members.items():
             place = joints.get(target, target)  # an actuator that drives no single joint speaks for itself
-            found.setdefault(place, []).append(f"{_SHORT[e.effect]} {with_interval(given)}")
+            less = "too much in the model, " if e.effect in _SIGNED and given.value < 0 else ""
+            found.setdefault(place, []).append(f"{_SHORT[e.effect]} {less}{with_interval(given)}")
     return [f"{joint}: {', '.join(members)}" for joint, members in found.items() if members]
 
 

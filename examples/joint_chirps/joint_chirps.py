@@ -63,8 +63,8 @@ def bare_model(xml: str, kp: np.ndarray, kd: np.ndarray, *, published: bool) -> 
     return str(spec.to_xml())
 
 
-def make(folder: Path, robot: str, out: Path, *, published: bool) -> Problem:
-    """Write model, log and config of a robot, and return its problem."""
+def write(folder: Path, robot: str, out: Path, *, published: bool) -> Path:
+    """Write model, log and config of a robot, and return the config's path."""
     count, log = JOINTS[robot], read_log(folder / robot / "traj_0.pt")
     kp, kd = (log[k].ravel()[:count] for k in ("kp", "kd"))
     kind = "published" if published else "bare"
@@ -79,7 +79,12 @@ def make(folder: Path, robot: str, out: Path, *, published: bool) -> Problem:
         f"model: {kind}.xml\ndata: {{path: log.npz, dt: {DT}}}\nframe_skip: {round(DT / STEP)}\n"
         f"observation: ['qpos[:{count}]', 'qvel[:{count}]']\n"
     )
-    return dropo.make_problem(dropo.load_config(config), general=True)
+    return config
+
+
+def make(folder: Path, robot: str, out: Path, *, published: bool) -> Problem:
+    """Write model, log and config of a robot, and return its problem."""
+    return dropo.make_problem(dropo.load_config(write(folder, robot, out, published=published)), general=True)
 
 
 def errors(scene: Scene, hypothesis: Hypothesis) -> list[float]:
@@ -88,7 +93,7 @@ def errors(scene: Scene, hypothesis: Hypothesis) -> list[float]:
 
 
 def listed(path: Path, scene: Scene) -> Hypothesis:
-    """Return the publishers' list of joint parameters, fitted to the whole log: its offsets act against the motor."""
+    """Return the publishers' list of joint parameters; offsets have the sign that predicts better."""
     found = {
         node.targets[0].id: ast.literal_eval(node.value)
         for node in ast.parse(path.read_text()).body
@@ -111,6 +116,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--robot", choices=sorted(JOINTS), default="z1")
     parser.add_argument("--out", type=Path, default=Path("out/joint_chirps"))
     given = parser.parse_args(arguments)
+    for needed in ("traj_0.pt", f"{given.robot}.xml"):
+        if not (path := given.folder / given.robot / needed).is_file():
+            parser.error(f"{path}: no such file; expected the folder with go2/ and z1/ of the publishers")
     given.out.mkdir(parents=True, exist_ok=True)
     bare, theirs = (prepare(make(given.folder, given.robot, given.out, published=p)) for p in (False, True))
     print("looking for what the model lacks", file=sys.stderr, flush=True)
@@ -125,7 +133,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         "published rotors and frictions": errors(theirs, theirs.begin),
     }
     if (extra := given.folder / given.robot / LIST).is_file():
-        rows["published list, whole log"] = errors(bare, listed(extra, bare))
+        rows["published list of parameters"] = errors(bare, listed(extra, bare))
     rows["with what was found"] = errors(bare, naming.final.hypothesis)
     for label, values in rows.items():
         print(f"{label:<32}" + "".join(f"{v:>9.1f}" for v in values))
