@@ -12,11 +12,11 @@ LONGEST = 1200
 def one_line(text: object) -> str:
     """Return text as one line that any terminal can show: what is unprintable written out, its middle left out."""
     line = " ".join(str(text).split())
-    if len(line) > LONGEST:
-        line = f"{line[: LONGEST - 400]} ... [{len(line) - LONGEST + 100:,} characters left out] ... {line[-300:]}"
-    if line.isprintable():
+    if not line.isprintable():
+        line = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    if len(line) <= LONGEST:
         return line
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in line)
+    return f"{line[: LONGEST - 400]} ... [{len(line) - LONGEST + 100:,} characters left out] ... {line[-300:]}"
 
 
 class InputError(ValueError):

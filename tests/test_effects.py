@@ -753,6 +753,11 @@ def test_gymnasium_environments_have_effects_around_them() -> None:
         ([], {"x": {"effect": "joint_cogging", "name": "elbow", "bounds": [0, 1]}}, "several numbers; add index"),
         ([], {"x": {"effect": "joint_cogging", "name": "elbow", "index": "amplitude", "bounds": [0, 1]}}, "no poles"),
         ([{"effect": "integration", "timestep": 0.003}], {}, "no whole number"),
+        (
+            [{"effect": "joint_friction", "target": "elbow", "friction": -1e18}],
+            {},
+            "effects: friction of joint_friction at elbow is -1e\\+18 N·m; expected .* or more",
+        ),
     ],
 )
 def test_errors_of_a_config(tmp_path: Path, effects: list, parameters: dict, message: str) -> None:

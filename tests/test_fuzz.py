@@ -59,6 +59,7 @@ def test_a_message_is_one_line_that_a_terminal_can_show() -> None:
     assert line.endswith(r"at\x1b[2J \x00 \ud800 ü; expected [low, high]")
     assert "characters left out" in line
     assert one_line("  plain   words ") == "plain words"
+    assert len(one_line("\x00" * 100_000)) < 1.1 * LONGEST  # written out, it is four times as long
 
 
 YAML_REFUSED = {
@@ -286,6 +287,24 @@ def test_damaged_matlab_files_do_not_take_the_process_along(tmp_path: Path) -> N
             assert np.isfinite(log.observations).all()
     path.write_bytes(whole)
     assert len(read_trajectories(path, observations="state", actions="u", dt=0.1, terminals=[])) == 9
+
+
+def test_a_model_with_names_that_are_no_text_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "model.xml"
+    path.write_bytes(b'<mujoco><worldbody><body name="a\xff"><joint/><geom size=".1"/></body></worldbody></mujoco>')
+    with pytest.raises(InputError, match=r"^model: .*: a name in it is no text in UTF-8; save the file in UTF-8"):
+        load_model(path)
+
+
+@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="no /proc")
+def test_memory_is_limited_to_more_than_is_taken() -> None:
+    code = (
+        "import numpy as np; from dropo_torch.support.child import limit_memory; limit_memory(2**28); "
+        "np.ones(2**20); print('little');\n"
+        "try: np.ones(2**27)\nexcept MemoryError: print('much')"
+    )
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.split() == ["little", "much"]
 
 
 def test_damaged_binary_models_are_refused(tmp_path: Path) -> None:

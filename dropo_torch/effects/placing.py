@@ -166,15 +166,19 @@ def lowest(effects: EffectSet, space: ParameterSpace) -> np.ndarray:
     """Return what each parameter cannot fall below ``(d,)``, by the effects' physics; minus infinity for fields.
 
     Raises:
-        InputError: bounds that reach below.
+        InputError: bounds that reach below, or a fixed number that is.
     """
     s = effects.setting
     settings = [plain_setting(s.model, s.observation, s.frame_skip, size) for size in (1.0, 3.0)]
     least = np.full(len(space), -np.inf)
     for entry in effects.entries:
         pairs = zip(*(entry.effect.quantities(x, entry.target) for x in settings), strict=True)
-        for (one, other), column in zip(pairs, entry.columns, strict=True):
+        for (one, other), value, column in zip(pairs, entry.fixed, entry.columns, strict=True):
             if column < 0:
+                if one.low == other.low and value < one.low - 1e-9 * abs(one.low):
+                    raise InputError(
+                        f"effects: {one.name} of {entry.place} is {value:g} {one.unit}; expected {one.low:g} or more"
+                    )
                 continue
             parameter = space.parameters[column]
             if one.low == other.low:  # a bound that no log shifts is one of physics

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.errors import InputError
-from dropo_torch.support.child import read_in_child
+from dropo_torch.support.child import limit_memory, read_in_child
 
 
 @contextlib.contextmanager
@@ -29,6 +29,8 @@ def quiet_mujoco() -> Iterator[None]:
         before.set()
 
 
+#: Bytes that a binary model and its simulation may take besides some times its file: a damaged one may ask for all.
+ROOM = 2**30
 #: Fields of bodies that MuJoCo takes for granted where it has compiled the body as simple.
 CENTRES = ("body_ipos", "body_iquat")
 
@@ -72,6 +74,7 @@ def try_binary(path: str) -> bytes:
     Raises:
         ValueError: no model, or one whose file has another size than it needs.
     """
+    limit_memory(ROOM + 8 * Path(path).stat().st_size)
     with quiet_mujoco():
         model = mujoco.MjModel.from_binary_path(path)
         if mujoco.mj_sizeModel(model) != Path(path).stat().st_size:
@@ -81,7 +84,7 @@ def try_binary(path: str) -> bytes:
 
 
 def checked(model: mujoco.MjModel, where: str) -> mujoco.MjModel:
-    """Return a model all of whose numbers are finite, and whose step is positive.
+    """Return a model all of whose numbers are finite, whose names are text, and whose step is positive.
 
     Raises:
         InputError: another one, naming the field.
@@ -91,6 +94,10 @@ def checked(model: mujoco.MjModel, where: str) -> mujoco.MjModel:
             values = getattr(part, name)
             if isinstance(values, np.ndarray | float) and not np.isfinite(values).all():
                 raise InputError(f"{where}: {name} has a value that is not finite")
+    try:
+        model.names.decode()
+    except UnicodeDecodeError:
+        raise InputError(f"{where}: a name in it is no text in UTF-8; save the file in UTF-8") from None
     if model.opt.timestep <= 0:
         raise InputError(f"{where}: timestep is {model.opt.timestep:g}; expected a positive number of seconds")
     return model
