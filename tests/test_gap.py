@@ -23,12 +23,13 @@ from arm import Folder
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
 from benchmarks.hidden.systems import CART_POLE, FURUTA, SERVO_ARM, TORQUE_ARM, Command, Scale, System, coarse, mass
-from benchmarks.hidden.truths import Before, Case, Effect, simulate_truth
+from benchmarks.hidden.truths import Before, Case, Effect, make_case, make_recording, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
+from dropo_torch.gap.accept import imitates
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
@@ -152,6 +153,18 @@ def test_many_numbers_account_for_nothing_while_much_remains(
     assert accounts(named, wrong, Rules()) == enough
 
 
+def test_many_numbers_that_leave_more_than_the_step_imitate() -> None:
+    """A spring from far away is imitated by a force and a ripple, up to four times the noise."""
+    spring, ripple = placed("joint_stiffness", 0.0, 0.0), placed("joint_cogging", 0.0, 6.0, 0.0)
+    case, evidence = sharp()
+    right = refit(evidence, true(case).with_effects((spring, ripple)))
+    assert right.cost.reduced > 3
+    assert not imitates(Ground(evidence, ()), right)
+    lacking = refit(evidence, Hypothesis(tuple(case.declared.values()), (spring, ripple)))
+    assert imitates(Ground(evidence, ()), lacking)
+    assert not imitates(Ground(evidence, ()), refit(evidence, Hypothesis(tuple(case.declared.values()), (spring,))))
+
+
 def test_coupling_of_joints_cannot_push_them_apart() -> None:
     setting = scene_of().setting
     effect = find_effect("joint_coupling")
@@ -169,12 +182,30 @@ def test_friction_that_is_larger_at_rest_is_found_from_plain_friction() -> None:
     assert gap.effects[0].parameters["coulomb"].value == pytest.approx(0.2, rel=0.05)
 
 
+def test_friction_that_is_larger_at_rest_is_told_from_what_the_step_leaves() -> None:
+    truth = Effect("joint_stribeck", "shoulder", {"coulomb": 0.3, "static": 0.4, "velocity": 0.3})
+    case = simulate_truth(TORQUE_ARM, [truth], 3, noise=0.25, **SIZE)
+    gap = search(case, ("joint_friction", "joint_stribeck"))
+    assert [e.effect for e in gap.effects] == ["joint_stribeck"]
+
+
+def test_what_is_absurd_gives_way_to_what_contains_it() -> None:
+    """A heavy tool shifts the centre of mass beyond the hand itself: it is a tool, not a shift."""
+    tool = Effect("payload", "hand", {"mass": 0.8, "x": 0.15, "y": 0.0, "z": -0.016})
+    only_the_best = dataclasses.replace(Rules(), tried=dataclasses.replace(Rules().tried, refits=1))
+    case = simulate_truth(SERVO_ARM, [tool], 3, **SIZE)
+    gap = search(case, ("center_of_mass", "payload"), rules=only_the_best)
+    assert next(r.effect for r in gap.ranking) == "payload"
+    assert [(e.effect, e.target) for e in gap.effects] == [("payload", "hand")]
+    assert gap.effects[0].parameters["mass"].value == pytest.approx(0.8, rel=0.02)
+
+
 def test_a_payload_begins_where_it_shifts_the_centre_of_mass_as_far() -> None:
     payload, setting, shift = find_effect("payload"), scene_of().setting, np.array([0.004, 0.0, -0.003])
     moved = Placed(find_effect("center_of_mass"), "pole", tuple(shift))
     body = setting.model.body("pole").id
     starts = payload.extends(setting, moved)
-    assert len(starts) == 3
+    assert len(starts) == 5
     for values in starts:
         model = copy.copy(setting.model)
         payload.apply(model, "pole", values)
@@ -540,10 +571,29 @@ def test_windows_in_which_a_force_jumps_are_no_noise() -> None:
     slope, truth = rng.standard_normal((160, 14, 5)), np.tile([1.0, 3.0], 7)
     residual = truth * rng.standard_normal((160, 14)) + np.einsum("wnq,wq->wn", slope, rng.standard_normal((160, 5)))
     residual[:60] += 30 * rng.standard_normal((60, 14))
-    relative, unsure = _relative_noise(residual, slope, 2)
+    relative, unsure = _relative_noise(residual, slope, np.ones(residual.shape, dtype=bool), 2)
     assert relative == pytest.approx([1, 3], rel=0.1)
     assert (np.abs(relative / [1, 3] - 1) < 3 * unsure).all()
     assert unsure == pytest.approx(0.03, abs=0.015)
+
+
+def test_noise_beside_a_late_sensor_is_that_of_the_log() -> None:
+    """What it shows first is from before a window: that this is not compared is no sign of little noise."""
+    late = Effect("sensor_delay", "wrist.position", {"delay": 0.003})
+    recording = make_recording(SERVO_ARM, [late], 3, episodes=8, transitions=150)
+    fine = dataclasses.replace(recording, noise=np.repeat([2e-5, 5e-3], 3))
+    case = make_case(SERVO_ARM, [late], fine, name="late", kind="single")
+    scene = prepare(load(case))
+    assert free_forces(scene.twin, scene.short, true(case).variant).noise == pytest.approx(case.noise, rel=0.1)
+
+
+def test_what_the_step_leaves_is_no_noise() -> None:
+    """A lag shorter than ten steps is resolved so badly that it shows among the noise, unless a finer step tells."""
+    lag = Effect("actuator_lag", "wrist_servo", {"time_constant": 0.0048})
+    case = simulate_truth(SERVO_ARM, [lag], 3, noise=0.5, **SIZE)
+    gap = search(case, ("actuator_lag", "actuator_gain"))
+    assert [(e.effect, e.target) for e in gap.effects] == [("actuator_lag", "wrist_servo")]
+    assert gap.noise == pytest.approx(case.noise, rel=0.1)
 
 
 def test_capped_windows_of_noise_are_noise() -> None:
@@ -651,7 +701,8 @@ def test_noise_stays_beside_a_hypothesis_under_which_nothing_can_be_simulated() 
     diverging = scene.begin.with_effects([Placed(find_effect("joint_stiffness"), "hinge", (-1e7, 0.0))])
     with pytest.raises(Diverges, match="diverges"):
         free_forces(scene.twin, scene.short, diverging.variant)
-    assert noise_beside(ground, dataclasses.replace(fitted, hypothesis=diverging)) == pytest.approx(scene.noise)
+    beside = noise_beside(scene.evidence, scene.short, dataclasses.replace(fitted, hypothesis=diverging))
+    assert beside == pytest.approx(scene.noise)
 
 
 def test_what_promises_no_number_comes_last() -> None:

@@ -108,7 +108,7 @@ class Payload(BodyEffect):
         own, center = float(setting.model.body_mass[body]), setting.model.body_ipos[body]
         quantities = self.quantities(setting, simpler.target)[1:]
         low, high = (np.array([getattr(q, end) for q in quantities]) for end in ("low", "high"))
-        masses = own * np.array([0.03, 0.1, 0.3])
+        masses = own * np.array([0.03, 0.1, 0.3, 1.0, 3.0])
         places = [center + np.array(simpler.values) * (own + mass) / mass for mass in masses]
         return [np.concatenate([[m], np.clip(p, low, high)]) for m, p in zip(masses, places, strict=True)]
 

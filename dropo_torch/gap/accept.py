@@ -7,8 +7,8 @@ from dataclasses import replace
 
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import FEWER, Ground, State
-from dropo_torch.gap.refit import Refit, refit
-from dropo_torch.gap.rules import significant, simplest
+from dropo_torch.gap.refit import Refit, refit, resolved
+from dropo_torch.gap.rules import beyond_free, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -36,6 +36,14 @@ def nonsense(ground: Ground, fitted: Refit) -> list[str]:
     return [reason for _, reason in absurd(ground.part, fitted, ground.rules.sound)]
 
 
+def imitates(ground: Ground, fitted: Refit) -> bool:
+    """Return whether effects with more numbers than are free leave more than noise, also with a finer step."""
+    wrong = ground.rules.sound.model_error
+    if not beyond_free(fitted.hypothesis, ground.rules) or fitted.cost.reduced <= wrong:
+        return False
+    return resolved(ground.part, fitted).fit.cost.reduced > wrong
+
+
 def is_done(ground: Ground, state: State) -> bool:
     """Return whether what is left is noise, or too small a part of the gap to tell anything."""
     base, current = state.base, state.current
@@ -51,7 +59,11 @@ def add(ground: Ground, state: State) -> State:
     alive = [c for c in ranked if not c.dead]
     singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.tried.refits]], "refitting")
     state = replace(state, refused=next((why for r in singles[:1] for why in nonsense(ground, r)), state.refused))
-    singles = sound(ground, singles)
+    promising, singles = singles, sound(ground, singles)
+    if promising and not singles:  # what contains them may explain as much within the bounds of physics
+        larger = [g for r in promising for g in extensions(ground, r.hypothesis.placed[-1])]
+        singles, state = ground.refits(state, current, larger, "refining")
+        singles = sound(ground, singles)
     if not singles:
         return replace(state, done=True)
     best = simplest(singles, rules)
@@ -97,19 +109,36 @@ def swap(ground: Ground, state: State) -> State:
 
 def extend(ground: Ground, state: State) -> State:
     """Put effects that contain an accepted one in its place, where that explains more."""
-    rules = ground.rules
     for index, own in enumerate(state.current.hypothesis.placed):
-        groups = [(Placed(e, own.target).at(v),) for e in ground.effects for v in e.extends(ground.setting, own)]
-        if not groups:
+        if not (groups := extensions(ground, own)):
             continue
         origin = state.current.hypothesis.without(index)
         found, state = ground.refits(state, ground.refit(origin), groups, "refining", origin)
         for better in found[:1]:
-            gained = state.current.cost.excess - better.cost.excess
-            least = min(rules.least * state.base.cost.excess, rules.most * state.current.cost.excess)
-            if gained >= least and beats(ground, better, state.current):
+            if refines(ground, state, better):
                 state = replace(state, current=better)
     return state
+
+
+def extensions(ground: Ground, own: Placed) -> list[tuple[Placed, ...]]:
+    """Return the effects that contain one, with the numbers with which they do."""
+    return [(Placed(e, own.target).at(v),) for e in ground.effects for v in e.extends(ground.setting, own)]
+
+
+def refines(ground: Ground, state: State, better: Refit) -> bool:
+    """Return whether an effect that contains an accepted one explains enough more to stand in its place.
+
+    Where the model's own step is part of what both leave, a finer one tells.
+    """
+    rules, own, here = ground.rules, state.current, better
+    gained = own.cost.excess - here.cost.excess
+    if gained < (1 - rules.most) * own.cost.excess:
+        return False
+    if gained < min(rules.least * state.base.cost.excess, rules.most * own.cost.excess):
+        own, here = (resolved(ground.part, r).fit for r in (own, here))
+        if own.cost.excess - here.cost.excess < rules.most * own.cost.excess:
+            return False
+    return beats(ground, here, own)
 
 
 def everywhere(ground: Ground, state: State) -> State:

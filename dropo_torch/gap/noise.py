@@ -77,14 +77,15 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     for dof in range(nv):
         pushes[1 + m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
     moved = np.eye(len(pushes), m, -1)[:, None]
-    found, _ = evidence.residuals([variant] * len(pushes), moved, pushes)
+    found, told = evidence.residuals([variant] * len(pushes), moved, pushes)
     usable = np.isfinite(found).all((0, 2))
     if not usable.any():
         raise Diverges(_lost(twin, windows))
     if (known := usable & twin.knows(variant, windows)).any():
         usable = known
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
-    relative, unsure = _relative_noise(residual, slope, m) if noise is None else (np.ones(m), np.zeros(m))
+    counted = np.asarray(told[:, usable].all(0))
+    relative, unsure = _relative_noise(residual, slope, counted, m) if noise is None else (np.ones(m), np.zeros(m))
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)
     forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))
@@ -102,9 +103,12 @@ def _lost(twin: Twin, windows: Windows) -> str:
     )
 
 
-def _relative_noise(residual: np.ndarray, slope: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
+def _relative_noise(
+    residual: np.ndarray, slope: np.ndarray, counted: np.ndarray, m: int
+) -> tuple[np.ndarray, np.ndarray]:
     """The noise of each feature relative to the guess ``(m,)``, and the relative standard errors, ``(m,)``.
 
+    Only residuals that are ``counted`` tell it, ``(W, N)``: what a late sensor shows first is from before the window.
     By reweighted least squares, each feature weighted by the noise before. Windows in which a force changes too fast,
     at contacts and where dry friction reverses, stand out: the noise begins with that of the quietest windows, and
     takes in whatever is then no more than chance.
@@ -116,7 +120,7 @@ def _relative_noise(residual: np.ndarray, slope: np.ndarray, m: int) -> tuple[np
         weighted = residual * factor
         left = weighted - np.einsum("wnq,wq->wn", basis, np.einsum("wnq,wn->wq", basis, weighted))
         chi2 = (left**2).reshape(-1, repeats, m).sum(1)
-        degrees = np.maximum((1 - (basis**2).sum(-1)).reshape(-1, repeats, m).sum(1), 1e-6)
+        degrees = np.maximum((counted * (1 - (basis**2).sum(-1))).reshape(-1, repeats, m).sum(1), 1e-6)
         if turn < QUIET_ROUNDS:
             typical = np.maximum(degrees.mean(0), LEAST_DEGREES)
             ratio = np.quantile(chi2 / degrees, QUIET, axis=0) / (stats.chi2.ppf(QUIET, typical) / typical)

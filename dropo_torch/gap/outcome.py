@@ -15,6 +15,7 @@ from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
+from dropo_torch.gap.renew import moved, noise_beside
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Remaining, Score, Strength
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
@@ -22,10 +23,11 @@ from dropo_torch.gap.search import Naming
 from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
+from dropo_torch.gap.twin import Windows
 from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, score
 
-#: Last fits, at most, each with the weights that the one before suggests.
-ROUNDS = 4
+#: Fits after the last one, at most, each with the weights that the one before suggests.
+ROUNDS = 3
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -42,7 +44,8 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
     last, rest = None, naming.final
     if naming.named:
-        last, rest = _last_fit(evidence, naming.final.hypothesis, rules.sound.model_error)
+        last, rest = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
+        evidence, noise = replace(evidence, noise=last.evidence.noise), last.evidence.noise
     final = naming.final if last is None else last.fit
     held = cut_held(evidence, scene.held, final.hypothesis)
     given, constant = score(evidence, held, base), constant_velocity(evidence, held)
@@ -90,25 +93,32 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     )
 
 
-def _last_fit(evidence: Evidence, hypothesis: Hypothesis, model_error: float) -> tuple[Resolved, Refit]:
+def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> tuple[Resolved, Refit]:
     """Fit the named effects on all windows, as they are weighted and stepped in the end; and beside it as noise weighs.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
-    error of a real model grows with the lead, and differs between columns.
+    error of a real model grows with the lead, and differs between columns. Where a finer step is better, the noise is
+    told beside it once more, for what the model's own step leaves passes for noise.
     """
-    rest = None
+    own = refit(evidence, hypothesis, iterations=6)
+    final = resolved(evidence, own)
+    if final.error.any():
+        noise = noise_beside(final.evidence, short, final.fit)
+        if moved(noise, evidence.noise, evidence.rules):
+            evidence = replace(evidence, noise=noise)
+            own = refit(evidence, own.hypothesis, iterations=2)
+            final = resolved(evidence, own)
+    rest = final.fit
     for _ in range(ROUNDS):
-        own = refit(evidence, hypothesis, iterations=6)
-        final = resolved(evidence, own)
-        rest = rest or final.fit
-        if final.fit.cost.reduced < model_error:
+        if final.fit.cost.reduced < evidence.rules.sound.model_error:
             break
         size = np.sqrt(np.median(final.fit.residual**2, axis=0) / MEDIAN) * evidence.model_error
         lead = size.reshape(-1, evidence.chart.size)
         smooth = np.maximum(np.maximum.accumulate(lead, axis=0), 1.0)
         smooth[0] = 1.0
-        evidence, hypothesis = replace(evidence, model_error=smooth.ravel()), own.hypothesis
-    assert rest is not None
+        evidence = replace(evidence, model_error=smooth.ravel())
+        own = refit(evidence, own.hypothesis, iterations=6)
+        final = resolved(evidence, own)
     return final, rest
 
 

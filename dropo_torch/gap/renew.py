@@ -11,25 +11,34 @@ from dataclasses import replace
 
 import numpy as np
 
-from dropo_torch.gap.evidence import caps_of
+from dropo_torch.gap.evidence import Evidence, caps_of
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.rules import Rules
+from dropo_torch.gap.twin import Windows
 
 #: Times that the variance components are weighted anew.
 COMPONENTS = 8
+#: Times that noise and windows are found beside the hypothesis that is fitted with them, at most.
+RENEWALS = 3
 
 
 def renewed(ground: Ground, state: State) -> State:
-    """Return a state with the noise beside its hypothesis, and on the windows whose commands that knows."""
-    since, noise = known_since(ground, state.current.hypothesis, state.since), noise_beside(ground, state.current)
-    if np.array_equal(since, state.since) and not moved(noise, state.noise, ground.rules):
-        return state
-    here, base = with_base(ground.on(noise, since), state.base.hypothesis)
-    current = here.refit(state.current.hypothesis, iterations=6) if state.current.hypothesis.placed else base
-    return replace(state, noise=noise, since=since, caps=here.caps, base=base, current=current)
+    """Return a state with the noise beside its hypothesis, and on the windows whose commands that knows.
+
+    Windows that it does not know show more than noise, so the noise is told anew once they are gone.
+    """
+    for _ in range(RENEWALS):
+        since = known_since(ground, state.current.hypothesis, state.since)
+        noise = noise_beside(ground.evidence, ground.short, state.current)
+        if np.array_equal(since, state.since) and not moved(noise, state.noise, ground.rules):
+            break
+        here, base = with_base(ground.on(noise, since), state.base.hypothesis)
+        current = here.refit(state.current.hypothesis, iterations=6) if state.current.hypothesis.placed else base
+        ground, state = here, replace(state, noise=noise, since=since, caps=here.caps, base=base, current=current)
+    return state
 
 
 def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:
@@ -56,21 +65,26 @@ def known_since(ground: Ground, hypothesis: Hypothesis, since: np.ndarray) -> np
     return later if len(since_known(windows, later)) >= ground.rules.weighed.known * len(windows) else since
 
 
-def noise_beside(ground: Ground, fitted: Refit) -> np.ndarray:
+def noise_beside(evidence: Evidence, short: Windows | None, fitted: Refit) -> np.ndarray:
     """Return the noise of each feature ``(m,)`` as it is beside a fitted hypothesis.
 
     Free forces in short windows tell it whether or not the hypothesis is right; what that leaves in the long windows
     tells it more precisely where it is, and it is never larger. A larger one is believed only as far as the short
     windows leave it open, so that what is missing does not pass for noise.
+
+    Args:
+        evidence: of the fit, with the noise under which it was made.
+        short: the short windows; ``None`` where the noise is given and can only be lower.
+        fitted: the fit.
     """
-    noise, left = ground.evidence.noise, noise_left(fitted, ground.evidence.noise, ground.rules)
-    if ground.short is None:
+    noise, left = evidence.noise, noise_left(fitted, evidence.noise, evidence.rules)
+    if short is None:
         return np.minimum(noise, left)
     try:
-        free = free_forces(ground.evidence.twin, ground.short, fitted.hypothesis.variant)
+        free = free_forces(evidence.twin, short, fitted.hypothesis.variant)
     except Diverges:  # beside a hypothesis under which nothing can be simulated, there is nothing to see
         return noise
-    return np.where(left < free.noise * (1 + ground.rules.weighed.agree * free.unsure), left, free.noise)
+    return np.where(left < free.noise * (1 + evidence.rules.weighed.agree * free.unsure), left, free.noise)
 
 
 def noise_left(fitted: Refit, noise: np.ndarray, rules: Rules) -> np.ndarray:

@@ -153,5 +153,4 @@ def _ruled(scene: Scene, rules: Rules | None) -> Scene:
 
 def _ground(scene: Scene, effects: Sequence[Effect] | None) -> Ground:
     """What a search stands on, by default with the whole vocabulary."""
-    short = None if scene.problem.objective.noise is not None else scene.short
-    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), short=short)
+    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), short=scene.noisy)

@@ -74,6 +74,11 @@ class Scene:
         """Short windows of the training part, in which forces may be left free."""
         return short_windows(self.setting, self.train, self.since)
 
+    @property
+    def noisy(self) -> Windows | None:
+        """The short windows by which the noise is estimated; ``None`` where it is given."""
+        return None if self.problem.objective.noise is not None else self.short
+
 
 def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     """Cut the log, estimate its noise, and choose windows.

@@ -10,7 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
-from dropo_torch.gap.accept import add, everywhere, extend, is_done, nonsense, prune, swap
+from dropo_torch.gap.accept import add, everywhere, extend, imitates, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.family import family_ties, shares_of, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
@@ -24,6 +24,8 @@ from dropo_torch.support.checkpoint import Checkpoint
 
 #: Why what a log is too short for has no name.
 UNSURE = "what explains most of it may do so by chance, for this log has too few stretches that show it"
+#: Why what needs many numbers, and is still not right, has none.
+IMITATES = "what explains most of it has many numbers and is still not right: they may only imitate it"
 #: Why a base family that leaves too much has no names.
 LEAVES = "friction, inertia, offset and delay at all joints leave too much of it"
 
@@ -115,7 +117,7 @@ def start(ground: Ground, begin: Hypothesis) -> State:
     ground.report("fitting the declared parameters", 0.0)
     since = np.zeros(len(ground.evidence.windows.commands), dtype=int)
     base = ground.refit(begin)
-    noise = noise_beside(ground, base)
+    noise = noise_beside(ground.evidence, ground.short, base)
     ground, base = with_base(ground.on(noise, since), base.hypothesis)
     ranked, focus = ground.screened(base), ground.focus(base)
     degrees = focus.evidence.degrees(focus.fitted.linear)
@@ -163,6 +165,8 @@ def conclude(ground: Ground, state: State) -> Naming:
     if not placed or not (partial or accounts(state.current, base, rules)):
         unsure = found.hypothesis.placed and accounts(found, base, rules)
         return replace(unnamed, refused=UNSURE if unsure else state.refused)
+    if not partial and imitates(ground, state.current):
+        return replace(unnamed, refused=IMITATES)
     tied, shares = [], []
     for index in range(len(placed)):
         rivals, share, state = ties(ground, state, index)
