@@ -368,6 +368,24 @@ def test_joint_chirps(tmp_path: Path) -> None:
     assert published < 0.3 * given < given < still
 
 
+@pytest.mark.skipif("DROPO_DATA" not in os.environ, reason="DROPO_DATA names no folder with double_pendulum")
+def test_pendulums(tmp_path: Path) -> None:
+    """The publishers' best model predicts better than a bare one, and best with the torques that it was made for."""
+    folder = Path(os.environ["DROPO_DATA"]) / "double_pendulum"
+    if not folder.is_dir():
+        pytest.skip("no double_pendulum in DROPO_DATA")
+    example = load_example(ROOT / "examples" / "pendulums" / "pendulums.py")
+    theirs = example.published(folder, tmp_path)
+    given, commanded, measured = (
+        example.errors(scene, scene.begin)[1]
+        for scene in (
+            example.scene_of("double", folder),
+            *(theirs[f"identified_model_h1.0, {torque} torque"] for torque in ("commanded", "measured")),
+        )
+    )
+    assert measured < 0.5 * commanded < 0.25 * given
+
+
 def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
     log = str(ROOT / "sims" / "hopper" / "log.npz")
     load_example(ROOT / "examples" / "authors_hopper.py").main([log, "--transitions", "60"])

@@ -16,9 +16,13 @@ import dropo_torch as dropo
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
+from dropo_torch.gap.evidence import Cost, Linearisation
 from dropo_torch.gap.family import base_family, joint_of, not_needed, shares_of
 from dropo_torch.gap.ground import Ground
+from dropo_torch.gap.refit import Hypothesis, Refit
+from dropo_torch.gap.rules import Rules, family_accounts
 from dropo_torch.gap.scene import prepare
+from dropo_torch.gap.search import Naming, resort, start
 from dropo_torch.report.gap_words import answer, by_joint
 
 Triple = tuple[float, ...]
@@ -124,6 +128,40 @@ def test_open_loop_errors_beside_those_of_constant_velocity(tmp_path: Path) -> N
 def test_what_one_joint_lacks_makes_no_family() -> None:
     gap = found(damping=(0, 0.25, 0), friction=(0, 0.4, 0))
     assert {joint for _, joint in told(gap)} == {"knee"}
+
+
+@pytest.mark.parametrize(
+    ("truth", "is_family"),
+    [({"damping": DAMPING, "friction": FRICTION, "rotor": ROTOR}, True), ({"friction": (0, 0.4, 0)}, False)],
+)
+def test_the_family_is_the_last_resort(truth: dict[str, Triple], is_family: bool, tmp_path: Path) -> None:
+    """Where no search has names, what all joints lack has them, and what one joint lacks has none."""
+    scene = prepare(dropo.make_problem(dropo.load_config(record(tmp_path, 11, **truth)), general=True))
+    ground = Ground(scene.evidence, tuple(VOCABULARY.values()), short=scene.noisy)
+    begun = start(ground, scene.begin)
+    nameless = Naming(ground.at(begun).evidence, begun.base, begun.first, begun.base, gap=True, refused="no")
+    naming = resort(ground, nameless)
+    assert naming.named == naming.family == is_family
+    if is_family:
+        assert naming.refused == ""
+        assert {p.effect.name for p in naming.final.hypothesis.placed} >= {"armature", "joint_friction"}
+    else:
+        assert naming is nameless
+
+
+@pytest.mark.parametrize(
+    ("left", "reduced", "enough"), [(0.04, 10.0, True), (0.06, 10.0, False), (0.01, 100.0, True), (0.03, 100.0, False)]
+)
+def test_a_family_leaves_little_that_is_wrong(left: float, reduced: float, enough: bool) -> None:
+    def fitted(excess: float, degrees: float) -> Refit:
+        empty = np.zeros((1, 0))
+        linear = Linearisation(np.zeros((1, 0, 0)), empty, empty, 0.0)
+        cost = Cost(np.array([excess + degrees]), np.zeros(1), degrees)
+        return Refit(Hypothesis((), ()), cost, empty, np.zeros((0, 1, 0)), linear, np.zeros(0), np.ones(1))
+
+    degrees = 1e3
+    whole = fitted((reduced - 1) * degrees, degrees)
+    assert family_accounts(whole, fitted(whole.cost.excess / left, degrees), Rules()) == enough
 
 
 def test_a_leg_that_lacks_nothing_has_no_gap() -> None:

@@ -52,25 +52,32 @@ def with_family(ground: Ground, state: State, found: State) -> State:
         state: where it stood before its first effects.
         found: where it stands with them.
     """
-    setting, rules = ground.setting, ground.rules.family
-    joints = {joint_of(setting, p) for p in base_family(setting, ground.effects)} - {None}
-    if (
-        setting.signals.contacts.any()
-        or len(joints) < rules.joints
-        or not significant(found.current.cost, ground.rules)
-    ):
+    rules = ground.rules.family
+    if not has_family(ground) or not significant(found.current.cost, ground.rules):
         return found
     kind = one_kind(found.current.hypothesis)
     best = found if found.done or kind else extend(ground, found)  # what contains the first effects may be the truth
     left = best.current.cost.excess
     if not significant(best.current.cost, ground.rules) or left < rules.left * state.base.cost.excess:
         return found
-    whole = needed(ground, fitted_family(ground, state.base.hypothesis))
+    whole = whole_family(ground, state.base.hypothesis)
     if whole is None or whole.cost.excess > rules.clearer[int(kind)] * left:
         return found
-    if not spread_out(setting, whole.hypothesis, rules.members):
-        return found
     return replace(found, current=whole, family=True, done=True, refused="")
+
+
+def has_family(ground: Ground) -> bool:
+    """Return whether the model has joints enough for a base family, and touches nothing."""
+    joints = {joint_of(ground.setting, p) for p in base_family(ground.setting, ground.effects)} - {None}
+    return not ground.setting.signals.contacts.any() and len(joints) >= ground.rules.family.joints
+
+
+def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
+    """Return the base family with the members that are needed, if several are at several joints."""
+    whole = needed(ground, fitted_family(ground, begin))
+    if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
+        return None
+    return whole
 
 
 def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:

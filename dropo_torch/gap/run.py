@@ -18,7 +18,7 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, prepare, searched
-from dropo_torch.gap.search import Naming, kept, search, start
+from dropo_torch.gap.search import Naming, kept, resort, search, start
 from dropo_torch.gap.verify import cut_held, floor_score, open_loop_error, score
 from dropo_torch.problem import Problem
 
@@ -125,7 +125,7 @@ def _name(
 
     Where there are contacts, long windows bend, and what is most of the gap there may be an effect of the wrong kind:
     names that leave a rest are then believed only if shorter windows find none that leave nothing, in most of the log
-    at least.
+    at least. Where no search has names, the base family of all joints is the last resort.
     """
     touches = bool(scene.setting.signals.contacts.any())
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
@@ -139,6 +139,9 @@ def _name(
         if not found[0].gap or (found[-1].named and not doubtful):
             return found[-1]
     best = min(found, key=lambda n: (not n.named, not n.partial))
+    for naming in () if best.named else found:
+        if time.monotonic() < end and (resorted := resort(ground, naming)).named:
+            return resorted
     late = next((n.unfinished for n in found if n.unfinished), "")
     if waiting:
         late = late or f"{len(waiting)} more searches over shorter windows were waiting"

@@ -12,7 +12,7 @@ from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.accept import add, everywhere, extend, imitates, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.family import family_ties, shares_of, with_family
+from dropo_torch.gap.family import family_ties, has_family, shares_of, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -179,6 +179,24 @@ def conclude(ground: Ground, state: State) -> Naming:
     )  # fmt: skip
 
 
+def resort(ground: Ground, naming: Naming) -> Naming:
+    """Return the base family, if it accounts for a gap for which no search has names; else what was found.
+
+    Args:
+        ground: what the searches stood on.
+        naming: what one of them found.
+    """
+    evidence = replace(naming.evidence, caps=1.0)
+    here, base = with_base(replace(ground, evidence=evidence), naming.base.hypothesis)
+    if not has_family(here) or (whole := whole_family(here, base.hypothesis)) is None:
+        return naming
+    since = np.zeros(len(evidence.windows.commands), dtype=int)
+    state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True)
+    state = renewed(here, replace(state, attempts=naming.attempts))
+    found = conclude_family(here.at(state), state, replace(naming, evidence=here.at(state).evidence, base=state.base))
+    return found if found.named else naming
+
+
 def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
     """Judge whether the base family accounts for the gap; its members are not exchanged one by one for others."""
     current = state.current
@@ -186,6 +204,6 @@ def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
     if reasons or not family_accounts(current, state.base, ground.rules):
         return replace(unnamed, attempts=state.attempts, refused=reasons[0] if reasons else LEAVES)
     return replace(
-        unnamed, final=current, named=True, ties=family_ties(ground, current), shares=shares_of(ground, current),
-        attempts=state.attempts, family=True,
+        unnamed, refused="", final=current, named=True, family=True, ties=family_ties(ground, current),
+        shares=shares_of(ground, current), attempts=state.attempts,
     )  # fmt: skip
