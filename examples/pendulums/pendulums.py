@@ -93,7 +93,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         numbers = placed.summary(scene.setting)
         print(f"{placed.effect.name} of {placed.target}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items()))
     if not naming.named:
-        print("nothing has a name" + (f": {naming.refused}" if naming.refused else ""))
+        print(f"nothing has a name: {naming.refused or 'no known effect accounts for the misfit'}")
     print(f"\nopen-loop error of positions, mrad, over {', '.join(f'{s:g}' for s in SECONDS)} s of unseen motion")
     rows = {
         "constant velocity": [1e3 * open_loop(scene, scene.begin, s)[1] for s in SECONDS],
