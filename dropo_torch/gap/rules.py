@@ -181,7 +181,7 @@ class Weighed:
     rows: int = 60
     agree: float = 4.0
     moved: float = 0.03
-    lacking: float = 1.5
+    lacking: float = 1.1
     growth: float = 0.1
 
 
