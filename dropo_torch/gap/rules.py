@@ -94,8 +94,8 @@ class Family:
         clearer: share of what they leave below which it takes their place: of effects at some joints, and of one effect
             at three or more.
         joints: the least that the model has.
-        rest: share of the first excess up to which what the family leaves may be wrong: with much motion and little
-            noise, the last hundredth of a real robot's misfit is.
+        rest: share of the first excess that the family may leave even if this is more than ``sound.wrong``: with much
+            motion and little noise, the last hundredth of a real robot's misfit is.
         members: of it, so many must be needed at half of the joints.
         spare: share of the excess that it leaves by which dropping the members least needed may raise it.
         iterations, rounds: of its fit, and how often those not needed are dropped, at most.

@@ -186,9 +186,11 @@ def resort(ground: Ground, naming: Naming) -> Naming:
         ground: what the searches stood on.
         naming: what one of them found.
     """
+    if not has_family(ground):
+        return naming
     evidence = replace(naming.evidence, caps=1.0)
     here, base = with_base(replace(ground, evidence=evidence), naming.base.hypothesis)
-    if not has_family(here) or (whole := whole_family(here, base.hypothesis)) is None:
+    if (whole := whole_family(here, base.hypothesis)) is None:
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
     state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True)
