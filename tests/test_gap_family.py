@@ -5,7 +5,9 @@ The log is made by plain MuJoCo: a leg with servos, of which the model given has
 
 from __future__ import annotations
 
+import dataclasses
 import functools
+import tempfile
 from pathlib import Path
 
 import mujoco
@@ -13,11 +15,13 @@ import numpy as np
 import pytest
 
 import dropo_torch as dropo
-from dropo_torch.effects import VOCABULARY
+from benchmarks.hidden.systems import SERVO_ARM
+from benchmarks.hidden.truths import Effect, simulate_truth
+from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap.evidence import Cost, Linearisation
-from dropo_torch.gap.family import base_family, joint_of, not_needed, shares_of
+from dropo_torch.gap.family import base_family, joint_of, not_needed, shares_of, without_steps
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.rules import Rules, family_accounts
@@ -75,8 +79,6 @@ def record(folder: Path, seed: int, **truth: Triple) -> Path:
 
 @functools.cache
 def found(**truth: Triple) -> Gap:
-    import tempfile
-
     with tempfile.TemporaryDirectory() as folder:
         path = record(Path(folder), 11, **truth)
         return find_gap(dropo.make_problem(dropo.load_config(path), general=True))
@@ -128,6 +130,24 @@ def test_open_loop_errors_beside_those_of_constant_velocity(tmp_path: Path) -> N
 def test_what_one_joint_lacks_makes_no_family() -> None:
     gap = found(damping=(0, 0.25, 0), friction=(0, 0.4, 0))
     assert {joint for _, joint in told(gap)} == {"knee"}
+
+
+def test_what_only_makes_up_for_the_step_is_no_member() -> None:
+    """Dry friction is resolved by the model's step only so well: beside it, an offset seems to be needed."""
+    truth = [Effect("joint_friction", "shoulder", {"friction": 1.0}),
+             Effect("actuator_delay", "elbow_servo", {"delay": 0.003})]  # fmt: skip
+    case = simulate_truth(SERVO_ARM, truth, 3, noise=0.3, episodes=4, transitions=100)
+    with tempfile.TemporaryDirectory() as folder:
+        scene = prepare(dropo.make_problem(dropo.load_config(case.write(folder)), general=True))
+    evidence = dataclasses.replace(scene.evidence, noise=np.array(case.noise))
+    ground = Ground(evidence, tuple(VOCABULARY.values()))
+    true = [(e.name, e.target, tuple(e.parameters.values())) for e in truth]
+    more = [("actuator_bias", "shoulder_servo", (0.0,)), ("armature", "elbow", (0.0,))]
+    placed = tuple(Placed(VOCABULARY[effect], target, values) for effect, target, values in (*true, *more))
+    whole = ground.refit(Hypothesis(tuple(case.declared.values()), placed))
+    assert not_needed(ground, whole, whole.cost.excess + 4 * whole.cost.sigma) == []
+    assert without_steps(ground, whole).hypothesis.placed[0].key == placed[0].key
+    assert {p.key for p in without_steps(ground, whole).hypothesis.placed} == {p.key for p in placed[:2]}
 
 
 @pytest.mark.parametrize(

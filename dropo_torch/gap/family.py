@@ -17,7 +17,7 @@ from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Effect, Placed, Setting, object_number
 from dropo_torch.gap.accept import extend
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import significant
 from dropo_torch.gap.sound import absurd
 
@@ -75,6 +75,7 @@ def has_family(ground: Ground) -> bool:
 def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
     """Return the base family with the members that are needed, if several are at several joints."""
     whole = needed(ground, fitted_family(ground, begin))
+    whole = None if whole is None else without_steps(ground, whole)
     if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
         return None
     return whole
@@ -112,6 +113,20 @@ def needed(ground: Ground, whole: Refit) -> Refit | None:
         else:  # by the derivatives it would not have mattered: half as many, the least needed
             tried = len(idle) // 2
     return whole if math.isfinite(most) else None
+
+
+def without_steps(ground: Ground, whole: Refit) -> Refit:
+    """Return the family without members that only make up for the model's own step.
+
+    Where a finer step is better, the interval that a member has there must not hold its neutral value.
+    """
+    last = resolved(ground.part, whole)
+    if last.fit is whole:
+        return whole
+    first, off = len(whole.hypothesis.declared), offsets(ground.setting, last.fit) * last.fit.scale
+    within = np.abs(off[first:]) < half_widths(last)[first:]
+    idle = [p for p, absent in zip(whole.hypothesis.placed, within, strict=True) if absent]
+    return _without(ground, whole, idle) if idle else whole
 
 
 def _without(ground: Ground, whole: Refit, idle: Sequence[Placed]) -> Refit:
