@@ -846,7 +846,7 @@ def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
 def test_intervals_cover_as_often_as_they_say(shared: float) -> None:
     rng, blocks = np.random.default_rng(0), np.repeat(np.arange(W // 3), 3)
     fits = [linear_fit(rng, shared) for _ in range(300)]
-    errors = [standard_errors(f, blocks, lacking=shared > 0) for f in fits]
+    errors = [standard_errors(f, blocks) for f in fits]
     inside = [np.abs(f.hypothesis.vector) < 1.6449 * e for f, e in zip(fits, errors, strict=True)]
     assert 0.84 < np.mean(inside) < 0.97
 

@@ -250,17 +250,15 @@ def _move(here: Refit, limits: Limits, caps: np.ndarray | float, damping: float)
     return np.clip(step, -LONGEST, LONGEST)
 
 
-def standard_errors(fitted: Refit, episodes: np.ndarray, *, lacking: bool = False) -> np.ndarray:
+def standard_errors(fitted: Refit, episodes: np.ndarray) -> np.ndarray:
     """Return standard errors of all numbers of a fit ``(q,)``, in their units; infinite for those without influence.
 
-    By the noise, of each feature as large as the residuals show. Where they are more than noise, the larger of this
-    and of how much the blocks of the log disagree (the sandwich of cluster-robust errors), which also counts what the
-    model still lacks.
+    The larger of two: by the noise, of each feature as large as the residuals show; and by how much the blocks of the
+    log disagree (the sandwich of cluster-robust errors), which also counts what the model still lacks.
 
     Args:
         fitted: a fit with its projected residuals and derivatives.
         episodes: trajectory of each window, ``(W,)``.
-        lacking: whether residuals are more than noise.
     """
     slope, residual = fitted.slope * fitted.factor[:, None], fitted.residual * fitted.factor[:, None]
     size = len(slope)
@@ -285,7 +283,7 @@ def standard_errors(fitted: Refit, episodes: np.ndarray, *, lacking: bool = Fals
     middle = sums.T @ sums * len(names) / max(len(names) - 1, 1)
     factor = stats.t.ppf(0.95, max(len(names) - 1, 1)) / Z90
     clustered = np.sqrt(np.maximum(np.diag(inverse @ middle @ inverse), 0.0)) * factor
-    return np.where(known, np.maximum(plain, clustered) if lacking else plain, np.inf) * fitted.scale
+    return np.where(known, np.maximum(plain, clustered), np.inf) * fitted.scale
 
 
 def _variances(fitted: Refit, residual: np.ndarray) -> np.ndarray:
@@ -339,9 +337,7 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
 
 def half_widths(last: Resolved) -> np.ndarray:
     """Return half-widths of the 90 % intervals of all numbers ``(q,)``, in their units."""
-    weighted = bool(np.any(last.evidence.model_error > 1))  # by their own sizes: then they no longer show it
-    lacking = weighted or last.fit.cost.reduced > last.evidence.rules.weighed.lacking
-    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes, lacking=lacking), last.error)
+    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes), last.error)
 
 
 def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:

@@ -169,7 +169,6 @@ class Weighed:
         agree: standard errors by which the noise that long windows leave may exceed what short ones with free forces
             say.
         moved: relative change of a feature's noise from which on everything is compared again.
-        lacking: χ² per degree of freedom from which on standard errors count how much blocks of the log disagree.
         growth: share of the motion's own standard deviation that noise at the start may grow to in an open-loop
             prediction.
     """
@@ -181,7 +180,6 @@ class Weighed:
     rows: int = 60
     agree: float = 4.0
     moved: float = 0.03
-    lacking: float = 1.1
     growth: float = 0.1
 
 
