@@ -146,7 +146,6 @@ def test_what_only_makes_up_for_the_step_is_no_member() -> None:
     placed = tuple(Placed(VOCABULARY[effect], target, values) for effect, target, values in (*true, *more))
     whole = ground.refit(Hypothesis(tuple(case.declared.values()), placed))
     assert not_needed(ground, whole, whole.cost.excess + 4 * whole.cost.sigma) == []
-    assert without_steps(ground, whole).hypothesis.placed[0].key == placed[0].key
     assert {p.key for p in without_steps(ground, whole).hypothesis.placed} == {p.key for p in placed[:2]}
 
 

@@ -92,6 +92,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for placed in naming.final.hypothesis.placed:
         numbers = placed.summary(scene.setting)
         print(f"{placed.effect.name} of {placed.target}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items()))
+    declared = dict(zip(scene.problem.space.names, naming.final.hypothesis.declared, strict=True))
+    print("".join(f"{parameter}: {value:.4g}\n" for parameter, value in declared.items()), end="")
     if not naming.named:
         print(f"nothing has a name: {naming.refused or 'no known effect accounts for the misfit'}")
     print(f"\nopen-loop error of positions, mrad, over {', '.join(f'{s:g}' for s in SECONDS)} s of unseen motion")
