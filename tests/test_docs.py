@@ -388,6 +388,24 @@ def test_pendulums(tmp_path: Path) -> None:
     assert best < 0.5 * commanded < 0.25 * bare
 
 
+def test_panda(tmp_path: Path) -> None:
+    """Forces tell the friction of all joints, offsets and masses, and leave less than the publishers' friction does."""
+    from dropo_torch.effects import VOCABULARY
+    from dropo_torch.gap import prepare
+    from dropo_torch.gap.forces.view import force_view
+
+    example = load_example(ROOT / "examples" / "panda" / "panda.py")
+    problem = example.make(measured("panda_excitation"), tmp_path)
+    scene = prepare(problem)
+    effects = list(VOCABULARY.values())
+    view = force_view(scene.setting, scene.train, scene.held, effects, scene.rules.forces)
+    friction = [p.values[0] for p in view.placed if p.effect.name == "joint_friction"]
+    assert friction == pytest.approx([0.30, 0.28, 0.27, 0.57, 0.28, 0.16, 0.27], abs=0.05)
+    assert {"joint_friction", "actuator_bias", "center_of_mass"} == {p.effect.name for p in view.placed}
+    assert (view.after <= example.published(problem)).all()
+    assert np.mean(view.after**2) < np.mean(view.before**2) / 9
+
+
 def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
     log = str(ROOT / "sims" / "hopper" / "log.npz")
     load_example(ROOT / "examples" / "authors_hopper.py").main([log, "--transitions", "60"])

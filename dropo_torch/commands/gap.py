@@ -83,6 +83,11 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
     for words, key, form in rows:
         table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))
     console.print(table)
+    if gap.forces:
+        forces = Table("unexplained force on held-out data", "unit", "before", "after")
+        for f in gap.forces:
+            forces.add_row(f.joint, f.unit, f"{f.before:.3g}", f"{f.after:.3g}")
+        console.print(forces)
     for line in filter(None, (gap.next_experiment, *gap.notes)):
         console.print(line)
     console.print(

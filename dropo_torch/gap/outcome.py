@@ -12,11 +12,12 @@ from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.family import joint_names
+from dropo_torch.gap.forces.view import ForceView
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.renew import moved, noise_beside
-from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Ranked, Remaining, Score, Strength
+from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Score, Strength
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
@@ -53,6 +54,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     floor = floor_score(evidence, held, final.hypothesis)
     if naming.named and not has_skill(after_score, floor, constant, rules.sound):
         return make_result(scene, _without_names(naming, after_score, constant), started)
+    skill = has_skill(given, floor, constant, rules.sound)
     short, best = scene.short, final.hypothesis
     before = free_forces(twin, short, base.variant, noise)
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
@@ -83,13 +85,60 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
-        notes=tuple(_notes(setting, naming, has_skill(given, floor, constant, rules.sound))),
+        notes=tuple(_notes(setting, naming, skill)),
+        skill=skill,
         remaining=remaining,
         refused=naming.refused,
         unfinished=naming.unfinished,
         own_step=_own_step(naming, rest, rules),
         joints=joint_names(setting) if naming.family else {},
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",
+    )
+
+
+def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
+    """Put what the forces at the joints say in the place of what predictions said, and score it as everything is.
+
+    Args:
+        scene: what the search worked on.
+        gap: a result by predictions.
+        view: what the forces say, with names.
+    """
+    setting, evidence = scene.setting, scene.evidence
+    model, hypothesis = setting.model, scene.begin.with_effects(view.placed)
+    held, noise = cut_held(evidence, scene.held, hypothesis), np.array(gap.noise)
+    before, after = (free_forces(scene.twin, scene.short, h.variant, noise) for h in (scene.begin, hypothesis))
+    chi2 = [refit(evidence, h, iterations=0, slopes=False).cost.reduced for h in (scene.begin, hypothesis)]
+    named = []
+    for placed, halves, share, tied in zip(view.placed, view.halves, view.shares, view.ties, strict=True):
+        found = zip(placed.effect.quantities(setting, placed.target), placed.values, halves, strict=True)
+        numbers = {q.name: _strength(q, value, float(half)) for q, value, half in found}
+        sentence = placed.effect.sentence.format(target=placed.target)
+        named.append(NamedEffect(*placed.key, numbers, share, tuple(p.key for p in tied), sentence))
+    kinds = {n: max(e.share_of_gap for e in named if e.effect == n) for n in {e.effect for e in named}}
+    after_score, constant = score(evidence, held, hypothesis), constant_velocity(evidence, held)
+    skill = has_skill(after_score, gap.noise_floor, constant, scene.rules.sound)
+    left = zip(dof_names(model), view.before.tolist(), view.after.tolist(), strict=True)
+    return replace(
+        gap,
+        effects=merge_families(tuple(sorted(named, key=lambda e: -kinds[e.effect])), setting),
+        before=score(evidence, held, scene.begin),
+        after=after_score,
+        declared={n: (given, alone, given) for n, (given, alone, _) in gap.declared.items()},
+        reduced=(chi2[0], chi2[1]),
+        residuals=residual_pictures(setting, before, after, 2),
+        simulated_transitions=scene.twin.simulated_transitions,
+        refused="",
+        symbolic="",
+        remaining=None,
+        own_step=None,
+        joints={},
+        next_experiment=None,
+        notes=(
+            f"Constant velocity has an open-loop error of {constant:.3g} on held-out data, the model with the effects "
+            f"{after_score.rollout_rmse:.3g}: {'it has' if skill else 'not even then has it'} skill.",
+        ),
+        forces=tuple(JointForce(j, force_unit(model, dof), b, a) for dof, (j, b, a) in enumerate(left)),
     )
 
 

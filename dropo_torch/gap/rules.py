@@ -215,6 +215,28 @@ class Shown:
 
 
 @dataclass(frozen=True)
+class Forces:
+    """When the forces that were logged at all joints give names, where open-loop predictions have no skill.
+
+    Attributes:
+        left: share of the forces' mean squares on unseen data, averaged over the joints, that may be left.
+        clearer: what may be left, relative to what effects leave that predictions named, to take their place.
+        apart: half-widths of its 90 % interval by which an effect of one number must differ from its neutral value.
+        error: how often chance may give an effect a name there, over all effects that forces can tell.
+        blocks: stretches of the log that count as independent, at least and at most.
+        sampled: change of the logarithm of a joint's missing force, where every second row of the log is left out, from
+            which on sampling makes too much of it.
+    """
+
+    left: float = 0.25
+    clearer: float = 0.7
+    apart: float = 1.6
+    error: float = 0.05
+    blocks: tuple[int, int] = (8, 20)
+    sampled: float = 0.2
+
+
+@dataclass(frozen=True)
 class Rules:
     """Thresholds of the naming; the same for every log, since all they compare is in units of the noise.
 
@@ -228,7 +250,7 @@ class Rules:
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
         least: share of the first excess below which an effect is not named.
         effects: the most effects that are named.
-        chance, alike, tried, family, sound, cut, weighed, shown: see there.
+        chance, alike, tried, family, sound, cut, weighed, forces, shown: see there.
     """
 
     gate: float = 5.0
@@ -246,6 +268,7 @@ class Rules:
     sound: Sound = field(default_factory=Sound)
     cut: Cut = field(default_factory=Cut)
     weighed: Weighed = field(default_factory=Weighed)
+    forces: Forces = field(default_factory=Forces)
     shown: Shown = field(default_factory=Shown)
 
 

@@ -8,12 +8,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from dropo_torch.effects import VOCABULARY, Effect
+import numpy as np
+
+from dropo_torch.effects import VOCABULARY, Effect, Placed
+from dropo_torch.gap.forces.view import force_view
 from dropo_torch.gap.ground import Ground, Report
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.locate import places
 from dropo_torch.gap.noise import free_forces
-from dropo_torch.gap.outcome import make_result
+from dropo_torch.gap.outcome import make_result, with_forces
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
@@ -115,7 +118,28 @@ def find_gap(
     ground, end = replace(_ground(scene, effects), report=report), time.monotonic() + time_limit
     naming = _name(scene, ground, checkpoint, resume, end)
     report("verifying", 0.0)
-    return make_result(scene, naming, started)
+    gap = make_result(scene, naming, started)
+    if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
+        return gap
+    return _by_forces(scene, ground, gap, naming.final.hypothesis.placed if naming.named else (), started)
+
+
+def _by_forces(scene: Scene, ground: Ground, gap: Gap, named: Sequence[Placed], started: float) -> Gap:
+    """Where no prediction of the model as it is has skill, let the forces at the joints decide, if the log has them.
+
+    Errors of such predictions grow so fast that what slows all motion down, such as inertia, makes them smaller. Names
+    that predictions gave stay unless forces have others, which leave clearly less unexplained.
+    """
+    problem = scene.problem
+    if problem.effects is not None:  # a delay or a late sensor of the config's would have to be undone first
+        return gap
+    ground.report("comparing forces", 0.0)
+    setting = replace(scene.setting, model=problem.space.apply(np.array(scene.begin.declared)))
+    rules = scene.rules.forces
+    view = force_view(setting, scene.train, scene.held, ground.effects, rules, named)
+    if view is None or not view.placed or (named and not view.beats_rival(rules)):
+        return gap
+    return replace(with_forces(scene, gap, view), seconds=time.perf_counter() - started)
 
 
 def _name(

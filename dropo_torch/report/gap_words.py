@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Remaining, Strength
+from dropo_torch.gap.result import Gap, NamedEffect, Place, Remaining, Strength, fallen
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
 UNNAMED = "unnamed"
@@ -76,6 +76,10 @@ _SHORT = {
     "actuator_delay": "delay",
 }
 _COUNTS = ("no", "one", "two", "three", "four", "five", "six", "seven", "eight", "nine", "ten")
+_BY_FORCES = (
+    "Open-loop predictions of your model are no better than constant velocity on this log, so the forces at its joints "
+    "decide. Your model and the robot differ in what follows; with it, {0}"
+)
 _CANNOT_RULE_OUT = "An effect that is weaker than the noise, or that this motion does not excite, cannot be ruled out."
 
 
@@ -177,6 +181,8 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
         step = f" (the model's own step leaves {own} times what noise would, a finer one {finer})"
     else:
         step = ""
+    if gap.forces:
+        return f"{_BY_FORCES.format(fallen(gap.forces))}:", by_force(named)
     if gap.joints:
         items = by_joint(named, gap.joints)
         rest = step if gap.remaining is None else f". They do not explain everything: {left(gap.remaining)}"
@@ -192,6 +198,25 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     differ = any(_too_much(e) or e.effect in _CLAUSES for e in named)
     rest = step if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
     return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
+
+
+def by_force(named: Sequence[NamedEffect]) -> list[str]:
+    """Return an item for each effect that forces tell; centres of mass that are only known together are one."""
+    kinds = [e.effect for e in named]
+    grouped = [e for e in named if any(effect == e.effect in kinds for effect, _ in e.indistinguishable_from)]
+    items = []
+    for e in named:
+        if e not in grouped:
+            ends = f" (or {joined(rivals(e), 3)})" if e.indistinguishable_from else ""
+            given = _members(e) if e.target == "*" else numbers(e.parameters)
+            items.append(f"{noun(e.effect, e.target)}: {given}{ends}")
+    if places := [str(e.target) for e in grouped]:
+        items.append(f"mass or center of mass of {joined(places, 12)}: known together, not one by one; see the table")
+    return items
+
+
+def _members(effect: NamedEffect) -> str:
+    return ", ".join(f"{target} {with_interval(given)}" for target, given in effect.parameters.items())
 
 
 def _count(items: Sequence[str]) -> str:

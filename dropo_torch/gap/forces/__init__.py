@@ -1,0 +1,1 @@
+"""A second opinion in the space of forces: does the logged force of every joint suit the motion that it made?"""

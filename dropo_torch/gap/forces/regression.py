@@ -1,0 +1,181 @@
+"""Which linear terms explain a signal, decided on stretches of it that each fit has not seen; mathematics alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy import linalg, optimize, stats
+
+from dropo_torch.gap.chance import p_of_ranks
+
+#: Times that the weights of the outputs are found anew.
+WEIGHTED = 4
+#: Change of the logarithm of all outputs' mean squares that matters to the choice of terms.
+GAIN = 0.02
+#: Ridge of the normal equations, relative to their diagonal.
+RIDGE = 1e-10
+
+
+@dataclass(frozen=True)
+class Regression:
+    """A signal of J outputs, and P columns that may explain it.
+
+    Attributes:
+        signal: ``(N, J)``.
+        columns: ``(P, N, J)``.
+        low, high: bounds of the coefficients, ``(P,)``; zero lies within.
+        prior: standard deviations of the coefficients about zero, infinite for none, ``(P,)``.
+        blocks: block of each row, ``(N,)``; blocks are left out one by one, and count as independent.
+        correlated: rows that count as one.
+    """
+
+    signal: np.ndarray
+    columns: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+    prior: np.ndarray
+    blocks: np.ndarray
+    correlated: float = 1.0
+
+    @cached_property
+    def names(self) -> np.ndarray:
+        """The blocks, B of them."""
+        return np.unique(self.blocks)
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Rows of each block, ``(B,)``."""
+        return np.unique(self.blocks, return_counts=True)[1]
+
+    @cached_property
+    def products(self) -> np.ndarray:
+        """Products of columns and signal, the signal last, in each block and output, ``(B, J, P + 1, P + 1)``."""
+        every = np.concatenate([self.columns, self.signal[None]])
+        parts = (every[:, self.blocks == name] for name in self.names)
+        return np.stack([np.einsum("pnj,qnj->jpq", part, part) for part in parts])
+
+    def left(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return what coefficients ``(P,)`` leave of the signal, ``(N, J)``."""
+        return self.signal - np.einsum("p,pnj->nj", coefficients, self.columns)
+
+    def squares(self, coefficients: np.ndarray) -> np.ndarray:
+        """Return the mean squares of what coefficients ``(P,)`` leave in each block, ``(B, J)``."""
+        full = np.append(-coefficients, 1.0)
+        sums = np.einsum("p,bjpq,q->bj", full, self.products, full)
+        return np.maximum(sums, 0.0) / self.counts[:, None]
+
+
+def fit(regression: Regression, chosen: np.ndarray, without: int | None = None) -> np.ndarray:
+    """Return coefficients ``(P,)`` within their bounds, zero for columns that are not chosen, ``(P,)`` bool.
+
+    Every output weighs by what is left of it in the end; a prior counts as much as one independent row.
+
+    Args:
+        regression: the signal and all columns.
+        chosen: the columns to use, ``(P,)`` bool.
+        without: number of the block that is left out, if any.
+    """
+    found, picked = np.zeros(len(chosen)), np.flatnonzero(chosen)
+    used = np.delete(np.arange(len(regression.names)), [] if without is None else [without])
+    products, rows = regression.products[used].sum(0), regression.counts[used].sum()
+    variance = products[:, -1, -1] / rows
+    for _ in range(WEIGHTED if picked.size else 0):
+        weighted = (products / np.maximum(variance, 1e-300)[:, None, None]).sum(0)
+        normal = weighted[np.ix_(picked, picked)] + np.diag(regression.correlated / regression.prior[picked] ** 2)
+        found[picked] = _solved(normal, weighted[picked, -1], regression.low[picked], regression.high[picked])
+        full = np.append(-found, 1.0)
+        variance = np.einsum("p,jpq,q->j", full, products, full) / rows
+    return found
+
+
+def _solved(normal: np.ndarray, right: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The least-squares solution of normal equations within bounds."""
+    size = np.sqrt(np.maximum(np.diag(normal), 1e-300))
+    matrix = normal / np.outer(size, size) + RIDGE * np.eye(len(size))
+    factor = linalg.cholesky(matrix)
+    target = linalg.solve_triangular(factor, right / size, trans="T")
+    free = linalg.solve_triangular(factor, target) / size
+    if (free >= low).all() and (free <= high).all():
+        return np.asarray(free)
+    return np.asarray(optimize.lsq_linear(factor, target, (low * size, high * size)).x / size)
+
+
+def unseen(regression: Regression, chosen: np.ndarray) -> np.ndarray:
+    """Return the mean squares of every block ``(B, J)`` by the coefficients that all others have."""
+    blocks = range(len(regression.names))
+    return np.stack([regression.squares(fit(regression, chosen, without=b))[b] for b in blocks])
+
+
+def score(squares: np.ndarray) -> float:
+    """Return the logarithm of the outputs' mean squares, summed, of blocks ``(B, J)``; less is better."""
+    return float(np.log(np.maximum(squares.mean(0), 1e-300)).sum())
+
+
+def select(regression: Regression, groups: np.ndarray, families: np.ndarray) -> np.ndarray:
+    """Return which columns explain unseen blocks, ``(P,)`` bool: whole families are added, single groups dropped.
+
+    Of groups that do not help, the one with the most columns goes first.
+
+    Args:
+        regression: the signal and all columns.
+        groups: group of each column, ``(P,)``; a group is chosen whole.
+        families: family of each column, ``(P,)``; of groups that are added together.
+    """
+    chosen = np.zeros(len(groups), dtype=bool)
+    best, waiting = score(unseen(regression, chosen)), set(np.unique(families).tolist())
+    while waiting:
+        tried = {f: score(unseen(regression, chosen | (families == f))) for f in sorted(waiting)}
+        family = min(tried, key=lambda f: tried[f])
+        if tried[family] > best - GAIN:
+            break
+        chosen, best = chosen | (families == family), tried[family]
+        waiting.discard(family)
+    while chosen.any():
+        tried = {g: score(unseen(regression, chosen & (groups != g))) for g in np.unique(groups[chosen]).tolist()}
+        idle = [g for g in tried if tried[g] <= best + GAIN]
+        if not idle:
+            break
+        group = min(idle, key=lambda g: (-np.count_nonzero(groups == g), tried[g]))
+        chosen, best = chosen & (groups != group), min(best, tried[group])
+    return chosen
+
+
+def chances(regression: Regression, chosen: np.ndarray, parts: Iterable[np.ndarray]) -> list[float]:
+    """Return how likely chance alone makes each part of the chosen columns help in unseen blocks as much.
+
+    By what each block loses without it, in the mean squares of what is left with all of them: the surer of Student's t
+    and the signed ranks, at half the level each. A true effect helps in every block, by very different amounts.
+
+    Args:
+        regression: the signal and all columns.
+        chosen: the columns, ``(P,)`` bool.
+        parts: of these, ``(P,)`` bool each.
+    """
+    whole = unseen(regression, chosen)
+    size, found = whole.mean(0), []
+    for part in parts:
+        gains = ((unseen(regression, chosen & ~part) - whole) / size).sum(1)
+        spread = max(float(gains.std(ddof=1)), 1e-300) / np.sqrt(len(gains))
+        by_size = float(stats.t.sf(gains.mean() / spread, len(gains) - 1))
+        found.append(min(1.0, 2 * min(by_size, p_of_ranks(gains))))
+    return found
+
+
+def half_widths(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return half-widths of the 90 % intervals of coefficients ``(P,)``, by how much blocks disagree (sandwich)."""
+    found, picked, left = np.zeros(len(chosen)), np.flatnonzero(chosen), regression.left(coefficients)
+    if not picked.size:
+        return found
+    scale = np.maximum(np.sqrt((left**2).mean(0)), 1e-300)
+    columns = regression.columns[picked] / scale
+    normal = np.einsum("pnj,qnj->pq", columns, columns) + np.diag(regression.correlated / regression.prior[picked] ** 2)
+    scores = np.einsum("pnj,nj->np", columns, left / scale)
+    sums = np.stack([scores[regression.blocks == name].sum(0) for name in regression.names])
+    count = len(sums)
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    covariance = inverse @ (sums.T @ sums) @ inverse * count / max(count - 1, 1)
+    found[picked] = stats.t.ppf(0.95, max(count - 1, 1)) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return found

@@ -1,0 +1,199 @@
+"""What the model lacks by the forces at its joints, for logs on which open-loop predictions have no skill.
+
+An arm that is driven by torques drifts: whatever its model lacks, an error of the force grows with the square of time,
+and a heavier arm predicts better only because it moves as it did. In the space of forces nothing drifts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from dropo_torch.data.trajectory import Trajectories
+from dropo_torch.effects.base import Effect, Placed, Setting
+from dropo_torch.gap.forces.motion import FORCES, KEPT, has_forces, highest_frequency, stretches
+from dropo_torch.gap.forces.regression import GAIN, Regression, chances, fit, half_widths, score, select, unseen
+from dropo_torch.gap.forces.terms import CENTER, Terms, linear_effects, needed, terms
+from dropo_torch.gap.rules import Forces
+
+#: Rows in half an oscillation at the highest frequency of the motion, which count as one observation.
+CORRELATED = 0.5 * KEPT * FORCES
+
+
+@dataclass(frozen=True)
+class ForceView:
+    """Effects by which the forces at the joints suit their motion.
+
+    Attributes:
+        placed: the effects, with values; none where forces give no names.
+        halves: half-widths of the 90 % intervals of each effect's numbers.
+        shares: share of the unseen forces' mean squares that comes back without each.
+        ties: for each effect those that may stand in its place: others that explain the log as well, and centres of
+            mass of other bodies, which are only known together.
+        before, after: root mean square of the force that is missing at each joint on held-out data, ``(nv,)``.
+        rival: the same with the effects that predictions named; ``None`` where forces cannot tell these.
+    """
+
+    placed: tuple[Placed, ...]
+    halves: tuple[np.ndarray, ...]
+    shares: tuple[float, ...]
+    ties: tuple[tuple[Placed, ...], ...]
+    before: np.ndarray
+    after: np.ndarray
+    rival: np.ndarray | None = None
+
+    def left(self, forces: np.ndarray) -> float:
+        """Return the share of the forces' mean squares that is left, averaged over the joints."""
+        return float(np.mean((forces / np.maximum(self.before, 1e-300)) ** 2))
+
+    def beats_rival(self, rules: Forces) -> bool:
+        """Return whether the effects leave clearly less than those that predictions named."""
+        return self.rival is not None and self.left(self.after) < rules.clearer * self.left(self.rival)
+
+
+def force_view(
+    setting: Setting, train: Trajectories, held: Trajectories, known: Sequence[Effect], rules: Forces,
+    rival: Sequence[Placed] = (),
+) -> ForceView | None:  # fmt: skip
+    """Return what the forces at the joints say; ``None`` where the log has not all of them, or is too short.
+
+    Args:
+        setting: the model as it is.
+        train: the log.
+        held: data for the last word.
+        known: the vocabulary.
+        rules: thresholds.
+        rival: effects that predictions named, with values.
+    """
+    if not has_forces(setting):
+        return None
+    placed, highest = linear_effects(setting, known), highest_frequency(train, setting)
+    parts, others = (stretches(log, setting, highest) for log in (train, held))
+    if not placed or not parts or not others or coarse(setting, train, highest, rules):
+        return None
+    seen, last = terms(setting, parts, placed), terms(setting, others, placed)
+    blocks = _blocks(seen.episodes, highest, rules)
+    if blocks is None:
+        return None
+    regression = _regression(seen, blocks)
+    chosen = _sure(seen, regression, select(regression, seen.owner, _families(seen)), rules)
+    found = fit(regression, chosen)
+    others_left = _regression(last, last.episodes)
+    before, after = _rms(last.missing), _rms(others_left.left(found))
+    theirs = _coefficients(placed, last.owner, rival)
+    seen_by = ForceView((), (), (), (), before, after, None if theirs is None else _rms(others_left.left(theirs)))
+    if not chosen.any() or seen_by.left(after) > rules.left:
+        return replace(seen_by, after=before)
+    members, halves = np.unique(seen.owner[chosen]), half_widths(regression, chosen, found)
+    return replace(
+        seen_by,
+        placed=tuple(placed[i].at(np.array(placed[i].values) + found[seen.owner == i]) for i in members),
+        halves=tuple(halves[seen.owner == i] for i in members),
+        shares=_shares(regression, chosen, seen.owner),
+        ties=_ties(seen, regression, chosen),
+    )
+
+
+def _coefficients(placed: Sequence[Placed], owner: np.ndarray, rival: Sequence[Placed]) -> np.ndarray | None:
+    """The coefficients ``(P,)`` that effects stand for; ``None`` where some are not among the linear ones."""
+    numbers, found = {p.key: n for n, p in enumerate(placed)}, np.zeros(len(owner))
+    for p in rival:
+        if p.key not in numbers:
+            return None
+        neutral = placed[numbers[p.key]].values
+        found[owner == numbers[p.key]] = np.array(p.values) - np.array(neutral)
+    return found
+
+
+def coarse(setting: Setting, log: Trajectories, highest: float, rules: Forces) -> bool:
+    """Return whether the forces that are missing come from the log's sampling: whether half of it makes others.
+
+    Differences of sampled positions err with the square of the step.
+    """
+    sizes = []
+    for rows in (1, 2):
+        parts = stretches(log, setting, highest, rows)
+        found = [part.compared(part.force - needed(setting.model, part)) for part in parts]
+        if not found:
+            return True
+        sizes.append(_rms(np.concatenate(found)))
+    return bool(np.abs(np.log(np.maximum(sizes[1], 1e-300) / np.maximum(sizes[0], 1e-300))).max() > rules.sampled)
+
+
+def _blocks(episodes: np.ndarray, highest: float, rules: Forces) -> np.ndarray | None:
+    """Blocks of rows ``(N,)``: episodes, or runs of one; none is shorter than what counts as one observation."""
+    least, most = rules.blocks
+    if len(np.unique(episodes)) >= least:
+        return episodes
+    count = min(int(len(episodes) / CORRELATED), most)
+    return np.arange(len(episodes)) * count // len(episodes) if count >= least else None
+
+
+def _regression(found: Terms, blocks: np.ndarray) -> Regression:
+    """The regression of missing forces; half an oscillation of the motion counts as one observation."""
+    return Regression(found.missing, found.columns, found.low, found.high, found.prior, blocks, CORRELATED)
+
+
+def _families(found: Terms) -> np.ndarray:
+    """The kind of effect of each column, ``(P,)``."""
+    names = [p.effect.name for p in found.placed]
+    kinds = {name: number for number, name in enumerate(dict.fromkeys(names))}
+    return np.array([kinds[n] for n in names])[found.owner]
+
+
+def _sure(found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces) -> np.ndarray:
+    """Of the chosen columns those that may have a name ``(P,)`` bool: of kinds of effects that chance does not explain.
+
+    What ends at a bound of physics has none. Of the rest, an effect of one number must differ from its neutral value by
+    clearly more than its interval.
+    """
+    families, single = _families(found), np.bincount(found.owner)[found.owner] == 1
+    kinds = np.unique(families)
+    while chosen.any():
+        values = fit(regression, chosen)
+        bound = chosen & ((values <= found.low) | (values >= found.high))
+        present = [k for k in kinds if (chosen & (families == k)).any()]
+        likely = chances(regression, chosen, [chosen & (families == k) for k in present])
+        worst = int(np.argmax(likely))
+        sizes = np.maximum(np.abs(values), 1e-300)
+        unsure = np.where(chosen & single, half_widths(regression, chosen, values) / sizes, 0.0)
+        if bound.any():
+            chosen = chosen & ~np.isin(found.owner, found.owner[bound])
+        elif likely[worst] > rules.error / len(kinds):
+            chosen = chosen & (families != present[worst])
+        elif unsure.max() * rules.apart >= 1:
+            chosen = chosen & (np.arange(len(chosen)) != int(np.argmax(unsure)))
+        else:
+            break
+    return chosen
+
+
+def _shares(regression: Regression, chosen: np.ndarray, owner: np.ndarray) -> tuple[float, ...]:
+    """The share of the first mean squares that comes back without each effect, of unseen blocks."""
+    first = unseen(regression, np.zeros_like(chosen)).mean(0)
+
+    def share(columns: np.ndarray) -> float:
+        return float((unseen(regression, columns).mean(0) / first).mean())
+
+    whole = share(chosen)
+    gone = [share(chosen & (owner != member)) - whole for member in np.unique(owner[chosen])]
+    return tuple(float(np.clip(g / max(1 - whole, 1e-12), 0, 1)) for g in gone)
+
+
+def _ties(found: Terms, regression: Regression, chosen: np.ndarray) -> tuple[tuple[Placed, ...], ...]:
+    """For each chosen effect those that may stand in its place."""
+    members = np.unique(found.owner[chosen]).tolist()
+    most, names, ties = score(unseen(regression, chosen)) + GAIN, [p.effect.name for p in found.placed], []
+    for member in members:
+        without = chosen & (found.owner != member)
+        grouped = [m for m in members if m != member and names[m] == names[member] == CENTER]
+        others = [n for n in range(len(names)) if n not in members]
+        rivals = [n for n in others if score(unseen(regression, without | (found.owner == n))) <= most]
+        ties.append(tuple(found.placed[n] for n in (*grouped, *rivals)))
+    return tuple(ties)
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    return np.asarray(np.sqrt((values**2).mean(0)))

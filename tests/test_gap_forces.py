@@ -1,0 +1,247 @@
+"""Laws of the forces at the joints: what they name, with which numbers, and when they have nothing to say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import pytest
+
+import dropo_torch as dropo
+from dropo_torch.effects import VOCABULARY, find_effect
+from dropo_torch.gap import add, find_gap
+from dropo_torch.gap.forces import regression
+from dropo_torch.gap.forces.motion import has_forces, low_pass
+from dropo_torch.gap.forces.terms import LINEAR
+from dropo_torch.gap.forces.view import ForceView, force_view
+from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.rules import Forces
+from dropo_torch.gap.verify import hold_out
+from dropo_torch.problem import Problem
+from dropo_torch.report import write_gap_report
+from dropo_torch.report.gap_words import answer
+
+ARM = """
+<mujoco>
+  <option timestep="0.0025" integrator="implicitfast"/>
+  <worldbody>
+    <body name="upper" pos="0 0 1">
+      <joint name="base" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".04" mass="2"/>
+      <body name="fore" pos=".3 0 0">
+        <joint name="shoulder" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03" mass="1.2"/>
+        <body name="hand" pos=".3 0 0">
+          <joint name="elbow" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".03" mass=".6"/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <motor name="m1" joint="base"/><motor name="m2" joint="shoulder" gear="2"/><motor name="m3" joint="elbow"/>
+  </actuator>
+</mujoco>
+"""
+JOINTS, GEARS = ("base", "shoulder", "elbow"), np.array([1.0, 2.0, 1.0])
+
+
+def recorded(
+    seed: int, *, friction: tuple[float, ...] = (0, 0, 0), offset: float = 0.0, center: float = 0.0,
+    ripple: float = 0.03, dt: float = 0.005, seconds: float = 40.0,
+) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+    """Return rows of positions and velocities, and torques, of joints that follow sines exactly.
+
+    Nothing is simulated: the torques are those that the motion needs, with dry friction, less a constant force at the
+    shoulder, with the fore arm's centre of mass elsewhere, and with ripple relative to each joint's largest torque.
+    """
+    draw, n = np.random.default_rng(seed), int(seconds / dt)
+    times, speed = np.arange(2 * n + 1) * 0.5 * dt, 2 * np.pi * np.array([0.13, 0.29, 0.53])
+    size, phase = draw.uniform(0.1, 0.35, (3, 3)), draw.uniform(0, 6.28, (3, 3))
+    waves = [size * speed**k * np.sin(speed * times[:, None, None] + phase + 0.5 * k * np.pi) for k in range(3)]
+    position, velocity, acceleration = (w.sum(-1) for w in waves)
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.body("fore").ipos[2] += center
+    model.body_sameframe[model.body("fore").id] = 0
+    data, torque = mujoco.MjData(model), np.empty((n, 3))
+    for row, at in enumerate(range(1, 2 * n, 2)):
+        data.qpos[:], data.qvel[:], data.qacc[:] = position[at], velocity[at], acceleration[at]
+        mujoco.mj_inverse(model, data)
+        torque[row] = data.qfrc_inverse + friction * np.tanh(velocity[at] / 0.01) - [0, offset, 0]
+    middle, waves = times[1::2, None], draw.uniform(0.3, 3, 12)
+    noise = sum(draw.normal(0, 1, 3) * np.sin(2 * np.pi * f * middle + draw.uniform(0, 6, 3)) for f in waves) / 6**0.5
+    rows = np.concatenate([position[::2] + draw.normal(0, 1e-5, (n + 1, 3)),
+                           velocity[::2] + draw.normal(0, 1e-3, (n + 1, 3))], 1)  # fmt: skip
+    return rows, (torque + ripple * np.abs(torque).max(0) * noise) / GEARS
+
+
+def problem_of(folder: Path, seed: int, model: str = ARM, **truth: Any) -> Problem:
+    rows, torque = recorded(seed, **truth)
+    (folder / "arm.xml").write_text(model)
+    ends, dt = np.arange(len(rows)) == len(rows) - 1, truth.get("dt", 0.005)
+    np.savez(folder / "log.npz", observations=rows, actions=np.vstack([torque, torque[-1:]]), terminals=ends)
+    (folder / "arm.yaml").write_text(
+        f"model: arm.xml\ndata: {{path: log.npz, dt: {dt}}}\nframe_skip: {round(dt / 0.0025)}\n"
+        "observation: ['qpos[:3]', 'qvel[:3]']\nthreads: 1\n"
+    )
+    return dropo.make_problem(dropo.load_config(folder / "arm.yaml"), general=True)
+
+
+def view_of(problem: Problem) -> ForceView | None:
+    log = problem.trajectories
+    train, held = hold_out(replace(log, dt=log.dt or problem.simulator.timestep))
+    return force_view(make_setting(problem, train), train, held, list(VOCABULARY.values()), Forces())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_friction_offset_and_center_are_named(tmp_path: Path, seed: int) -> None:
+    """Each at its joint and with its number; a unit of the motor makes two of the joint with a gear ratio of two."""
+    truth = {"friction": (0.5, 0.8, 0.3), "offset": 0.4, "center": 0.05, "ripple": 0.02}
+    view = view_of(problem_of(tmp_path, seed, **truth))
+    found = {p.key: np.array(p.values) for p in view.placed}
+    assert {*found} == {*(("joint_friction", j) for j in JOINTS), ("actuator_bias", "m2"), ("center_of_mass", "fore")}
+    friction = [found["joint_friction", j][0] for j in JOINTS]
+    assert friction == pytest.approx(truth["friction"], rel=0.02)
+    assert found["actuator_bias", "m2"] == pytest.approx(0.2, abs=0.02)
+    assert found["center_of_mass", "fore"][2] == pytest.approx(0.05, abs=0.005)
+    assert (view.after < 0.2 * view.before).all()
+
+
+def test_intervals_hold_the_truth(tmp_path: Path) -> None:
+    truth, inside = (0.5, 0.8, 0.3), []
+    for seed in range(10, 18):
+        view = view_of(problem_of(tmp_path, seed, friction=truth, ripple=0.05))
+        assert [p.key for p in view.placed] == [("joint_friction", j) for j in JOINTS]
+        inside += [abs(p.values[0] - t) < h[0] for p, h, t in zip(view.placed, view.halves, truth, strict=True)]
+    assert np.mean(inside) >= 0.7
+
+
+@pytest.mark.parametrize("ripple", [0.0, 0.003, 0.1])
+def test_a_right_model_has_nothing_named(tmp_path: Path, ripple: float) -> None:
+    view = view_of(problem_of(tmp_path, 3, ripple=ripple))
+    assert view is None or not view.placed
+
+
+def test_what_ties_is_told(tmp_path: Path) -> None:
+    """A shoulder that moves little cannot tell a constant force from a centre of mass further out."""
+    view = view_of(problem_of(tmp_path, 1, friction=(0.5, 0.8, 0.3), offset=0.4, center=0.05, ripple=0.06))
+    told = {p.key: {other.key for other in tied} for p, tied in zip(view.placed, view.ties, strict=True)}
+    assert ("actuator_bias", "m2") in told or ("actuator_bias", "m2") in told["center_of_mass", "upper"]
+
+
+def test_a_log_that_is_too_coarse_says_nothing(tmp_path: Path) -> None:
+    """At two rows in a period of the fastest sine, differences of positions make forces of their own."""
+    truth = {"friction": (0.05, 0.05, 0.05), "ripple": 0.0}
+    assert view_of(problem_of(tmp_path, 0, dt=0.3, seconds=600, **truth)) is None
+    assert view_of(problem_of(tmp_path, 0, **truth)).placed
+
+
+def test_only_logs_with_all_forces_are_judged(tmp_path: Path) -> None:
+    def holds(old: str, new: str) -> bool:
+        assert old in ARM
+        problem = problem_of(tmp_path, 0, ARM.replace(old, new), seconds=4)
+        return has_forces(make_setting(problem, problem.trajectories))
+
+    assert holds("<mujoco>", "<mujoco>")
+    assert not holds('<motor name="m3" joint="elbow"/>', '<position name="m3" joint="elbow" kp="10"/>')
+    assert not holds('<motor name="m3" joint="elbow"/>', '<motor name="m3" joint="shoulder"/>')
+    assert not holds("<actuator>", '<equality><joint joint1="base" joint2="elbow"/></equality><actuator>')
+
+
+@pytest.fixture
+def linear() -> Callable[..., regression.Regression]:
+    def make(seed: int, *, columns: int = 6, effects: int = 2, blocks: int = 12) -> regression.Regression:
+        draw, n = np.random.default_rng(seed), 20 * blocks
+        basis, truth = draw.normal(size=(columns, n, 2)), np.zeros(columns)
+        truth[:effects] = draw.uniform(0.5, 1.5, effects)
+        signal = np.einsum("p,pnj->nj", truth, basis) + draw.normal(size=(n, 2)) * [0.3, 2.0]
+        every = np.full(columns, np.inf)
+        return regression.Regression(signal, basis, -every, every, every, np.repeat(np.arange(blocks), 20))
+
+    return make
+
+
+def test_unseen_blocks_are_predicted_by_the_others(linear: Callable) -> None:
+    problem, chosen = linear(0), np.array([True, True, True, False, False, False])
+    found = regression.unseen(problem, chosen)
+    for block in (0, 7):
+        rows = problem.blocks != block
+        rest = replace(problem, signal=problem.signal[rows], columns=problem.columns[:, rows],
+                       blocks=problem.blocks[rows])  # fmt: skip
+        left = problem.left(regression.fit(rest, chosen))[~rows]
+        assert found[block] == pytest.approx((left**2).mean(0), rel=1e-9)
+
+
+def test_every_output_weighs_by_its_own_noise(linear: Callable) -> None:
+    """Coefficients are those of weighted least squares with the noise of the outputs, and lie within bounds."""
+    problem, chosen = linear(1), np.ones(6, dtype=bool)
+    found = regression.fit(problem, chosen)
+    size = np.sqrt((problem.left(found) ** 2).mean(0))
+    matrix = (problem.columns / size).reshape(6, -1).T
+    best = np.linalg.lstsq(matrix, (problem.signal / size).ravel(), rcond=None)[0]
+    assert found == pytest.approx(best, abs=1e-3)
+    bounded = regression.fit(replace(problem, high=np.full(6, 0.4)), chosen)
+    assert bounded.max() <= 0.4 + 1e-9
+    assert bounded[:2] == pytest.approx(0.4, abs=1e-6)
+
+
+def test_a_prior_holds_what_the_signal_does_not_show(linear: Callable) -> None:
+    problem = linear(2)
+    columns = problem.columns.copy()
+    columns[5] = columns[0] + 1e-6 * columns[5]
+    told = np.full(6, np.inf)
+    told[5] = 1e-3
+    found = regression.fit(replace(problem, columns=columns, prior=told), np.ones(6, dtype=bool))
+    assert abs(found[5]) < 3e-3
+
+
+def test_chance_chooses_rarely(linear: Callable) -> None:
+    """Of logs with noise alone, few keep a column that chance does not explain at one in a hundred."""
+    kept = 0
+    for seed in range(60):
+        problem = linear(100 + seed, effects=0)
+        chosen = regression.select(problem, np.arange(6), np.arange(6))
+        parts = [np.arange(6) == p for p in np.flatnonzero(chosen)]
+        kept += any(p < 0.01 for p in regression.chances(problem, chosen, parts))
+    assert kept <= 6
+
+
+def test_half_widths_cover(linear: Callable) -> None:
+    inside = []
+    for seed in range(60):
+        problem, chosen = linear(200 + seed, effects=0), np.ones(6, dtype=bool)
+        found = regression.fit(problem, chosen)
+        inside.append(np.abs(found) < regression.half_widths(problem, chosen, found))
+    assert 0.85 <= np.mean(inside) <= 0.96
+
+
+def test_low_pass_keeps_phase_and_constants() -> None:
+    times = np.arange(2000) * 0.005
+    slow, fast = np.sin(2 * np.pi * times)[:, None], np.sin(2 * np.pi * 40 * times)[:, None]
+    assert low_pass(slow + fast + 1, 200, 10)[200:-200] == pytest.approx((slow + 1)[200:-200], abs=2e-3)
+    assert low_pass(fast, 200, 90) is fast
+
+
+def test_forces_overrule_what_predictions_reward(tmp_path: Path) -> None:
+    """An arm under torques drifts, and predictions name rotor inertias that slow it down: the forces know better."""
+    truth = {"friction": (0.5, 0.8, 0.3), "center": 0.05, "ripple": 0.02, "seconds": 20}
+    problem = problem_of(tmp_path, 5, **truth)
+    gap = find_gap(problem, effects=[find_effect(name) for name in LINEAR])
+    assert not gap.skill
+    assert gap.verdict == "partly explained"
+    assert {(e.effect, e.target) for e in gap.effects} == {("joint_friction", "*"), ("center_of_mass", "fore")}
+    friction = next(e.parameters for e in gap.effects if e.effect == "joint_friction")
+    assert [friction[j].value for j in JOINTS] == pytest.approx(truth["friction"], rel=0.05)
+    assert [f.joint for f in gap.forces] == list(JOINTS)
+    assert all(f.after < 0.3 * f.before for f in gap.forces)
+    assert gap.after.rollout_rmse < 0.1 * gap.before.rollout_rmse
+    headline, items = answer(gap)
+    assert "forces at its joints decide" in headline
+    assert any("base 0.5" in item and "elbow 0.3" in item for item in items)
+    assert "by the forces at the joints" in gap.document()["verdict_reason"]
+    add(problem, gap, tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert model.dof_frictionloss == pytest.approx([friction[j].value for j in JOINTS], rel=1e-4)
+    write_gap_report(tmp_path / "report.html", gap)
+    assert "Unexplained force at the joints" in (tmp_path / "report.html").read_text()
