@@ -17,7 +17,7 @@ from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.renew import moved, noise_beside
-from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Score, Strength
+from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Residuals, Score, Strength
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
@@ -29,6 +29,8 @@ from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, sco
 
 #: Fits after the last one, at most, each with the weights that the one before suggests.
 ROUNDS = 3
+#: Joints of which forces are shown, where these decide.
+PICTURES = 4
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -106,8 +108,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
     """
     setting, evidence = scene.setting, scene.evidence
     model, hypothesis = setting.model, scene.begin.with_effects(view.placed)
-    held, noise = cut_held(evidence, scene.held, hypothesis), np.array(gap.noise)
-    before, after = (free_forces(scene.twin, scene.short, h.variant, noise) for h in (scene.begin, hypothesis))
+    held = cut_held(evidence, scene.held, hypothesis)
     chi2 = [refit(evidence, h, iterations=0, slopes=False).cost.reduced for h in (scene.begin, hypothesis)]
     named = []
     for placed, halves, share, tied in zip(view.placed, view.halves, view.shares, view.ties, strict=True):
@@ -126,7 +127,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
         after=after_score,
         declared={n: (given, alone, given) for n, (given, alone, _) in gap.declared.items()},
         reduced=(chi2[0], chi2[1]),
-        residuals=residual_pictures(setting, before, after, 2),
+        residuals=_force_pictures(setting, view),
         simulated_transitions=scene.twin.simulated_transitions,
         refused="",
         symbolic="",
@@ -140,6 +141,19 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
         ),
         forces=tuple(JointForce(j, force_unit(model, dof), b, a) for dof, (j, b, a) in enumerate(left)),
     )
+
+
+def _force_pictures(setting: Setting, view: ForceView) -> tuple[Residuals, ...]:
+    """The forces that a simulation would need besides, where most is explained, against the joints' velocity."""
+    gained = 1 - view.after / np.maximum(view.before, 1e-300)
+    return tuple(
+        Residuals(
+            f"Missing force at {dof_names(setting.model)[dof]}, on held-out data",
+            f"velocity ({'m/s' if force_unit(setting.model, dof) == 'N' else 'rad/s'})", force_unit(setting.model, dof),
+            view.velocity[:, dof], -view.missing[:, dof], -view.left[:, dof],
+        )
+        for dof in np.argsort(-gained)[:PICTURES].tolist()
+    )  # fmt: skip
 
 
 def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> tuple[Resolved, Refit]:

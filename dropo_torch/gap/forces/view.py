@@ -27,30 +27,43 @@ class ForceView:
     """Effects by which the forces at the joints suit their motion.
 
     Attributes:
+        velocity: of the joints on held-out data, ``(N, nv)``.
+        missing: logged force minus what that motion needs in the model as it is, ``(N, nv)``.
+        left: the same with the effects, ``(N, nv)``.
+        rival: the same with the effects that predictions named; ``None`` where forces cannot tell these.
         placed: the effects, with values; none where forces give no names.
         halves: half-widths of the 90 % intervals of each effect's numbers.
         shares: share of the unseen forces' mean squares that comes back without each.
         ties: for each effect those that may stand in its place: others that explain the log as well, and centres of
             mass of other bodies, which are only known together.
-        before, after: root mean square of the force that is missing at each joint on held-out data, ``(nv,)``.
-        rival: the same with the effects that predictions named; ``None`` where forces cannot tell these.
     """
 
-    placed: tuple[Placed, ...]
-    halves: tuple[np.ndarray, ...]
-    shares: tuple[float, ...]
-    ties: tuple[tuple[Placed, ...], ...]
-    before: np.ndarray
-    after: np.ndarray
+    velocity: np.ndarray
+    missing: np.ndarray
+    left: np.ndarray
     rival: np.ndarray | None = None
+    placed: tuple[Placed, ...] = ()
+    halves: tuple[np.ndarray, ...] = ()
+    shares: tuple[float, ...] = ()
+    ties: tuple[tuple[Placed, ...], ...] = ()
 
-    def left(self, forces: np.ndarray) -> float:
-        """Return the share of the forces' mean squares that is left, averaged over the joints."""
-        return float(np.mean((forces / np.maximum(self.before, 1e-300)) ** 2))
+    @property
+    def before(self) -> np.ndarray:
+        """Root mean square of the missing force of each joint ``(nv,)``."""
+        return _rms(self.missing)
+
+    @property
+    def after(self) -> np.ndarray:
+        """The same with the effects, ``(nv,)``."""
+        return _rms(self.left)
+
+    def share(self, left: np.ndarray) -> float:
+        """Return the share of the forces' mean squares that is left ``(N, nv)``, averaged over the joints."""
+        return float(np.mean((_rms(left) / np.maximum(self.before, 1e-300)) ** 2))
 
     def beats_rival(self, rules: Forces) -> bool:
         """Return whether the effects leave clearly less than those that predictions named."""
-        return self.rival is not None and self.left(self.after) < rules.clearer * self.left(self.rival)
+        return self.rival is not None and self.share(self.left) < rules.clearer * self.share(self.rival)
 
 
 def force_view(
@@ -74,21 +87,21 @@ def force_view(
     if not placed or not parts or not others or coarse(setting, train, highest, rules):
         return None
     seen, last = terms(setting, parts, placed), terms(setting, others, placed)
-    blocks = _blocks(seen.episodes, highest, rules)
+    blocks = _blocks(seen.episodes, rules)
     if blocks is None:
         return None
-    regression = _regression(seen, blocks)
+    regression, unknown = _regression(seen, blocks), _regression(last, last.episodes)
     chosen = _sure(seen, regression, select(regression, seen.owner, _families(seen)), rules)
-    found = fit(regression, chosen)
-    others_left = _regression(last, last.episodes)
-    before, after = _rms(last.missing), _rms(others_left.left(found))
-    theirs = _coefficients(placed, last.owner, rival)
-    seen_by = ForceView((), (), (), (), before, after, None if theirs is None else _rms(others_left.left(theirs)))
-    if not chosen.any() or seen_by.left(after) > rules.left:
-        return replace(seen_by, after=before)
+    found, theirs = fit(regression, chosen), _coefficients(placed, last.owner, rival)
+    named = ForceView(
+        np.concatenate([part.compared(part.velocity) for part in others]), last.missing, unknown.left(found),
+        None if theirs is None else unknown.left(theirs),
+    )  # fmt: skip
+    if not chosen.any() or named.share(named.left) > rules.left:
+        return replace(named, left=last.missing)
     members, halves = np.unique(seen.owner[chosen]), half_widths(regression, chosen, found)
     return replace(
-        seen_by,
+        named,
         placed=tuple(placed[i].at(np.array(placed[i].values) + found[seen.owner == i]) for i in members),
         halves=tuple(halves[seen.owner == i] for i in members),
         shares=_shares(regression, chosen, seen.owner),
@@ -122,7 +135,7 @@ def coarse(setting: Setting, log: Trajectories, highest: float, rules: Forces) -
     return bool(np.abs(np.log(np.maximum(sizes[1], 1e-300) / np.maximum(sizes[0], 1e-300))).max() > rules.sampled)
 
 
-def _blocks(episodes: np.ndarray, highest: float, rules: Forces) -> np.ndarray | None:
+def _blocks(episodes: np.ndarray, rules: Forces) -> np.ndarray | None:
     """Blocks of rows ``(N,)``: episodes, or runs of one; none is shorter than what counts as one observation."""
     least, most = rules.blocks
     if len(np.unique(episodes)) >= least:
