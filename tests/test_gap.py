@@ -38,7 +38,7 @@ from dropo_torch.gap.noise import Diverges, _relative_noise, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
-from dropo_torch.gap.rules import Rules, accounts, allowance, clears
+from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Naming
@@ -361,6 +361,16 @@ def test_what_named_effects_leave_is_said_first() -> None:
     assert "a finer step" in gap.document()["verdict_reason"]
 
 
+def test_what_adds_up_in_open_loop_is_said() -> None:
+    """However little short windows show: an open-loop error far above that of noise is no full explanation."""
+    names = ("joint_damping",)
+    assert found(names).verdict == "explained"
+    gap = search(hidden(*names), FEW, rules=Rules(sound=Sound(astray=0.01)))
+    assert gap.verdict == "partly explained"
+    assert gap.remaining.open_loop == pytest.approx(gap.after.rollout_rmse / gap.noise_floor.rollout_rmse)
+    assert "open-loop errors are" in gap.document()["verdict_reason"]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("yield_at", [0.1, 0.4])
 def test_outsider_is_not_named_while_it_misfits_by_far(yield_at: float) -> None:
@@ -402,7 +412,7 @@ def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
 NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
-    "effects": list, "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
+    "effects": list, "forces": (list, type(None)), "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)), "unfinished": (str, type(None)),
     "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dropo_torch.gap.chance import least_surplus, p_of_gain, p_of_ranks, p_of_share
+from dropo_torch.gap.chance import least_surplus, p_of_gain, p_of_ranks, p_of_share, p_of_stretch
 from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.log import parts_of
 from dropo_torch.gap.rules import Rules, as_good
@@ -49,6 +49,31 @@ def test_true_effects_have_their_name_although_gains_differ_by_decades(share: fl
         before = np.exp(2.0 * rng.standard_normal(20) + 6)
         after = before * (1 - share) * rng.uniform(0.5, 1, 20)
         assert p_of_gain(before, after, 1) * CANDIDATES <= ERROR
+
+
+@pytest.mark.parametrize("numbers", [1, 2])
+def test_what_shows_in_one_stretch_is_seldom_named_by_chance(numbers: int) -> None:
+    """Misfits of three shapes in a stretch, and a direction drawn at random for each number of 100 candidates."""
+    rng, named, noise = np.random.default_rng(3), 0, np.full(20, 20.0)
+    for _ in range(300):
+        before = np.append(np.full(19, 10.0), 1e8)
+        shape, found = rng.standard_normal(3), []
+        for _ in range(CANDIDATES):
+            basis = np.linalg.qr(rng.standard_normal((3, numbers)))[0]
+            left = 1 - np.sum((basis.T @ shape) ** 2) / (shape @ shape)
+            found.append(p_of_stretch(before, np.append(before[:19], left * 1e8), noise, numbers))
+        named += 3 * min(found) * CANDIDATES <= ERROR
+    assert named <= stats.binom.ppf(0.99, 300, ERROR)
+
+
+def test_what_shows_in_one_stretch_is_named_where_it_explains_all_of_it() -> None:
+    quiet, noise = np.full(20, 10.0), np.full(20, 20.0)
+    once = np.append(quiet[:19], 1e8)
+    assert p_of_gain(once, quiet, 1) * CANDIDATES > ERROR
+    assert 3 * p_of_stretch(once, quiet, noise, 1) * CANDIDATES <= ERROR
+    assert 3 * p_of_stretch(once, 1e-3 * once, noise, 1) * CANDIDATES > ERROR
+    assert 3 * p_of_stretch(np.append(quiet[:19], 1e4), quiet, noise, 1) * CANDIDATES > ERROR  # as far as noise shows
+    assert p_of_stretch(once, quiet, noise, 3) == 1
 
 
 def test_short_log_shows_what_removes_nearly_everything() -> None:

@@ -253,7 +253,7 @@ def test_unnamed(tmp_path: Path) -> None:
     assert text.count("<svg") == 3 + 1
 
 
-LEFT = Remaining(1354.7, 0.0075, 0.83, "wrist", "when wrist accelerates")
+LEFT = Remaining(1354.7, 0.0075, 0.83, "wrist", "when wrist accelerates", 2.0)
 
 
 @pytest.mark.parametrize("effects", [(FRICTION,), (FRICTION, replace(FRICTION, target="wrist"))])

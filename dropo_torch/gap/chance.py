@@ -11,6 +11,9 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+#: Independent shapes that the misfit of one stretch may have, at least.
+SHAPES = 3
+
 
 def p_of_ranks(gains: np.ndarray) -> float:
     """Return how likely gains of blocks ``(B,)`` are as large, by Wilcoxon's signed ranks, where either sign is.
@@ -39,6 +42,25 @@ def p_of_share(before: np.ndarray, after: np.ndarray, numbers: int) -> float:
     if count <= numbers or share <= 0:
         return 1.0
     return float(stats.beta.sf(share, 0.5 * numbers, 0.5 * (count - numbers)))
+
+
+def p_of_stretch(before: np.ndarray, after: np.ndarray, noise: np.ndarray, numbers: int) -> float:
+    """Return how likely an effect that has nothing to do with the worst block's misfit removes as large a share of it.
+
+    What shows in one stretch only, such as a limit that is reached once, no test over blocks can see. Of misfits of
+    :data:`SHAPES` independent shapes, p numbers drawn at random remove a share as in :func:`p_of_share`. That proves
+    something only where all but a hundred-thousandth is gone, of a misfit that is as much larger than its noise.
+
+    Args:
+        before, after: excess χ² of each block without and with the effect, ``(B,)``.
+        noise: standard deviation of each block's χ² by noise alone, ``(B,)``.
+        numbers: p, those that the effect has.
+    """
+    worst = int(np.argmax(before))
+    if numbers >= SHAPES or before[worst] <= 0:
+        return 1.0
+    left = max(float(after[worst]), 2 * float(noise[worst])) / float(before[worst])
+    return float(stats.beta.cdf(min(left, 1.0), 0.5 * (SHAPES - numbers), 0.5 * numbers))
 
 
 def p_of_gain(before: np.ndarray, after: np.ndarray, numbers: int) -> float:

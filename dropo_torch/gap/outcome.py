@@ -63,7 +63,9 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
         shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
-    remaining = _remaining(setting, naming, rest, after, rules) if naming.named else None
+    own_step, astray = _own_step(naming, rest, rules), after_score.rollout_rmse / max(floor.rollout_rmse, 1e-300)
+    untold = naming.named and (own_step is None or naming.partial)
+    remaining = _remaining(setting, naming, rest, after, astray, rules) if untold else None
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)
     return Gap(
         where=places(setting, before, naming.first, rules.shown) if naming.gap else (),
@@ -92,7 +94,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         remaining=remaining,
         refused=naming.refused,
         unfinished=naming.unfinished,
-        own_step=_own_step(naming, rest, rules),
+        own_step=own_step,
         joints=joint_names(setting) if naming.family else {},
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",
     )
@@ -196,18 +198,19 @@ def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
     return replace(naming, final=naming.base, named=False, ties=(), shares=(), partial=False, refused=reason)
 
 
-def _remaining(setting: Setting, naming: Naming, rest: Refit, after: FreeForces, rules: Rules) -> Remaining | None:
+def _remaining(
+    setting: Setting, naming: Naming, rest: Refit, after: FreeForces, astray: float, rules: Rules
+) -> Remaining | None:
     """What the named effects leave, if it is more than noise; what only the step of the model leaves is no part."""
     cost, typical = rest.cost, rest.typical
-    if not naming.partial and not remains(cost, rules):
+    if not naming.partial and not remains(cost, rules) and not astray > rules.sound.astray:
         return None
     base = naming.base.cost
     dof = guilty(after)
     share = float(np.clip(cost.excess / cost.degrees / (base.excess / base.degrees), 0, 1))
     off = float(np.mean(typical > rules.sound.rest))
-    return Remaining(
-        cost.reduced, share, off, dof_names(setting.model)[dof], regime(setting, after, dof, rules.shown).words
-    )
+    when = regime(setting, after, dof, rules.shown).words
+    return Remaining(cost.reduced, share, off, dof_names(setting.model)[dof], when, astray)
 
 
 def _own_step(naming: Naming, rest: Refit, rules: Rules) -> tuple[float, float] | None:

@@ -121,6 +121,7 @@ class Remaining:
         windows: share of the log's stretches in which it shows.
         where: joint whose missing force stands out most.
         when: the regime in which that shows, in words, or empty.
+        open_loop: open-loop error on held-out data, in units of what noise alone makes.
     """
 
     chi2_per_degree: float
@@ -128,6 +129,7 @@ class Remaining:
     windows: float
     where: str
     when: str
+    open_loop: float
 
 
 @dataclass(frozen=True)
@@ -276,7 +278,8 @@ def reason(gap: Gap) -> str:
     when = f", {left.when}" if left.when else ""
     return (
         f"what the named effects leave is more than noise: χ² per degree of freedom is {left.chi2_per_degree:.3g} "
-        f"(1 is noise alone), in {100 * left.windows:.0f} % of the log's stretches, mostly at {left.where}{when}"
+        f"(1 is noise alone), in {100 * left.windows:.0f} % of the log's stretches, mostly at {left.where}{when}; "
+        f"open-loop errors are {left.open_loop:.3g} times what noise alone makes"
     )
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dropo_torch.gap.chance import least_surplus, p_of_gain
+from dropo_torch.gap.chance import least_surplus, p_of_gain, p_of_stretch
 
 if TYPE_CHECKING:
     from dropo_torch.gap.evidence import Cost
@@ -120,6 +120,8 @@ class Sound:
         edge: distance from a bound, relative to the number's scale, within which it is at it.
         floor: open-loop error, relative to what noise alone makes, up to which a model has skill although constant
             velocity predicts as well: where nothing accelerates, a perfect model is no better.
+        astray: open-loop error, relative to what noise alone makes, from which on something remains besides the named
+            effects although short windows hardly show it: a small force adds up.
         rest: χ² per degree of freedom from which on what remains beside the named effects is said in the first
             sentence. An estimate of the noise that is a fifth too low makes as much.
         model_error: χ² per degree of freedom from which on the last fit weighs residuals by their own sizes, since the
@@ -131,6 +133,7 @@ class Sound:
     pushes: float = 3.0
     edge: float = 1e-3
     floor: float = 1.5
+    astray: float = 5.0
     rest: float = 1.5
     model_error: float = 3.0
     wrong: float = 20.0
@@ -330,7 +333,17 @@ def clears(base: Refit, current: Refit, rules: Rules) -> bool:
 def chance_of(better: Refit, worse: Refit, blocks: np.ndarray) -> float:
     """Return how likely a hypothesis is as much better by chance, over blocks of the log ``(W,)``."""
     numbers = max(1, len(better.hypothesis.vector) - len(worse.hypothesis.vector))
-    return p_of_gain(_excesses(worse.cost, blocks), _excesses(better.cost, blocks), numbers)
+    everywhere = p_of_gain(_excesses(worse.cost, blocks), _excesses(better.cost, blocks), numbers)
+    every = np.unique(blocks, return_inverse=True)[1]
+    noise = np.sqrt(2 * worse.residual.shape[1] * np.bincount(every))
+    before, after = (np.bincount(every, _plain(r)) for r in (worse, better))
+    return min(1.0, 1.5 * everywhere, 3 * p_of_stretch(before, after, noise, numbers))
+
+
+def _plain(fitted: Refit) -> np.ndarray:
+    """Excess χ² of each window as it is, however it is capped ``(W,)``; none of those that do not count."""
+    chi2 = (fitted.residual**2).sum(-1)
+    return np.where(fitted.linear.counted, chi2 - fitted.linear.weights.astype(bool).sum(-1), 0.0)
 
 
 def as_good(rival: Cost, own: Cost, blocks: np.ndarray, rules: Rules) -> bool:

@@ -11,6 +11,8 @@ from dropo_torch.gap.result import Gap, NamedEffect, Place, Remaining, Strength,
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
 UNNAMED = "unnamed"
+#: Open-loop errors, relative to those by noise alone, from which on they are told.
+FAR = 5.0
 #: Times in seconds below this are given in milliseconds.
 SHORT = 0.1
 #: Of effects with more numbers than this, the answer gives only the first.
@@ -239,7 +241,12 @@ def left(remaining: Remaining) -> str:
     """Return what named effects leave, and where and when it shows."""
     size = f"what remains is {short(remaining.chi2_per_degree)} times what noise would leave (χ² per degree of freedom)"
     when = f", {remaining.when}" if remaining.when else ""
-    return f"{size}, mostly at {remaining.where}{when}"
+    far = (
+        f"; open-loop errors are {short(remaining.open_loop)} times what noise makes"
+        if remaining.open_loop > FAR
+        else ""
+    )
+    return f"{size}, mostly at {remaining.where}{when}{far}"
 
 
 def shows(gap: Gap) -> str:
