@@ -23,7 +23,7 @@ from dropo_torch.gap import add, find_gap, prepare
 from dropo_torch.gap.forces.motion import highest_frequency, stretches
 from dropo_torch.gap.forces.terms import needed
 from dropo_torch.problem import Problem
-from dropo_torch.report.gap_words import answer
+from dropo_torch.report.gap_words import answer, change
 
 HERE = Path(__file__).parent
 FILES = {"q": "positions", "dq": "velocity", "tau": "torques"}
@@ -82,7 +82,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     gap = find_gap(problem)
     gap = replace(gap, notes=(*gap.notes, *add(problem, gap, given.out)))
     headline, items = answer(gap)
-    print(headline, *(f"  - {item}" for item in items), *gap.notes, sep="\n")
+    print(headline, *(f"  - {item}" for item in items), change(gap), *gap.notes, sep="\n")
     print(f"\nunexplained torque in the unseen quarter, N·m\n{'joint':<8}{'as given':>10}{'published':>11}{'found':>9}")
     for force, theirs in zip(gap.forces, published(problem), strict=True):
         print(f"{force.joint:<8}{force.before:>10.3f}{theirs:>11.3f}{force.after:>9.3f}")
