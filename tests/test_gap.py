@@ -29,7 +29,7 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
-from dropo_torch.gap.accept import imitates
+from dropo_torch.gap.accept import imitates, is_done
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
@@ -359,6 +359,33 @@ def test_what_named_effects_leave_is_said_first() -> None:
     assert gap.own_step[0] > 3 > gap.own_step[1]
     assert "the model's own step leaves" in answer(gap)[0]
     assert "a finer step" in gap.document()["verdict_reason"]
+
+
+def test_a_small_part_of_a_large_gap_is_named_where_it_leaves_nothing() -> None:
+    """A delay, and beside it a damping that is 0.04 % of the misfit: without it the log is still not explained."""
+    truth = [
+        Effect("actuator_delay", "push", {"delay": 0.03}), Effect("joint_damping", "hinge", {"damping": 0.0005})
+    ]  # fmt: skip
+    case = simulate_truth(CART_POLE, truth, 3, **SIZE)
+    gap = search(case, ("actuator_delay", "actuator_lag", "joint_damping", "actuator_gain"))
+    assert {(e.effect, e.target) for e in gap.effects} == {(e.name, e.target) for e in truth}
+    damping = next(e for e in gap.effects if e.effect == "joint_damping")
+    assert damping.share_of_gap < Rules().least
+    assert damping.parameters["damping"].value == pytest.approx(0.0005, rel=0.02)
+    assert gap.verdict == "explained"
+
+
+@pytest.mark.parametrize(("excess", "done"), [(30.0, True), (98.0, False), (400.0, False)])
+def test_search_goes_on_while_what_is_left_is_too_much_to_be_named(excess: float, done: bool) -> None:
+    """A gap of 50 standard deviations of χ²: a tenth of it is no more than noise may be, and yet too much."""
+
+    def fitted(excess: float) -> SimpleNamespace:
+        cost = Cost(np.full(20, 10 + excess / 20), np.zeros(20), 200.0)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis(()))
+
+    assert fitted(98.0).cost.excess == pytest.approx(4.9 * fitted(98.0).cost.sigma)
+    ground = SimpleNamespace(rules=Rules(least_reduced=1.0), clears=lambda base, current: False)
+    assert is_done(ground, SimpleNamespace(base=fitted(1000.0), current=fitted(excess))) == done
 
 
 def test_what_adds_up_in_open_loop_is_said() -> None:

@@ -8,7 +8,7 @@ from dataclasses import replace
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit, resolved
-from dropo_torch.gap.rules import beyond_free, significant, simplest
+from dropo_torch.gap.rules import accounts, beyond_free, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -21,9 +21,17 @@ def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
 
 def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
     """Return whether an effect may have a name: it removes enough, and chance among all candidates does not."""
-    rules = ground.rules
-    enough = without.cost.excess - whole.cost.excess >= rules.least * state.base.cost.excess
-    return enough and ground.chance(whole, without) * ground.comparisons <= rules.chance.error
+    by_chance = ground.chance(whole, without) * ground.comparisons
+    return matters(ground, state, whole, without) and by_chance <= ground.rules.chance.error
+
+
+def matters(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
+    """Return whether an effect removes enough of the first excess, or all that is left where that is a small part."""
+    rules, left = ground.rules, without.cost.excess
+    if left - whole.cost.excess >= rules.least * state.base.cost.excess:
+        return True
+    clears = significant(without.cost, rules) and not significant(whole.cost, rules)
+    return clears and whole.cost.excess <= (1 - rules.most) * left
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
@@ -45,11 +53,18 @@ def imitates(ground: Ground, fitted: Refit) -> bool:
 
 
 def is_done(ground: Ground, state: State) -> bool:
-    """Return whether what is left is noise, or too small a part of the gap to tell anything."""
-    base, current = state.base, state.current
-    if ground.clears(base, current) or not significant(current.cost, ground.rules):
+    """Return whether what is left is noise, or so small a part of the gap that the model's own step makes it.
+
+    Of a gap that is itself little more than noise, what is left may be both no more than that and too much to be named.
+    """
+    base, current, rules = state.base, state.current, ground.rules
+    if ground.clears(base, current):
         return True
-    return current.cost.excess < ground.rules.least * base.cost.excess
+    if not significant(current.cost, rules):
+        return accounts(current, base, rules) or current.cost.excess < 0.5 * rules.gate * current.cost.sigma
+    if current.cost.excess >= rules.least * base.cost.excess:
+        return False
+    return not significant(resolved(ground.part, current).fit.cost, rules)
 
 
 def add(ground: Ground, state: State) -> State:
@@ -78,8 +93,7 @@ def add(ground: Ground, state: State) -> State:
             tried = sound(ground, tried)
             if tried and tried[0].cost.excess < rules.tried.clearer * best.cost.excess:
                 best = tried[0]
-    gained = current.cost.excess - best.cost.excess
-    hopeless = best.cost.excess > rules.hopeless * current.cost.excess or gained < rules.least * state.base.cost.excess
+    hopeless = best.cost.excess > rules.hopeless * current.cost.excess or not matters(ground, state, best, current)
     if hopeless or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best)
