@@ -137,6 +137,16 @@ def test_a_log_that_is_too_coarse_says_nothing(tmp_path: Path) -> None:
     assert view_of(problem_of(tmp_path, 0, **truth)).placed
 
 
+def test_a_log_of_short_episodes_says_nothing(tmp_path: Path) -> None:
+    """Episodes of a few rows have no frequencies, nor has a robot that rests."""
+    problem = problem_of(tmp_path, 0, friction=(0.5, 0.8, 0.3))
+    log = problem.trajectories
+    ends = np.arange(len(log.terminals)) % 4 == 3
+    assert view_of(replace(problem, trajectories=replace(log, terminals=ends))) is None
+    resting = replace(log, observations=0 * log.observations, next_observations=0 * log.next_observations)
+    assert view_of(replace(problem, trajectories=resting)) is None
+
+
 def test_only_logs_with_all_forces_are_judged(tmp_path: Path) -> None:
     def holds(old: str, new: str) -> bool:
         assert old in ARM

@@ -8,11 +8,10 @@ import numpy as np
 
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.gap.result import Gap, NamedEffect, Place, Remaining, Strength, fallen
+from dropo_torch.gap.rules import Sound
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
 UNNAMED = "unnamed"
-#: Open-loop errors, relative to those by noise alone, from which on they are told.
-FAR = 5.0
 #: Times in seconds below this are given in milliseconds.
 SHORT = 0.1
 #: Of effects with more numbers than this, the answer gives only the first.
@@ -243,7 +242,7 @@ def left(remaining: Remaining) -> str:
     when = f", {remaining.when}" if remaining.when else ""
     far = (
         f"; open-loop errors are {short(remaining.open_loop)} times what noise makes"
-        if remaining.open_loop > FAR
+        if remaining.open_loop > Sound().astray
         else ""
     )
     return f"{size}, mostly at {remaining.where}{when}{far}"

@@ -84,8 +84,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     headline, items = answer(gap)
     print(headline, *(f"  - {item}" for item in items), change(gap), *gap.notes, sep="\n")
     print(f"\nunexplained torque in the unseen quarter, N·m\n{'joint':<8}{'as given':>10}{'published':>11}{'found':>9}")
-    for force, theirs in zip(gap.forces, published(problem), strict=True):
-        print(f"{force.joint:<8}{force.before:>10.3f}{theirs:>11.3f}{force.after:>9.3f}")
+    left = np.array([(f.before, theirs, f.after) for f, theirs in zip(gap.forces, published(problem), strict=True)])
+    joints = [*(force.joint for force in gap.forces), "all"]
+    for joint, row in zip(joints, [*left, np.sqrt((left**2).mean(0))], strict=True):
+        print(f"{joint:<8}{row[0]:>10.3f}{row[1]:>11.3f}{row[2]:>9.3f}")
 
 
 if __name__ == "__main__":

@@ -68,7 +68,7 @@ def has_forces(setting: Setting) -> bool:
 
 
 def highest_frequency(log: Trajectories, setting: Setting) -> float:
-    """Return the frequency in Hz below which the joints move, by the power of their velocities."""
+    """Return the frequency in Hz below which the joints move, by the power of their velocities; 0 if none does."""
     frequencies, powers = [], []
     for path, _ in _paths(log, setting):
         speed, rate = np.diff(path, axis=0), 1 / setting.signals.timestep
@@ -78,11 +78,12 @@ def highest_frequency(log: Trajectories, setting: Setting) -> float:
     at, power = np.concatenate(frequencies), np.concatenate(powers)
     order = np.argsort(at)
     below = np.cumsum(power[order], axis=0) / np.maximum(power.sum(0), 1e-300)
-    return float(max(at[order][np.searchsorted(column, POWER)] for column in below.T if column[-1] > 0))
+    moving = [at[order][np.searchsorted(column, POWER)] for column in below.T if column[-1] > 0]
+    return float(max(moving, default=0.0))
 
 
 def stretches(log: Trajectories, setting: Setting, highest: float, rows: int = 1) -> list[Stretch]:
-    """Return the motion of the episodes that are long enough.
+    """Return the motion of the episodes that are long enough; none where rows are too rare for a low-pass.
 
     Args:
         log: with the force of every joint.
@@ -92,6 +93,8 @@ def stretches(log: Trajectories, setting: Setting, highest: float, rows: int = 1
     """
     dt, found = rows * setting.signals.timestep, []
     cutoff = FORCES * highest
+    if not 0 < cutoff * dt < HIGHEST:
+        return []
     every = max(1, int(1 / (ROWS * cutoff * dt)))
     for path, commands in _paths(log, setting, rows):
         if len(commands) * dt * cutoff < 4:
