@@ -72,9 +72,9 @@ def test_coarse_models_err(name: str) -> None:
     assert error(system, truths.true_model(system, case.declared), case).max() > 5.0
 
 
-def _with_payload(model: mujoco.MjModel, mass: float, place: np.ndarray) -> None:
+def _with_payload(model: mujoco.MjModel, mass: float, place: np.ndarray, name: str = "fore") -> None:
     """A point mass merged into a body: parallel axes by hand."""
-    body = model.body("fore")
+    body = model.body(name)
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, body.iquat)
     turn = turn.reshape(3, 3)
@@ -87,6 +87,19 @@ def _with_payload(model: mujoco.MjModel, mass: float, place: np.ndarray) -> None
     body.ipos[:], body.inertia[:] = centre, inertia
     mujoco.mju_mat2Quat(body.iquat, axes.reshape(-1))
     body.mass[0] += mass
+
+
+def test_a_payload_touches_as_part_of_its_body() -> None:
+    """What stiffens contacts is the inertia of a body with its payload, not of the body beside a welded one."""
+    mass, place, values = 0.4, np.array([0.1, 0.02, -0.03]), {"thigh_mass": 4.0, "leg_mass": 2.7}
+    payload = Effect("payload", "foot", dict(zip(("mass", "x", "y", "z"), (mass, *place), strict=True)))
+    truth, model = truths.true_model(HOPPER, values, [payload]), truths.true_model(HOPPER, values)
+    body = truth.body("foot").id
+    bare = model.body_invweight0[body, 0]
+    _with_payload(model, mass, place, "foot")
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    assert truth.body_invweight0[body, 0] == pytest.approx(model.body_invweight0[body, 0], rel=1e-9)
+    assert truth.body_invweight0[body, 0] < 0.99 * bare
 
 
 def _spring(model: mujoco.MjModel) -> None:

@@ -601,7 +601,27 @@ def true_model(system: System, declared: Mapping[str, float], effects: Sequence[
     for e in effects:
         _change_model(model, e)
     mujoco.mj_setConst(model, mujoco.MjData(model))
+    for e in effects:
+        if e.name in ("payload", "inertia"):
+            _touch_as_one(model, model.body(e.target).id)
     return model
+
+
+def _touch_as_one(model: mujoco.MjModel, body: int) -> None:
+    """Make a body's contacts as stiff as those of one rigid body with all that is welded to it.
+
+    A contact's stiffness grows with the inertia of the bodies that touch, which MuJoCo takes at the centre of mass of
+    each; two bodies that are welded together are to it not what one with the mass of both is.
+    """
+    data, whole = mujoco.MjData(model), [body]
+    whole += [b for b in range(model.nbody) if model.body_parentid[b] == body and model.body_jntnum[b] == 0]
+    mujoco.mj_forward(model, data)
+    center = np.average(data.xipos[whole], axis=0, weights=model.body_mass[whole])
+    jacobian = np.zeros((3, model.nv))
+    mujoco.mj_jac(model, data, jacobian, None, center, body)
+    solved = np.zeros_like(jacobian)
+    mujoco.mj_solveM(model, data, solved, jacobian)
+    model.body_invweight0[body, 0] = (jacobian * solved).sum() / 3
 
 
 def make_plant(system: System, declared: Mapping[str, float], effects: Sequence[Effect], substeps: int) -> Plant:

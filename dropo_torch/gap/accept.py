@@ -8,6 +8,7 @@ from dataclasses import replace
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit, resolved
+from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import accounts, beyond_free, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
@@ -20,9 +21,20 @@ def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
 
 
 def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
-    """Return whether an effect may have a name: it removes enough, and chance among all candidates does not."""
-    by_chance = ground.chance(whole, without) * ground.comparisons
-    return matters(ground, state, whole, without) and by_chance <= ground.rules.chance.error
+    """Return whether an effect may have a name: it removes enough, and chance among all candidates does not.
+
+    Where the windows that refits use leave this open, all windows decide, at half the level.
+    """
+    if not matters(ground, state, whole, without):
+        return False
+    chance, error = ground.rules.chance, ground.chance(whole, without) * ground.comparisons
+    if error <= chance.error or error > chance.open or len(ground.evidence.windows) <= ground.few:
+        return error <= chance.error
+    ground.report("judging on all windows", 0.5)
+    every, base = with_base(replace(ground, few=len(ground.evidence.windows), caps=1.0), state.base.hypothesis)
+    whole, without = (every.refit(r.hypothesis, iterations=4) for r in (whole, without))
+    error = every.chance(whole, without) * ground.comparisons
+    return matters(every, replace(state, base=base), whole, without) and error <= 0.5 * chance.error
 
 
 def matters(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:

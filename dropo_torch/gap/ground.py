@@ -85,6 +85,7 @@ class Ground:
         report: called with a stage and its share done.
         caps: factors of the refitted windows' residuals, ``(W,)``, or 1.
         short: short windows from which the noise is estimated; ``None`` where it is given.
+        few: windows that refits use, at most.
     """
 
     evidence: Evidence
@@ -92,6 +93,7 @@ class Ground:
     report: Report = lambda stage, share: None
     caps: np.ndarray | float = 1.0
     short: Windows | None = None
+    few: int = FEW
 
     def at(self, state: State) -> Ground:
         """Return the ground with the noise, the windows and the caps that a state has found."""
@@ -115,7 +117,7 @@ class Ground:
     @cached_property
     def part(self) -> Evidence:
         """The evidence on the windows that refits use."""
-        return replace(self.evidence.on(spread(self.evidence.windows, FEW)), caps=self.caps)
+        return replace(self.evidence.on(spread(self.evidence.windows, self.few)), caps=self.caps)
 
     @cached_property
     def candidates(self) -> list[Placed]:

@@ -23,12 +23,14 @@ class Chance:
         error: share of logs in which an effect that has nothing to do with the gap may get a name: the level of each
             named effect's test against what is left without it, over all candidates together (Bonferroni).
         explore: level at which the search goes on with an effect; it only costs time, for the test above decides.
+        open: level up to which an effect that misses ``error`` on the windows that refits use is judged on all.
         blocks: stretches of the log that count as independent, at least, where it has as many windows: of fewer than
             about 15, no ranks are sure enough among hundreds of candidates.
     """
 
     error: float = 0.01
     explore: float = 0.05
+    open: float = 1.0
     blocks: int = 20
 
 
