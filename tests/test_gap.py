@@ -29,7 +29,7 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
-from dropo_torch.gap.accept import imitates, is_done
+from dropo_torch.gap.accept import imitates, is_done, is_needed
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
@@ -386,6 +386,41 @@ def test_search_goes_on_while_what_is_left_is_too_much_to_be_named(excess: float
     assert fitted(98.0).cost.excess == pytest.approx(4.9 * fitted(98.0).cost.sigma)
     ground = SimpleNamespace(rules=Rules(least_reduced=1.0), clears=lambda base, current: False)
     assert is_done(ground, SimpleNamespace(base=fitted(1000.0), current=fitted(excess))) == done
+
+
+@dataclasses.dataclass(frozen=True)
+class Judged:
+    """What a search stands on, reduced to how sure a name is on how many windows."""
+
+    chances: dict[int, float]
+    few: int = 40
+    caps: float = 1.0
+    comparisons: int = 10
+    rules: Rules = dataclasses.field(default_factory=Rules)
+    windows: range = range(120)
+    robust: bool = True
+    report: Callable = lambda *_: None
+
+    @property
+    def evidence(self) -> Judged:
+        return self
+
+    def chance(self, _whole: SimpleNamespace, _without: SimpleNamespace) -> float:
+        return self.chances[self.few]
+
+    def refit(self, hypothesis: Hypothesis, iterations: int) -> SimpleNamespace:
+        excess = {0: 5000.0, 1: 20.0}[len(hypothesis.placed)] * self.few / 40
+        return SimpleNamespace(hypothesis=hypothesis, cost=SimpleNamespace(excess=excess))
+
+
+@pytest.mark.parametrize(
+    ("few", "every", "named"),
+    [(0.0009, None, True), (0.0011, 0.0004, True), (0.0011, 0.0006, False), (0.09, 1e-9, True), (0.11, None, False)],
+)
+def test_all_windows_decide_where_few_leave_it_open(few: float, every: float | None, named: bool) -> None:
+    ground = Judged({40: few, 120: every})
+    without, whole = (ground.refit(Hypothesis((), effects), 1) for effects in ((), (placed("joint_friction", 0.3),)))
+    assert is_needed(ground, SimpleNamespace(base=without), whole, without) == named
 
 
 def test_what_adds_up_in_open_loop_is_said() -> None:

@@ -25,7 +25,7 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
 
     Where the windows that refits use leave this open, all windows decide, at half the level.
     """
-    if not matters(ground, state, whole, without):
+    if not matters(ground, state.base, whole, without):
         return False
     chance, error = ground.rules.chance, ground.chance(whole, without) * ground.comparisons
     if error <= chance.error or error > chance.open or len(ground.evidence.windows) <= ground.few:
@@ -34,13 +34,13 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
     every, base = with_base(replace(ground, few=len(ground.evidence.windows), caps=1.0), state.base.hypothesis)
     whole, without = (every.refit(r.hypothesis, iterations=4) for r in (whole, without))
     error = every.chance(whole, without) * ground.comparisons
-    return matters(every, replace(state, base=base), whole, without) and error <= 0.5 * chance.error
+    return matters(every, base, whole, without) and error <= 0.5 * chance.error
 
 
-def matters(ground: Ground, state: State, whole: Refit, without: Refit) -> bool:
+def matters(ground: Ground, base: Refit, whole: Refit, without: Refit) -> bool:
     """Return whether an effect removes enough of the first excess, or all that is left where that is a small part."""
     rules, left = ground.rules, without.cost.excess
-    if left - whole.cost.excess >= rules.least * state.base.cost.excess:
+    if left - whole.cost.excess >= rules.least * base.cost.excess:
         return True
     clears = significant(without.cost, rules) and not significant(whole.cost, rules)
     return clears and whole.cost.excess <= (1 - rules.most) * left
@@ -105,7 +105,7 @@ def add(ground: Ground, state: State) -> State:
             tried = sound(ground, tried)
             if tried and tried[0].cost.excess < rules.tried.clearer * best.cost.excess:
                 best = tried[0]
-    hopeless = best.cost.excess > rules.hopeless * current.cost.excess or not matters(ground, state, best, current)
+    hopeless = best.cost.excess > rules.hopeless * current.cost.excess or not matters(ground, state.base, best, current)
     if hopeless or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best)
