@@ -21,7 +21,7 @@ from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap.evidence import Cost, Linearisation
-from dropo_torch.gap.family import base_family, joint_of, not_needed, shares_of, without_steps
+from dropo_torch.gap.family import base_family, joint_of, not_needed, pushing, shares_of, without_steps
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.rules import Rules, family_accounts
@@ -56,11 +56,15 @@ def leg(damping: Triple = NONE, friction: Triple = NONE, rotor: Triple = NONE, o
     )
 
 
-def record(folder: Path, seed: int, **truth: Triple) -> Path:
-    """Write a noisy log of chirps of a leg with some truth, and a config with the leg as given."""
+def record(folder: Path, seed: int, *, slope: Triple = NONE, **truth: Triple) -> Path:
+    """Write a noisy log of chirps of a leg with some truth, and a config with the leg as given.
+
+    Dry friction that changes along the range, by a slope, is written into the model before each step.
+    """
     rng = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(leg(**truth))
     data = mujoco.MjData(model)
+    friction = model.dof_frictionloss.copy()
     time = 0.005 * np.arange(ROWS + 1)
     phase = 2 * np.pi * (0.3 * time + 0.15 * time**2)
     targets = 0.5 * np.sin(phase[:, None] * rng.uniform(0.8, 1.2, 3) + rng.uniform(0, 6, 3))
@@ -68,7 +72,9 @@ def record(folder: Path, seed: int, **truth: Triple) -> Path:
     for target in targets:
         rows.append(np.concatenate([data.qpos, data.qvel]))
         data.ctrl[:] = target
-        mujoco.mj_step(model, data, 2)
+        for _ in range(2):
+            model.dof_frictionloss[:] = friction + slope * data.qpos
+            mujoco.mj_step(model, data)
     observations = np.array(rows) + rng.standard_normal((len(rows), 6)) * np.repeat(NOISE, 3)
     np.savez(folder / "leg.npz", observations=observations, actions=targets, terminals=np.arange(len(rows)) == ROWS)
     (folder / "leg.xml").write_text(leg())
@@ -116,6 +122,25 @@ def test_a_leg_with_its_base_family_predicts_nearly_as_well_as_its_sensors_allow
     gap = everything()
     assert gap.after.rollout_rmse < 3 * gap.noise_floor.rollout_rmse < 0.1 * gap.before.rollout_rmse
     assert gap.reduced[1] < 2.5 < 100 < gap.reduced[0]
+
+
+def test_dry_friction_that_changes_along_the_range_is_found_where_it_does() -> None:
+    gap = found(damping=DAMPING, friction=FRICTION, rotor=ROTOR, offset=OFFSET, slope=(0, 0.35, 0))
+    numbers = told(gap)
+    assert numbers["joint_friction_slope", "knee"] == pytest.approx(0.35, rel=0.1)
+    assert [numbers["joint_friction", j] for j in JOINTS] == pytest.approx(FRICTION, rel=0.1)
+    assert [key for key in numbers if key[0] == "joint_friction_slope"] == [("joint_friction_slope", "knee")]
+    assert not any(effect == "joint_friction_slope" for effect, _ in told(everything()))
+    assert gap.after.rollout_rmse < 4 * gap.noise_floor.rollout_rmse
+
+
+@pytest.mark.parametrize(("slope", "pushes"), [(0.7, False), (0.9, True), (-0.7, False), (-0.9, True)])
+def test_dry_friction_never_pushes(slope: float, pushes: bool, tmp_path: Path) -> None:
+    setting = prepare(dropo.make_problem(dropo.load_config(record(tmp_path, 3)), general=True)).setting
+    far = float(np.abs(setting.signals.position[setting.coordinate("knee")]).max())
+    members = [Placed(VOCABULARY["joint_friction"], "knee", (0.8 * far,)),
+               Placed(VOCABULARY["joint_friction_slope"], "knee", (slope,))]  # fmt: skip
+    assert pushing(setting, Hypothesis((), tuple(members))) == (members[1:] if pushes else [])
 
 
 def test_open_loop_errors_beside_those_of_constant_velocity(tmp_path: Path) -> None:

@@ -148,6 +148,7 @@ class Effect(abc.ABC):
         sentence: what it is, to a person; ``{target}`` stands for the target.
         shares: the values, in scales of its only quantity, from which a search begins; none for the neutral value.
         contains: names of effects that are special cases of it, at the same target.
+        alone: whether it is looked for by itself; otherwise only as a member of the base family, beside the others.
     """
 
     name: ClassVar[str]
@@ -155,6 +156,7 @@ class Effect(abc.ABC):
     sentence: ClassVar[str]
     shares: ClassVar[tuple[float, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
+    alone: ClassVar[bool] = True
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""

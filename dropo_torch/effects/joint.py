@@ -160,6 +160,44 @@ class JointStribeck(JointEffect):
         return out
 
 
+class JointFrictionSlope(JointEffect):
+    """Dry friction that is larger at one end of a joint's range than at the other, as where a linkage drives it.
+
+    On top of the dry friction that the joint has otherwise, which is that at the middle of its range (at ``qpos0``
+    where it has none), slope·(q − middle) acts against the motion. Near rest this part is no larger than what stops the
+    joint within a few physics steps; what holds it there is its other dry friction.
+    """
+
+    name = "joint_friction_slope"
+    positional = True
+    alone = False
+    sentence = "dry friction in {target} that changes along its range"
+    #: Physics steps in which its part of the friction stops a joint that is slow.
+    STOPS = 4.0
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        low, high = setting.signals.position[setting.coordinate(target)]
+        scale = float(setting.signals.force[setting.dof(target)] / max(high - low, 1e-9))
+        return (Quantity("slope", unit(setting, target, "N·m/rad", "N/m"), 0.0, -10 * scale, 10 * scale, scale),)
+
+    @staticmethod
+    def middle(model: mujoco.MjModel, target: str | None) -> float:
+        """Return the position at which it is nothing."""
+        joint = object_number(model, "jnt", target)
+        if model.jnt_limited[joint]:
+            return float(model.jnt_range[joint].mean())
+        return float(model.qpos0[model.jnt_qposadr[joint]])
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        m, dof, out = setting.model, setting.dof(target), np.zeros_like(velocity)
+        level = values[:, 0] * (position[:, setting.coordinate(target)] - self.middle(m, target))
+        stopping = m.dof_M0[dof] * np.abs(velocity[:, dof]) / (self.STOPS * m.opt.timestep)
+        out[:, dof] = -np.sign(velocity[:, dof]) * np.sign(level) * np.minimum(np.abs(level), stopping)
+        return out
+
+
 class JointStiffness(JointEffect):
     """A spring, such as a cable harness, that pulls the joint towards a rest position."""
 

@@ -15,14 +15,17 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Effect, Placed, Setting, object_number
+from dropo_torch.effects.joint import JointFrictionSlope
 from dropo_torch.gap.accept import extend
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
-from dropo_torch.gap.rules import significant
+from dropo_torch.gap.rules import remains, significant
 from dropo_torch.gap.sound import absurd
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
+#: One more of them, where what these leave is more than noise; and that on top of which it is.
+SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
 
 #: What is reported.
 STAGE = "fitting friction, inertia, offset and delay of all joints"
@@ -75,6 +78,7 @@ def has_family(ground: Ground) -> bool:
 def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
     """Return the base family with the members that are needed, if several are at several joints."""
     whole = needed(ground, fitted_family(ground, begin))
+    whole = None if whole is None else with_slopes(ground, whole)
     whole = None if whole is None else without_steps(ground, whole)
     if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
         return None
@@ -92,12 +96,48 @@ def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
     return late if late.loss < prompt.loss else prompt
 
 
+def with_slopes(ground: Ground, whole: Refit) -> Refit:
+    """Return the family with dry friction that changes along the ranges of joints, if it leaves much less so."""
+    effect, rules = find_effect(SLOPE), ground.rules
+    rubbing = {p.target for p in whole.hypothesis.placed if p.effect.name == FRICTION}
+    targets = [t for t in effect.targets(ground.setting) if t in rubbing]
+    if not targets or effect not in ground.effects or not remains(whole.cost, rules):
+        return whole
+    ground.report(STAGE, 0.5)
+    slopes = [Placed(effect, t, tuple(effect.starts(ground.setting, t)[0].tolist())) for t in targets]
+    sloped, most = whole.hypothesis.with_effects(slopes), rules.family.sloped * whole.cost.excess
+    if whole.cost.excess - promised_gain(ground, whole, sloped) > most:
+        return whole
+    more = needed(ground, ground.refit(sloped, iterations=rules.family.iterations))
+    return whole if more is None or more.cost.excess > most else more
+
+
+def promised_gain(ground: Ground, whole: Refit, larger: Hypothesis) -> float:
+    """Return by how much χ² would fall with more members, by the derivatives where these are still absent."""
+    slope, residual = refit(ground.part, larger, linear=whole.linear, iterations=0).weighted(ground.part.caps)
+    left = residual - slope.T @ np.linalg.lstsq(slope.T, residual, rcond=1e-9)[0]
+    return float(residual @ residual - left @ left)
+
+
+def pushing(setting: Setting, hypothesis: Hypothesis) -> list[Placed]:
+    """Return slopes by which dry friction would push somewhere in the measured range."""
+    level = {p.target: p.values[0] for p in hypothesis.placed if p.effect.name == FRICTION}
+    found = []
+    for p in hypothesis.placed:
+        if isinstance(p.effect, JointFrictionSlope):
+            away = setting.signals.position[setting.coordinate(p.target)] - p.effect.middle(setting.model, p.target)
+            if level.get(p.target, 0.0) + min(p.values[0] * away) < 0:
+                found.append(p)
+    return found
+
+
 def needed(ground: Ground, whole: Refit) -> Refit | None:
     """Return a fitted family without members that are absurd or not needed; ``None`` if that comes to no end."""
     rules, most, tried = ground.rules.family, math.inf, math.inf
     for number in range(rules.rounds):
         ground.report(STAGE, 0.5 + 0.5 * number / rules.rounds)
         idle = [placed for placed, _ in absurd(ground.part, whole, ground.rules.sound)]
+        idle += pushing(ground.setting, whole.hypothesis)
         if idle:
             whole, most = _without(ground, whole, idle), math.inf
             continue

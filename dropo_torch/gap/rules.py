@@ -100,6 +100,7 @@ class Family:
             motion and little noise, the last hundredth of a real robot's misfit is.
         members: of it, so many must be needed at half of the joints.
         spare: share of the excess that it leaves by which dropping the members least needed may raise it.
+        sloped: share of the excess that it must leave at most where dry friction changes along the joints' ranges.
         iterations, rounds: of its fit, and how often those not needed are dropped, at most.
     """
 
@@ -109,6 +110,7 @@ class Family:
     rest: float = 0.02
     members: int = 2
     spare: float = 0.03
+    sloped: float = 0.7
     iterations: int = 24
     rounds: int = 8
 

@@ -88,8 +88,8 @@ class Candidate:
 
 
 def all_candidates(setting: Setting, effects: Sequence[Effect]) -> Iterator[Placed]:
-    """Yield every effect at every target, at each of its starts."""
-    for effect in effects:
+    """Yield every effect that is looked for by itself at every target, at each of its starts."""
+    for effect in (e for e in effects if e.alone):
         for target in effect.targets(setting):
             for start in effect.starts(setting, target):
                 yield Placed(effect, target, tuple(float(v) for v in start))

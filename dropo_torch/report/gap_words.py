@@ -22,6 +22,7 @@ _NOUNS = {
     "joint_quadratic_damping": "friction in {0} that grows with the square of its velocity",
     "joint_friction": "dry (Coulomb) friction in {0}",
     "joint_stribeck": "dry friction in {0} that is larger at rest than in motion (Stribeck)",
+    "joint_friction_slope": "dry friction in {0} that changes along its range",
     "joint_stiffness": "a spring at {0}",
     "joint_cogging": "a force at {0} that is periodic in its position (cogging)",
     "armature": "rotor or gear inertia (armature) at {0}",
@@ -71,6 +72,7 @@ _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_
 #: Members of the base family, in a list of a joint's.
 _SHORT = {
     "joint_friction": "dry friction",
+    "joint_friction_slope": "slope of dry friction along the range",
     "joint_damping": "viscous friction",
     "armature": "rotor inertia",
     "actuator_bias": "offset",
