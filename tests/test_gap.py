@@ -410,7 +410,7 @@ class Judged:
 
     def refit(self, hypothesis: Hypothesis, iterations: int) -> SimpleNamespace:
         excess = {0: 5000.0, 1: 20.0}[len(hypothesis.placed)] * self.few / 40
-        return SimpleNamespace(hypothesis=hypothesis, cost=SimpleNamespace(excess=excess))
+        return SimpleNamespace(hypothesis=hypothesis, cost=Cost(np.array([excess + 10]), np.zeros(1), 10.0))
 
 
 @pytest.mark.parametrize(
@@ -421,6 +421,24 @@ def test_all_windows_decide_where_few_leave_it_open(few: float, every: float | N
     ground = Judged({40: few, 120: every})
     without, whole = (ground.refit(Hypothesis((), effects), 1) for effects in ((), (placed("joint_friction", 0.3),)))
     assert is_needed(ground, SimpleNamespace(base=without), whole, without) == named
+
+
+@pytest.mark.parametrize(("left", "named"), [(1.0, True), (1.04, True), (1.2, False)])
+@pytest.mark.parametrize("inflated", [0.0, 30.0])
+def test_noise_that_contacts_inflate_is_no_rest(left: float, named: bool, inflated: float) -> None:
+    """Whether names account for a gap does not depend on by how much noise before a contact widens what follows."""
+
+    def fitted(reduced: float, *effects: Placed) -> SimpleNamespace:
+        penalty = np.full(120, inflated)
+        return SimpleNamespace(
+            cost=Cost(np.full(120, 15 * reduced), penalty, 1800.0), hypothesis=Hypothesis((), effects)
+        )
+
+    base, whole = fitted(2.0), fitted(left, placed("joint_friction", 0.3))
+    assert accounts(whole, base, Rules()) == named
+    assert whole.cost.left_of(base.cost) == pytest.approx(left - 1)
+    ground = SimpleNamespace(rules=Rules(), clears=lambda base, current: False)
+    assert is_done(ground, SimpleNamespace(base=base, current=whole)) == named
 
 
 def test_what_adds_up_in_open_loop_is_said() -> None:

@@ -16,7 +16,7 @@ from dropo_torch.gap.sound import absurd
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
     """Return whether a hypothesis removes most of another's excess, or so much that the search goes on with it."""
-    most = better.cost.excess < (1 - ground.rules.most) * worse.cost.excess
+    most = better.cost.left_of(worse.cost) < 1 - ground.rules.most
     return most or ground.chance(better, worse) <= ground.rules.chance.explore
 
 
@@ -39,11 +39,11 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
 
 def matters(ground: Ground, base: Refit, whole: Refit, without: Refit) -> bool:
     """Return whether an effect removes enough of the first excess, or all that is left where that is a small part."""
-    rules, left = ground.rules, without.cost.excess
-    if left - whole.cost.excess >= rules.least * base.cost.excess:
+    rules = ground.rules
+    if without.cost.excess - whole.cost.excess >= rules.least * base.cost.above(whole.cost):
         return True
     clears = significant(without.cost, rules) and not significant(whole.cost, rules)
-    return clears and whole.cost.excess <= (1 - rules.most) * left
+    return clears and whole.cost.left_of(without.cost) <= 1 - rules.most
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
@@ -73,8 +73,8 @@ def is_done(ground: Ground, state: State) -> bool:
     if ground.clears(base, current):
         return True
     if not significant(current.cost, rules):
-        return accounts(current, base, rules) or current.cost.excess < 0.5 * rules.gate * current.cost.sigma
-    if current.cost.excess >= rules.least * base.cost.excess:
+        return accounts(current, base, rules) or current.cost.misfit < 0.5 * rules.gate * current.cost.sigma
+    if current.cost.left_of(base.cost) >= rules.least:
         return False
     return not significant(resolved(ground.part, current).fit.cost, rules)
 
@@ -94,7 +94,7 @@ def add(ground: Ground, state: State) -> State:
     if not singles:
         return replace(state, done=True)
     best = simplest(singles, rules)
-    if best.cost.excess / current.cost.excess > 1 - rules.most:
+    if best.cost.left_of(current.cost) > 1 - rules.most:
         focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
         pairs = promising_pairs(
             focus, screen(focus, [c.placed for c in alive[: rules.tried.paired]], rules.tried), rules.tried
@@ -103,9 +103,9 @@ def add(ground: Ground, state: State) -> State:
         for words, groups in (("pairs", pairs), ("families", families)):
             tried, state = ground.refits(state, current, groups, f"refitting {words}")
             tried = sound(ground, tried)
-            if tried and tried[0].cost.excess < rules.tried.clearer * best.cost.excess:
+            if tried and tried[0].cost.left_of(best.cost) < rules.tried.clearer:
                 best = tried[0]
-    hopeless = best.cost.excess > rules.hopeless * current.cost.excess or not matters(ground, state.base, best, current)
+    hopeless = best.cost.left_of(current.cost) > rules.hopeless or not matters(ground, state.base, best, current)
     if hopeless or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best)
@@ -157,12 +157,12 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
     Where the model's own step is part of what both leave, a finer one tells.
     """
     rules, own, here = ground.rules, state.current, better
-    gained = own.cost.excess - here.cost.excess
-    if gained < (1 - rules.most) * own.cost.excess:
+    if here.cost.left_of(own.cost) > rules.most:
         return False
-    if gained < min(rules.least * state.base.cost.excess, rules.most * own.cost.excess):
+    gained, least = own.cost.excess - here.cost.excess, rules.least * state.base.cost.above(here.cost)
+    if gained < min(least, rules.most * own.cost.above(here.cost)):
         own, here = (resolved(ground.part, r).fit for r in (own, here))
-        if own.cost.excess - here.cost.excess < rules.most * own.cost.excess:
+        if here.cost.left_of(own.cost) > 1 - rules.most:
             return False
     return beats(ground, here, own)
 

@@ -222,9 +222,26 @@ class Cost:
         return float(self.windows.sum())
 
     @property
+    def misfit(self) -> float:
+        """χ² − degrees of freedom: what is left above noise, which the initial states may have inflated."""
+        return float(self.windows.sum() - self.degrees)
+
+    @property
     def excess(self) -> float:
-        """E = χ² − degrees of freedom, with the penalty."""
-        return float(self.windows.sum() + self.penalty.sum() - self.degrees)
+        """E = χ² − degrees of freedom, with the penalty, by which hypotheses compare.
+
+        One that is right has its penalty left, so by itself it says nothing: see :attr:`misfit` and :meth:`left_of`.
+        """
+        return self.misfit + float(self.penalty.sum())
+
+    def above(self, other: Cost) -> float:
+        """Return the excess over that of a hypothesis which is right and inflates the noise as another one does."""
+        return self.excess - float(other.penalty.sum())
+
+    def left_of(self, other: Cost) -> float:
+        """Return the share of another hypothesis' excess that this one leaves; infinite where there is none."""
+        whole = other.above(self)
+        return max(self.misfit, 0.0) / whole if whole > 0 else np.inf
 
     @property
     def reduced(self) -> float:

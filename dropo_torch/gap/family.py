@@ -60,11 +60,11 @@ def with_family(ground: Ground, state: State, found: State) -> State:
         return found
     kind = one_kind(found.current.hypothesis)
     best = found if found.done or kind else extend(ground, found)  # what contains the first effects may be the truth
-    left = best.current.cost.excess
-    if not significant(best.current.cost, ground.rules) or left < rules.left * state.base.cost.excess:
+    cost = best.current.cost
+    if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
         return found
     whole = whole_family(ground, state.base.hypothesis)
-    if whole is None or whole.cost.excess > rules.clearer[int(kind)] * left:
+    if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)]:
         return found
     return replace(found, current=whole, family=True, done=True, refused="")
 
@@ -105,11 +105,11 @@ def with_slopes(ground: Ground, whole: Refit) -> Refit:
         return whole
     ground.report(STAGE, 0.5)
     slopes = [Placed(effect, t, tuple(effect.starts(ground.setting, t)[0].tolist())) for t in targets]
-    sloped, most = whole.hypothesis.with_effects(slopes), rules.family.sloped * whole.cost.excess
-    if whole.cost.excess - promised_gain(ground, whole, sloped) > most:
+    sloped, misfit = whole.hypothesis.with_effects(slopes), whole.cost.misfit
+    if misfit - promised_gain(ground, whole, sloped) > rules.family.sloped * misfit:
         return whole
     more = needed(ground, ground.refit(sloped, iterations=rules.family.iterations))
-    return whole if more is None or more.cost.excess > most else more
+    return whole if more is None or more.cost.left_of(whole.cost) > rules.family.sloped else more
 
 
 def promised_gain(ground: Ground, whole: Refit, larger: Hypothesis) -> float:
@@ -141,7 +141,7 @@ def needed(ground: Ground, whole: Refit) -> Refit | None:
         if idle:
             whole, most = _without(ground, whole, idle), math.inf
             continue
-        spare = max(rules.spare * whole.cost.excess, ground.rules.alike.sigmas * whole.cost.sigma)
+        spare = max(rules.spare * whole.cost.misfit, ground.rules.alike.sigmas * whole.cost.sigma)
         most = min(most, whole.cost.excess + spare)
         idle = not_needed(ground, whole, most)
         idle = idle[: int(min(len(idle), tried))]
@@ -235,7 +235,7 @@ def family_ties(ground: Ground, whole: Refit) -> tuple[tuple[Placed, ...], ...]:
     beside = refit(ground.part, hypothesis.with_effects(absent), linear=whole.linear, iterations=0)
     (slope, residual), first = beside.weighted(ground.part.caps), len(hypothesis.declared)
     off, own = offsets(setting, beside), np.arange(len(hypothesis.vector))
-    margin = max(ground.rules.alike.chi2, ground.rules.alike.share * whole.cost.excess)
+    margin = max(ground.rules.alike.chi2, ground.rules.alike.share * whole.cost.misfit)
 
     def left(rows: np.ndarray, gone: int | None) -> float:
         moved = residual if gone is None else residual - off[gone] * slope[gone]

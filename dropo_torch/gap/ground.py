@@ -194,7 +194,7 @@ class Ground:
         if not groups:
             return [], state
         focus = self.focus(beside, 2 * FEWER)
-        before, known = focus.excess, len(beside.hypothesis.placed)
+        before, known = focus.cost, len(beside.hypothesis.placed)
 
         def rough(hypothesis: Hypothesis, most: int) -> Refit:
             return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=most, slopes=False)
@@ -206,11 +206,12 @@ class Ground:
         found.sort(key=lambda r: r.cost.excess)
         found[: most + 1] = [rough(r.hypothesis, iterations[1]) for r in found[: most + 1]]
         found.sort(key=lambda r: r.cost.excess)
-        left = [(p, max(r.cost.excess, 0.0) / max(before, 1e-12)) for r in found for p in r.hypothesis.placed[known:]]
+        left = [(p, r.cost.left_of(before)) for r in found for p in r.hypothesis.placed[known:]]
         attempts = [Ranked(*p.key, p.summary(self.setting), share, state.number) for p, share in left]
         best = found[0].cost
         tried = self.rules.tried
-        near = tried.worse * max(best.excess, 0.0) + self.rules.least * before + tried.sigmas * best.sigma
+        near = best.excess + (tried.worse - 1) * max(best.misfit, 0.0)
+        near += self.rules.least * before.above(best) + tried.sigmas * best.sigma
         full = []
         for number, fitted in enumerate(r for r in found[:most] if r.cost.excess <= near):
             self.report(stage, (len(groups) + number / (most + 1)) / (len(groups) + 2))

@@ -207,7 +207,7 @@ def _remaining(
         return None
     base = naming.base.cost
     dof = guilty(after)
-    share = float(np.clip(cost.excess / cost.degrees / (base.excess / base.degrees), 0, 1))
+    share = float(np.clip(cost.left_of(base) * base.degrees / cost.degrees, 0, 1))
     off = float(np.mean(typical > rules.sound.rest))
     when = regime(setting, after, dof, rules.shown).words
     return Remaining(cost.reduced, share, off, dof_names(setting.model)[dof], when, astray)
@@ -254,7 +254,7 @@ def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffec
         numbers = {
             q.name: _strength(q, value, half) for q, value, half in zip(quantities, placed.values, own, strict=False)
         }
-        share = float(np.clip(excess / naming.base.cost.excess, 0, 1))
+        share = float(np.clip(excess / naming.base.cost.above(naming.final.cost), 0, 1))
         sentence = placed.effect.sentence.format(target=placed.target)
         found.append(NamedEffect(*placed.key, numbers, share, tuple(p.key for p in tied), sentence))
     return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)

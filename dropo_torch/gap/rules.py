@@ -281,7 +281,7 @@ class Rules:
 
 def significant(cost: Cost, rules: Rules) -> bool:
     """Return whether a misfit is more than noise."""
-    return cost.excess > rules.gate * cost.sigma and cost.reduced > rules.least_reduced
+    return cost.misfit > rules.gate * cost.sigma and cost.reduced > rules.least_reduced
 
 
 def remains(cost: Cost, rules: Rules) -> bool:
@@ -291,7 +291,7 @@ def remains(cost: Cost, rules: Rules) -> bool:
 
 def near(cost: Cost, rules: Rules) -> float:
     """Return how much more excess a hypothesis may have that is about as good."""
-    return max(rules.alike.excess * max(cost.excess, 0.0), rules.alike.sigmas * cost.sigma)
+    return max(rules.alike.excess * max(cost.misfit, 0.0), rules.alike.sigmas * cost.sigma)
 
 
 def beyond_free(hypothesis: Hypothesis, rules: Rules) -> int:
@@ -314,7 +314,7 @@ def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
     """
     if beyond_free(named.hypothesis, rules) and named.cost.reduced > rules.sound.wrong:
         return False
-    return max(named.cost.excess, 0.0) <= allowance(named.hypothesis, rules) * base.cost.excess
+    return named.cost.left_of(base.cost) <= allowance(named.hypothesis, rules)
 
 
 def family_accounts(named: Refit, base: Refit, rules: Rules) -> bool:
@@ -323,7 +323,7 @@ def family_accounts(named: Refit, base: Refit, rules: Rules) -> bool:
     Its members are each needed beside all others, so their number does not count against them.
     """
     most = 1 - rules.accounted if named.cost.reduced <= rules.sound.wrong else rules.family.rest
-    return max(named.cost.excess, 0.0) <= most * base.cost.excess
+    return named.cost.left_of(base.cost) <= most
 
 
 def clears(base: Refit, current: Refit, rules: Rules) -> bool:
@@ -337,7 +337,8 @@ def clears(base: Refit, current: Refit, rules: Rules) -> bool:
 def chance_of(better: Refit, worse: Refit, blocks: np.ndarray) -> float:
     """Return how likely a hypothesis is as much better by chance, over blocks of the log ``(W,)``."""
     numbers = max(1, len(better.hypothesis.vector) - len(worse.hypothesis.vector))
-    everywhere = p_of_gain(_excesses(worse.cost, blocks), _excesses(better.cost, blocks), numbers)
+    right = better.cost.penalty  # what one that is right would leave
+    everywhere = p_of_gain(_excesses(worse.cost, blocks, right), _excesses(better.cost, blocks, right), numbers)
     every = np.unique(blocks, return_inverse=True)[1]
     noise = np.sqrt(2 * worse.residual.shape[1] * np.bincount(every))
     before, after = (np.bincount(every, _plain(r)) for r in (worse, better))
@@ -352,14 +353,15 @@ def _plain(fitted: Refit) -> np.ndarray:
 
 def as_good(rival: Cost, own: Cost, blocks: np.ndarray, rules: Rules) -> bool:
     """Return whether a rival explains a log as well: it is not surely worse by more than what matters."""
-    surplus, alike = _excesses(rival, blocks) - _excesses(own, blocks), rules.alike
-    margin = max(alike.chi2, alike.share * own.excess)
+    surplus = _excesses(rival, blocks, own.penalty) - _excesses(own, blocks, own.penalty)
+    alike = rules.alike
+    margin = max(alike.chi2, alike.share * own.misfit)
     return surplus.sum() < near(own, rules) and least_surplus(surplus, alike.error) <= margin
 
 
-def _excesses(cost: Cost, blocks: np.ndarray) -> np.ndarray:
-    """The excess of each block ``(B,)``."""
-    windows = cost.windows + cost.penalty - cost.degrees / len(cost.windows)
+def _excesses(cost: Cost, blocks: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """The excess of each block ``(B,)`` over that of a hypothesis with these penalties that is right."""
+    windows = cost.windows + cost.penalty - right - cost.degrees / len(cost.windows)
     return np.bincount(np.unique(blocks, return_inverse=True)[1], windows)
 
 

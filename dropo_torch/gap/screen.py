@@ -16,7 +16,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant, parts
-from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
 from dropo_torch.gap.rules import Tried
 
@@ -56,9 +56,9 @@ class Focus:
         return self.fitted.slope.reshape(len(self.fitted.slope), self.factor.size) * self.factor
 
     @property
-    def excess(self) -> float:
-        """Excess misfit of the fitted hypothesis."""
-        return self.evidence.cost(self.fitted.residual, self.fitted.linear).excess
+    def cost(self) -> Cost:
+        """The misfit of the fitted hypothesis."""
+        return self.evidence.cost(self.fitted.residual, self.fitted.linear)
 
 
 @dataclass(frozen=True)
