@@ -25,6 +25,7 @@ import yaml
 
 from dropo_torch.commands import cli
 from dropo_torch.config import make_config, parse_overrides
+from dropo_torch.data.readers import read_trajectories
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
 from dropo_torch.rl.policy import Policy
@@ -404,6 +405,35 @@ def test_panda(tmp_path: Path) -> None:
     assert {"joint_friction", "actuator_bias", "center_of_mass"} == {p.effect.name for p in view.placed}
     assert (view.after <= example.published(problem)).all()
     assert np.mean(view.after**2) < np.mean(view.before**2) / 9
+
+
+def test_tosses(tmp_path: Path) -> None:
+    """The published friction predicts tosses better than a guess; that of impacts is less than that of sliding."""
+    folder = measured("cube_tosses") / "tosses"
+    example = load_example(ROOT / "examples" / "tosses" / "tosses.py")
+    tosses = [example.read(folder, number) for number in range(60)]
+    problem = example.make(tosses[:5], tmp_path)
+    given, published = example.guesses(problem)
+    (far, _), (near, _) = (example.errors(problem, tosses, values).mean(0) for values in (given, published))
+    assert near < far / 2
+    where = example.windows(tosses)
+    _, _, most = example.best_friction(problem, tosses, where["impacts"], published)
+    _, least, _ = example.best_friction(problem, tosses, where["sliding"], published)
+    assert most < least
+
+
+def test_a_twin_of_a_log_has_its_commands_and_noise() -> None:
+    example = load_example(ROOT / "examples" / "noisy_hopper.py")
+    log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz").select(slice(0, 300))
+    made = example.twin(log, 3)
+    assert made["actions"] == pytest.approx(log.actions)
+    starts = np.append(True, log.terminals[:-1])
+    again = example.twin(log, 4)
+    assert made["observations"][starts] == pytest.approx(log.observations[starts], abs=0.02)
+    difference = (made["observations"] - again["observations"]) / np.sqrt(2 * example.VARIANCE)
+    assert difference.std() == pytest.approx(1, rel=0.05)
+    today = mujoco.MjModel.from_xml_path(str(example.SIM.model))
+    assert list(example.factors(today).values()) == pytest.approx([0.893, 0.903, 0.927, 0.874], abs=5e-4)
 
 
 def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
