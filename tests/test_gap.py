@@ -677,6 +677,46 @@ def test_noise_beside_a_late_sensor_is_that_of_the_log() -> None:
     assert free_forces(scene.twin, scene.short, true(case).variant).noise == pytest.approx(case.noise, rel=0.1)
 
 
+def two_joints(folder: Path, friction: tuple[float, float], seed: int) -> Path:
+    """Write a log of an arm with MuJoCo's own ``frictionloss``, and a config with the arm that lacks it."""
+    xml = (
+        '<mujoco><default><geom type="capsule" size=".02" contype="0" conaffinity="0"/></default><worldbody>'
+        '<body pos="0 0 1"><joint name="a" axis="0 1 0" damping=".05"/><geom fromto="0 0 0 0 0 -.3" mass="1"/>'
+        '<body pos="0 0 -.3"><joint name="b" axis="0 1 0" damping=".02"/><geom fromto="0 0 0 0 0 -.25" mass=".6"/>'
+        '</body></body></worldbody><actuator><motor joint="a"/><motor joint="b"/></actuator></mujoco>'
+    )
+    model, rng, time = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(seed), 0.004 * np.arange(2000)
+    model.dof_frictionloss[:], data, rows = friction, mujoco.MjData(model), []
+    waves = [1.2 * np.sin(2 * np.pi * (0.4 + 0.025 * time) * time), 0.5 * np.sin(2 * np.pi * 0.9 * time + 1)]
+    for data.ctrl[:] in np.stack(waves, 1):
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+        mujoco.mj_step(model, data, 2)
+    noisy = np.array(rows) + rng.standard_normal((2000, 4)) * [1e-4, 1e-4, 2e-3, 2e-3]
+    ends = np.arange(2000) % 500 == 499
+    np.savez(folder / "arm.npz", observations=noisy, actions=np.stack(waves, 1), terminals=ends)
+    (folder / "arm.xml").write_text(xml)
+    config = {"model": "arm.xml", "data": "arm.npz", "frame_skip": 2, "observation": ["qpos", "qvel"]}
+    (folder / "arm.yaml").write_text(yaml.safe_dump(config))
+    return folder / "arm.yaml"
+
+
+@pytest.mark.parametrize("friction", [(0.08, 0.0), (0.08, 0.03)])
+def test_the_friction_of_an_mjcf_is_dry_friction(friction: tuple[float, float], tmp_path: Path) -> None:
+    """``frictionloss`` creeps at rest; that is neither Stribeck's friction nor a rest that has no name."""
+    problem = make_problem(load_config(two_joints(tmp_path, friction, 7)), general=True)
+    gap = find_gap(problem)
+    truth = {("joint_friction", joint): f for joint, f in zip("ab", friction, strict=True) if f}
+    found = {(e.effect, e.target): e.parameters["friction"].value for e in gap.effects}
+    assert found == {key: pytest.approx(value, rel=0.01) for key, value in truth.items()}
+    assert {e["variant"] for e in gap.document()["effects"]} == {"joint_soft_friction"}
+    assert gap.verdict == "explained"
+    assert gap.reduced[1] == pytest.approx(1, abs=0.1)
+    add(problem, gap, tmp_path)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert model.dof_frictionloss == pytest.approx(friction, rel=0.01)
+    assert (model.dof_solref == problem.space.model.dof_solref).all()
+
+
 def test_what_the_step_leaves_is_no_noise() -> None:
     """A lag shorter than ten steps is resolved so badly that it shows among the noise, unless a finer step tells."""
     lag = Effect("actuator_lag", "wrist_servo", {"time_constant": 0.0048})

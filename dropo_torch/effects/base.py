@@ -148,7 +148,8 @@ class Effect(abc.ABC):
         sentence: what it is, to a person; ``{target}`` stands for the target.
         shares: the values, in scales of its only quantity, from which a search begins; none for the neutral value.
         contains: names of effects that are special cases of it, at the same target.
-        alone: whether it is looked for by itself; otherwise only as a member of the base family, beside the others.
+        alone: whether it is looked for by itself; otherwise only in the place of a simpler one, or in the base family.
+        known_as: name of the effect of which it is a kind, by which answers call it; none for its own.
     """
 
     name: ClassVar[str]
@@ -157,6 +158,7 @@ class Effect(abc.ABC):
     shares: ClassVar[tuple[float, ...]] = ()
     contains: ClassVar[tuple[str, ...]] = ()
     alone: ClassVar[bool] = True
+    known_as: ClassVar[str] = ""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""

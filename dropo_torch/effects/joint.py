@@ -117,6 +117,33 @@ class JointFriction(AddedToJoint):
         add_friction(model, self.dof(model, target), values[0])
 
 
+class JointSoftFriction(JointFriction):
+    """Coulomb friction with the model's own ``solreffriction`` and ``solimpfriction``: by default, what holds creeps.
+
+    Simulated logs have it wherever ``frictionloss`` stands in an MJCF without more. Near rest it is viscous, up to a
+    speed that falls with the joint's inertia.
+    """
+
+    name = "joint_soft_friction"
+    known_as = JointFriction.name
+    alone = False
+    contains = (JointFriction.name,)
+    sentence = "dry (Coulomb) friction in {target}, which creeps at rest as MuJoCo's does by default"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return the joints in which the model has no dry friction; where it has, more of it is of the same kind."""
+        m = setting.model
+        return [t for t in super().targets(setting) if m.dof_frictionloss[self.dof(m, t)] == 0]
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        """Stand in the place of friction that holds, also of what imitates this where that leaves less."""
+        dry = simpler.effect.name in (JointFriction.name, "joint_stribeck") and simpler.target in self.targets(setting)
+        return [np.array(simpler.values[:1])] if dry and simpler.values[0] > 0 else []
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.dof_frictionloss[self.dof(model, target)] += values[0]
+
+
 class JointStribeck(JointEffect):
     """Dry friction that is larger at rest than in motion.
 

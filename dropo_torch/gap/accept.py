@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
+from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit, resolved
@@ -12,6 +13,9 @@ from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import accounts, beyond_free, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
+
+#: Dry friction as MuJoCo has it by default.
+SOFT = "joint_soft_friction"
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
@@ -135,6 +139,7 @@ def swap(ground: Ground, state: State) -> State:
 
 def extend(ground: Ground, state: State) -> State:
     """Put effects that contain an accepted one in its place, where that explains more."""
+    state = replace(state, current=with_soft_friction(ground, state.current))
     for index, own in enumerate(state.current.hypothesis.placed):
         if not (groups := extensions(ground, own)):
             continue
@@ -144,6 +149,18 @@ def extend(ground: Ground, state: State) -> State:
             if refines(ground, state, better):
                 state = replace(state, current=better)
     return state
+
+
+def with_soft_friction(ground: Ground, fitted: Refit) -> Refit:
+    """Return a hypothesis with dry friction that creeps at rest, at all joints, if it leaves next to nothing so."""
+    setting, soft = ground.setting, find_effect(SOFT)
+    found = {i: v[0] for i, p in enumerate(fitted.hypothesis.placed) if (v := soft.extends(setting, p))}
+    if not found or soft not in ground.effects or not significant(fitted.cost, ground.rules):
+        return fitted
+    ground.report("refining", 0.5)
+    placed = [Placed(soft, p.target).at(found[i]) if i in found else p for i, p in enumerate(fitted.hypothesis.placed)]
+    softer = ground.refit(replace(fitted.hypothesis, placed=tuple(placed)))
+    return softer if softer.cost.left_of(fitted.cost) < 1 - ground.rules.most else fitted
 
 
 def extensions(ground: Ground, own: Placed) -> list[tuple[Placed, ...]]:
@@ -157,7 +174,8 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
     Where the model's own step is part of what both leave, a finer one tells.
     """
     rules, own, here = ground.rules, state.current, better
-    if here.cost.left_of(own.cost) > rules.most:
+    larger = len(better.hypothesis.vector) > len(own.hypothesis.vector)
+    if here.cost.left_of(own.cost) > (rules.most if larger else 1 - rules.most):
         return False
     gained, least = own.cost.excess - here.cost.excess, rules.least * state.base.cost.above(here.cost)
     if gained < min(least, rules.most * own.cost.above(here.cost)):

@@ -51,7 +51,7 @@ def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, flo
     for e in gap.effects:
         if e.effect == "unnamed":
             continue
-        effect, numbers = find_effect(e.effect), e.parameters
+        effect, numbers = find_effect(e.variant or e.effect), e.parameters
         members = {t: (s,) for t, s in numbers.items()} if e.target == FAMILY else {e.target: tuple(numbers.values())}
         for target, strengths in members.items():
             quantities = effect.quantities(setting, target)

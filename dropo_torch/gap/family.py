@@ -16,7 +16,7 @@ from dropo_torch.effects import find_effect
 from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Effect, Placed, Setting, object_number
 from dropo_torch.effects.joint import JointFrictionSlope
-from dropo_torch.gap.accept import extend
+from dropo_torch.gap.accept import SOFT, extend, with_soft_friction
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
@@ -24,7 +24,7 @@ from dropo_torch.gap.sound import absurd
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
-#: One more of them, where what these leave is more than noise; and that on top of which it is.
+#: One more of them, where what these leave is more than noise; and those on top of which it is.
 SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
 
 #: What is reported.
@@ -78,7 +78,8 @@ def has_family(ground: Ground) -> bool:
 def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
     """Return the base family with the members that are needed, if several are at several joints."""
     whole = needed(ground, fitted_family(ground, begin))
-    whole = None if whole is None else with_slopes(ground, whole)
+    for refined in (with_soft_friction, with_slopes, with_soft_friction):
+        whole = None if whole is None else refined(ground, whole)
     whole = None if whole is None else without_steps(ground, whole)
     if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
         return None
@@ -99,7 +100,7 @@ def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
 def with_slopes(ground: Ground, whole: Refit) -> Refit:
     """Return the family with dry friction that changes along the ranges of joints, if it leaves much less so."""
     effect, rules = find_effect(SLOPE), ground.rules
-    rubbing = {p.target for p in whole.hypothesis.placed if p.effect.name == FRICTION}
+    rubbing = {p.target for p in whole.hypothesis.placed if p.effect.name in (FRICTION, SOFT)}
     targets = [t for t in effect.targets(ground.setting) if t in rubbing]
     if not targets or effect not in ground.effects or not remains(whole.cost, rules):
         return whole
@@ -121,7 +122,7 @@ def promised_gain(ground: Ground, whole: Refit, larger: Hypothesis) -> float:
 
 def pushing(setting: Setting, hypothesis: Hypothesis) -> list[Placed]:
     """Return slopes by which dry friction would push somewhere in the measured range."""
-    level = {p.target: p.values[0] for p in hypothesis.placed if p.effect.name == FRICTION}
+    level = {p.target: p.values[0] for p in hypothesis.placed if p.effect.name in (FRICTION, SOFT)}
     found = []
     for p in hypothesis.placed:
         if isinstance(p.effect, JointFrictionSlope):
@@ -229,7 +230,7 @@ def shares_of(ground: Ground, whole: Refit) -> tuple[float, ...]:
 def family_ties(ground: Ground, whole: Refit) -> tuple[tuple[Placed, ...], ...]:
     """Return for each member those that could stand in its place at its joint, by the derivatives at the fit."""
     setting, hypothesis = ground.setting, whole.hypothesis
-    taken = {p.key for p in hypothesis.placed}
+    taken = {(p.effect.known_as or p.effect.name, p.target) for p in hypothesis.placed}
     idle = [p for p in base_family(setting, ground.effects) if p.key not in taken]
     absent = [p.at(np.array([p.effect.quantities(setting, p.target)[0].neutral])) for p in idle]
     beside = refit(ground.part, hypothesis.with_effects(absent), linear=whole.linear, iterations=0)

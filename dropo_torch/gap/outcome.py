@@ -116,8 +116,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
     for placed, halves, share, tied in zip(view.placed, view.halves, view.shares, view.ties, strict=True):
         found = zip(placed.effect.quantities(setting, placed.target), placed.values, halves, strict=True)
         numbers = {q.name: _strength(q, value, float(half)) for q, value, half in found}
-        sentence = placed.effect.sentence.format(target=placed.target)
-        named.append(NamedEffect(*placed.key, numbers, share, tuple(p.key for p in tied), sentence))
+        named.append(NamedEffect.of(placed, numbers, share, tied))
     kinds = {n: max(e.share_of_gap for e in named if e.effect == n) for n in {e.effect for e in named}}
     after_score, constant = score(evidence, held, hypothesis), constant_velocity(evidence, held)
     skill = has_skill(after_score, gap.noise_floor, constant, scene.rules.sound)
@@ -255,8 +254,7 @@ def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffec
             q.name: _strength(q, value, half) for q, value, half in zip(quantities, placed.values, own, strict=False)
         }
         share = float(np.clip(excess / naming.base.cost.above(naming.final.cost), 0, 1))
-        sentence = placed.effect.sentence.format(target=placed.target)
-        found.append(NamedEffect(*placed.key, numbers, share, tuple(p.key for p in tied), sentence))
+        found.append(NamedEffect.of(placed, numbers, share, tied))
     return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)
 
 
@@ -270,15 +268,15 @@ def _strength(quantity: Quantity, value: float, half: float) -> Strength:
 def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[NamedEffect, ...]:
     """Return effects that were named at every one of three or more targets as one, with target ``*``."""
     kept = list(effects)
-    for name in dict.fromkeys(e.effect for e in effects):
-        members = [e for e in kept if e.effect == name and len(e.parameters) == 1]
-        effect = VOCABULARY.get(name)
+    for name, variant in dict.fromkeys((e.effect, e.variant) for e in effects):
+        members = [e for e in kept if (e.effect, e.variant) == (name, variant) and len(e.parameters) == 1]
+        effect = VOCABULARY.get(variant or name)
         if effect is None or len(members) < max(3, len(effect.targets(setting))):
             continue
         numbers = {str(e.target): next(iter(e.parameters.values())) for e in members}
         share = min(1.0, sum(e.share_of_gap for e in members))
         sentence = effect.sentence.format(target=f"all {effect.kind}s")
-        whole = NamedEffect(name, FAMILY, numbers, share, (), sentence)
+        whole = NamedEffect(name, FAMILY, numbers, share, (), sentence, variant)
         kept = [whole if e is members[0] else e for e in kept if e not in members[1:]]
     return tuple(kept)
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
 
+from dropo_torch.effects.base import Placed
 from dropo_torch.support.files import plain_numbers
 
 SCHEMA = "dropo-torch/gap/1"
@@ -53,6 +54,7 @@ class NamedEffect:
         share_of_gap: share of the excess misfit that goes when it is added, in [0, 1].
         indistinguishable_from: effect and target of those that explain this log as well.
         sentence: what it is, to a person.
+        variant: name in the vocabulary of the kind of the effect that it is, where that has another.
     """
 
     effect: str
@@ -61,6 +63,17 @@ class NamedEffect:
     share_of_gap: float
     indistinguishable_from: tuple[tuple[str, str | None], ...] = ()
     sentence: str = ""
+    variant: str = ""
+
+    @classmethod
+    def of(
+        cls, placed: Placed, parameters: Mapping[str, Strength], share: float, tied: Iterable[Placed]
+    ) -> NamedEffect:
+        """Return a named effect as it was found, with its numbers, its share of the gap, and what ties with it."""
+        kind, sentence = placed.effect, placed.effect.sentence.format(target=placed.target)
+        keys = tuple((p.effect.known_as or p.effect.name, p.target) for p in tied)
+        name, variant = (kind.known_as, kind.name) if kind.known_as else (kind.name, "")
+        return cls(name, placed.target, parameters, share, keys, sentence, variant)
 
 
 @dataclass(frozen=True)
@@ -298,6 +311,7 @@ def _pair(placed: tuple[str, str | None]) -> dict[str, str | None]:
 def _effect(e: NamedEffect) -> dict[str, Any]:
     return {
         **_pair((e.effect, e.target)),
+        **({"variant": e.variant} if e.variant else {}),
         "parameters": {n: asdict(s) for n, s in e.parameters.items()},
         "share_of_gap": e.share_of_gap,
         "indistinguishable_from": [_pair(p) for p in e.indistinguishable_from],
