@@ -188,7 +188,7 @@ def test_the_family_is_the_last_resort(truth: dict[str, Triple], is_family: bool
     assert naming.named == naming.family == is_family
     if is_family:
         assert naming.refused == ""
-        assert {p.effect.name for p in naming.final.hypothesis.placed} >= {"armature", "joint_friction"}
+        assert {p.effect.name for p in naming.final.hypothesis.placed} >= {"armature", "joint_soft_friction"}
     else:
         assert naming is nameless
 
