@@ -14,7 +14,7 @@ import numpy as np
 
 from dropo_torch.config import TRAINING_KEYS, Config
 from dropo_torch.data.observation import Observation, generic_observation, parse_observation
-from dropo_torch.data.trajectory import Trajectories, make_transitions
+from dropo_torch.data.trajectory import Trajectories, make_transitions, reckoned
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator, first_known
@@ -112,11 +112,18 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
+    trajectories = reckoned(trajectories, observation, simulator.timestep, _ahead(space.model, frame_skip))
     transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history, since=since)
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
     return Problem(given, model_path, space, simulator, trajectories, observation, objective, digest, effects, since)
+
+
+def _ahead(model: mujoco.MjModel | None, frame_skip: int) -> float:
+    """By what share of a transition positions follow later velocities: all integrators but RK4 are semi-implicit."""
+    explicit = model is None or model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
+    return 0.0 if explicit else 1 / frame_skip
 
 
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:

@@ -49,6 +49,22 @@ class _Joint:
 
 
 @dataclass(frozen=True)
+class Reckoned:
+    """A position that is not observed, of which the velocity is.
+
+    Attributes:
+        position: its column in the state ``[qpos, qvel]``.
+        velocity: the observed column of its velocity.
+        low, high: its joint's range; infinite where it has none.
+    """
+
+    position: int
+    velocity: int
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
 class Observation:
     """The columns of an observation in the simulator's state.
 
@@ -61,6 +77,8 @@ class Observation:
         units: for each observed column ``"m"``, ``"rad"``, ``"m/s"``, ``"rad/s"`` or ``"-"``.
         quaternions: observed columns of each complete quaternion, a tuple of four each.
         at_rest: joints whose position is observed and whose velocity is not: every window starts with them at rest.
+        reckoned: positions that are not observed, with their velocities, which are. Such a position is where its
+            velocity has led since the episode's start, where it had its default.
     """
 
     columns: tuple[int, ...]
@@ -71,6 +89,7 @@ class Observation:
     units: tuple[str, ...]
     quaternions: tuple[tuple[int, int, int, int], ...] = ()
     at_rest: tuple[str, ...] = ()
+    reckoned: tuple[Reckoned, ...] = ()
 
     @property
     def size(self) -> int:
@@ -82,10 +101,15 @@ class Observation:
         """``columns`` as an integer array, ``(n,)``."""
         return np.asarray(self.columns, dtype=np.int64)
 
-    def states(self, observations: np.ndarray) -> np.ndarray:
-        """Return full states ``(T, nq + nv)`` of logged observations ``(T, log_width)``."""
+    def states(self, observations: np.ndarray, unseen: np.ndarray | None = None) -> np.ndarray:
+        """Return full states ``(T, nq + nv)`` of logged observations ``(T, log_width)``.
+
+        Args:
+            observations: rows of the log.
+            unseen: positions that :attr:`reckoned` lists, ``(T, k)``; their defaults if not given.
+        """
         self.check_quaternions(np.asarray(observations, dtype=np.float64), "observations")
-        states = self.full(self.observed(observations))
+        states = self.full(self.observed(observations), unseen)
         for quaternion in self.quaternions:
             block = self.index[list(quaternion)]
             states[:, block] /= np.linalg.norm(states[:, block], axis=1, keepdims=True)
@@ -106,11 +130,41 @@ class Observation:
                     "a unit quaternion (w, x, y, z) is expected"
                 )
 
-    def full(self, columns: np.ndarray) -> np.ndarray:
-        """Return full states ``(T, nq + nv)`` of observed columns ``(T, n)``; what is not observed has its default."""
+    def full(self, columns: np.ndarray, unseen: np.ndarray | None = None) -> np.ndarray:
+        """Return full states ``(T, nq + nv)`` of observed columns ``(T, n)``; what is not observed has its default.
+
+        Positions that :attr:`reckoned` lists have those of ``unseen``, ``(T, k)``, where it is given.
+        """
         states = np.tile(np.asarray(self.default_state), (len(columns), 1))
         states[:, self.index] = columns
+        if unseen is not None:
+            states[:, [r.position for r in self.reckoned]] = unseen
         return states
+
+    def reckon(
+        self, before: np.ndarray, after: np.ndarray, terminals: np.ndarray, timestep: float, ahead: float = 0.0
+    ) -> np.ndarray:
+        """Return the positions that :attr:`reckoned` lists at the start of every transition, ``(T, k)``.
+
+        Dead reckoning: ground that slopes, walls and springs act by where a robot is, which a log that tells its
+        velocity only does not show.
+
+        Args:
+            before: observations at the transitions' starts, ``(T, log_width)``.
+            after: those at their ends, ``(T, log_width)``.
+            terminals: which transitions end an episode, ``(T,)`` bool.
+            timestep: seconds of a transition.
+            ahead: share of a transition by which positions follow later velocities: 0 is the trapezoidal rule; a
+                simulator whose n steps a transition move positions by the new velocities has 1/n.
+        """
+        velocities = [r.velocity for r in self.reckoned]
+        first, last = (self.observed(x)[:, velocities] for x in (before, after))
+        moved = 0.5 * timestep * ((1 - ahead) * first + (1 + ahead) * last)
+        passed = np.cumsum(moved, axis=0) - moved
+        begins = np.concatenate([[0], np.flatnonzero(terminals)[:-1] + 1])
+        start = np.repeat(passed[begins], np.diff(np.append(begins, len(passed))), axis=0)
+        default = np.array([self.default_state[r.position] for r in self.reckoned])
+        return np.clip(default + passed - start, [r.low for r in self.reckoned], [r.high for r in self.reckoned])
 
     def observed(self, log: np.ndarray) -> np.ndarray:
         """Return the observed columns ``(T, n)`` of a log ``(T, log_width)``."""
@@ -162,6 +216,7 @@ def parse_observation(
             for joint in joints
             if not joint.positions.keys().isdisjoint(columns) and not joint.velocities.keys() <= set(columns)
         ),
+        reckoned=_reckoned(model, joints, columns),
     )
 
 
@@ -192,6 +247,18 @@ def _joints(model: mujoco.MjModel) -> list[_Joint]:
         place = columns(f"{name}.position", positions, int(model.jnt_qposadr[j]))
         found.append(_Joint(name, place, columns(f"{name}.velocity", velocities, model.nq + int(model.jnt_dofadr[j]))))
     return found
+
+
+def _reckoned(model: mujoco.MjModel, joints: Sequence[_Joint], columns: Sequence[int]) -> tuple[Reckoned, ...]:
+    """The positions that are not among the observed columns although their velocities are."""
+    found = []
+    for j, joint in enumerate(joints):
+        low, high = model.jnt_range[j] if model.jnt_limited[j] else (-np.inf, np.inf)
+        for position, velocity in zip(joint.positions, joint.velocities, strict=False):  # a quaternion has one more
+            integrates = joint.positions[position][1] in ("m", "rad")
+            if integrates and position not in columns and velocity in columns:
+                found.append(Reckoned(position, columns.index(velocity), float(low), float(high)))
+    return tuple(found)
 
 
 def _entry_columns(model: mujoco.MjModel, joints: Sequence[_Joint], entry: str) -> list[int] | list[None]:

@@ -57,6 +57,8 @@ class Trajectories:
         dt: duration of a transition in seconds, or ``None`` where the log does not say.
         source: where the log came from, for messages.
         origin: what the file calls its columns and rows, where it was read from one.
+        unseen: positions before each transition that no column has, dead-reckoned from their velocities, ``(T, k)``;
+            see :func:`reckoned`. ``None`` where they are not needed.
 
     Raises:
         InputError: shapes that do not fit, a value that is not finite, no transition.
@@ -69,6 +71,7 @@ class Trajectories:
     dt: float | None = None
     source: str = "log"
     origin: Origin | None = None
+    unseen: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("observations", "next_observations", "actions"):
@@ -132,7 +135,8 @@ class Trajectories:
         gap = np.append(np.diff(index) != 1, True)
         rest = {name: getattr(self, name)[index] for name in ("observations", "next_observations", "actions")}
         origin = None if self.origin is None else self.origin.select(index)
-        return replace(self, **rest, terminals=self.terminals[index] | gap, origin=origin)
+        unseen = None if self.unseen is None else self.unseen[index]
+        return replace(self, **rest, terminals=self.terminals[index] | gap, origin=origin, unseen=unseen)
 
     def select_episodes(self, which: Sequence[int]) -> Trajectories:
         """Return the given episodes, counted from 0."""
@@ -144,6 +148,25 @@ class Trajectories:
                 f"the log has {self.num_episodes} episodes, counted from 0"
             )
         return self.select(np.isin(self.episodes, wanted))
+
+
+def reckoned(
+    trajectories: Trajectories, observation: Observation, timestep: float | None, ahead: float = 0.0
+) -> Trajectories:
+    """Return a log with the positions that only their velocities show, as :meth:`Observation.reckon` has them.
+
+    Args:
+        trajectories: the log.
+        observation: its columns.
+        timestep: seconds of a transition where the log does not say; without either, nothing is reckoned.
+        ahead: of :meth:`Observation.reckon`.
+    """
+    step = trajectories.dt or timestep
+    if not observation.reckoned or step is None:
+        return trajectories
+    log = trajectories
+    unseen = observation.reckon(log.observations, log.next_observations, log.terminals, step, ahead)
+    return replace(log, unseen=unseen)
 
 
 def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
@@ -255,8 +278,9 @@ def make_transitions(
             f"lag must be at most {longest}"
         )
     steps = np.maximum(rows[:, None] + np.arange(-history, lag), first[:, None])
+    unseen = None if trajectories.unseen is None else trajectories.unseen[rows]
     return Transitions(
-        states=observation.states(trajectories.observations[rows]),
+        states=observation.states(trajectories.observations[rows], unseen),
         controls=trajectories.actions[steps],
         measured=observation.observed(trajectories.next_observations[rows + lag - 1]),
         rows=rows,

@@ -85,6 +85,11 @@ class Setting:
     frame_skip: int
     masked: frozenset[int] = frozenset()
 
+    @property
+    def has_impacts(self) -> bool:
+        """Whether contacts or stops may break a motion off."""
+        return bool(self.signals.contacts.any() or self.model.jnt_limited.any())
+
     def joint(self, name: str | None) -> int:
         """Return a joint's number."""
         return object_number(self.model, "jnt", name)

@@ -273,21 +273,26 @@ class JointCogging(JointEffect):
     SMALL = 0.01
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        scale = float(setting.signals.force[setting.dof(target)])
+        scale, (low, high) = self._scale(setting, target), setting.signals.position[setting.coordinate(target)]
+        fewest = float(np.pi / max(high - low, 1e-3))  # half a wave over the measured range: less is no ripple
         return (
             Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),
-            Quantity("poles", unit(setting, target, "1/rad", "1/m"), 1.0, 0.1, 1e4, 1.0),
+            Quantity("poles", unit(setting, target, "1/rad", "1/m"), max(1.0, fewest), fewest, 1e4, 1.0),
             Quantity("phase", "rad", 0.0, -20.0, 20.0, 1.0),
         )
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         low, high = setting.signals.position[setting.coordinate(target)]
-        amplitude = self.SMALL * self.quantities(setting, target)[0].scale
+        amplitude = self.SMALL * self._scale(setting, target)
         if setting.is_slide(target):  # so dense that no ripple is half a wave off over the whole range
             poles = [float(np.pi * n / max(high - low, 1e-9)) for n in range(2, 2 + self.WAVES)]
         else:
             poles = [float(n) for n in self.POLES if n * (high - low) > 2 * np.pi]
         return [np.array([amplitude, n, 0.0]) for n in poles]
+
+    @staticmethod
+    def _scale(setting: Setting, target: str | None) -> float:
+        return float(setting.signals.force[setting.dof(target)])
 
     def screened(self) -> list[int]:
         """Return amplitude and phase: the force is linear in their sine and cosine parts."""

@@ -63,7 +63,7 @@ def force_unit(model: mujoco.MjModel, dof: int) -> str:
 def middles(setting: Setting, windows: Windows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return positions ``(W, nq)``, velocities ``(W, nv)`` and commands ``(W, nu)`` in the middle of windows."""
     middle = windows.length // 2
-    states = setting.observation.full(windows.measured[:, middle])
+    states = setting.observation.full(windows.measured[:, middle], windows.unseen)
     commands = windows.commands[windows.episodes, windows.steps + middle]
     return states[:, : setting.model.nq], states[:, setting.model.nq :], commands
 

@@ -50,10 +50,13 @@ def cut_windows(
         starts = range(int(begin[e]), b - a - length + 1, stride or length + 1)
         found += [(path[s : s + length + 1], slope[s], e, s) for s in starts]
     measured, rates, episodes, steps = zip(*found, strict=True) if found else ((), (), (), ())
+    firsts = np.array([a for a, _ in bounds])
+    rows = firsts[np.array(episodes, dtype=int)] + np.array(steps, dtype=int)
     return Windows(
         np.reshape(measured, (-1, length + 1, observation.size)),
         np.reshape(rates, (-1, observation.size)) / (log.dt or 1.0),
         np.array(episodes, dtype=int), np.array(steps, dtype=int), commands,
+        None if log.unseen is None else log.unseen[rows],
     )  # fmt: skip
 
 
@@ -109,7 +112,7 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     nq, nv, physics, step = model.nq, model.nv, float(model.opt.timestep), problem.simulator.timestep
     step = problem.simulator.frame_skip * physics if step is None else step
     frame_skip = round(step / physics)  # steps of the given model, whatever the simulator makes of them
-    states, after = observation.states(log.observations), observation.states(log.next_observations)
+    states, after = observation.states(log.observations, log.unseen), observation.states(log.next_observations)
     rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
     inertia, force, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.ngeom, bool)
     squares = np.zeros((model.nbody, 2))  # of angular and linear velocity
@@ -127,7 +130,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
             squares[b] += (velocity**2).reshape(2, 3).sum(1)
         for contact in data.contact[: data.ncon]:
             touches[contact.geom[contact.geom >= 0]] = True
-    seen, speeds = np.isin(np.arange(nq), observation.columns), np.sqrt(squares / len(rows))
+    known = [*observation.columns, *(r.position for r in observation.reckoned if log.unseen is not None)]
+    seen, speeds = np.isin(np.arange(nq), known), np.sqrt(squares / len(rows))
     signals = Signals(
         timestep=step,
         position=np.where(seen[:, None], np.percentile(states[:, :nq], [1, 99], axis=0).T, np.nan),

@@ -19,7 +19,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, family_accounts, significant
-from dropo_torch.gap.ties import canonical, ties
+from dropo_torch.gap.ties import canonical, rivals_of_all
 from dropo_torch.support.checkpoint import Checkpoint
 
 #: Why what a log is too short for has no name.
@@ -167,11 +167,7 @@ def conclude(ground: Ground, state: State) -> Naming:
         return replace(unnamed, refused=UNSURE if unsure else state.refused)
     if not partial and imitates(ground, state.current):
         return replace(unnamed, refused=IMITATES)
-    tied, shares = [], []
-    for index in range(len(placed)):
-        rivals, share, state = ties(ground, state, index)
-        tied.append(rivals)
-        shares.append(share)
+    tied, shares, state = rivals_of_all(ground, state)
     state, told = canonical(ground, state, tied)
     return replace(
         unnamed, refused="", final=state.current, named=True, ties=told, shares=tuple(shares), attempts=state.attempts,

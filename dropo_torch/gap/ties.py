@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -43,6 +44,34 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     )
     tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
     return tied, without.cost.excess - current.cost.excess, replace(state, attempts=found.attempts)
+
+
+def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]], list[float], State]:
+    """Return :func:`ties` of every named effect, with one effect in the place of two wherever it does for both.
+
+    A search that takes one effect at a time may have explained by two, each a part of it, what one explains alone.
+    """
+    while True:
+        tied, shares = [], []
+        for index in range(len(state.current.hypothesis.placed)):
+            rivals, share, state = ties(ground, state, index)
+            tied.append(rivals)
+            shares.append(share)
+        if (fewer := _one_for_two(ground, state, tied)) is None:
+            return tied, shares, state
+        state = replace(state, current=fewer)
+
+
+def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]) -> Refit | None:
+    """A fit in which what ties with two named effects stands in the place of both, and explains the log as well."""
+    for one, other in combinations(range(len(tied)), 2):
+        shared = {p.key for p in tied[other]}
+        for rival in (p for p in tied[one] if p.key in shared):
+            ground.report("looking for ties", 0.9)
+            fewer = ground.refit(state.current.hypothesis.instead(one, rival).without(other), ITERATIONS[-1])
+            if as_good(ground, state, fewer):
+                return fewer
+    return None
 
 
 def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Alike) -> list[Candidate]:

@@ -36,6 +36,7 @@ class Windows:
         episodes: episode of each window, ``(W,)``.
         steps: logged step of each window's start within its episode, ``(W,)``.
         commands: commands of every episode at every logged step, the last one repeated, ``(E, N, nu)``.
+        unseen: positions at the starts that no column has, dead-reckoned from their velocities, ``(W, k)``.
     """
 
     measured: np.ndarray
@@ -43,6 +44,7 @@ class Windows:
     episodes: np.ndarray
     steps: np.ndarray
     commands: np.ndarray
+    unseen: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of windows."""
@@ -55,7 +57,9 @@ class Windows:
 
     def select(self, rows: np.ndarray | slice) -> Windows:
         """Return the given windows."""
-        return replace(self, **{k: getattr(self, k)[rows] for k in ("measured", "rates", "episodes", "steps")})
+        unseen = None if self.unseen is None else self.unseen[rows]
+        own = {k: getattr(self, k)[rows] for k in ("measured", "rates", "episodes", "steps")}
+        return replace(self, **own, unseen=unseen)
 
 
 class Twin:
@@ -176,7 +180,8 @@ class Twin:
             if late > 0:
                 steps = late / self.setting.signals.timestep
                 rates[:, f.column] = secants(windows.measured[:, :, f.column], steps) / late
-        states = observation.full(self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy())
+        true = self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy()
+        states = observation.full(true, windows.unseen)
         for q in observation.quaternions:
             at = observation.index[list(q)]
             states[:, at] /= np.linalg.norm(states[:, at], axis=1, keepdims=True)

@@ -1,0 +1,225 @@
+"""Logs that plain MuJoCo made with a model of which a number is other than in the user's."""
+
+from __future__ import annotations
+
+import functools
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+import yaml
+
+from dropo_torch.config import load_config
+from dropo_torch.data.observation import parse_observation
+from dropo_torch.effects import VOCABULARY, Placed
+from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
+from dropo_torch.gap.ground import Ground
+from dropo_torch.gap.log import cut_windows
+from dropo_torch.gap.refit import refit
+from dropo_torch.gap.search import start
+from dropo_torch.gap.ties import rivals_of_all
+from dropo_torch.problem import make_problem
+
+RAIL = """
+<mujoco><option timestep="0.005" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body>
+    <joint name="rail" type="slide" axis="1 0 0"/><geom type="box" size=".1 .1 .1" mass="2"/>
+    <body><joint name="pole" axis="0 1 0" damping=".02"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass=".3"/></body>
+  </body></worldbody>
+  <actuator><motor name="push" joint="rail" gear="5"/></actuator>
+</mujoco>"""
+ARM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="upper" pos="0 0 1">
+    <joint name="a" axis="0 1 0" damping=".05" range="-57.3 57.3" limited="true"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" mass="1"/>
+    <body name="lower" pos="0 0 -.3">
+      <joint name="b" axis="0 1 0" damping=".02" range="-68.8 68.8" limited="true"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.25" mass=".6"/></body>
+  </body></worldbody>
+  <actuator><position name="sa" joint="a" kp="20" kv="1"/><position name="sb" joint="b" kp="8" kv=".4"/></actuator>
+</mujoco>"""
+PENDULUM = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body name="upper" pos="0 0 1">
+    <joint name="a" axis="0 1 0" damping=".05"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" mass="1"/>
+    <body name="lower" pos="0 0 -.3">
+      <joint name="b" axis="0 1 0" damping=".02"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.25" mass=".6"/>
+    </body>
+  </body></worldbody>
+</mujoco>"""
+NOISE = {"position": 1e-4, "velocity": 1e-3}
+Change = Callable[[mujoco.MjModel], None]
+
+
+def scene_of(
+    xml: str, change: Change, commands: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    observation: tuple[str, ...] = ("qpos", "qvel"), shape: tuple[int, int] = (8, 150), seed: int = 5,
+) -> Scene:  # fmt: skip
+    """A log of episodes of so many transitions, by a model that differs from the user's ``xml``.
+
+    Args:
+        xml: the user's model.
+        change: makes the true one of it.
+        commands: of times ``(N,)`` and the phases of an episode ``(4,)``.
+        observation: the log's columns.
+        shape: episodes and transitions of each.
+        seed: of initial states, phases and noise.
+    """
+    own, truth = (mujoco.MjModel.from_xml_string(xml) for _ in range(2))
+    change(truth)
+    columns, rng = parse_observation(own, observation), np.random.default_rng(seed)
+    noise = np.array([NOISE["velocity" if unit.endswith("/s") else "position"] for unit in columns.units])
+    before, after, actions = [], [], []
+    for _ in range(shape[0]):
+        data, phases = mujoco.MjData(truth), rng.uniform(0, 6, 4)
+        data.qpos[-1] = 0.5 * rng.normal()
+        signal = commands(np.arange(shape[1]) * 2 * own.opt.timestep, phases)
+        path = []
+        for command in (*signal, None):
+            path.append(np.concatenate([data.qpos, data.qvel])[columns.index])
+            if command is not None:
+                data.ctrl[:] = command
+                mujoco.mj_step(truth, data, 2)
+        measured = np.array(path) + noise * rng.standard_normal((len(path), columns.size))
+        before.append(measured[:-1])
+        after.append(measured[1:])
+        actions.append(signal)
+    config = {"model": "m.xml", "data": "l.npz", "frame_skip": 2, "observation": list(observation), "threads": 1}
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "m.xml").write_text(xml)
+        np.savez(
+            folder / "l.npz", observations=np.concatenate(before), next_observations=np.concatenate(after),
+            actions=np.concatenate(actions), terminals=np.arange(shape[0] * shape[1]) % shape[1] == shape[1] - 1,
+        )  # fmt: skip
+        (folder / "c.yaml").write_text(yaml.safe_dump(config))
+        return prepare(make_problem(load_config(folder / "c.yaml"), general=True))
+
+
+def named(gap: Gap) -> list[tuple[str, str | None]]:
+    return [(e.effect, e.target) for e in gap.effects]
+
+
+def pushes(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
+    return (0.8 * np.sin(3 * time + phases[0]) + 0.4 * np.sin(11 * time + phases[1]))[:, None]
+
+
+def swings(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
+    chirp = 0.8 * np.sin(2 * np.pi * (0.3 + 0.0125 * time) * time + phases[0]) + 0.4 * np.sin(5 * time + phases[1])
+    return np.stack([chirp, np.sin(4.4 * time + phases[2]) + 0.4 * np.sin(9 * time + phases[3])], 1)
+
+
+def tether(model: mujoco.MjModel) -> None:
+    model.jnt_stiffness[0], model.qpos_spring[0] = 6.0, 0.1
+
+
+def resist(model: mujoco.MjModel) -> None:
+    model.dof_frictionloss[0] = 0.1
+    model.dof_damping[1] += 0.05
+
+
+def tilt(model: mujoco.MjModel) -> None:
+    model.opt.gravity[:] = 9.81 * np.array([-np.sin(0.1), 0, -np.cos(0.1)])
+
+
+def test_what_acts_by_a_position_that_no_column_has_is_named() -> None:
+    scene = scene_of(RAIL, tether, pushes, ("pole.position", "qvel"))
+    effects = [VOCABULARY[n] for n in ("joint_stiffness", "joint_friction", "joint_damping", "gravity_tilt")]
+    gap = find_gap(scene.problem, scene=scene, effects=effects)
+    assert named(gap) == [("joint_stiffness", "rail")]
+    strengths = gap.effects[0].parameters
+    assert strengths["stiffness"].value == pytest.approx(6.0, rel=2e-3)
+    assert strengths["reference"].value == pytest.approx(0.1, abs=1e-3)
+
+
+@functools.cache
+def stopped(seed: int) -> Scene:
+    """Of a window that begins a step before a stop, noise decides in which step the stop is reached."""
+    return scene_of(ARM, resist, swings, shape=(3, 1000), seed=seed)
+
+
+@pytest.mark.parametrize("seed", [4, 7])
+def test_noise_before_a_stop_is_no_rest(seed: int) -> None:
+    scene = stopped(seed)
+    friction = Placed(VOCABULARY["joint_soft_friction"], "a", (0.1,))
+    truth = Hypothesis((), (friction, Placed(VOCABULARY["joint_damping"], "b", (0.05,))))
+    windows = cut_windows(scene.train, scene.setting.observation, 8, stride=1)
+    every = replace(scene.evidence.on(windows), rough=False)
+    by_differences = every._differences(truth.variant)[0]
+    before = refit(every, truth, linear=by_differences, iterations=0, slopes=False).cost
+    after = refit(every, truth, iterations=0, slopes=False).cost
+    assert before.reduced > 1.5
+    assert after.reduced == pytest.approx(1, abs=0.15)
+    assert (after.penalty > 0).sum() < 0.02 * len(windows)
+
+
+def test_what_is_one_effect_is_not_told_as_two() -> None:
+    scene = scene_of(PENDULUM, tilt, lambda time, phases: np.zeros((len(time), 0)), shape=(6, 150))
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in ("external_force", "gravity_tilt")))
+    forces = [Placed(VOCABULARY["external_force"], body, (0.1, 0.0, 0.0)) for body in ("upper", "lower")]
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    two = ground.refit(state.base.hypothesis.with_effects(forces))
+    assert two.cost.reduced == pytest.approx(1, abs=0.1)
+    tied, _, found = rivals_of_all(ground, replace(state, current=two))
+    assert [p.key for p in found.current.hypothesis.placed] == [("gravity_tilt", None)]
+    assert abs(found.current.hypothesis.placed[0].values[1]) == pytest.approx(0.1, abs=1e-3)
+    assert tied == [()]
+
+
+def test_a_wave_longer_than_the_motion_is_no_ripple() -> None:
+    setting = stopped(4).setting
+    for joint in ("a", "b"):
+        low, high = setting.signals.position[setting.coordinate(joint)]
+        _, poles, _ = VOCABULARY["joint_cogging"].quantities(setting, joint)
+        assert poles.low * (high - low) == pytest.approx(np.pi)
+        assert poles.low <= poles.neutral
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "implicitfast", "RK4"])
+def test_positions_that_no_column_has_are_where_velocities_led(integrator: str) -> None:
+    model = mujoco.MjModel.from_xml_string(RAIL.replace("implicitfast", integrator))
+    observation, data = parse_observation(model, ["pole.position", "qvel"]), mujoco.MjData(model)
+    path, rows = [], 40
+    for i in range(2 * rows):
+        if i % rows == 0:
+            mujoco.mj_resetData(model, data)
+            data.qvel[:] = 0.5, -1.0
+        path.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[0] = np.sin(0.1 * i)
+        mujoco.mj_step(model, data)
+        path.append(np.concatenate([data.qpos, data.qvel]))
+    before, after = (np.array(path)[i::2] for i in (0, 1))
+    explicit = integrator == "RK4"
+    logs = (x[:, observation.index] for x in (before, after))
+    ends = np.arange(2 * rows) % rows == rows - 1
+    unseen = observation.reckon(*logs, ends, model.opt.timestep, 0.0 if explicit else 1.0)
+    np.testing.assert_allclose(unseen[:, 0], before[:, 0], atol=1e-5 if explicit else 1e-13)
+    np.testing.assert_array_equal(observation.states(before[:, observation.index], unseen)[:, 0], unseen[:, 0])
+
+
+def test_a_position_is_reckoned_within_its_range() -> None:
+    limited = RAIL.replace('axis="1 0 0"/>', 'axis="1 0 0" range="-.1 .1" limited="true"/>')
+    observation = parse_observation(mujoco.MjModel.from_xml_string(limited), ["pole.position", "qvel"])
+    moving = np.tile([0.0, 1.0, 0.0], (50, 1))
+    unseen = observation.reckon(moving, moving, np.arange(50) == 49, 0.01)
+    assert unseen.max() == 0.1
+    assert unseen.min() == 0.0
+
+
+def test_what_is_observed_or_an_orientation_is_not_reckoned() -> None:
+    free = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><freejoint name="root"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    assert parse_observation(free, None).reckoned == ()
+    assert [r.position for r in parse_observation(free, ["qpos[2:]", "qvel"]).reckoned] == [0, 1]
+    assert [r.position for r in parse_observation(free, ["qvel"]).reckoned] == [0, 1, 2]
