@@ -327,10 +327,14 @@ def _at_effect(where: str, name: str, spec: Mapping[str, Any]) -> Parameter:
             raise InputError(
                 f"{where}: {key} belongs to a field; a parameter of an effect has {', '.join(_EFFECT_KEYS)}"
             )
-    for key in ("effect", "name", "index"):
+    for key in ("effect", "index"):
         if not isinstance(spec.get(key, ""), str | None):
             raise InputError(f"{where}: {key} is {spec[key]!r}; expected a name")
-    objects = (spec["name"],) if spec.get("name") else ()
+    given = spec.get("name") or ()
+    objects = (given,) if isinstance(given, str) else given
+    if not isinstance(objects, list | tuple) or not all(isinstance(o, str) for o in objects):
+        raise InputError(f"{where}: name is {given!r}; expected a name, or a list of them")
+    objects = tuple(dict.fromkeys(objects))
     return Parameter(name, objects=objects, effect=str(spec["effect"]), quantity=spec.get("index") or "")
 
 

@@ -422,6 +422,33 @@ def test_tosses(tmp_path: Path) -> None:
     assert most < least
 
 
+def test_pushes(tmp_path: Path) -> None:
+    """Friction and a late camera predict measured pushes at least twice as well as the model as given."""
+    example = load_example(ROOT / "examples" / "pushing" / "pushing.py")
+    pushes = example.chosen(list(example.read(measured("planar_pushing"), "20_neg30_90")), 1)
+    assert len({p.group for p in pushes}) == len(pushes) == 3
+    problem = example.make(pushes[:1], tmp_path, (0.0,), example.WINDOW)
+    assert len(problem.objective.transitions) == 1
+    given, better = np.nan_to_num(problem.space.nominal), np.array([1.3, 0.004, 0.12, -0.001])
+    (far, _), (near, turned) = (
+        example.errors(pushes, [p[0] for p in example.predict(problem, pushes, values)]).mean(0)
+        for values in (given, better)
+    )
+    assert near < min(far / 2, 1.5)
+    assert turned < 1.5
+
+
+def test_an_error_term_holds_what_repeats_have_in_common() -> None:
+    example, rng = load_example(ROOT / "examples" / "pushing" / "pushing.py"), np.random.default_rng(0)
+    shared = np.repeat(rng.normal(size=(400, 3)) * [3, 2, 1], 5, axis=0)
+    off = shared + rng.normal(size=shared.shape) * [1, 1, 0.5]
+    covariance, groups = example.error_term(off, [("push", n) for n in np.repeat(np.arange(400), 5)])
+    assert groups == 400
+    assert np.diag(covariance) == pytest.approx([9 + 1.2, 4 + 1.2, 1 + 0.3], rel=0.15)
+    draws = rng.multivariate_normal(np.zeros(3), covariance, 400)
+    assert example.energy_score(draws * 1e-3, np.zeros(3)) < example.energy_score(draws * 1e-3, np.full(3, 0.02))
+
+
 def test_a_twin_of_a_log_has_its_commands_and_noise() -> None:
     example = load_example(ROOT / "examples" / "noisy_hopper.py")
     log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz").select(slice(0, 300))

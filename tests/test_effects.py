@@ -595,6 +595,32 @@ def test_a_fit_recovers_a_hidden_delay_and_friction(tmp_path: Path, backend: str
     assert backend == "warp" or mean["friction"]["mean"] == pytest.approx(0.15, abs=1e-4)
 
 
+@pytest.mark.parametrize("names", [["shoulder", "elbow"], ["*"], ["elbow", "*"], "*"])
+def test_a_number_that_several_places_share_is_one_parameter(tmp_path: Path, names: list[str] | str) -> None:
+    shared = {"friction": {"effect": "joint_friction", "name": names, "bounds": [0.0, 0.5]}}
+    problem = make_problem(make_config({**record_arm(tmp_path, friction=0.15), "parameters": shared}))
+    assert problem.effects is not None
+    found = problem.effects.at(np.array([0.2]))
+    assert sorted((p.effect.name, p.target, p.values) for p in found) == [
+        ("joint_friction", "elbow", (0.2,)), ("joint_friction", "shoulder", (0.2,)),
+    ]  # fmt: skip
+
+
+def test_where_velocities_are_not_observed_a_late_sensor_saw_rest_before(tmp_path: Path) -> None:
+    """A window begins at rest there, however hard something pushes at its start."""
+    late = [{"effect": "sensor_delay", "target": "elbow.position", "delay": 0.05}]
+    mass = {"mass": {"field": "body_mass", "name": "lower", "bounds": [0.3, 1.0]}}
+    document = {**record_arm(tmp_path, steps=20), "parameters": mass, "effects": late}
+    log = np.load(document["data"])
+    np.savez(document["data"], **{**log, "observations": log["observations"][:, :2],
+                                  "next_observations": log["next_observations"][:, :2]})  # fmt: skip
+    problem = make_problem(make_config({**document, "observation": ["qpos"]}))
+    start, push = torch.tensor([[0.3, -0.4, 0.0, 0.0]], dtype=torch.float64), torch.full((1, 8, 2), 3.0)
+    shown = problem.simulator.rollout(start, push.double(), torch.tensor([[0.5]], dtype=torch.float64))[0, 0]
+    assert shown[0, 1].item() == pytest.approx(-0.4, abs=1e-12)
+    assert (shown[:, 0] - 0.3).abs().max() > 0.1
+
+
 REMEMBERING = [
     ("actuator_delay", "bend", {"delay": 0.033}), ("actuator_lag", "bend", {"time_constant": 0.02}),
     ("actuator_backlash", "bend", {"width": 0.5}), ("sensor_delay", "elbow.velocity", {"delay": 0.013}),
@@ -750,6 +776,10 @@ def test_gymnasium_environments_have_effects_around_them() -> None:
             "parameters.x: bounds .* allow a delay of actuator_delay below 0",
         ),
         ([], {"x": DELAY, "y": DELAY}, "already a parameter"),
+        ([], {"x": {**DELAY, "name": ["bend", "bent"]}}, "cannot be at 'bent'.*did you mean 'bend'"),
+        ([], {"x": {**DELAY, "name": "q*"}}, r"parameters.x: actuator_delay cannot be at 'q\*'"),
+        ([], {"x": {**DELAY, "name": 3}}, "parameters.x: name is 3; expected a name, or a list of them"),
+        ([], {"x": {**DELAY, "effect": "delai", "name": "b*"}}, "parameters.x: effect: unknown 'delai'"),
         ([], {"x": {"effect": "joint_cogging", "name": "elbow", "bounds": [0, 1]}}, "several numbers; add index"),
         ([], {"x": {"effect": "joint_cogging", "name": "elbow", "index": "amplitude", "bounds": [0, 1]}}, "no poles"),
         ([{"effect": "integration", "timestep": 0.003}], {}, "no whole number"),

@@ -35,6 +35,7 @@ from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import Diverges, _relative_noise, free_forces
+from dropo_torch.gap.outcome import _notes
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
@@ -43,7 +44,7 @@ from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.sound import absurd, has_skill
-from dropo_torch.gap.twin import secants
+from dropo_torch.gap.twin import Windows, secants
 from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.report.gap_words import answer
@@ -715,6 +716,14 @@ def test_the_friction_of_an_mjcf_is_dry_friction(friction: tuple[float, float], 
     model = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
     assert model.dof_frictionloss == pytest.approx(friction, rel=0.01)
     assert (model.dof_solref == problem.space.model.dof_solref).all()
+
+
+@pytest.mark.parametrize(("transitions", "said"), [(3_600, False), (1_000_000, True)])
+def test_what_of_a_long_log_was_compared_is_said(transitions: int, said: bool) -> None:
+    windows = Windows(np.zeros((120, 31, 4)), *[np.zeros(120)] * 3, np.zeros((1, 1, 1)))
+    naming = SimpleNamespace(evidence=SimpleNamespace(windows=windows), unfinished="", gap=False, named=False)
+    notes = " ".join(_notes(scene_of().setting, naming, True, transitions))  # type: ignore[arg-type]
+    assert ("of 1,000,000 transitions, 3,600 were compared, 120 windows of 30" in notes) == said
 
 
 def test_what_the_step_leaves_is_no_noise() -> None:

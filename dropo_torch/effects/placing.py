@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fnmatch
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -146,18 +147,17 @@ def place_effects(given: Sequence[Mapping[str, Any]], space: ParameterSpace, set
     for column, parameter in enumerate(space.parameters):
         if parameter.effect:
             where = f"parameters.{parameter.name}"
-            document = {"effect": parameter.effect, "name": next(iter(parameter.objects), None)}
-            effect, target = key = _located(where, document, "name", setting, find)
-            quantities = effect.quantities(setting, target)
-            quantity = _quantity(where, parameter, quantities)
-            if next(q for q in quantities if q.name == quantity).discrete:
-                raise InputError(
-                    f"{where}: {quantity} of {effect.name} is a choice, which cannot vary; "
-                    f"give it in effects: {{effect: {effect.name}, {quantity}: a number}}"
-                )
-            if known.setdefault(key, {}).get(quantity, (0.0, -1))[1] >= 0:
-                raise InputError(f"{where}: {quantity} of {effect.name} is already a parameter; keep one of them")
-            known[key][quantity] = math.nan, column
+            for effect, target in _places(where, parameter, setting, find):
+                quantities = effect.quantities(setting, target)
+                quantity = _quantity(where, parameter, quantities)
+                if next(q for q in quantities if q.name == quantity).discrete:
+                    raise InputError(
+                        f"{where}: {quantity} of {effect.name} is a choice, which cannot vary; "
+                        f"give it in effects: {{effect: {effect.name}, {quantity}: a number}}"
+                    )
+                if known.setdefault((effect, target), {}).get(quantity, (0.0, -1))[1] >= 0:
+                    raise InputError(f"{where}: {quantity} of {effect.name} is already a parameter; keep one of them")
+                known[effect, target][quantity] = math.nan, column
     entries = [_entry(effect, target, effect.quantities(setting, target), of) for (effect, target), of in known.items()]
     return EffectSet(tuple(entries), setting)
 
@@ -193,17 +193,21 @@ def lowest(effects: EffectSet, space: ParameterSpace) -> np.ndarray:
     return least
 
 
+def _places(where: str, parameter: Parameter, setting: Setting, find: Find) -> list[tuple[Effect, str | None]]:
+    """The effect of a parameter at each of its targets: one, a list of them, or patterns with ``*``."""
+    effect, found = _find(where, parameter.effect, find), list[str | None]()
+    for name in parameter.objects or (None,):
+        pattern = name is not None and "*" in name
+        matches = [t for t in effect.targets(setting) if t and fnmatch.fnmatchcase(t, str(name))] if pattern else []
+        found += matches or [name]  # what matches nothing is refused by name
+    return [_located(where, {"effect": effect.name, "name": t}, "name", setting, find) for t in dict.fromkeys(found)]
+
+
 def _located(
     where: str, document: Mapping[str, Any], key: str, setting: Setting, find: Find
 ) -> tuple[Effect, str | None]:
     """The effect and the target of an entry."""
-    name, target = document.get("effect"), document.get(key)
-    if name is None:
-        raise InputError(f"{where}: no effect named; expected effect: NAME, such as effect: joint_friction")
-    try:
-        effect = find(str(name))
-    except InputError as error:
-        raise InputError(f"{where}: {error}") from None
+    effect, target = _find(where, document.get("effect"), find), document.get(key)
     possible = effect.targets(setting)
     if target not in possible:
         names = [str(t) for t in possible if t is not None]
@@ -214,6 +218,16 @@ def _located(
         has = f"cannot be at {target!r}" if target is not None else "fits nowhere in this model"
         raise InputError(f"{where}: {effect.name} {has}" + choices(target, names))
     return effect, target
+
+
+def _find(where: str, name: str | None, find: Find) -> Effect:
+    """The effect of an entry, by its name."""
+    if name is None:
+        raise InputError(f"{where}: no effect named; expected effect: NAME, such as effect: joint_friction")
+    try:
+        return find(str(name))
+    except InputError as error:
+        raise InputError(f"{where}: {error}") from None
 
 
 def _numbers(where: str, document: Mapping[str, Any], quantities: Sequence[Quantity]) -> dict[str, float]:

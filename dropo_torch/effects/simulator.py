@@ -188,11 +188,12 @@ class EffectSimulator(Simulator):
     def _shown(self, fine: np.ndarray, rates: np.ndarray, sensors: list[Filter]) -> np.ndarray:
         """Return observed columns as the sensors show them, of states at every physics step ``(K, T, L·skip + 1, ·)``.
 
-        Before its start, a window has moved with the start's velocity and acceleration.
+        Before its start, a window has moved with the start's velocity and acceleration; at rest, where that is not
+        observed.
         """
         index, skip = self._setting.observation.index, self.frame_skip
         of = self._rates[index]
-        curved = np.where(of >= 0, rates[..., of], 0.0)
+        curved = np.where((of >= 0) & (np.array(self._observed_rates) >= 0), rates[..., of], 0.0)
         columns, slope, curvature = (
             torch.from_numpy(x.reshape(-1, *x.shape[2:])) for x in (fine[..., index], rates[..., index], curved)
         )

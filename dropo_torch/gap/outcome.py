@@ -31,6 +31,8 @@ from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, sco
 ROUNDS = 3
 #: Joints of which forces are shown, where these decide.
 PICTURES = 4
+#: Share of a log's transitions below which it is said that no more were compared.
+SPARSE = 0.2
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -89,7 +91,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         seconds=time.perf_counter() - started,
         backend=problem.config.backend,
         seed=problem.config.seed,
-        notes=tuple(_notes(setting, naming, skill)),
+        notes=tuple(_notes(setting, naming, skill, len(scene.train))),
         skill=skill,
         remaining=remaining,
         refused=naming.refused,
@@ -219,9 +221,14 @@ def _own_step(naming: Naming, rest: Refit, rules: Rules) -> tuple[float, float] 
     return (own.reduced, rest.cost.reduced) if only else None
 
 
-def _notes(setting: Setting, naming: Naming, skill: bool) -> Iterator[str]:
-    """What a person should know besides; ``skill`` is that of the model as it is."""
-    names = dof_names(setting.model)
+def _notes(setting: Setting, naming: Naming, skill: bool, transitions: int) -> Iterator[str]:
+    """What a person should know besides; ``skill`` is that of the model as it is, on a log of so many transitions."""
+    names, windows = dof_names(setting.model), naming.evidence.windows
+    if (compared := len(windows) * windows.length) < SPARSE * transitions:
+        yield (
+            f"The log has more than the search needs: of {transitions:,} transitions, {compared:,} were compared, "
+            f"{len(windows)} windows of {windows.length} spread over all of it."
+        )
     still = [name for name, speed in zip(names, setting.signals.speed, strict=True) if speed <= 0]
     if naming.unfinished:
         yield (

@@ -1,0 +1,271 @@
+"""Where does a robot's push leave a rectangle, and how sure can that be?
+
+    python examples/pushing/pushing.py FOLDER
+
+FOLDER holds the measured pushes (see docs/real-robots.md): bigrect_3pts and bigrect_ridge, each with three conditions.
+Friction of the fingers and of turning, softness and size of the contact, and how late the camera is are fitted to two
+conditions; the table has the errors of predictions of the third, each push from its first pose to its end. Then the
+regions that predictions with an error term give to the last poses are compared with what repeats of the push did.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import sys
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy import stats
+from scipy.signal import medfilt
+
+import dropo_torch as dropo
+from dropo_torch.problem import Problem
+
+HERE = Path(__file__).parent
+SUPPORTS, CONDITIONS = ("bigrect_3pts", "bigrect_ridge"), ("20_neg30_90", "30_50_60", "60_20_150")
+#: s between two pushes of a file, at least; before the object is seen, and without it within a push, at most.
+PAUSE, SOON, LOST = 0.5, 0.2, 0.8
+#: m and rad from the running median at which a pose is no measurement, and samples of that median.
+OUTLIERS, MEDIAN = (3e-3, 3e-3, 0.1), 7
+#: s of a push that a window has, and before which it waits, so that windows of equal length end at several times.
+WINDOW, WAITS = 3.15, (0.0, 1.05, 2.1)
+#: s between the commands of a prediction.
+STEP = 0.03
+#: Standard deviations of a prediction without an error term, in m, m and rad.
+EPSILON = (1e-3, 1e-3, 0.017)
+#: m from the centre at which an angle counts as a distance; draws from the box of parameters, and of a prediction.
+ARM, DRAWS, SAMPLES = 0.025, 20, 400
+
+
+@dataclass(frozen=True)
+class Push:
+    """One push: times ``(T,)``, poses of the object with NaN where it was not seen and of the hand, ``(T, 3)`` each."""
+
+    condition: str
+    repeat: str
+    number: int
+    time: np.ndarray
+    object: np.ndarray
+    hand: np.ndarray
+
+    @property
+    def group(self) -> tuple[str, int]:
+        """What repeats of a push have in common: the support with the condition, and the number in its file."""
+        return f"{self.repeat.split()[0]} {self.condition}", self.number
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Where the camera saw the object, ``(T,)`` bool."""
+        return np.isfinite(self.object).all(1)
+
+
+def read(folder: Path, condition: str) -> Iterator[Push]:
+    """Yield the pushes of a condition that the camera saw from the start, without a long loss."""
+    for support in SUPPORTS:
+        for path in sorted(folder.glob(f"{support}/{support}_{condition}/*.txt")):
+            rows = np.loadtxt(path, delimiter=",")[1:]
+            breaks = np.flatnonzero(np.diff(rows[:, 0]) > PAUSE) + 1
+            rests = None
+            for number, part in enumerate(np.split(rows, breaks)):
+                push = _push(condition, f"{support} {path.stem}", number, part)
+                if rests is not None and not push.seen[0]:  # nothing moved it since the push before
+                    turn = 2 * np.pi * np.round((push.object[push.seen][0, 2] - rests[2]) / (2 * np.pi))
+                    push.object[0] = rests + [0, 0, turn]
+                when = push.time[push.seen]
+                rests = push.object[push.seen][-1]
+                if len(when) > MEDIAN and when[0] < SOON and np.diff(when).max() < LOST:
+                    yield push
+
+
+def _push(condition: str, repeat: str, number: int, rows: np.ndarray) -> Push:
+    """A push from the file's rows, without outliers; in metres, angles without jumps."""
+    time, scale = rows[:, 0] - rows[0, 0], np.array([1e-3, 1e-3, 1.0])
+    pose, hand = rows[:, 1:4] * scale, rows[:, 4:7] * scale
+    seen = (rows[:, 1:4] != 0).any(1)
+    pose[seen, 2], hand[:, 2] = np.unwrap(pose[seen, 2]), np.unwrap(hand[:, 2])
+    for column, far in enumerate(OUTLIERS):
+        filled = np.interp(time, time[seen], pose[seen, column])
+        seen = seen & (np.abs(filled - medfilt(filled, MEDIAN)) < far)
+    pose[~seen] = np.nan
+    return Push(condition, repeat, number, time, pose, hand)
+
+
+def make(pushes: Sequence[Push], out: Path, waits: Sequence[float], length: float, **changes: object) -> Problem:
+    """Write pushes as a log, each after some waits, with model and config; return the problem.
+
+    Args:
+        pushes: the pushes.
+        out: folder to write into.
+        waits: seconds that the hand waits before a push, by one episode each.
+        length: seconds of an episode.
+        changes: entries of the config that differ.
+    """
+    rows = []
+    for number, (push, wait) in enumerate((p, w) for p in pushes for w in waits):
+        begin = int(np.flatnonzero(push.seen)[0])
+        at, path = push.time[begin:] - push.time[begin] + wait, np.hstack([push.object, push.hand])[begin:]
+        waiting = np.arange(0, wait, STEP)
+        at, path = np.append(waiting, at), np.vstack([np.repeat(path[:1], len(waiting), 0), path])
+        rows += [[t, number, *pose] for t, pose in zip(at, path, strict=True) if t <= length + LOST]
+    with (out / "pushes.csv").open("w", newline="") as stream:
+        names = ("x", "y", "yaw", "hand_x", "hand_y", "hand_yaw")
+        csv.writer(stream).writerows([("time", "push", *names), *rows])
+    for name in ("rectangle.xml", "rectangle.yaml"):
+        (out / name).write_text((HERE / name).read_text())
+    return dropo.make_problem(dropo.load_config(out / "rectangle.yaml", changes))
+
+
+def predict(problem: Problem, pushes: Sequence[Push], values: np.ndarray) -> list[np.ndarray]:
+    """Return the poses that the camera would have shown at the times of each push, ``(K, T, 3)`` for K vectors."""
+    found = []
+    for push in pushes:
+        begin = int(np.flatnonzero(push.seen)[0])
+        at = push.time[begin:] - push.time[begin]
+        count = int(at[-1] / STEP)
+        targets = np.stack([np.interp(STEP * np.arange(1, count + 1), at, h) for h in push.hand[begin:].T], 1)
+        start = np.concatenate([push.object[begin, :2], [0.0], push.object[begin, 2:], push.hand[begin], np.zeros(7)])
+        states = problem.simulator.rollout(
+            torch.from_numpy(start[None]), torch.from_numpy(np.vstack([targets[:1], targets])[None]),
+            torch.from_numpy(np.atleast_2d(values)),
+        )[0].numpy()  # fmt: skip
+        path = np.concatenate([np.repeat(start[None, None], len(states), 0), states], 1)[..., [0, 1, 3]]
+        grid = STEP * np.arange(path.shape[1])
+        shown = np.array([[np.interp(at, grid, p[:, c]) for c in range(3)] for p in path]).swapaxes(1, 2)
+        found.append(np.concatenate([np.full((len(shown), begin, 3), np.nan), shown], 1))
+    return found
+
+
+def errors(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarray:
+    """Return root mean square errors over each push, of the position in mm and of the angle in degrees, ``(P, 2)``."""
+    found = []
+    for push, pose in zip(pushes, poses, strict=True):
+        off = (pose - push.object)[push.seen]
+        found.append((1e3 * np.sqrt((off[:, :2] ** 2).sum(1).mean()), np.degrees(np.sqrt((off[:, 2] ** 2).mean()))))
+    return np.array(found)
+
+
+def last_errors(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarray:
+    """Return errors of the last poses seen, along the hand's heading, across it and of the angle, ``(K, P, 3)``."""
+    found = []
+    for push, pose in zip(pushes, poses, strict=True):
+        end, heading = int(np.flatnonzero(push.seen)[-1]), push.hand[-1, 2]
+        off = push.object[end] - pose[:, end]
+        along = np.array([[np.cos(heading), np.sin(heading)], [-np.sin(heading), np.cos(heading)]])
+        found.append(np.hstack([off[:, :2] @ along.T, off[:, 2:]]))
+    return np.stack(found, 1)
+
+
+def error_term(off: np.ndarray, groups: Sequence[tuple[str, int]]) -> tuple[np.ndarray, int]:
+    """Return the covariance of errors ``(P, 3)`` of a push that was not seen, and the groups of which it is.
+
+    What repeats of a push have in common is no noise: it is the model's own error. So a group of repeats is one draw of
+    it, and what differs between them is the second part.
+    """
+    names = sorted(set(groups))
+    parts = [off[[g == name for g in groups]] for name in names]
+    means = np.array([part.mean(0) for part in parts])
+    within = np.concatenate([part - part.mean(0) for part in parts])
+    free = max(len(within) - len(parts), 1)
+    return means.T @ means / len(means) + within.T @ within / free, len(names)
+
+
+def energy_score(samples: np.ndarray, off: np.ndarray) -> float:
+    """Return the energy score of errors drawn, ``(N, 3)``, for one that came, ``(3,)``: in mm, an angle by its arc."""
+    scale = 1e3 * np.array([1.0, 1.0, ARM])
+    near = np.linalg.norm((samples - off) * scale, axis=1).mean()
+    return float(near - 0.5 * np.linalg.norm((samples - samples[::-1]) * scale, axis=1).mean())
+
+
+def fit(pushes: Sequence[Push], out: Path) -> tuple[Problem, np.ndarray]:
+    """Return the problem of some pushes and the parameters that fit them."""
+    print(f"fitting {len(pushes)} pushes", file=sys.stderr, flush=True)
+    problem = make(pushes, out, WAITS, WINDOW)
+    return problem, dropo.fit_problem(problem).distribution.center
+
+
+def chosen(pushes: Sequence[Push], repeats: int) -> list[Push]:
+    """Return the first repeats of each push, of each support and condition."""
+    kept: Counter[tuple[str, int]] = Counter()
+    found = []
+    for push in pushes:
+        kept[push.group] += 1
+        found += [push] if kept[push.group] <= repeats else []
+    return found
+
+
+def regions(
+    problem: Problem, seen: Sequence[Push], unseen: Sequence[Push], best: np.ndarray, rng: np.random.Generator
+) -> tuple[list[bool], dict[str, list[float]]]:
+    """Return which unseen last poses lie in the 90 % region of the error term, and energy scores of three predictions.
+
+    Those are of the parameters with the error term, of the parameters with ε, and of parameters drawn from all of
+    their box with ε.
+    """
+    covariance, groups = error_term(last_errors(seen, predict(problem, seen, best))[0], [p.group for p in seen])
+    size = len(covariance)
+    largest = size * groups / (groups - size + 1) * stats.f.ppf(0.9, size, groups - size + 1)
+    boxes = rng.uniform(problem.space.low, problem.space.high, (DRAWS, len(best)))
+    off = last_errors(unseen, predict(problem, unseen, np.vstack([best, boxes])))
+    epsilon = rng.normal(size=(SAMPLES, size)) * EPSILON
+    scores: dict[str, list[float]] = {"with an error term": [], "with ε": [], "drawn from the box (UDR)": []}
+    inside = []
+    for own, *others in off.swapaxes(0, 1):
+        inside.append(bool(own @ np.linalg.solve(covariance, own) <= largest))
+        drawn = {
+            "with an error term": rng.multivariate_normal(np.zeros(size), covariance, SAMPLES),
+            "with ε": epsilon,
+            "drawn from the box (UDR)": own - np.array(others)[rng.integers(len(others), size=SAMPLES)] + epsilon,
+        }
+        for name, samples in drawn.items():
+            scores[name].append(energy_score(samples, own))
+    return inside, scores
+
+
+def _row(label: str, found: np.ndarray) -> str:
+    millimetres, degrees = np.sqrt((found**2).mean(0))
+    return f"{f'{label}, {len(found)} pushes':<46}{millimetres:>8.2f}{degrees:>9.2f}"
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="holds bigrect_3pts and bigrect_ridge")
+    parser.add_argument("--out", type=Path, default=Path("out/pushing"))
+    parser.add_argument("--repeats", type=int, default=1, help="repeats of each push that are fitted")
+    parser.add_argument(
+        "--conditions", nargs="+", choices=CONDITIONS, default=CONDITIONS, help="those left out in turn"
+    )
+    given = parser.parse_args(arguments)
+    given.out.mkdir(parents=True, exist_ok=True)
+    every = {c: list(read(given.folder, c)) for c in CONDITIONS}
+    if missing := [c for c, pushes in every.items() if not pushes]:
+        parser.error(f"{given.folder}: no pushes of {missing[0]}; expected the folder that holds bigrect_3pts")
+    inside, scores, rng = list[bool](), dict[str, list[float]](), np.random.default_rng(0)
+    table = [f"{'root mean square error over unseen pushes':<46}{'mm':>8}{'degrees':>9}"]
+    all_errors: dict[str, list[np.ndarray]] = {"as given": [], "as fitted to the others": []}
+    for left_out in given.conditions:
+        seen, unseen = [p for c in CONDITIONS if c != left_out for p in every[c]], every[left_out]
+        problem, best = fit(chosen(seen, given.repeats), given.out)
+        numbers = (f"{p.name} {v:.4g} {p.unit}" for p, v in zip(problem.space.parameters, best, strict=True))
+        print(f"{left_out} left out: {', '.join(n.strip() for n in numbers)}")
+        as_given = np.nan_to_num(problem.space.nominal)  # neither late nor off
+        for (label, every_error), values in zip(all_errors.items(), (as_given, best), strict=True):
+            every_error.append(errors(unseen, [p[0] for p in predict(problem, unseen, values)]))
+            table.append(_row(f"{left_out}, {label}", every_error[-1]))
+        here, own = regions(problem, seen, unseen, best, rng)
+        inside += here
+        for name, values_of in own.items():
+            scores.setdefault(name, []).extend(values_of)
+    table += [_row(f"all, {label}", np.concatenate(of)) for label, of in all_errors.items()]
+    print("", *table, sep="\n")
+    print(f"\nlast poses of unseen pushes in the 90 % region of the error term: {sum(inside)} of {len(inside)}")
+    for name, of in scores.items():
+        print(f"energy score {name:<26}{np.mean(of):>8.2f} mm")
+
+
+if __name__ == "__main__":
+    main()
