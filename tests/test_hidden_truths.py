@@ -22,6 +22,7 @@ from benchmarks.hidden.systems import (
     SYSTEMS,
     TORQUE_ARM,
     TUMBLER,
+    WALKING,
     System,
     load,
 )  # fmt: skip
@@ -61,7 +62,7 @@ def error(system: System, model: mujoco.MjModel, case: truths.Case) -> np.ndarra
 def test_null_is_mujoco_with_the_true_values(name: str) -> None:
     system = SYSTEMS[name]
     case = short(system, noise=0.0, transitions=80)
-    assert error(system, truths.true_model(system, case.declared), case).max() < 0.1
+    assert error(system, truths.true_model(system, case.declared), case).max() < (0.2 if system in WALKING else 0.1)
     assert error(system, mujoco.MjModel.from_xml_string(system.xml), case).max() > 1.0
 
 
@@ -311,12 +312,13 @@ def test_unusual_cases_follow_the_plain_ones() -> None:
     assert {s.system for s in plain} <= {s.name for s in CORE}
     assert all(s.name.startswith(f"{s.trait}-") for s in unusual)
     count = {
-        trait: sum(s.trait == trait for s in unusual) for trait in ("motion", "passive", "coarse", "unequal", "tie")
+        trait: sum(s.trait == trait for s in unusual)
+        for trait in ("motion", "passive", "coarse", "unequal", "tie", "walking")
     }
     assert min(count.values()) >= 4
     assert sum(count.values()) == len(unusual) >= 20
     assert all(s.effects[0] == "integration" and len(s.effects) == 2 for s in unusual if s.trait == "coarse")
-    assert {s.trait for s in unusual if s.kind == "null"} >= {"motion", "passive", "unequal"}
+    assert {s.trait for s in unusual if s.kind == "null"} >= {"motion", "passive", "unequal", "walking"}
 
 
 @pytest.mark.parametrize("system", [PASSIVE_PUCK, DOUBLE_PENDULUM, TUMBLER], ids=lambda s: s.name)

@@ -2,77 +2,119 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from types import SimpleNamespace
-from typing import Any
+import functools
+import tempfile
+from dataclasses import replace
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
+import yaml
 
-from dropo_torch.effects import Placed, find_effect
-from dropo_torch.gap.rules import Rules
-from dropo_torch.gap.suggest import excite, suggest
-from dropo_torch.testing.effects import rig
+from dropo_torch.config import load_config
+from dropo_torch.effects import VOCABULARY, Placed
+from dropo_torch.gap import Hypothesis, Scene, prepare
+from dropo_torch.gap.refit import refit
+from dropo_torch.gap.suggest import COMMANDS, STARTS, Advice, excite, motions, separation, suggest
+from dropo_torch.gap.twin import Windows
+from dropo_torch.problem import make_problem
 
-FRICTION = Placed(find_effect("joint_friction"), "elbow", (0.1,))
-TILT = Placed(find_effect("gravity_tilt"), None, (0.1, 0.0))
-
-
-@dataclass(frozen=True)
-class Windows:
-    commands: np.ndarray
-
-    def __len__(self) -> int:
-        return len(self.commands)
-
-    def select(self, rows: np.ndarray) -> Windows:
-        return replace(self, commands=self.commands[rows])
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """Two hypotheses whose residuals differ by as many σ as the commands are large; one may diverge."""
-
-    windows: Windows
-    share: float = 1.0
-    diverges: bool = False
-    rules: Rules = field(default_factory=Rules)
-
-    @property
-    def twin(self) -> Any:
-        model = rig()
-        model.actuator_ctrllimited[0], model.actuator_ctrlrange[0] = True, (-1.0, 1.0)
-        return SimpleNamespace(setting=SimpleNamespace(model=model))
-
-    def on(self, windows: Windows) -> Evidence:
-        return replace(self, windows=windows)
-
-    def residuals(self, variants: list[Any]) -> tuple[np.ndarray, None]:
-        told = self.share * np.abs(self.windows.commands).sum((1, 2))
-        return np.stack([np.zeros_like(told), np.full_like(told, np.nan) if self.diverges else told]), None
-
-    def linearise(self, variant: Any) -> None: ...
-
-    def project_slope(self, difference: np.ndarray, initial: None) -> np.ndarray:
-        return difference
+PENDULUM = """
+<mujoco><option timestep="0.005" integrator="implicitfast"/>
+  <worldbody><body name="rod" pos="0 0 1">
+    <joint name="pivot" axis="0 1 0" damping=".1"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.5" mass="1"/>
+  </body></worldbody>
+  {actuators}
+</mujoco>"""
+MOTOR = '<actuator><motor name="motor" joint="pivot" gear="2" ctrlrange="-1 1"/></actuator>'
+LINEAR, QUADRATIC = "joint_damping", "joint_quadratic_damping"
 
 
-def advice(**options: Any) -> str:
-    commands = np.zeros((20, 6, 3))
-    commands[..., 0], commands[..., 1] = 1.0, 0.5
-    hypothesis: Any = SimpleNamespace(variant=None)
-    return suggest(Evidence(Windows(commands), **options), hypothesis, hypothesis, FRICTION, TILT)  # type: ignore[arg-type]
+def recorded(actuators: str = MOTOR, size: float = 0.1) -> Scene:
+    """A log of slow pushes of a pendulum, or of one that is let go."""
+    model = mujoco.MjModel.from_xml_string(PENDULUM.format(actuators=actuators))
+    rng, rows = np.random.default_rng(0), []
+    for _ in range(4):
+        data = mujoco.MjData(model)
+        data.qpos[0], data.qvel[0] = 0.3 * rng.standard_normal(2)
+        for t in range(150):
+            data.ctrl[:] = size * np.sin(0.02 * t)
+            state = np.concatenate([data.qpos, data.qvel])
+            mujoco.mj_step(model, data, 2)
+            rows.append((state, np.concatenate([data.qpos, data.qvel]), data.ctrl.copy()))
+    before, after, commands = (np.array(part) for part in zip(*rows, strict=True))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        (folder / "model.xml").write_text(PENDULUM.format(actuators=actuators))
+        np.savez(
+            folder / "log.npz", observations=before, next_observations=after, actions=commands,
+            terminals=np.arange(1, len(before) + 1) % 150 == 0, dt=0.01,
+        )  # fmt: skip
+        document = {"model": "model.xml", "data": "log.npz", "frame_skip": 2, "noise": [1e-3, 1e-2]}
+        (folder / "config.yaml").write_text(yaml.safe_dump(document))
+        return prepare(make_problem(load_config(folder / "config.yaml"), general=True))
 
 
-def test_the_motion_that_separates_most_is_told() -> None:
-    found = advice()
-    assert found.startswith("To tell joint_friction of elbow from gravity_tilt, record the same motion with commands t")
-    assert found.endswith("by 48 σ.")  # 16 windows of 6 steps of 1 (its range) and 2 · 0.5
+@functools.cache
+def scene() -> Scene:
+    return recorded()
 
 
-def test_what_no_motion_tells_is_said() -> None:
-    assert "None of 6 motions that were tried would tell" in advice(share=0.9 * Rules().shown.apart / 48)
-    assert advice(diverges=True) == "No motion that was tried tells joint_friction of elbow from gravity_tilt."
+def placed(effect: str, target: str, value: float) -> Placed:
+    return Placed(VOCABULARY[effect], target, (value,))
+
+
+def advice(one: Placed, other: Placed) -> Advice:
+    """What is said where one effect is in the log, and another one may be."""
+    evidence = scene().evidence
+    shown = evidence.twin.predict([Hypothesis((), (one,)).variant], evidence.windows)[0][0]
+    evidence = replace(evidence, windows=replace(evidence.windows, measured=shown))
+    return suggest(evidence, Hypothesis((), (one,)), Hypothesis((), (other,)), one, other)
+
+
+def test_a_motion_is_proposed_that_separates_what_a_slow_one_does_not() -> None:
+    found = advice(placed(QUADRATIC, "pivot", 0.3), placed(LINEAR, "pivot", 0.01))
+    assert found.tells
+    assert found.sentence.startswith(
+        "To tell joint_quadratic_damping of pivot from joint_damping of pivot, record the same motion with commands "
+        "twice as large: over 16 windows"
+    )
+
+
+def test_no_motion_is_proposed_between_two_names_of_one_thing() -> None:
+    """Damping of a joint and of its motor are the same on every motion, once their numbers are the same."""
+    found = advice(placed(LINEAR, "pivot", 0.2), placed("actuator_damping", "motor", 0.01))
+    assert not found.tells
+    assert found.sentence.startswith("None of 6 motions that were tried would tell joint_damping of pivot from actuat")
+
+
+def test_a_rival_adapts_to_a_motion_as_far_as_the_log_lets_it() -> None:
+    evidence = scene().evidence
+    truth, rival = Hypothesis((), (placed(LINEAR, "pivot", 0.2),)), Hypothesis((), (placed(LINEAR, "pivot", 0.1),))
+    motion = evidence.on(dict(motions(evidence.windows, evidence.twin.setting))["the same motion again"])
+    wrong = refit(evidence, rival, iterations=0)
+    free, tied = separation(motion, truth, wrong, share=0.0), separation(motion, truth, wrong, share=1e6)
+    assert free is not None
+    assert tied is not None
+    assert free < 0.01 < 1 < tied
+
+
+def test_commands_stay_within_their_range() -> None:
+    model = scene().setting.model
+    strong = replace(scene().evidence.windows, commands=np.full((4, 151, model.nu), 0.8))
+    found = dict(motions(strong, scene().setting))
+    assert set(found) == set(COMMANDS)
+    assert np.unique(found["the same motion with commands twice as large"].commands) == pytest.approx([1.0])
+
+
+def test_where_nothing_is_commanded_motions_start_faster() -> None:
+    passive = recorded(actuators="")
+    windows: Windows = passive.evidence.windows
+    found = dict(motions(windows, passive.setting))
+    assert set(found) == set(STARTS)
+    same, fast = (found[w].measured[:, 0] for w in ("the same motion again", "motions that start twice as fast"))
+    np.testing.assert_allclose(fast, same * [1, 2])
 
 
 @pytest.mark.parametrize(
@@ -85,6 +127,6 @@ def test_what_no_motion_tells_is_said() -> None:
     ],
 )  # fmt: skip
 def test_what_a_log_must_show_to_judge_the_rest(silent: list[tuple[str, str | None]], words: str) -> None:
-    placed = [Placed(find_effect(effect), target) for effect, target in silent]
+    placed = [Placed(VOCABULARY[effect], target) for effect, target in silent]
     assert excite(placed) == f"To judge what this log cannot, record a motion that {words}."
     assert excite([]) is None

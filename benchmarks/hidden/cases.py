@@ -132,11 +132,25 @@ UNUSUAL_OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     "joint_damping": {"double_pendulum": _PENDULUM, "runner": _RUNNER},
     "joint_friction": {"double_pendulum": _PENDULUM, "runner": _RUNNER},
     "gravity_tilt": dict.fromkeys(("double_pendulum", "tumbler", "passive_puck"), (None,)),
-    "payload": {"double_pendulum": ("upper",), "tumbler": ("brick",), "passive_puck": ("puck",)},
+    "payload": {
+        "double_pendulum": ("upper",),
+        "tumbler": ("brick",),
+        "passive_puck": ("puck",),
+        "carriage_leg": ("shank",),
+        "quadruped": ("trunk",),
+    },
+    "contact_stiffness": {"carriage_leg": ("foot",), "quadruped": ("floor",)},
+    "contact_margin": {"carriage_leg": ("floor",), "quadruped": ("floor",)},
+    "sensor_delay": {
+        "carriage_leg": ("knee.position", "up.velocity"),
+        "quadruped": ("root.velocity[vz]", "FR_knee.position", "RL_hip.velocity"),
+    },
+    "actuator_delay": {"quadruped": ("FL_knee_servo", "RR_hip_servo")},
     "fluid_drag": {"double_pendulum": _PENDULUM, "tumbler": ("brick",), "passive_puck": ("puck",)},
-    "contact_friction": {"passive_puck": ("puck",)},
+    "contact_friction": {"passive_puck": ("puck",), "carriage_leg": ("foot",), "quadruped": ("floor", "FL_foot")},
     "inertia": {"runner": ("torso",)},
     "integration": dict.fromkeys(("coarse_servo_arm", "coarse_puck"), (None,)),
+    "ground_slope": dict.fromkeys(("carriage_leg", "quadruped"), (None,)),
 }
 #: Effects of the small list, each once.
 SMALL = (
@@ -144,7 +158,10 @@ SMALL = (
     "contact_friction", "torque_ripple",
 )  # fmt: skip
 #: Systems and bodies that move in the world's x-z plane only: nothing along y, no roll, shows there.
-_PLANAR = frozenset({"cart_pole", "hopper", "servo_arm", "double_pendulum", "runner"})
+_PLANAR = frozenset({"cart_pole", "hopper", "servo_arm", "double_pendulum", "runner", "carriage_leg"})
+
+#: Systems on feet that do not slip.
+_STANDING = frozenset({"hopper", "carriage_leg", "quadruped"})
 
 
 @dataclass(frozen=True)
@@ -209,7 +226,7 @@ class CaseSpec:
     def make(self) -> Case:
         """Draw the strengths and simulate the log."""
         system, rng = SYSTEMS[self.system], np.random.default_rng([*self.seed, 1])
-        effects = tuple(_drawn(system, e, rng, self.seed, self.unusual) for e in self.effects)
+        effects = tuple(drawn(system, e, rng, self.seed, self.unusual) for e in self.effects)
         recording = make_recording(system, effects, self.seed, noise=self.unusual.noise, before=self.unusual.before)
         ratio = gap_ratio(system, recording)
         same = () if self.kind == "outside" else exact_ties(system, effects, recording)
@@ -271,7 +288,7 @@ def _spread(effect: str, seed: int, count: int) -> list[CaseSpec]:
 Draw = Callable[[float], dict[str, float]]
 
 
-def _drawn(
+def drawn(
     system: System, effect: str, rng: np.random.Generator, seed: Sequence[int], unusual: Unusual = Unusual()
 ) -> Effect:
     """An effect on a target that shows it, of a strength that makes the wanted gap."""
@@ -502,7 +519,7 @@ def _sensor(key: str, neutral: float, span: float, signed: bool = True) -> Calla
 
 def _contact_friction(system: System, target: str | None, rng: np.random.Generator) -> Draw:
     own, sign = float(load(system.xml).geom(target).friction[0]), _sign(rng)
-    if system.name == "hopper":  # what does not slip does not slip more with more friction
+    if system.name in _STANDING:  # what does not slip does not slip more with more friction
         return lambda s: {"friction": own / (1 + 9 * s)}
     return lambda s: {"friction": own * (1 + 0.6 * sign * s)}
 
@@ -617,7 +634,7 @@ def _noise(noise: str) -> Unusual:
     return Unusual("unequal", noise=noise, note=noise)
 
 
-_PASSIVE, _COARSE = Unusual("passive"), Unusual("coarse")
+_PASSIVE, _COARSE, _WALKING = Unusual("passive"), Unusual("coarse"), Unusual("walking")
 #: What is unusual, the system, and what is hidden.
 UNUSUAL_CASES: tuple[tuple[Unusual, str, tuple[str, ...]], ...] = (
     (_motion(_QUIET, _LATE), "cart_pole", ("actuator_delay",)),
@@ -649,4 +666,19 @@ UNUSUAL_CASES: tuple[tuple[Unusual, str, tuple[str, ...]], ...] = (
     (_at("tie", "external_force", "cart"), "coarse_cart_pole", ("integration", "external_force")),
     (_at("tie", "actuator_damping", "shoulder_motor"), "torque_arm", ("actuator_damping",)),
     (_at("tie", "payload", "hand", _ON_AXIS), "servo_arm", ("payload",)),
+    (_WALKING, "carriage_leg", ()),
+    (_WALKING, "carriage_leg", ("contact_friction",)),
+    (_WALKING, "carriage_leg", ("contact_stiffness",)),
+    (_WALKING, "carriage_leg", ("contact_margin",)),
+    (_WALKING, "carriage_leg", ("ground_slope",)),
+    (_WALKING, "carriage_leg", ("sensor_delay",)),
+    (_WALKING, "carriage_leg", ("payload", "contact_friction")),
+    (_WALKING, "quadruped", ()),
+    (_WALKING, "quadruped", ("contact_friction",)),
+    (_WALKING, "quadruped", ("contact_stiffness",)),
+    (_WALKING, "quadruped", ("contact_margin",)),
+    (_WALKING, "quadruped", ("ground_slope",)),
+    (_WALKING, "quadruped", ("sensor_delay",)),
+    (_WALKING, "quadruped", ("payload",)),
+    (_WALKING, "quadruped", ("actuator_delay",)),
 )

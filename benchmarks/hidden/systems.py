@@ -63,6 +63,7 @@ class System:
         episodes, transitions: size of the log; the length of an episode is drawn from a range.
         free: the name of a free joint which starts with random velocities, on a table or in the air.
         airborne: whether it starts in the air.
+        height: of a free joint that starts upright on its feet; 0 for one that does not.
         substeps: steps of the truth in one logged transition.
         coarse: whether the user's model takes steps too large to be right.
     """
@@ -80,6 +81,7 @@ class System:
     transitions: tuple[int, int] = (300, 450)
     free: str = ""
     airborne: bool = False
+    height: float = 0.0
     substeps: int = 40
     coarse: bool = False
 
@@ -485,13 +487,126 @@ RUNNER = System(
     substeps=60,
 )  # fmt: skip
 
+# --- systems that walk ------------------------------------------------------------------------------------------
+
+_SOFT = 'solref="0.05 1" solimp="0 0.95 0.03 0.5 2"'
+_FEET = f'contype="1" conaffinity="0" friction="0.1 0.005 0.0001" {_SOFT}'
+_GROUND = (
+    f'<geom name="floor" type="plane" size="40 40 .1" contype="0" conaffinity="1" friction="0.6 0.005 0.0001" {_SOFT}/>'
+)
+
+CARRIAGE_LEG = System(
+    name="carriage_leg",
+    xml=f"""
+<mujoco model="carriage_leg">
+  <compiler angle="radian"/>
+  <option integrator="RK4" timestep="0.001"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    {_GROUND}
+    <body name="carriage" pos="0 0 0.42">
+      <joint name="along" type="slide" axis="1 0 0" damping="0.5"/>
+      <joint name="up" type="slide" axis="0 0 1" damping="0.5"/>
+      <geom name="carriage" type="box" size=".08 .05 .05" mass="1.6"/>
+      <body name="thigh">
+        <joint name="hip" type="hinge" axis="0 1 0" damping="0.05" armature="0.02"/>
+        <geom name="thigh" type="capsule" size=".025" fromto="0 0 0 0 0 -.22" mass=".8"/>
+        <body name="shank" pos="0 0 -.22">
+          <joint name="knee" type="hinge" axis="0 1 0" damping="0.05" armature="0.02"/>
+          <geom name="shank" type="capsule" size=".015" fromto="0 0 0 0 0 -.2" mass=".3"/>
+          <geom name="foot" type="sphere" size=".025" pos="0 0 -.21" mass=".1" {_FEET}/>
+        </body>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <position name="hip_servo" joint="hip" kp="50" kv="1.5"/>
+    <position name="knee_servo" joint="knee" kp="50" kv="1.5"/>
+  </actuator>
+</mujoco>""",
+    declared={"carriage_mass": mass("carriage", 1.6)},
+    commands=(Command(0.35, 0.6, (1.0, 3.5)), Command(0.45, -1.2, (1.0, 3.5))),
+    start={"along": (0.1, 0.3), "up": (0.02, 0.1), "hip": (0.05, 0.5), "knee": (0.05, 0.5)},
+    start_mean={"up": -0.01, "hip": 0.6, "knee": -1.2},
+    scales={
+        "along": Scale(15.0, 0.6, 2.5), "up": Scale(30.0, 0.6, 2.5), "hip": Scale(8.0, 5.0, 0.03),
+        "knee": Scale(6.0, 6.0, 0.02),
+    },
+    equivalents=groups(
+        (("contact_friction", "foot"), ("contact_friction", "floor")),
+        (("contact_stiffness", "foot"), ("contact_stiffness", "floor")),
+        (("contact_margin", "foot"), ("contact_margin", "floor"), ("sensor_bias", "up.position")),
+        (("armature", "up"), ("armature", "along"), ("payload", "carriage")),
+    ),
+    episodes=16,
+    transitions=(110, 140),
+    substeps=60,
+)  # fmt: skip
+
+_CORNERS = {"FL": (0.19, 0.12), "FR": (0.19, -0.12), "RL": (-0.19, 0.12), "RR": (-0.19, -0.12)}
+
+
+def _quadruped_leg(name: str, x: float, y: float) -> str:
+    return f"""
+      <body name="{name}_thigh" pos="{x} {y} 0">
+        <joint name="{name}_hip" type="hinge" axis="0 1 0" damping="0.1" armature="0.01"/>
+        <geom name="{name}_thigh" type="capsule" size=".025" fromto="0 0 0 0 0 -.2" mass=".7"/>
+        <body name="{name}_shank" pos="0 0 -.2">
+          <joint name="{name}_knee" type="hinge" axis="0 1 0" damping="0.1" armature="0.01"/>
+          <geom name="{name}_shank" type="capsule" size=".015" fromto="0 0 0 0 0 -.19" mass=".2"/>
+          <geom name="{name}_foot" type="sphere" size=".025" pos="0 0 -.2" mass=".06" {_FEET}/>
+        </body>
+      </body>"""
+
+
+def _servos(name: str) -> str:
+    return f"""
+    <position name="{name}_hip_servo" joint="{name}_hip" kp="80" kv="2.5"/>
+    <position name="{name}_knee_servo" joint="{name}_knee" kp="80" kv="2.5"/>"""
+
+
+QUADRUPED = System(
+    name="quadruped",
+    xml=f"""
+<mujoco model="quadruped">
+  <compiler angle="radian"/>
+  <option integrator="RK4" timestep="0.001"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    {_GROUND}
+    <body name="trunk" pos="0 0 0.4">
+      <freejoint name="root"/>
+      <geom name="trunk" type="box" size=".2 .09 .05" mass="6"/>
+      {"".join(_quadruped_leg(n, x, y) for n, (x, y) in _CORNERS.items())}
+    </body>
+  </worldbody>
+  <actuator>{"".join(map(_servos, _CORNERS))}
+  </actuator>
+</mujoco>""",
+    declared={"trunk_mass": mass("trunk", 6.0)},
+    commands=tuple(c for _ in _CORNERS for c in (Command(0.12, 0.7, (1.0, 3.0)), Command(0.2, -1.4, (1.0, 3.0)))),
+    start={"root": (0.1, 0.2), **{f"{n}_{j}": (0.03, 0.3) for n in _CORNERS for j in ("hip", "knee")}},
+    start_mean={f"{n}_{j}": a for n in _CORNERS for j, a in (("hip", 0.7), ("knee", -1.4))},
+    scales={
+        "root": Scale(60.0, 0.6, 8.0),
+        **{f"{n}_{j}": Scale(t, 5.0, 0.03) for n in _CORNERS for j, t in (("hip", 12.0), ("knee", 9.0))},
+    },
+    equivalents=groups((("contact_margin", "floor"), ("sensor_bias", "root.position[z]"))),
+    free="root",
+    height=0.33,
+    episodes=16,
+    transitions=(90, 120),
+    substeps=60,
+)  # fmt: skip
+
 #: The systems of the plain list; those of the unusual cases besides.
 CORE = (
     TORQUE_ARM, SERVO_ARM, CART_POLE, FURUTA, PUCK, HOPPER,
     coarse(TORQUE_ARM, 0.005), coarse(FURUTA, 0.01), coarse(CART_POLE, 0.01),
 )  # fmt: skip
 UNUSUAL = (PASSIVE_PUCK, DOUBLE_PENDULUM, TUMBLER, RUNNER, coarse(SERVO_ARM, 0.005), coarse(PUCK, 0.01))
-SYSTEMS = {s.name: s for s in (*CORE, *UNUSUAL)}
+WALKING = (CARRIAGE_LEG, QUADRUPED)
+SYSTEMS = {s.name: s for s in (*CORE, *UNUSUAL, *WALKING)}
 
 
 def fine(system: System) -> System:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -685,7 +685,10 @@ def start_state(system: System, rng: np.random.Generator) -> tuple[np.ndarray, n
     for joint, (position, velocity) in system.start.items():
         j = model.joint(joint)
         if joint == system.free:
-            (_throw if system.airborne else _slide_off)(model, q, v, velocity, rng)
+            if system.height:
+                _stand(q, v, system.height, position, velocity, rng)
+            else:
+                (_throw if system.airborne else _slide_off)(model, q, v, velocity, rng)
             continue
         q[j.qposadr[0]] = system.start_mean.get(joint, q[j.qposadr[0]]) + rng.uniform(-position, position)
         v[j.dofadr[0]] = rng.uniform(-velocity, velocity)
@@ -702,6 +705,16 @@ def _slide_off(model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, velocity: fl
     heading = rng.uniform(-np.pi, np.pi)
     v[:2] = velocity * rng.uniform(0.4, 1.0) * np.array([np.cos(heading), np.sin(heading)])
     v[5] = rng.uniform(-4, 4)
+
+
+def _stand(
+    q: np.ndarray, v: np.ndarray, height: float, position: float, velocity: float, rng: np.random.Generator
+) -> None:
+    """A body upright on its feet, or a little above, that moves a little."""
+    turn = rng.uniform(-np.pi, np.pi)
+    q[:2], q[2] = rng.uniform(-position, position, 2), height + rng.uniform(0.0, 0.02)
+    q[3:7] = (np.cos(turn / 2), 0, 0, np.sin(turn / 2))
+    v[:3], v[3:6] = rng.uniform(-velocity, velocity, 3), rng.uniform(-velocity, velocity, 3)
 
 
 def _throw(_model: mujoco.MjModel, q: np.ndarray, v: np.ndarray, velocity: float, rng: np.random.Generator) -> None:
@@ -734,6 +747,27 @@ def record(
         states.append(sensed)
         commands.append(given)
         unlogged.append(np.array(plant.commands[: len(plant.commands) - steps]))
+    return Log(tuple(states), tuple(commands), tuple(unlogged))
+
+
+def repeat(
+    system: System,
+    declared: Mapping[str, float],
+    effects: Sequence[Effect],
+    log: Log,
+    vary: Callable[[np.ndarray], np.ndarray] = lambda commands: commands,
+    faster: float = 1.0,
+) -> Log:
+    """Record the motions of a log again, with its commands varied and without feedback, or started faster."""
+    plant, v = make_plant(system, declared, effects, system.substeps), load(system.xml).nq
+    free = tuple(replace(c, offset=0.0, hold=(0.0, 0.0), joint="") for c in system.commands)
+    states, commands, unlogged = [], [], []
+    for logged, given in zip(log.states, log.commands, strict=True):
+        start = logged[0, :v], faster * logged[0, v:]
+        sensed, held = _episode(replace(system, commands=free), plant, effects, vary(given[None])[0], *start)
+        states.append(sensed)
+        commands.append(held)
+        unlogged.append(np.array(plant.commands[:1]))
     return Log(tuple(states), tuple(commands), tuple(unlogged))
 
 

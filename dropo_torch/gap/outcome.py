@@ -33,6 +33,8 @@ ROUNDS = 3
 PICTURES = 4
 #: Share of a log's transitions below which it is said that no more were compared.
 SPARSE = 0.2
+#: Pairs of tied effects for which a motion is sought that tells them apart.
+RIVALS = 4
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -289,13 +291,17 @@ def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[
 
 
 def _next_experiment(naming: Naming, final: Refit) -> str | None:
-    """What motion would tell tied effects apart, or would show what this log cannot."""
+    """What motion would tell tied effects apart, the first that are told so, or would show what this log cannot."""
     rivals: list[tuple[int, Placed]] = [(i, other) for i, tied in enumerate(naming.ties) for other in tied]
     if not rivals:
         return excite(naming.first.silent)
-    index, other = rivals[0]
-    best = final.hypothesis
-    return suggest(naming.evidence, best, best.instead(index, other), best.placed[index], other)
+    best, said = final.hypothesis, ""
+    for index, other in rivals[:RIVALS]:
+        advice = suggest(naming.evidence, best, best.instead(index, other), best.placed[index], other)
+        if advice.tells:
+            return advice.sentence
+        said = said or advice.sentence
+    return said
 
 
 def _ranking(attempts: Iterable[Ranked]) -> tuple[Ranked, ...]:
