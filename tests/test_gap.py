@@ -657,6 +657,14 @@ def test_noise_is_what_a_right_model_leaves(factor: float) -> None:
     assert (left > 0.9 * np.array(told)).all()
 
 
+@pytest.mark.parametrize("factor", [0.4, 3.0])
+def test_noise_beside_a_right_model_is_found_from_above_and_from_below(factor: float) -> None:
+    scene, truth = scene_of(), np.array(hidden().noise)
+    evidence = dataclasses.replace(scene.evidence, noise=factor * truth)
+    fitted = refit(evidence, true(hidden()), iterations=3)
+    assert noise_beside(evidence, scene.short, fitted) == pytest.approx(truth, rel=0.15)
+
+
 def test_windows_in_which_a_force_jumps_are_no_noise() -> None:
     rng = np.random.default_rng(0)
     slope, truth = rng.standard_normal((160, 14, 5)), np.tile([1.0, 3.0], 7)
@@ -1008,6 +1016,8 @@ def test_numbers_are_not_those_of_the_step() -> None:
     assert (np.abs(last.fit.hypothesis.vector - truth) < half).all()
     assert (half < 1e-3 * truth).all()
     assert last.fit.cost.reduced < 1.2
+    assert last.error.max() > 0
+    np.testing.assert_allclose(half, np.hypot(half_widths(dataclasses.replace(last, error=0 * half)), last.error))
 
 
 def test_late_sensor_leaves_nothing_but_noise() -> None:
