@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 import scipy.io
-from arm import Folder
+from arm import XML, Folder
 from conftest import SLIDE_XML
 
 from dropo_torch.commands.cli import main
@@ -305,6 +305,19 @@ def test_memory_is_limited_to_more_than_is_taken() -> None:
     )
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["little", "much"]
+
+
+@pytest.mark.parametrize(("field", "value"), [("bvh_nodeid", 738197505), ("bvh_nodeid", 2), ("bvh_child", 1 << 30)])
+def test_a_binary_model_that_addresses_what_is_not_there_is_refused(field: str, value: int, tmp_path: Path) -> None:
+    """MuJoCo loads and steps it; it dies later, in whichever process computes the model's constants again."""
+    (tmp_path / "arm.xml").write_text(XML)
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "arm.xml"))
+    mujoco.mj_saveModel(model, str(tmp_path / "whole.mjb"))
+    assert load_model(tmp_path / "whole.mjb").nbody == model.nbody
+    getattr(model, field).flat[-1] = value
+    mujoco.mj_saveModel(model, str(tmp_path / "arm.mjb"))
+    with pytest.raises(InputError, match=rf"arm\.mjb: cannot be read .*{field} has {value}, which addresses nothing"):
+        load_model(tmp_path / "arm.mjb")
 
 
 def test_damaged_binary_models_are_refused(tmp_path: Path) -> None:

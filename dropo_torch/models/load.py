@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -31,6 +32,12 @@ def quiet_mujoco() -> Iterator[None]:
 
 #: Bytes that a binary model and its simulation may take besides some times its file: a damaged one may ask for all.
 ROOM = 2**30
+#: Fields of whole numbers that are no addresses, by how their names end.
+PLAIN = re.compile(
+    "_(signature|group|contype|conaffinity|condim|priority|mode|resolution|width|height|nchannel|size|dim|depth|"
+    "type|dyntype|gaintype|biastype|trntype|objtype|reftype|datatype|needstage|intprm|history|ctrlspec|output|"
+    "projection|colorspace|data|policy|interp|passive|selfcollide|activelayers|simple|sameframe|plasticmode|attr)$"
+)
 #: Fields of bodies that MuJoCo takes for granted where it has compiled the body as simple.
 CENTRES = ("body_ipos", "body_iquat")
 
@@ -79,8 +86,25 @@ def try_binary(path: str) -> bytes:
         model = mujoco.MjModel.from_binary_path(path)
         if mujoco.mj_sizeModel(model) != Path(path).stat().st_size:
             raise ValueError("its size is not that of its contents")
+        check_addresses(model)
         mujoco.mj_step(model, mujoco.MjData(model))
     return b""
+
+
+def check_addresses(model: mujoco.MjModel) -> None:
+    """Refuse a binary model with a whole number that addresses nothing; MuJoCo itself checks only some of them.
+
+    Raises:
+        ValueError: naming the field.
+    """
+    arrays = {n: v for n in dir(model) if not n.startswith("_") and isinstance(v := getattr(model, n), np.ndarray)}
+    longest = max(len(model.names), len(model.paths), *(a.size for a in arrays.values()))
+    limits = {"bvh_nodeid": max(model.ngeom, model.nmeshface, model.nflexelem, model.nflexvert) - 1}
+    for name, values in arrays.items():
+        if values.dtype.kind in "iu" and values.size and not PLAIN.search(name):
+            largest = int(np.abs(values.astype(np.int64)).max())
+            if largest > limits.get(name, longest):
+                raise ValueError(f"{name} has {largest}, which addresses nothing")
 
 
 def checked(model: mujoco.MjModel, where: str) -> mujoco.MjModel:
