@@ -100,6 +100,11 @@ def test_a_rival_adapts_to_a_motion_as_far_as_the_log_lets_it() -> None:
     assert free < 0.01 < 1 < tied
 
 
+def test_a_rival_without_numbers_is_compared_as_it_is() -> None:
+    found = advice(placed(LINEAR, "pivot", 0.2), Placed(VOCABULARY["integration"], None, (0.00125,)))
+    assert found.tells
+
+
 def test_commands_stay_within_their_range() -> None:
     model = scene().setting.model
     strong = replace(scene().evidence.windows, commands=np.full((4, 151, model.nu), 0.8))

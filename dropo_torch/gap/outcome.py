@@ -33,7 +33,7 @@ ROUNDS = 3
 PICTURES = 4
 #: Share of a log's transitions below which it is said that no more were compared.
 SPARSE = 0.2
-#: Pairs of tied effects for which a motion is sought that tells them apart.
+#: Pairs of tied effects for which a motion is sought that tells them apart; of a family, whose motions cost more, one.
 RIVALS = 4
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
@@ -296,7 +296,7 @@ def _next_experiment(naming: Naming, final: Refit) -> str | None:
     if not rivals:
         return excite(naming.first.silent)
     best, said = final.hypothesis, ""
-    for index, other in rivals[:RIVALS]:
+    for index, other in rivals[: 1 if naming.family else RIVALS]:
         advice = suggest(naming.evidence, best, best.instead(index, other), best.placed[index], other)
         if advice.tells:
             return advice.sentence

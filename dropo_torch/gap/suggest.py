@@ -19,7 +19,7 @@ from dropo_torch.optimizers.least_squares import bounded_step
 WINDOWS, LOGGED = 16, 40
 #: χ² that a motion must show, in units of what hypotheses may differ by and still explain a log alike.
 SURELY = 2.0
-#: Steps in which a rival adapts to a motion.
+#: Steps in which a rival adapts to the log, and to a motion.
 ADAPTED = 4
 #: Other commands ``(E, N, nu)`` for the motions of a log, by what they are called.
 COMMANDS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
@@ -78,7 +78,7 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     """
     names = f"{_called(one)} from {_called(other)}"
     log = evidence.on(spread(evidence.windows, LOGGED))
-    rival, own = refit(log, second), refit(log, first, iterations=0, slopes=False).cost
+    rival, own = refit(log, second, iterations=ADAPTED), refit(log, first, iterations=0, slopes=False).cost
     share = len(evidence.windows) / max(len(log.windows), 1)
     found = []
     for words, windows in motions(evidence.windows, evidence.twin.setting):
@@ -122,7 +122,8 @@ def separation(motion: Evidence, true: Hypothesis, rival: Refit, share: float = 
             return None if least == np.inf else float(np.sqrt(least))
         apart = motion.project_slope(found[0] - shown, linear).ravel()
         slope = np.zeros((len(vector), apart.size))
-        slope[free] = motion.project_slope((found[1:] - found[0]) / steps[:, None, None], linear).reshape(len(free), -1)
+        moves = motion.project_slope((found[1:] - found[0]) / steps[:, None, None], linear)
+        slope[free] = moves.reshape(len(free), apart.size)
         change = (vector - start) / limits.scale
         least = min(least, float(apart @ apart + change @ cost @ change))
         force, (low, high) = -(slope @ apart + cost @ change), limits.moves(vector)
