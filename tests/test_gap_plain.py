@@ -21,7 +21,7 @@ from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.search import start
-from dropo_torch.gap.ties import rivals_of_all
+from dropo_torch.gap.ties import _one_for_two, rivals_of_all
 from dropo_torch.problem import make_problem
 
 RAIL = """
@@ -122,6 +122,15 @@ def tether(model: mujoco.MjModel) -> None:
     model.jnt_stiffness[0], model.qpos_spring[0] = 6.0, 0.1
 
 
+def load(model: mujoco.MjModel) -> None:
+    """A point mass of 0.4 kg at (0.05, 0, 0.05) m of the first body."""
+    mass, here, point = model.body_mass[1], model.body_ipos[1].copy(), np.array([0.05, 0, 0.05])
+    center = (mass * here + 0.4 * point) / (mass + 0.4)
+    spread = [m * (v @ v * np.eye(3) - np.outer(v, v)) for m, v in ((mass, here - center), (0.4, point - center))]
+    model.body_inertia[1, 1] += sum(spread)[1, 1]  # the pendulum turns about y
+    model.body_mass[1], model.body_ipos[1] = mass + 0.4, center
+
+
 def resist(model: mujoco.MjModel) -> None:
     model.dof_frictionloss[0] = 0.1
     model.dof_damping[1] += 0.05
@@ -174,6 +183,25 @@ def test_what_is_one_effect_is_not_told_as_two() -> None:
     assert [p.key for p in found.current.hypothesis.placed] == [("gravity_tilt", None)]
     assert abs(found.current.hypothesis.placed[0].values[1]) == pytest.approx(0.1, abs=1e-3)
     assert tied == [()]
+
+
+@pytest.mark.parametrize("order", [("inertia", "center_of_mass"), ("center_of_mass", "inertia")])
+def test_a_tie_of_one_effect_may_stand_for_two(order: tuple[str, str]) -> None:
+    scene = scene_of(PENDULUM, load, lambda time, phases: np.zeros((len(time), 0)), shape=(6, 150))
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in ("payload", *order)))
+    values = {"inertia": (1.1,), "center_of_mass": (0.0, 0.0, 0.0)}
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    two = ground.refit(state.base.hypothesis.with_effects([Placed(VOCABULARY[n], "upper", values[n]) for n in order]))
+    assert two.cost.reduced == pytest.approx(1, abs=0.1)
+    payload = Placed(VOCABULARY["payload"], "upper", (0.3, 0.03, 0.0, 0.0))
+    fewer = _one_for_two(ground, replace(state, current=two), [(payload,), ()])
+    assert fewer is not None
+    mass, x, _, z = fewer.hypothesis.placed[0].values
+    assert [p.key for p in fewer.hypothesis.placed] == [payload.key]
+    assert (mass * x, mass * z) == pytest.approx((0.02, 0.02), abs=5e-4)
+    elsewhere = Placed(VOCABULARY["payload"], "lower", payload.values)
+    assert _one_for_two(ground, replace(state, current=two), [(elsewhere,), ()]) is None
 
 
 def test_a_wave_longer_than_the_motion_is_no_ripple() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from itertools import combinations
+from itertools import permutations
 
 import numpy as np
 
@@ -63,12 +63,19 @@ def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]
 
 
 def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]) -> Refit | None:
-    """A fit in which what ties with two named effects stands in the place of both, and explains the log as well."""
-    for one, other in combinations(range(len(tied)), 2):
-        shared = {p.key for p in tied[other]}
-        for rival in (p for p in tied[one] if p.key in shared):
+    """A fit in which what ties with one named effect stands in the place of two, and explains the log as well.
+
+    Tried are ties of both, and ties of one that are at the target of the other: a payload ties with an inertia beside a
+    shifted centre of mass, and needs neither.
+    """
+    hypothesis = state.current.hypothesis
+    for one, other in permutations(range(len(tied)), 2):
+        shared, target = {p.key for p in tied[other]}, hypothesis.placed[other].target
+        for rival in tied[one]:
+            if not (rival.key in shared and one < other or target is not None and rival.target == target):
+                continue
             ground.report("looking for ties", 0.9)
-            fewer = ground.refit(state.current.hypothesis.instead(one, rival).without(other), ITERATIONS[-1])
+            fewer = ground.refit(hypothesis.instead(one, rival).without(other), ITERATIONS[-1])
             if as_good(ground, state, fewer):
                 return fewer
     return None
