@@ -109,7 +109,7 @@ class JointFriction(AddedToJoint):
 
     name = "joint_friction"
     sentence = "dry (Coulomb) friction in {target}: a constant force against any motion"
-    shares = (0.02, 0.2)
+    shares = (0.001, 0.02, 0.2)
     field = "dof_frictionloss"
     quantity = ("friction", "N·m", "N", 10.0)
 
