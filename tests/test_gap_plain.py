@@ -7,6 +7,7 @@ import tempfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -16,12 +17,17 @@ import yaml
 from dropo_torch.config import load_config
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed
+from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
 from dropo_torch.gap.ground import Ground
+from dropo_torch.gap.locate import regressors
 from dropo_torch.gap.log import cut_windows
+from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
+from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.search import start
 from dropo_torch.gap.ties import _one_for_two, rivals_of_all
+from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem
 
 RAIL = """
@@ -60,9 +66,14 @@ NOISE = {"position": 1e-4, "velocity": 1e-3}
 Change = Callable[[mujoco.MjModel], None]
 
 
+def sway(data: mujoco.MjData, rng: np.random.Generator) -> None:
+    data.qpos[-1] = 0.5 * rng.normal()
+
+
 def scene_of(
     xml: str, change: Change, commands: Callable[[np.ndarray, np.ndarray], np.ndarray],
     observation: tuple[str, ...] = ("qpos", "qvel"), shape: tuple[int, int] = (8, 150), seed: int = 5,
+    begin: Callable[[mujoco.MjData, np.random.Generator], None] = sway, mask: tuple[str, ...] = (),
 ) -> Scene:  # fmt: skip
     """A log of episodes of so many transitions, by a model that differs from the user's ``xml``.
 
@@ -73,6 +84,8 @@ def scene_of(
         observation: the log's columns.
         shape: episodes and transitions of each.
         seed: of initial states, phases and noise.
+        begin: sets the initial state of an episode.
+        mask: columns that are not compared.
     """
     own, truth = (mujoco.MjModel.from_xml_string(xml) for _ in range(2))
     change(truth)
@@ -81,7 +94,7 @@ def scene_of(
     before, after, actions = [], [], []
     for _ in range(shape[0]):
         data, phases = mujoco.MjData(truth), rng.uniform(0, 6, 4)
-        data.qpos[-1] = 0.5 * rng.normal()
+        begin(data, rng)
         signal = commands(np.arange(shape[1]) * 2 * own.opt.timestep, phases)
         path = []
         for command in (*signal, None):
@@ -94,6 +107,7 @@ def scene_of(
         after.append(measured[1:])
         actions.append(signal)
     config = {"model": "m.xml", "data": "l.npz", "frame_skip": 2, "observation": list(observation), "threads": 1}
+    config["mask"] = list(mask)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "m.xml").write_text(xml)
@@ -186,6 +200,84 @@ def test_friction_of_a_thousandth_of_the_forces_is_foreseen() -> None:
     assert first.ranked[0].key == ("joint_friction", "rail")
     assert first.ranked[0].placed.values[0] == pytest.approx(1.0, rel=0.1)
     assert first.ranked[0].chi2 < 1.2 * first.degrees
+
+
+def test_the_noise_of_masked_columns_is_no_smaller() -> None:
+    """Windows start where they say, so a start that passes for exact would be a gap of a right model."""
+    scene = scene_of(RAIL, lambda model: None, pushes, mask=("pole.position",))
+    assert scene.noise == pytest.approx([1e-4, 1e-4, 1e-3, 1e-3], rel=0.2)
+    gap = find_gap(scene.problem, scene=scene, effects=[VOCABULARY["joint_damping"], VOCABULARY["joint_friction"]])
+    assert not gap.found
+    assert gap.noise == pytest.approx([1e-4, 1e-4, 1e-3, 1e-3], rel=0.2)
+    assert position_features(scene.setting).tolist() == [True, False, False, False]
+    assert np.isnan(gap.before.rollout).tolist() == [False, True, False, False]
+    assert gap.before.rollout_rmse == gap.before.rollout[0]
+
+
+BALL = """
+<mujoco><option timestep="0.005" gravity="0 0 0"/>
+  <worldbody><body name="ball"><freejoint name="root"/><geom type="sphere" size=".1" mass="1"/></body></worldbody>
+</mujoco>"""
+
+
+def thrown(data: mujoco.MjData, rng: np.random.Generator) -> None:
+    data.qpos[3:] = rng.normal(size=4)
+    data.qpos[3:] /= np.linalg.norm(data.qpos[3:])
+    data.qvel[:] = 3 * rng.normal(size=6)
+
+
+def test_constant_velocity_turns_what_turns() -> None:
+    """A ball on which nothing acts moves and turns just so."""
+    scene = scene_of(BALL, lambda model: None, lambda t, phases: np.zeros((len(t), 0)), begin=thrown)
+    held = cut_held(scene.evidence, scene.held, scene.begin)
+    assert held.seconds > 0.5
+    assert constant_velocity(scene.evidence, held) < 0.02
+    units = [regressors(scene.setting, scene.short, dof)[1].unit for dof in range(6)]
+    assert units == ["m/s"] * 3 + ["rad/s"] * 3
+
+
+TRIPLE = """
+<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <default><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.3" mass="1" contype="0" conaffinity="0"/></default>
+  <worldbody><body><joint name="one" axis="0 1 0" damping=".05"/><geom/>
+    <body pos="0 0 -.3"><joint name="two" axis="0 1 0" damping=".05"/><geom/>
+      <body pos="0 0 -.3"><joint name="three" axis="0 1 0" damping=".05"/><geom/></body></body></body></worldbody>
+</mujoco>"""
+
+
+def test_what_ties_with_members_of_a_family_ties_with_it() -> None:
+    setting = scene_of(TRIPLE, lambda model: None, lambda t, phases: np.zeros((len(t), 0)), shape=(4, 60)).setting
+    number = {"damping": Strength(0.1, 0.09, 0.11, "N·m·s/rad")}
+    ties = {j: (("actuator_damping", f"motor {j}"),) for j in ("one", "three")}
+    members = tuple(NamedEffect("joint_damping", j, number, 0.3, ties.get(j, ())) for j in ("one", "two", "three"))
+    (whole,) = merge_families(members, setting)
+    assert whole.target == "*"
+    assert whole.indistinguishable_from == (("actuator_damping", "motor one"), ("actuator_damping", "motor three"))
+
+
+DRIVES = """
+<mujoco><worldbody><site name="hook" pos="0 0 1"/>
+    <body><joint name="hinge" axis="0 1 0"/><joint name="slide" type="slide"/><geom size=".1"/><site name="tip"/></body>
+  </worldbody>
+  <tendon>
+    <spatial name="rope"><site site="hook"/><site site="tip"/></spatial>
+    <fixed name="turns"><joint joint="hinge" coef="1"/></fixed>
+    <fixed name="slides"><joint joint="slide" coef="1"/></fixed>
+    <fixed name="both"><joint joint="slide" coef="1"/><joint joint="hinge" coef="1"/></fixed>
+  </tendon>
+  <actuator>
+    <motor name="N·m hinge" joint="hinge"/><motor name="N slide" joint="slide"/>
+    <motor name="N parent" jointinparent="slide"/><motor name="N rope" tendon="rope"/>
+    <motor name="N·m turns" tendon="turns"/><motor name="N slides" tendon="slides"/><motor name=" both" tendon="both"/>
+    <motor name="N push" site="tip" gear="1 0 0 0 0 0"/><motor name="N·m twist" site="tip" gear="0 0 0 0 0 2"/>
+    <motor name=" wrench" site="tip" gear="1 0 0 0 0 2"/>
+  </actuator></mujoco>"""
+
+
+def test_a_force_has_the_unit_of_what_it_acts_on() -> None:
+    model = mujoco.MjModel.from_xml_string(DRIVES)
+    names = [model.actuator(i).name for i in range(model.nu)]
+    assert [unit_of(SimpleNamespace(model=model), n, "N·m", "N") for n in names] == [n.split(" ")[0] for n in names]
 
 
 def test_what_is_one_effect_is_not_told_as_two() -> None:

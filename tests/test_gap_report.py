@@ -1,5 +1,6 @@
 """The page of a gap says what is missing in its first sentence, hides nothing, and stands on its own."""
 
+import io
 import re
 from collections.abc import Mapping
 from dataclasses import replace
@@ -7,7 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
+from dropo_torch.commands.gap import _show
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.gap.result import Gap, NamedEffect, Place, Ranked, Remaining, Residuals, Score, Strength
 from dropo_torch.report import gap_words, write_gap_report
@@ -377,6 +380,41 @@ def test_too_much_of_an_effect() -> None:
     sentence, items = gap_words.answer(replace(single(), effects=both))
     assert sentence == "Your model and the robot differ in two things:"
     assert items[1].startswith("viscous friction in elbow: too much in the model, −0.02")
+
+
+def test_a_family_of_either_sign_is_neither_missing_nor_too_much() -> None:
+    values = {"left_knee": -0.1, "right_knee": 0.2, "left_hip": 0.3}
+    given = {joint: Strength(v, v - 0.01, v + 0.01, "N·m") for joint, v in values.items()}
+    family = NamedEffect("joint_friction", "*", given, 0.9)
+    sentence, _ = gap_words.answer(replace(single(), effects=(family,)))
+    assert sentence.startswith(
+        "Your model has too little or too much dry (Coulomb) friction in all joints: left_knee −0.1"
+    )
+    all_less = {joint: Strength(-0.1, -0.11, -0.09, "N·m") for joint in values}
+    sentence, _ = gap_words.answer(replace(single(), effects=(replace(family, parameters=all_less),)))
+    assert sentence.startswith("Your model has too much dry (Coulomb) friction in all joints")
+    gains = NamedEffect("actuator_gain", "*", {"m": Strength(0.9, 0.8, 1.0, "-")}, 0.9)
+    assert gap_words.answer(replace(single(), effects=(gains,)))[0].startswith(
+        "The force of all actuators for the same"
+    )
+
+
+def test_a_search_that_ran_out_of_time_does_not_say_that_no_effect_explains_it(tmp_path: Path) -> None:
+    seen = text_of(page(tmp_path, replace(unnamed(), unfinished="refitting")))
+    assert "The time for the search was over" in seen
+    assert "no known effect, alone" not in seen
+    assert "an effect outside" not in seen
+    assert "--resume" in seen
+
+
+def test_ties_are_told_in_the_terminal(tmp_path: Path) -> None:
+    console = Console(record=True, width=200, file=io.StringIO())
+    _show(double(), tmp_path, console)
+    text = console.export_text()
+    assert (
+        "This log is explained equally well by a spring between wrist and its parent joint or a constant external "
+        "force on hand, in place of a spring at wrist."
+    ) in " ".join(text.split())
 
 
 @pytest.mark.parametrize(

@@ -78,7 +78,7 @@ def test_a_motion_is_proposed_that_separates_what_a_slow_one_does_not() -> None:
     assert found.tells
     assert found.sentence.startswith(
         "To tell joint_quadratic_damping of pivot from joint_damping of pivot, record the same motion with commands "
-        "twice as large: over 16 windows"
+        "twice as large: over 12 windows"
     )
 
 
@@ -120,6 +120,8 @@ def test_where_nothing_is_commanded_motions_start_faster() -> None:
     assert set(found) == set(STARTS)
     same, fast = (found[w].measured[:, 0] for w in ("the same motion again", "motions that start twice as fast"))
     np.testing.assert_allclose(fast, same * [1, 2])
+    idle = recorded(size=0.0)  # a motor that is off
+    assert set(dict(motions(idle.evidence.windows, idle.setting))) == set(STARTS)
 
 
 @pytest.mark.parametrize(

@@ -69,11 +69,14 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
 
 
 def _show(gap: Gap, out: Path, console: Console) -> None:
-    from dropo_torch.report.gap_words import answer
+    from dropo_torch.report.gap_words import ambiguous, answer
 
     headline, items = answer(gap)
     for line in (headline, *(f"  - {item}" for item in items)):
         console.print(line)
+    for effect in () if gap.forces else gap.effects:
+        if effect.indistinguishable_from:
+            console.print(ambiguous(effect))
     table = Table("held-out data", "before", "after", "noise alone")
     rows = (
         ("one-step mean squared error", "mse", "{:.3g}"),

@@ -50,10 +50,31 @@ def gear(model: mujoco.MjModel, actuator: int) -> float:
     return max(abs(float(model.actuator_gear[actuator, 0])), 1e-9)
 
 
-def _unit(setting: Setting, target: str | None, hinge: str, slide: str) -> str:
-    joint = driven_joint(setting.model, object_number(setting.model, "actuator", target))
-    slides = joint is not None and setting.model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_SLIDE
-    return slide if slides else hinge
+def unit_of(setting: Setting, target: str | None, turning: str, sliding: str) -> str:
+    """Of two units that of an actuator, by whether its force turns or slides what it acts on; none where it does both.
+
+    Of a tendon over joints and of a site, by these joints and by which components the gear has.
+    """
+    model = setting.model
+    i = object_number(model, "actuator", target)
+    kind, through, kinds = int(model.actuator_trntype[i]), int(model.actuator_trnid[i, 0]), mujoco.mjtTrn
+    if kind in (kinds.mjTRN_JOINT, kinds.mjTRN_JOINTINPARENT):
+        slides = {_slides(model, through, i)}
+    elif kind == kinds.mjTRN_TENDON:
+        wraps = range(model.tendon_adr[through], model.tendon_adr[through] + model.tendon_num[through])
+        over = [int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT]
+        slides = {_slides(model, joint, i) for joint in over} or {True}  # one in space pulls along its length
+    elif kind == kinds.mjTRN_SITE:
+        slides = {half == 0 for half in (0, 1) if model.actuator_gear[i, 3 * half : 3 * half + 3].any()}
+    else:
+        slides = {True}
+    return {frozenset({True}): sliding, frozenset({False}): turning}.get(frozenset(slides), "")
+
+
+def _slides(model: mujoco.MjModel, joint: int, actuator: int) -> bool:
+    """Whether a force on a joint is in newtons; on a free one, by the components that the actuator's gear has."""
+    kind, kinds = int(model.jnt_type[joint]), mujoco.mjtJoint
+    return kind == kinds.mjJNT_SLIDE or (kind == kinds.mjJNT_FREE and not model.actuator_gear[actuator, 3:].any())
 
 
 def make_affine(model: mujoco.MjModel, actuator: int) -> None:
@@ -86,7 +107,7 @@ class ActuatorBias(ActuatorEffect):
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         scale = self.force_scale(setting, target)
-        return (Quantity("force", _unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),)
+        return (Quantity("force", unit_of(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         i = object_number(model, "actuator", target)
@@ -105,7 +126,7 @@ class ActuatorDamping(ActuatorEffect):
         speed = gear(m, i) * float(setting.signals.speed[m.jnt_dofadr[driven_joint(m, i)]])
         scale = self.force_scale(setting, target) / max(speed, 1e-12)
         own = max(-float(m.actuator_biasprm[i, 2]), 0.0)
-        unit = _unit(setting, target, "N·m·s/rad", "N·s/m")
+        unit = unit_of(setting, target, "N·m·s/rad", "N·s/m")
         return (Quantity("damping", unit, 0.0, -own, 30 * scale, scale),)
 
     def targets(self, setting: Setting) -> list[str | None]:
@@ -266,7 +287,7 @@ class ActuatorSaturation(ActuatorEffect):
         largest = abs(float(m.actuator_gainprm[i, 0])) * self.command_scale(setting, target)
         if m.actuator_biasprm[i, 1] != 0:  # of a servo, roughly
             largest = 3 * self.force_scale(setting, target)
-        unit = _unit(setting, target, "N·m", "N")
+        unit = unit_of(setting, target, "N·m", "N")
         return (Quantity("limit", unit, 4 * largest, 0.02 * largest, 4 * largest, largest),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:

@@ -72,6 +72,7 @@ class Evidence:
             must then be right in most windows, and otherwise explain all of them together.
         caps: factors of the windows' residuals in fits, ``(W,)``, or 1.
         rules: thresholds.
+        whole: whether masked columns are compared, too.
     """
 
     twin: Twin
@@ -83,6 +84,7 @@ class Evidence:
     robust: bool = False
     caps: np.ndarray | float = 1.0
     rules: Rules = field(default_factory=Rules)
+    whole: bool = False
 
     def on(self, windows: Windows) -> Evidence:
         """Return the same over other windows, none of them capped."""
@@ -96,7 +98,8 @@ class Evidence:
     @cached_property
     def chart(self) -> Features:
         """The features that are compared."""
-        return Features.of(self.twin.setting.observation, self.twin.setting.masked)
+        setting = self.twin.setting
+        return Features.of(setting.observation, frozenset() if self.whole else setting.masked)
 
     @property
     def num_rows(self) -> int:

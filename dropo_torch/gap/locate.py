@@ -74,7 +74,7 @@ def regressors(setting: Setting, windows: Windows, dof: int) -> list[Regressor]:
     position, velocity, command = middles(setting, windows)
     joint = int(model.dof_jntid[dof])
     name, v = dof_names(model)[dof], velocity[:, dof]
-    angular = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_HINGE
+    angular = force_unit(model, dof) == "N·m"
     speed = (f"velocity of {name}", "rad/s" if angular else "m/s")
     found = [
         Regressor(f"with the direction in which {name} moves", np.sign(v), *speed, v),

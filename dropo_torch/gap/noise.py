@@ -7,7 +7,7 @@ What even this cannot explain is noise; the forces that it needed tell where the
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -58,6 +58,8 @@ class Diverges(InputError):
 def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarray | None = None) -> FreeForces:
     """Estimate the noise and the forces that are missing.
 
+    Masked columns are not compared, but the windows start where they say; their noise is told as if they were.
+
     Args:
         twin: simulates windows.
         windows: short windows, spread over the log.
@@ -69,6 +71,19 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     """
     sizes = np.maximum(feature_sizes(twin.setting, windows.measured), 1e-12)
     evidence = Evidence(twin, windows, GUESS * sizes if noise is None else noise, variant, rough=False)
+    found = _free_forces(evidence, sizes, known=noise is not None)
+    if noise is not None or not twin.setting.masked:
+        return found
+    whole = _free_forces(replace(evidence, whole=True), sizes, known=False)
+    told = evidence.chart.known(np.ones(twin.setting.observation.size, dtype=bool))
+    return replace(
+        found, noise=np.where(told, found.noise, whole.noise), unsure=np.where(told, found.unsure, whole.unsure)
+    )
+
+
+def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeForces:
+    """The forces, and the noise of features of given sizes ``(m,)`` unless that of the evidence is known."""
+    twin, windows, variant = evidence.twin, evidence.windows, evidence.begin
     m, nv, length = len(sizes), twin.setting.model.nv, windows.length
     scale = TRIAL * twin.setting.signals.force
     time = (np.arange(length) + 0.5) / length - 0.5
@@ -77,15 +92,15 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     for dof in range(nv):
         pushes[1 + m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
     moved = np.eye(len(pushes), m, -1)[:, None]
-    found, told = evidence.residuals([variant] * len(pushes), moved, pushes)
+    found, seen = evidence.residuals([variant] * len(pushes), moved, pushes)
     usable = np.isfinite(found).all((0, 2))
     if not usable.any():
         raise Diverges(_lost(twin, windows))
-    if (known := usable & twin.knows(variant, windows)).any():
-        usable = known
+    if (told := usable & twin.knows(variant, windows)).any():
+        usable = told
     residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
-    counted = np.asarray(told[:, usable].all(0))
-    relative, unsure = _relative_noise(residual, slope, counted, m) if noise is None else (np.ones(m), np.zeros(m))
+    counted = np.asarray(seen[:, usable].all(0))
+    relative, unsure = _relative_noise(residual, slope, counted, m) if not known else (np.ones(m), np.zeros(m))
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)
     forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))

@@ -249,7 +249,7 @@ def _unnamed(setting: Setting, free: FreeForces) -> NamedEffect:
     force = float(np.sqrt(np.nanmean(free.forces[:, dof] ** 2)))
     words, name = regime(setting, free, dof).words, dof_names(setting.model)[dof]
     strength = Strength(force, float("nan"), float("nan"), force_unit(setting.model, dof))
-    text = f"something that no known effect explains, at {name}" + (f", {words}" if words else "")
+    text = f"something without a name, at {name}" + (f", {words}" if words else "")
     return NamedEffect("unnamed", name, {"force": strength}, 1.0, (), text)
 
 
@@ -285,7 +285,8 @@ def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[
         numbers = {str(e.target): next(iter(e.parameters.values())) for e in members}
         share = min(1.0, sum(e.share_of_gap for e in members))
         sentence = effect.sentence.format(target=f"all {effect.kind}s")
-        whole = NamedEffect(name, FAMILY, numbers, share, (), sentence, variant)
+        ties = tuple(dict.fromkeys(tie for e in members for tie in e.indistinguishable_from))
+        whole = NamedEffect(name, FAMILY, numbers, share, ties, sentence, variant)
         kept = [whole if e is members[0] else e for e in kept if e not in members[1:]]
     return tuple(kept)
 

@@ -94,7 +94,8 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
             "on this robot they may be the same thing.",
             tells=False,
         )
-    sentence = f"To tell {names}, record {words}: over {WINDOWS} windows it would separate them by {most:.0f} σ."
+    count = min(WINDOWS, len(evidence.windows))
+    sentence = f"To tell {names}, record {words}: over {count} windows it would separate them by {most:.0f} σ."
     return Advice(sentence, tells=True)
 
 
@@ -154,7 +155,7 @@ def _called(placed: Placed) -> str:
 def motions(windows: Windows, setting: Setting) -> list[tuple[str, Windows]]:
     """Return motions to try, in words and as windows, from those of a log."""
     base, model = spread(windows, WINDOWS), setting.model
-    if model.nu:
+    if base.commands.any():
         ranges = model.actuator_ctrlrange.T if model.nactuator == model.nu else None
         limited = model.actuator_ctrllimited.astype(bool)
         found = []

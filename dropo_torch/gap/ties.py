@@ -72,7 +72,7 @@ def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]
     for one, other in permutations(range(len(tied)), 2):
         shared, target = {p.key for p in tied[other]}, hypothesis.placed[other].target
         for rival in tied[one]:
-            if not (rival.key in shared and one < other or target is not None and rival.target == target):
+            if not ((rival.key in shared and one < other) or (target is not None and rival.target == target)):
                 continue
             ground.report("looking for ties", 0.9)
             fewer = ground.refit(hypothesis.instead(one, rival).without(other), ITERATIONS[-1])

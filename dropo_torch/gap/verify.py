@@ -94,9 +94,10 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
 
 
 def position_features(setting: Setting) -> np.ndarray:
-    """Return which features are positions, ``(m,)`` bool; all of them where none is."""
-    found = Features.of(setting.observation).known(setting.observation.index < setting.model.nq)
-    return found if found.any() else ~found
+    """Return which compared features are positions, ``(m,)`` bool; all that are compared where none is."""
+    compared, positions = Features.of(setting.observation, setting.masked), setting.observation.index < setting.model.nq
+    found = compared.known(positions)
+    return found if found.any() else compared.known(np.ones_like(positions))
 
 
 def score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
@@ -185,11 +186,17 @@ def below(noise: np.ndarray) -> float:
 
 
 def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
-    """Root mean square open-loop error of each feature, ``(m,)``; infinite where a simulation diverged."""
+    """Root mean square open-loop error of each feature ``(m,)``; infinite where it diverged, NaN where it is masked."""
     found, known = (_after(x, evidence) for x in evidence.residuals([hypothesis.variant]))
     error = found * evidence.noise
     error = np.where(np.isfinite(error), error, np.inf)
-    return np.sqrt((error**2 * known).sum((0, 1, 2)) / np.maximum(known.sum((0, 1, 2)), 1))
+    error = np.sqrt((error**2 * known).sum((0, 1, 2)) / np.maximum(known.sum((0, 1, 2)), 1))
+    return np.where(_compared(evidence), error, np.nan)
+
+
+def _compared(evidence: Evidence) -> np.ndarray:
+    """Which features are compared, ``(m,)`` bool."""
+    return evidence.chart.known(np.ones(evidence.twin.setting.observation.size, dtype=bool))
 
 
 def open_loop_error(
@@ -218,12 +225,27 @@ def _after(rows: np.ndarray, evidence: Evidence) -> np.ndarray:
 
 def constant_velocity(evidence: Evidence, held: Held) -> float:
     """Return the open-loop error of positions that go on with the velocity at the start."""
-    windows, twin = held.rollouts, evidence.twin
-    time = np.arange(windows.length + 1)[None, :, None] * twin.setting.signals.timestep
-    rates = np.where(twin.rates >= 0, windows.measured[:, 0][:, np.maximum(twin.rates, 0)], windows.rates)
-    moved = windows.measured[:, :1] + rates[:, None] * time
+    windows, setting = held.rollouts, evidence.twin.setting
+    time = np.arange(windows.length + 1)[None, :, None] * setting.signals.timestep
+    moved = evidence.chart.move(windows.measured[:, :1], _rates(evidence, windows)[:, None] * time)
     error = evidence.chart.difference(windows.measured, moved)[:, 1:]
-    return _rms(error[..., position_features(twin.setting)])
+    return _rms(error[..., position_features(setting)])
+
+
+def _rates(evidence: Evidence, windows: Windows) -> np.ndarray:
+    """Time derivatives of the features at the starts, ``(W, m)``: velocities of the log, or how its positions change.
+
+    Those of rotations are angular velocities in the body's frame; every observed orientation has its own.
+    """
+    twin, plain, start = evidence.twin, list(evidence.chart.plain), windows.measured[:, 0]
+    model, index = twin.setting.model, twin.setting.observation.index
+    rates = [np.where(twin.rates >= 0, start[:, np.maximum(twin.rates, 0)], windows.rates)[:, plain]]
+    for quaternion in evidence.chart.quaternions:
+        joint = int(np.searchsorted(model.jnt_qposadr, index[quaternion[0]], side="right")) - 1
+        free = model.jnt_type[joint] == mujoco.mjtJoint.mjJNT_FREE
+        first = model.nq + model.jnt_dofadr[joint] + (3 if free else 0)
+        rates.append(start[:, [int(np.flatnonzero(index == first + axis)[0]) for axis in range(3)]])
+    return np.concatenate(rates, 1)
 
 
 def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
@@ -241,4 +263,4 @@ def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     if not finite.any():
         return np.full(m, np.inf)
     change = change[finite].reshape(-1, evidence.windows.length + 1, m)[:, 1:]
-    return np.asarray(np.sqrt((change**2).mean((0, 1)) + 1) * evidence.noise)
+    return np.where(_compared(evidence), np.sqrt((change**2).mean((0, 1)) + 1) * evidence.noise, np.nan)

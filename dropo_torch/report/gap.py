@@ -97,7 +97,13 @@ def _residual(residuals: Residuals, named: bool) -> list[tuple[str, str, Any]]:
 
 def _ranking(gap: Gap) -> dict[str, Any]:
     """The first rounds of the search, each with its best candidates, and the scale of their bars."""
-    named = {(e.effect, e.target) for e in gap.effects if words.is_named(e)}
+    named = {
+        (kind, target)
+        for e in gap.effects
+        if words.is_named(e)
+        for kind in (e.effect, e.variant)
+        for target in (e.parameters if e.target == "*" else [e.target])
+    }
     rounds: dict[int, list[Ranked]] = {}
     for ranked in sorted(gap.ranking, key=lambda r: (r.round, float(np.nan_to_num(r.left, nan=np.inf)))):
         rounds.setdefault(ranked.round, []).append(ranked)

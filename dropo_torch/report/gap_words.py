@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -60,16 +60,17 @@ _CLAUSES = {
     "gravity_tilt": "The base is tilted, unlike in your model",
     "ground_slope": "The ground is sloped, unlike in your model",
     "integration": "The integration step of your model is too coarse for this motion",
-    "actuator_gain": "{0} produces a different force for the same command than in your model",
+    "actuator_gain": "The force of {0} for the same command is not that of your model",
     "sensor_bias": "The measurement of {0} has a constant offset",
     "sensor_scale": "The measurement of {0} has a scale error",
     "sensor_delay": "The measurement of {0} is delayed",
     "contact_friction": "The sliding friction of {0} is not that of your model",
     "contact_stiffness": "The contacts of {0} are softer or stiffer than in your model",
+    "contact_margin": "The margin of contacts of {0} is not that of your model",
 }
 #: Effects whose first number, if negative, says that the model has too much of them.
 _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_stiffness", "armature",
-           "actuator_damping", "contact_margin")  # fmt: skip
+           "actuator_damping")  # fmt: skip
 #: Members of the base family, in a list of a joint's.
 _SHORT = {
     "joint_friction": "dry friction",
@@ -159,13 +160,19 @@ def with_interval(given: Strength) -> str:
     return f"{with_unit(value, unit)} ({interval or 'interval not known'})".replace(" ", "\u00a0")
 
 
-def numbers(parameters: Mapping[str, Strength]) -> str:
-    """Return all numbers of an effect, or the first of many."""
+def numbers(parameters: Mapping[str, Strength], named: Callable[[str], str] = quantity) -> str:
+    """Return all numbers of an effect, each with its name in words, or the first of many."""
     if len(parameters) < 2:
         return next(map(with_interval, parameters.values()), "strength not known")
     shown = list(parameters.items())[: MOST_NUMBERS if len(parameters) <= MOST_NUMBERS else 1]
     more = "" if len(shown) == len(parameters) else "; more in the table"
-    return ", ".join(f"{quantity(n)} {with_interval(s)}" for n, s in shown) + more
+    return ", ".join(f"{named(n)} {with_interval(s)}" for n, s in shown) + more
+
+
+def ambiguous(effect: NamedEffect) -> str:
+    """Return what explains the log as well as an effect, in a sentence."""
+    others = joined(rivals(effect), last="or", rest="one of {} more")
+    return f"This log is explained equally well by {others}, in place of {noun(effect.effect, effect.target)}."
 
 
 def answer(gap: Gap) -> tuple[str, list[str]]:
@@ -193,13 +200,12 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
         return f"Friction, inertia, offset or delay of {_count(items)} joints are not those of your model{rest}:", items
     if len(named) == 1:
         rest = step if gap.remaining is None else f", but this does not explain everything: {left(gap.remaining)}"
-        return f"{_clause(named[0])}: {numbers(named[0].parameters)}{rest}.", []
+        return f"{_clause(named[0])}: {_strengths(named[0])}{rest}.", []
     items = [
-        f"{noun(e.effect, e.target)}: {'too much in the model, ' if _too_much(e) else ''}{numbers(e.parameters)}"
-        for e in named
+        f"{noun(e.effect, e.target)}: {'too much in the model, ' if _too_much(e) else ''}{_strengths(e)}" for e in named
     ]
     count = _count(items)
-    differ = any(_too_much(e) or e.effect in _CLAUSES for e in named)
+    differ = any(_too_much(e) or _mixed(e) or e.effect in _CLAUSES for e in named)
     rest = step if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
     return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
 
@@ -320,15 +326,30 @@ def _clause(effect: NamedEffect) -> str:
     missing = noun(effect.effect, effect.target)
     if _too_much(effect):
         return f"Your model has too much {missing.removeprefix('a ')}"
+    if _mixed(effect):
+        return f"Your model has too little or too much {missing.removeprefix('a ')}"
     if effect.effect not in _CLAUSES:
         return f"Your model lacks {missing}"
     text = _CLAUSES[effect.effect].format(_at(effect.effect, effect.target))
     return text[0].upper() + text[1:] if text.startswith(("actuator ", "all ", "the world ")) else text
 
 
+def _signs(effect: NamedEffect) -> set[bool]:
+    """Whether the model has too much of an effect, wherever that can be said; of a family at each of its places."""
+    given = list(effect.parameters.values())[: None if effect.target == "*" else 1]
+    return {s.value < 0 for s in given} if effect.effect in _SIGNED else set()
+
+
 def _too_much(effect: NamedEffect) -> bool:
-    first = next(iter(effect.parameters.values()), None)
-    return effect.effect in _SIGNED and first is not None and first.value < 0
+    return _signs(effect) == {True}
+
+
+def _mixed(effect: NamedEffect) -> bool:
+    return len(_signs(effect)) > 1
+
+
+def _strengths(effect: NamedEffect) -> str:
+    return numbers(effect.parameters, str if effect.target == "*" else quantity)
 
 
 def _at(effect: str, target: str | None) -> str:
