@@ -21,11 +21,11 @@ from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.locate import regressors
-from dropo_torch.gap.log import cut_windows
+from dropo_torch.gap.log import cut_windows, spread
 from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import NamedEffect, Strength
-from dropo_torch.gap.search import start
+from dropo_torch.gap.search import start, start_anywhere
 from dropo_torch.gap.ties import _one_for_two, rivals_of_all
 from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem
@@ -278,6 +278,37 @@ def test_a_force_has_the_unit_of_what_it_acts_on() -> None:
     model = mujoco.MjModel.from_xml_string(DRIVES)
     names = [model.actuator(i).name for i in range(model.nu)]
     assert [unit_of(SimpleNamespace(model=model), n, "N·m", "N") for n in names] == [n.split(" ")[0] for n in names]
+
+
+def test_what_shows_in_a_few_stretches_only_is_missing() -> None:
+    """Refits use some of the windows; where these show nothing, all of them are asked."""
+    scene = scene_of(RAIL, lambda model: None, pushes, shape=(8, 700))
+    windows = scene.evidence.windows
+    ground = Ground(scene.evidence, (VOCABULARY["joint_damping"], VOCABULARY["joint_stiffness"]))
+    assert len(windows) > 2 * ground.few
+    (hidden,) = np.flatnonzero(~np.isin(windows.measured, spread(windows, ground.few).measured).any((1, 2)))[:1]
+    other = Hypothesis((), (Placed(VOCABULARY["joint_damping"], "rail", (3.0,)),))
+    path = scene.evidence.twin.predict([other.variant], windows.select([hidden]))[0][0, 0]
+    measured = windows.measured.copy()
+    measured[hidden] = path + scene.noise * np.random.default_rng(0).standard_normal(path.shape)
+    ground = replace(ground, evidence=replace(scene.evidence, windows=replace(windows, measured=measured)))
+    assert start(ground, scene.begin).done
+    found = start_anywhere(ground, scene.begin)
+    assert not found.done
+    assert found.few == len(windows)
+    assert found.first.ranked[0].chi2 < 0.5 * found.first.chi2
+    untouched = start_anywhere(replace(ground, evidence=scene.evidence), scene.begin)
+    assert untouched.done
+    assert untouched.few < len(windows)
+
+
+def test_a_model_that_is_wrong_on_unseen_data_lacks_something() -> None:
+    right, other = (scene_of(RAIL, change, pushes) for change in (lambda model: None, resist))
+    damping = [VOCABULARY["joint_damping"]]
+    assert not find_gap(right.problem, scene=right, effects=damping).found
+    gap = find_gap(right.problem, scene=replace(right, held=other.held), effects=damping)
+    assert gap.verdict == "unnamed"
+    assert "open-loop errors on unseen data are" in gap.refused
 
 
 def test_what_is_one_effect_is_not_told_as_two() -> None:

@@ -60,6 +60,7 @@ class State:
         attempts: what was refitted, in order.
         refused: why what explained the most has no name, if it has none.
         family: whether the hypothesis is the base family, at all joints where it is needed.
+        few: windows that refits use, at most.
     """
 
     noise: np.ndarray
@@ -73,6 +74,7 @@ class State:
     attempts: tuple[Ranked, ...] = ()
     refused: str = ""
     family: bool = False
+    few: int = FEW
 
 
 @dataclass(frozen=True)
@@ -97,7 +99,7 @@ class Ground:
 
     def at(self, state: State) -> Ground:
         """Return the ground with the noise, the windows and the caps that a state has found."""
-        return self.on(state.noise, state.since, state.caps)
+        return replace(self, few=state.few).on(state.noise, state.since, state.caps)
 
     def on(self, noise: np.ndarray, since: np.ndarray, caps: np.ndarray | float = 1.0) -> Ground:
         """Return the ground with another noise, and without windows that start before some steps, ``(E,)``."""

@@ -35,6 +35,11 @@ PICTURES = 4
 SPARSE = 0.2
 #: Pairs of tied effects for which a motion is sought that tells them apart; of a family, whose motions cost more, one.
 RIVALS = 4
+#: Why a model that is right where it is compared may still lack something.
+UNSEEN = (
+    "the stretches that were compared show no more than noise, but open-loop errors on unseen data are {:.0f} times "
+    "what noise makes"
+)
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -58,6 +63,9 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     given, constant = score(evidence, held, base), constant_velocity(evidence, held)
     after_score = score(evidence, held, final.hypothesis) if naming.named else given
     floor = floor_score(evidence, held, final.hypothesis)
+    astray = after_score.rollout_rmse / max(floor.rollout_rmse, 1e-300)
+    if not naming.gap and astray > rules.sound.astray:
+        naming = replace(naming, gap=True, refused=UNSEEN.format(astray))
     if naming.named and not has_skill(after_score, floor, constant, rules.sound):
         return make_result(scene, _without_names(naming, after_score, constant), started)
     skill = has_skill(given, floor, constant, rules.sound)
@@ -67,7 +75,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
         shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
-    own_step, astray = _own_step(naming, rest, rules), after_score.rollout_rmse / max(floor.rollout_rmse, 1e-300)
+    own_step = _own_step(naming, rest, rules)
     untold = naming.named and (own_step is None or naming.partial)
     remaining = _remaining(setting, naming, rest, after, astray, rules) if untold else None
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)

@@ -102,7 +102,7 @@ def search(
         content = checkpoint.load()
         state, twin.simulated_transitions = content["state"], content["simulated_transitions"]
     else:
-        state = keep(start(ground, begin))
+        state = keep(start_anywhere(ground, begin))
     hurried, unfinished = replace(ground, report=until(ground.report, end)), ""
     try:
         while not state.done:
@@ -110,6 +110,15 @@ def search(
     except OutOfTime as error:
         unfinished = f"{error}, with {len(state.current.hypothesis.placed)} effects accepted"
     return replace(conclude(ground.at(state), state), unfinished=unfinished)
+
+
+def start_anywhere(ground: Ground, begin: Hypothesis) -> State:
+    """Return :func:`start`, on all windows where those that refits use show nothing: a gap may show in a few only."""
+    state, count = start(ground, begin), len(ground.evidence.windows)
+    if not state.done or count <= ground.few:
+        return state
+    every = start(replace(ground, few=count), begin)
+    return state if every.done else every
 
 
 def start(ground: Ground, begin: Hypothesis) -> State:
@@ -122,7 +131,8 @@ def start(ground: Ground, begin: Hypothesis) -> State:
     ranked, focus = ground.screened(base), ground.focus(base)
     degrees = focus.evidence.degrees(focus.fitted.linear)
     first = Screening(tuple(ranked), float((focus.residual**2).sum()), degrees)
-    return State(noise, since, ground.caps, base, first, base, done=not significant(base.cost, ground.rules))
+    missing = significant(base.cost, ground.rules)
+    return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few)
 
 
 def step(ground: Ground, state: State) -> State:
@@ -189,7 +199,7 @@ def resort(ground: Ground, naming: Naming) -> Naming:
     if (whole := whole_family(here, base.hypothesis)) is None:
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
-    state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True)
+    state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.few)
     state = renewed(here, replace(state, attempts=naming.attempts))
     found = conclude_family(here.at(state), state, replace(naming, evidence=here.at(state).evidence, base=state.base))
     return found if found.named else naming
