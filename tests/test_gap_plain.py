@@ -296,7 +296,6 @@ def test_what_shows_in_a_few_stretches_only_is_missing() -> None:
     found = start_anywhere(ground, scene.begin)
     assert not found.done
     assert found.few == len(windows)
-    assert found.first.ranked[0].chi2 < 0.5 * found.first.chi2
     untouched = start_anywhere(replace(ground, evidence=scene.evidence), scene.begin)
     assert untouched.done
     assert untouched.few < len(windows)
