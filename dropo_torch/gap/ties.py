@@ -18,6 +18,8 @@ from dropo_torch.gap.screen import Candidate, Focus, left_by
 ALONG = (0.75, 0.5, 0.25, 0.125)
 #: Iterations of their fits on few windows: a tie with more numbers than needed settles slowly.
 ITERATIONS = (6, 12)
+#: Iterations in which one effect settles in the place of two, of which it had done the part of one.
+SETTLED = 40
 #: The round of attempts that only look for ties.
 ROUND = -1
 
@@ -75,7 +77,7 @@ def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]
             if not ((rival.key in shared and one < other) or (target is not None and rival.target == target)):
                 continue
             ground.report("looking for ties", 0.9)
-            fewer = ground.refit(hypothesis.instead(one, rival).without(other), ITERATIONS[-1])
+            fewer = ground.refit(hypothesis.instead(one, rival).without(other), SETTLED)
             if as_good(ground, state, fewer):
                 return fewer
     return None
