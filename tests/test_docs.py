@@ -438,15 +438,28 @@ def test_pushes(tmp_path: Path) -> None:
     assert turned < 1.5
 
 
+def shared_errors(rng: np.random.Generator, pushes: int) -> tuple[np.ndarray, list[tuple[str, int]]]:
+    """Errors of five repeats of each push, mostly those that its repeats have in common."""
+    shared = np.repeat(rng.normal(size=(pushes, 3)) * [3, 2, 1], 5, axis=0)
+    return shared + rng.normal(size=shared.shape) * [1, 1, 0.5], [("push", n) for n in np.repeat(np.arange(pushes), 5)]
+
+
 def test_an_error_term_holds_what_repeats_have_in_common() -> None:
     example, rng = load_example(ROOT / "examples" / "pushing" / "pushing.py"), np.random.default_rng(0)
-    shared = np.repeat(rng.normal(size=(400, 3)) * [3, 2, 1], 5, axis=0)
-    off = shared + rng.normal(size=shared.shape) * [1, 1, 0.5]
-    covariance, groups = example.error_term(off, [("push", n) for n in np.repeat(np.arange(400), 5)])
-    assert groups == 400
-    assert np.diag(covariance) == pytest.approx([9 + 1.2, 4 + 1.2, 1 + 0.3], rel=0.15)
-    draws = rng.multivariate_normal(np.zeros(3), covariance, 400)
-    assert example.energy_score(draws * 1e-3, np.zeros(3)) < example.energy_score(draws * 1e-3, np.full(3, 0.02))
+    term = example.error_term(*shared_errors(rng, 400), rng)
+    assert term.scale**2 == pytest.approx([9 + 1.2, 4 + 1.2, 1 + 0.3], rel=0.15)
+    draws = term.draws * 1e-3
+    assert example.energy_score(draws, np.zeros(3)) < example.energy_score(draws, np.full(3, 0.02))
+
+
+def test_an_error_term_of_few_pushes_holds_nine_in_ten_others() -> None:
+    example, rng = load_example(ROOT / "examples" / "pushing" / "pushing.py"), np.random.default_rng(1)
+    others, _ = shared_errors(rng, 100)
+    held = [
+        np.mean([term.holds(off) for off in others[::5]])
+        for term in (example.error_term(*shared_errors(rng, 8), rng) for _ in range(100))
+    ]
+    assert np.mean(held) == pytest.approx(0.9, abs=0.05)
 
 
 def test_a_twin_of_a_log_has_its_commands_and_noise() -> None:

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from scipy import stats
 from scipy.signal import medfilt
 
 import dropo_torch as dropo
@@ -39,7 +38,7 @@ STEP = 0.03
 #: Standard deviations of a prediction without an error term, in m, m and rad.
 EPSILON = (1e-3, 1e-3, 0.017)
 #: m from the centre at which an angle counts as a distance; draws from the box of parameters, and of a prediction.
-ARM, DRAWS, SAMPLES = 0.025, 20, 400
+ARM, DRAWS, SAMPLES = 0.025, 20, 4000
 
 
 @dataclass(frozen=True)
@@ -160,18 +159,33 @@ def last_errors(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarr
     return np.stack(found, 1)
 
 
-def error_term(off: np.ndarray, groups: Sequence[tuple[str, int]]) -> tuple[np.ndarray, int]:
-    """Return the covariance of errors ``(P, 3)`` of a push that was not seen, and the groups of which it is.
+@dataclass(frozen=True)
+class ErrorTerm:
+    """An error of predictions: the scale of each axis, ``(3,)``, and draws, ``(SAMPLES, 3)``."""
+
+    scale: np.ndarray
+    draws: np.ndarray
+
+    def holds(self, off: np.ndarray) -> bool:
+        """Return whether an error ``(3,)`` lies in the ellipsoid of 90 % of the draws."""
+        far = ((self.draws / self.scale) ** 2).sum(1)
+        return bool(((off / self.scale) ** 2).sum() <= np.quantile(far, 0.9))
+
+
+def error_term(off: np.ndarray, groups: Sequence[tuple[str, int]], rng: np.random.Generator) -> ErrorTerm:
+    """Return the error of a push that was not seen, from the errors ``(P, 3)`` of those that were.
 
     What repeats of a push have in common is no noise: it is the model's own error. So a group of repeats is one draw of
-    it, and what differs between them is the second part.
+    it, and what differs between them is the second part. So few groups say nothing of how the axes go together, and of
+    each axis' size no more than Student's t of as many degrees of freedom.
     """
     names = sorted(set(groups))
     parts = [off[[g == name for g in groups]] for name in names]
     means = np.array([part.mean(0) for part in parts])
     within = np.concatenate([part - part.mean(0) for part in parts])
     free = max(len(within) - len(parts), 1)
-    return means.T @ means / len(means) + within.T @ within / free, len(names)
+    scale = np.sqrt((means**2).mean(0) + (within**2).sum(0) / free)
+    return ErrorTerm(scale, scale * rng.standard_t(len(names), (SAMPLES, len(scale))))
 
 
 def energy_score(samples: np.ndarray, off: np.ndarray) -> float:
@@ -206,18 +220,16 @@ def regions(
     Those are of the parameters with the error term, of the parameters with ε, and of parameters drawn from all of
     their box with ε.
     """
-    covariance, groups = error_term(last_errors(seen, predict(problem, seen, best))[0], [p.group for p in seen])
-    size = len(covariance)
-    largest = size * groups / (groups - size + 1) * stats.f.ppf(0.9, size, groups - size + 1)
+    term = error_term(last_errors(seen, predict(problem, seen, best))[0], [p.group for p in seen], rng)
     boxes = rng.uniform(problem.space.low, problem.space.high, (DRAWS, len(best)))
     off = last_errors(unseen, predict(problem, unseen, np.vstack([best, boxes])))
-    epsilon = rng.normal(size=(SAMPLES, size)) * EPSILON
+    epsilon = rng.normal(size=(SAMPLES, len(EPSILON))) * EPSILON
     scores: dict[str, list[float]] = {"with an error term": [], "with ε": [], "drawn from the box (UDR)": []}
     inside = []
     for own, *others in off.swapaxes(0, 1):
-        inside.append(bool(own @ np.linalg.solve(covariance, own) <= largest))
+        inside.append(term.holds(own))
         drawn = {
-            "with an error term": rng.multivariate_normal(np.zeros(size), covariance, SAMPLES),
+            "with an error term": term.draws,
             "with ε": epsilon,
             "drawn from the box (UDR)": own - np.array(others)[rng.integers(len(others), size=SAMPLES)] + epsilon,
         }
@@ -235,7 +247,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="holds bigrect_3pts and bigrect_ridge")
     parser.add_argument("--out", type=Path, default=Path("out/pushing"))
-    parser.add_argument("--repeats", type=int, default=1, help="repeats of each push that are fitted")
+    parser.add_argument("--repeats", type=int, default=9, help="repeats of each push that are fitted, at most")
     parser.add_argument(
         "--conditions", nargs="+", choices=CONDITIONS, default=CONDITIONS, help="those left out in turn"
     )
