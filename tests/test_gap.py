@@ -45,7 +45,7 @@ from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.twin import Windows, secants
-from dropo_torch.gap.verify import cut_held, floor_score, hold_out, rollout_floor, score
+from dropo_torch.gap.verify import cut_held, hold_out, rollout_floor, score, scores
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.report.gap_words import answer
 from dropo_torch.support.checkpoint import dumps
@@ -511,9 +511,9 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
     assert set(document) == set(CONTRACT)
     assert not [key for key, kind in CONTRACT.items() if not isinstance(document[key], kind)]
     assert set(document["gap"]) == {"before", "after", "noise_floor"}
-    for scores in document["gap"].values():
-        assert set(scores) == {"mse", "log_likelihood", "rollout_rmse"}
-        assert all(isinstance(v, NUMBER) for v in scores.values())
+    for numbers in document["gap"].values():
+        assert set(numbers) == {"mse", "log_likelihood", "rollout_rmse"}
+        assert all(isinstance(v, NUMBER) for v in numbers.values())
     for e in document["effects"]:
         assert set(e) == {"effect", "target", "parameters", "share_of_gap", "indistinguishable_from"}
         assert 0 <= e["share_of_gap"] <= 1
@@ -756,7 +756,7 @@ def test_a_late_position_begins_where_it_was() -> None:
     case = simulate_truth(CART_POLE, [Effect("sensor_delay", "hinge.position", {"delay": 0.008})], 3, **SIZE)
     scene = prepare(load(case, noise=list(case.noise)))
     held = cut_held(scene.evidence, scene.held, true(case))
-    found, floor = (f(scene.evidence, held, true(case)) for f in (score, floor_score))
+    found, floor = scores(scene.evidence, held, true(case))
     assert found.log_likelihood > floor.log_likelihood - 40
 
 
@@ -1077,7 +1077,7 @@ def test_scores_order_by_how_wrong_a_model_is() -> None:
     held = cut_held(scene.evidence, scene.held, right)
     models = [right.at(np.array([right.declared[0], d])) for d in (0.02, 0.03, 0.05)]
     best, worse, worst = (score(scene.evidence, held, m) for m in models)
-    floor = floor_score(scene.evidence, held, right)
+    floor = scores(scene.evidence, held, right)[1]
     assert best.mse < worse.mse < worst.mse
     assert best.rollout_rmse < worse.rollout_rmse < worst.rollout_rmse
     assert best.log_likelihood > worse.log_likelihood > worst.log_likelihood

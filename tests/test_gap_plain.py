@@ -231,7 +231,7 @@ def test_constant_velocity_turns_what_turns() -> None:
     scene = scene_of(BALL, lambda model: None, lambda t, phases: np.zeros((len(t), 0)), begin=thrown)
     held = cut_held(scene.evidence, scene.held, scene.begin)
     assert held.seconds > 0.5
-    assert constant_velocity(scene.evidence, held) < 0.02
+    assert constant_velocity(scene.evidence, held.rollouts) < 0.02
     units = [regressors(scene.setting, scene.short, dof)[1].unit for dof in range(6)]
     assert units == ["m/s"] * 3 + ["rad/s"] * 3
 

@@ -11,7 +11,7 @@ from dropo_torch.effects import Placed, find_effect
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.placing import plain_setting
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators.warp.variants import Variants
+from dropo_torch.simulators.warp.variants import Variants, Worlds
 from dropo_torch.testing.effects import RIG
 
 pytest.importorskip("warp")
@@ -27,6 +27,12 @@ NATIVE: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
     (("integration", None, (0.0025,)),),
     (("actuator_gain", "lift", (0.7,)), ("armature", "elbow", (0.05,))),
 ]
+#: Effects that are forces, alone, together, and beside another step.
+FORCED: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
+    (("joint_cogging", "elbow", (0.5, 3.0, 0.2)),),
+    (("joint_cogging", "elbow", (0.3, 2.0, 0.0)), ("joint_stribeck", "rail", (0.1, 0.3, 0.2))),
+    (("joint_stribeck", "elbow", (0.05, 0.1, 0.5)), ("integration", None, (0.0025,))),
+]
 
 
 def engines() -> tuple[VariantEngine, VariantEngine]:
@@ -40,7 +46,9 @@ def variant(effects: tuple[tuple[str, str | None, tuple[float, ...]], ...], mass
     return Variant((mass,), tuple(Placed(find_effect(name), target, values) for name, target, values in effects))
 
 
-def simulated(engine: VariantEngine, variants: list[Variant], fine: bool = False) -> np.ndarray:
+def simulated(
+    engine: VariantEngine, variants: list[Variant], fine: bool = False, pushes: np.ndarray | None = None
+) -> np.ndarray:
     rng, model = np.random.default_rng(0), engine.model(variants[0])
     starts = np.tile(np.concatenate([model.qpos0, np.zeros(model.nv)]), (WINDOWS, 1))
     starts[:, [0, 1, 9]] += rng.uniform(-0.5, 0.5, (WINDOWS, 3))
@@ -48,13 +56,13 @@ def simulated(engine: VariantEngine, variants: list[Variant], fine: bool = False
     signals = np.repeat(rng.uniform(-1, 1, (WINDOWS, STEPS // SKIP, model.nu)), SKIP, 1)
     shape = (len(variants), 1, 1, 1)
     return engine.paths(
-        variants, engine.models(variants), np.tile(starts, shape[:3]), np.tile(signals, shape), fine=fine
+        variants, engine.models(variants), np.tile(starts, shape[:3]), np.tile(signals, shape), fine=fine, pushes=pushes
     )
 
 
 @pytest.mark.parametrize("fine", [False, True])
 def test_variants_are_those_of_mujoco(fine: bool) -> None:
-    variants = [variant(effects, mass) for effects in NATIVE for mass in (0.7, 1.1)]
+    variants = [variant(effects, mass) for effects in (*NATIVE, *FORCED) for mass in (0.7, 1.1)]
     ours, theirs = (simulated(engine, variants, fine) for engine in engines())
     assert ours.shape == (len(variants), WINDOWS, STEPS if fine else STEPS // SKIP, 9 + 8 + 2)
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8)
@@ -62,16 +70,16 @@ def test_variants_are_those_of_mujoco(fine: bool) -> None:
 
 
 def test_what_is_simulated_with_warp_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Forces and models outside the subset go to MuJoCo; an engine serves all variants of a structure."""
+    """Wrenches and models outside the subset go to MuJoCo; an engine serves all variants of a structure."""
     asked: list[bool] = []
-    rollout = Variants.rollout
+    worlds = Variants.worlds
 
-    def counted(self: Variants, *arguments: object) -> np.ndarray | None:
-        found = rollout(self, *arguments)  # type: ignore[arg-type]
+    def counted(self: Variants, *arguments: object) -> Worlds | None:
+        found = worlds(self, *arguments)  # type: ignore[arg-type]
         asked.append(found is not None)
         return found
 
-    monkeypatch.setattr(Variants, "rollout", counted)
+    monkeypatch.setattr(Variants, "worlds", counted)
     ours, theirs = engines()
     pushed = variant((("external_force", "cart", (1.0, 0.0, 0.0)),), 0.7)
     np.testing.assert_array_equal(simulated(ours, [pushed]), simulated(theirs, [pushed]))
@@ -81,5 +89,15 @@ def test_what_is_simulated_with_warp_is(monkeypatch: pytest.MonkeyPatch) -> None
     assert asked == [False]
     plain = [variant((), mass) for mass in (0.5, 0.9)]
     simulated(ours, plain)
-    assert asked == [False, True, True]
+    assert asked == [False, True]
     assert sum(e is not None for e in ours._warp._engines.values()) == 1
+
+
+def test_pushes_are_those_of_mujoco() -> None:
+    """Generalised forces of every logged step, alone and beside an effect that is a force."""
+    ours, theirs = engines()
+    variants = [variant((), 0.7), variant(FORCED[0], 0.7)]
+    pushes = np.random.default_rng(1).normal(0, 0.5, (len(variants), STEPS // SKIP, 9))
+    pushed, same = (simulated(engine, variants, pushes=pushes) for engine in (ours, theirs))
+    np.testing.assert_allclose(pushed, same, rtol=0, atol=1e-8)
+    assert np.abs(pushed - simulated(ours, variants)).max() > 1e-3

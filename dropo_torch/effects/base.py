@@ -7,6 +7,7 @@ import copy
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar, Literal
 
 import mujoco
@@ -92,7 +93,11 @@ class Setting:
 
     def joint(self, name: str | None) -> int:
         """Return a joint's number."""
-        return object_number(self.model, "jnt", name)
+        return self._joints.index(str(name))
+
+    @cached_property
+    def _joints(self) -> list[str]:
+        return object_names(self.model, "jnt")
 
     def dof(self, name: str | None) -> int:
         """Return the degree of freedom of a hinge or slide joint."""

@@ -43,7 +43,25 @@ class Force:
     effect: Effect
     target: str | None
     values: np.ndarray
-    rows: slice
+    rows: slice | np.ndarray
+
+
+def forces_of(variants: Sequence[Variant], each: int) -> list[Force]:
+    """Return the forces of variants, each in ``each`` rows; those of one effect at one target together."""
+    acting: dict[tuple, list[tuple[int, Placed]]] = {}
+    for k, variant in enumerate(variants):
+        for p in variant.placed:
+            if p.effect.has("force"):
+                acting.setdefault((*p.key, len(p.values)), []).append((k, p))
+    found = []
+    for group in acting.values():
+        members, first = np.array([k for k, _ in group]), group[0][1]
+        values = np.repeat(np.array([p.values for _, p in group]), each, axis=0)
+        rows: slice | np.ndarray = (members[:, None] * each + np.arange(each)).ravel()
+        if len(members) == np.ptp(members) + 1:
+            rows = slice(members[0] * each, (members[-1] + 1) * each)
+        found.append(Force(first.effect, first.target, values, rows))
+    return found
 
 
 class Forces:
@@ -171,11 +189,9 @@ class VariantEngine:
         for (finer, *_), members in groups.items():
             rows = members if len(members) < len(variants) else slice(None)  # all of them need no copy
             own, their = [models[k] for k in members], [variants[k] for k in members]
-            forced = pushes is not None or len(self._filters) or any(v.has("force", "wrench") for v in their)
-            found = None if forced else self._by_warp(own, starts[rows], signals[rows], finer, every)
-            out[rows] = found if found is not None else self._by_mujoco(
-                own, their, starts[rows], signals[rows], None if pushes is None else pushes[rows], finer, every
-            )  # fmt: skip
+            given = starts[rows], signals[rows], None if pushes is None else pushes[rows], finer, every
+            found = self._by_warp(own, their, *given)
+            out[rows] = found if found is not None else self._by_mujoco(own, their, *given)
         return out
 
     def _kind(self, variant: Variant, model: mujoco.MjModel) -> tuple:
@@ -185,16 +201,38 @@ class VariantEngine:
         return finer, variant.has("force"), self._warp is not None and variant.has("wrench"), natives
 
     def _by_warp(
-        self, models: Models, starts: np.ndarray, signals: np.ndarray, finer: int, every: int
-    ) -> np.ndarray | None:
+        self, models: Models, variants: Sequence[Variant], starts: np.ndarray, signals: np.ndarray,
+        pushes: np.ndarray | None, finer: int, every: int,
+    ) -> np.ndarray | None:  # fmt: skip
         """Do what :meth:`_by_mujoco` does with Warp, or return ``None`` where it cannot."""
-        out = []
-        for model, start, signal in zip(models, starts, signals, strict=True):
-            path = None if self._warp is None else self._warp.rollout(model, start, np.repeat(signal, finer, axis=1))
-            if path is None:
-                return None
-            out.append(path[:, finer * every - 1 :: finer * every])
-        return np.stack(out)
+        if self._warp is None or len(self._filters) or any(v.has("wrench") for v in variants):
+            return None
+        (num_k, num_w, total), nq = signals.shape[:3], self._base.nq
+        worlds = self._warp.worlds([m for m in models if m is not None], num_w)
+        if worlds is None:
+            return None
+        states, control = starts.reshape(num_k * num_w, -1), signals.reshape(num_k * num_w, total, -1)
+        forces, applied = forces_of(variants, num_w), pushes is not None
+        if pushes is not None:
+            pushed = np.repeat(np.repeat(pushes, self._setting.frame_skip, axis=1), num_w, axis=0)
+            control = np.concatenate([control, pushed], 2)
+        if not forces:
+            held = 1 if _varies(control, every) else every
+            path = worlds.rollout(states, control[:, ::held], held * finer, applied=applied)
+            return path[:, every // held - 1 :: every // held].reshape(num_k, num_w, -1, states.shape[1])
+        if not applied:
+            control = np.concatenate([control, np.zeros((*control.shape[:2], self._base.nv))], 2)
+        own = control[:, :, -self._base.nv :].copy()
+        out, before = np.empty((len(states), total // every, states.shape[1])), states[:, nq:]
+        for step in range(total):
+            for _ in range(finer):
+                found = self._forces(forces, states[:, :nq], states[:, nq:], before, self._base.opt.timestep / finer)
+                control[:, step, -self._base.nv :], before = own[:, step] + found, states[:, nq:]
+                states = worlds.rollout(states, control[:, step : step + 1], 1, applied=True)[:, 0]
+            if (step + 1) % every == 0:
+                out[:, (step + 1) // every - 1] = states
+        out[~np.isfinite(states).all(1)] = np.nan
+        return out.reshape(num_k, num_w, *out.shape[1:])
 
     def _by_mujoco(
         self, models: Models, variants: Sequence[Variant], starts: np.ndarray, signals: np.ndarray,
@@ -223,13 +261,11 @@ class VariantEngine:
             acting = self._filters.replayed(self._base, control[:, : self.lead], 1, constants.repeat(num_w, 0))
             batch.bind("act")[:, self._filters.activations] = acting
         control = control[:, self.lead :]
-        forces = []
+        forces = forces_of(variants, num_w)
         for k, variant in enumerate(variants):
-            own = slice(k * num_w, (k + 1) * num_w)
             for p in variant.placed:
-                if p.effect.has("force"):
-                    forces.append(Force(p.effect, p.target, np.array([p.values]), own))
                 if p.effect.has("wrench"):
+                    own = slice(k * num_w, (k + 1) * num_w)
                     batch.bind("xfrc_applied")[own] += p.effect.wrench(self._setting, p.target, np.array(p.values))
         held = 1 if forces or _varies(control, every) else every  # steps of the base between changes
         calls, steps = (finer, 1) if forces else (1, finer * held)

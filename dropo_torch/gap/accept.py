@@ -10,7 +10,7 @@ from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import Refit, refit, resolved
 from dropo_torch.gap.renew import with_base
-from dropo_torch.gap.rules import accounts, beyond_free, significant, simplest
+from dropo_torch.gap.rules import accounts, beyond_free, remains, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -84,7 +84,11 @@ def is_done(ground: Ground, state: State) -> bool:
 
 
 def add(ground: Ground, state: State) -> State:
-    """Accept the one or two effects that remove the most; where nothing does, the search is done."""
+    """Accept the one or two effects that remove the most; where nothing does, the search is done.
+
+    Pairs and families are tried where no single effect removes most of what is left, unless what was accepted before
+    accounts for the gap: of the little that it leaves, not several more are found at once.
+    """
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
     alive = [c for c in ranked if not c.dead]
@@ -98,7 +102,7 @@ def add(ground: Ground, state: State) -> State:
     if not singles:
         return replace(state, done=True)
     best = simplest(singles, rules)
-    if best.cost.left_of(current.cost) > 1 - rules.most:
+    if best.cost.left_of(current.cost) > 1 - rules.most and not accounts(current, state.base, rules):
         focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
         pairs = promising_pairs(
             focus, screen(focus, [c.placed for c in alive[: rules.tried.paired]], rules.tried), rules.tried
@@ -171,14 +175,16 @@ def extensions(ground: Ground, own: Placed) -> list[tuple[Placed, ...]]:
 def refines(ground: Ground, state: State, better: Refit) -> bool:
     """Return whether an effect that contains an accepted one explains enough more to stand in its place.
 
-    Where the model's own step is part of what both leave, a finer one tells.
+    Where the model's own step is part of what both leave, a finer one tells: it may even be that the own step makes
+    the wrong one of two the better.
     """
     rules, own, here = ground.rules, state.current, better
     larger = len(better.hypothesis.vector) > len(own.hypothesis.vector)
-    if here.cost.left_of(own.cost) > (rules.most if larger else 1 - rules.most):
-        return False
     gained, least = own.cost.excess - here.cost.excess, rules.least * state.base.cost.above(here.cost)
-    if gained < min(least, rules.most * own.cost.above(here.cost)):
+    more = here.cost.left_of(own.cost) <= (rules.most if larger else 1 - rules.most)
+    if not more or gained < min(least, rules.most * own.cost.above(here.cost)):
+        if not more and not remains(own.cost, rules):
+            return False
         own, here = (resolved(ground.part, r).fit for r in (own, here))
         if here.cost.left_of(own.cost) > 1 - rules.most:
             return False

@@ -25,7 +25,7 @@ from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows
-from dropo_torch.gap.verify import constant_velocity, cut_held, floor_score, score
+from dropo_torch.gap.verify import constant_velocity, cut_held, score, scores
 
 #: Fits after the last one, at most, each with the weights that the one before suggests.
 ROUNDS = 3
@@ -60,9 +60,11 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         evidence, noise = replace(evidence, noise=last.evidence.noise), last.evidence.noise
     final = naming.final if last is None else last.fit
     held = cut_held(evidence, scene.held, final.hypothesis)
-    given, constant = score(evidence, held, base), constant_velocity(evidence, held)
-    after_score = score(evidence, held, final.hypothesis) if naming.named else given
-    floor = floor_score(evidence, held, final.hypothesis)
+    constant, (after_score, floor) = (
+        constant_velocity(evidence, held.rollouts),
+        scores(evidence, held, final.hypothesis),
+    )
+    given = score(evidence, held, base) if naming.named else after_score
     astray = after_score.rollout_rmse / max(floor.rollout_rmse, 1e-300)
     if not naming.gap and astray > rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(astray))
@@ -130,7 +132,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
         numbers = {q.name: _strength(q, value, float(half)) for q, value, half in found}
         named.append(NamedEffect.of(placed, numbers, share, tied))
     kinds = {n: max(e.share_of_gap for e in named if e.effect == n) for n in {e.effect for e in named}}
-    after_score, constant = score(evidence, held, hypothesis), constant_velocity(evidence, held)
+    after_score, constant = score(evidence, held, hypothesis), constant_velocity(evidence, held.rollouts)
     skill = has_skill(after_score, gap.noise_floor, constant, scene.rules.sound)
     left = zip(dof_names(model), view.before.tolist(), view.after.tolist(), strict=True)
     return replace(

@@ -21,8 +21,8 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, prepare, searched
-from dropo_torch.gap.search import Naming, kept, resort, search, start
-from dropo_torch.gap.verify import cut_held, floor_score, open_loop_error, score
+from dropo_torch.gap.search import Ended, Naming, believed, kept, resort, search, start, with_ties
+from dropo_torch.gap.verify import cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
 
 
@@ -67,8 +67,7 @@ def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
         scene: of :func:`prepare`.
         hypothesis: such as ``name(scene).base.hypothesis`` and ``.final.hypothesis``.
     """
-    held = cut_held(scene.evidence, scene.held, hypothesis)
-    return score(scene.evidence, held, hypothesis), floor_score(scene.evidence, held, hypothesis)
+    return scores(scene.evidence, cut_held(scene.evidence, scene.held, hypothesis), hypothesis)
 
 
 def open_loop(scene: Scene, hypothesis: Hypothesis, seconds: float) -> tuple[float, float]:
@@ -148,29 +147,33 @@ def _name(
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly.
 
     Where there are contacts, long windows bend, and what is most of the gap there may be an effect of the wrong kind:
-    names that leave a rest are then believed only if shorter windows find none that leave nothing, in most of the log
-    at least. Where no search has names, the base family of all joints is the last resort.
+    names that leave a rest are then believed only if they leave none in shorter windows, in most of the log at least,
+    or if these find no others that do. Where no search has names, the base family of all joints is the last resort.
     """
     touches = bool(scene.setting.signals.contacts.any())
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
-    found, waiting = list[Naming](), list(searched(scene))
+    found, waiting = list[Ended](), list(searched(scene))
     while waiting and (not found or time.monotonic() < end):
         suffix, evidence = waiting.pop(0)
         path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
         ends = share_of(end, len(waiting))
         found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume, end=ends))
-        doubtful = touches and remains(found[-1].final.cost, ground.rules)
-        if not found[0].gap or (found[-1].named and not doubtful):
-            return found[-1]
-    best = min(found, key=lambda n: (not n.named, not n.partial))
-    for naming in () if best.named else found:
-        if time.monotonic() < end and (resorted := resort(ground, naming)).named:
+        last = found[-1].naming
+        doubtful = touches and remains(last.final.cost, ground.rules)
+        if not found[0].naming.gap or (last.named and not doubtful):
+            return with_ties(found[-1])
+        for _, other in waiting if last.named and time.monotonic() < end else ():
+            if sure := believed(replace(ground, evidence=other), scene.begin, found[-1]):
+                return with_ties(sure)
+    best = min(found, key=lambda e: (not e.naming.named, not e.naming.partial))
+    for ended in () if best.naming.named else found:
+        if time.monotonic() < end and (resorted := resort(ground, ended.naming)).named:
             return resorted
-    late = next((n.unfinished for n in found if n.unfinished), "")
+    late = next((e.naming.unfinished for e in found if e.naming.unfinished), "")
     if waiting:
         late = late or f"{len(waiting)} more searches over shorter windows were waiting"
-    refused = best.refused or next((n.refused for n in found if n.refused), "")
-    return replace(best, refused="" if best.named else refused, unfinished=late)
+    refused = best.naming.refused or next((e.naming.refused for e in found if e.naming.refused), "")
+    return replace(with_ties(best), refused="" if best.naming.named else refused, unfinished=late)
 
 
 def _ruled(scene: Scene, rules: Rules | None) -> Scene:

@@ -18,7 +18,7 @@ from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
-from dropo_torch.gap.rules import accounts, family_accounts, significant
+from dropo_torch.gap.rules import accounts, family_accounts, remains, significant
 from dropo_torch.gap.ties import canonical, rivals_of_all
 from dropo_torch.support.checkpoint import Checkpoint
 
@@ -65,6 +65,21 @@ class Naming:
     family: bool = False
 
 
+@dataclass(frozen=True)
+class Ended:
+    """Where a search ended.
+
+    Attributes:
+        ground: what it stood on, with the noise and the windows that it found.
+        state: with the named effects.
+        naming: what was found; what ties with it is told by :func:`with_ties`, for it costs as much as a round.
+    """
+
+    ground: Ground
+    state: State
+    naming: Naming
+
+
 def kept(path: Path, fingerprint: str) -> Checkpoint:
     """Return where a search keeps its state between rounds.
 
@@ -78,8 +93,8 @@ def kept(path: Path, fingerprint: str) -> Checkpoint:
 def search(
     ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = None, *, resume: bool = False,
     end: float = math.inf,
-) -> Naming:  # fmt: skip
-    """Return what is missing, beginning from the declared parameters' values.
+) -> Ended:  # fmt: skip
+    """Find what is missing, beginning from the declared parameters' values.
 
     Args:
         ground: what the search stands on.
@@ -109,7 +124,26 @@ def search(
             state = keep(step(hurried.at(state), state))
     except OutOfTime as error:
         unfinished = f"{error}, with {len(state.current.hypothesis.placed)} effects accepted"
-    return replace(conclude(ground.at(state), state), unfinished=unfinished)
+    ended = conclude(ground.at(state), state)
+    return replace(ended, naming=replace(ended.naming, unfinished=unfinished))
+
+
+def believed(ground: Ground, begin: Hypothesis, known: Ended) -> Ended | None:
+    """Return the end of a search on other windows with the names of an earlier one, if nothing remains there.
+
+    Args:
+        ground: what the search would stand on.
+        begin: the declared parameters' values.
+        known: where the earlier one ended, with names.
+    """
+    state = start(ground, begin, known.naming.first)
+    if state.done:
+        return None
+    current = ground.at(state).refit(known.naming.final.hypothesis)
+    state = renewed(ground, replace(state, current=current, number=1, attempts=known.state.attempts))
+    ended = conclude(ground.at(state), state)
+    cost, same = ended.naming.final.cost, len(ended.state.current.hypothesis.placed) == len(current.hypothesis.placed)
+    return ended if same and ended.naming.named and (ended.naming.partial or not remains(cost, ground.rules)) else None
 
 
 def start_anywhere(ground: Ground, begin: Hypothesis) -> State:
@@ -121,16 +155,23 @@ def start_anywhere(ground: Ground, begin: Hypothesis) -> State:
     return state if every.done else every
 
 
-def start(ground: Ground, begin: Hypothesis) -> State:
-    """Fit the declared parameters alone, with the influence of single windows capped, and screen beside them."""
+def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> State:
+    """Fit the declared parameters alone, with the influence of single windows capped, and screen beside them.
+
+    Args:
+        ground: what the search stands on.
+        begin: the declared parameters' values.
+        first: the screening, where it is known from other windows.
+    """
     ground.report("fitting the declared parameters", 0.0)
     since = np.zeros(len(ground.evidence.windows.commands), dtype=int)
     base = ground.refit(begin)
     noise = noise_beside(ground.evidence, ground.short, base)
     ground, base = with_base(ground.on(noise, since), base.hypothesis)
-    ranked, focus = ground.screened(base), ground.focus(base)
-    degrees = focus.evidence.degrees(focus.fitted.linear)
-    first = Screening(tuple(ranked), float((focus.residual**2).sum()), degrees)
+    if first is None:
+        ranked, focus = ground.screened(base), ground.focus(base)
+        degrees = focus.evidence.degrees(focus.fitted.linear)
+        first = Screening(tuple(ranked), float((focus.residual**2).sum()), degrees)
     missing = significant(base.cost, ground.rules)
     return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few)
 
@@ -159,15 +200,21 @@ def step(ground: Ground, state: State) -> State:
     return replace(found, number=number, done=is_done(ground, found) or number >= ground.rules.effects)
 
 
-def conclude(ground: Ground, state: State) -> Naming:
-    """Drop what is not needed, judge whether the rest accounts for the gap, and tell what ties with it."""
-    base, rules = state.base, ground.rules
-    unnamed = Naming(ground.evidence, base, state.first, base, gap=significant(base.cost, rules))
-    if not unnamed.gap:
-        return unnamed
+def conclude(ground: Ground, state: State) -> Ended:
+    """Drop what is not needed, and judge whether the rest accounts for the gap."""
+    gap = significant(state.base.cost, ground.rules)
+    unnamed = Naming(ground.evidence, state.base, state.first, state.base, gap)
+    if not gap:
+        return Ended(ground, state, unnamed)
     if state.family:
-        return conclude_family(ground, state, unnamed)
-    found, state = state.current, prune(ground, state)
+        return Ended(ground, state, conclude_family(ground, state, unnamed))
+    pruned = prune(ground, state)
+    return Ended(ground, pruned, judged(ground, pruned, state.current, unnamed))
+
+
+def judged(ground: Ground, state: State, found: Refit, unnamed: Naming) -> Naming:
+    """Return the effects that are left of those found with names, if they account for the gap; else without."""
+    base, rules = state.base, ground.rules
     unnamed = replace(unnamed, attempts=state.attempts, refused=state.refused)
     if reasons := nonsense(ground, state.current):
         return replace(unnamed, refused=reasons[0])
@@ -177,12 +224,17 @@ def conclude(ground: Ground, state: State) -> Naming:
         return replace(unnamed, refused=UNSURE if unsure else state.refused)
     if not partial and imitates(ground, state.current):
         return replace(unnamed, refused=IMITATES)
-    tied, shares, state = rivals_of_all(ground, state)
+    return replace(unnamed, refused="", final=state.current, named=True, partial=partial)
+
+
+def with_ties(ended: Ended) -> Naming:
+    """Return what was found, and what ties with it."""
+    naming, ground = ended.naming, ended.ground
+    if not naming.named or naming.family:
+        return naming
+    tied, shares, state = rivals_of_all(ground, ended.state)
     state, told = canonical(ground, state, tied)
-    return replace(
-        unnamed, refused="", final=state.current, named=True, ties=told, shares=tuple(shares), attempts=state.attempts,
-        partial=partial,
-    )  # fmt: skip
+    return replace(naming, final=state.current, ties=told, shares=tuple(shares), attempts=state.attempts)
 
 
 def resort(ground: Ground, naming: Naming) -> Naming:

@@ -72,6 +72,7 @@ class Twin:
         chunk_size: simulations at a time.
         warp: simulate with the Warp backend wherever it can; MuJoCo does the rest, with the same physics.
         standing: effects that every variant has, of the declared parameters' values ``(d,)``; those of the config.
+        coarser: the one of which this is the same with a finer step, whose transitions count these, too.
 
     Attributes:
         rates: for a column, the column that is its time derivative, or -1, ``(n,)``.
@@ -81,21 +82,27 @@ class Twin:
     def __init__(
         self, setting: Setting, space: ParameterSpace, *, num_threads: int = 0, chunk_size: int = 6000,
         warp: bool = False, standing: Callable[[np.ndarray], tuple[Placed, ...]] | None = None,
+        coarser: Twin | None = None,
     ) -> None:  # fmt: skip
         self.setting, self.space, self._standing, self._chunk = setting, space, standing, chunk_size
-        self.num_threads = num_threads
+        self.num_threads, self._warp = num_threads, warp
         self._engine = VariantEngine(setting, space, num_threads=num_threads, warp=warp)
         self.rates = np.array(observed_rates(setting))
         self._commands: np.ndarray | None = None
         self._filtered: dict[tuple, np.ndarray] = {}
-        self.simulated_transitions = 0
+        self.simulated_transitions, self._finer, self._coarser = 0, dict[float, Twin](), coarser
 
     def finer(self, step: float) -> Twin:
         """Return the same with another physics step, as ``integration`` has it: of filters and effects, too."""
-        model = applied(self.setting.model, [Placed(find_effect("integration"), None, (step,))])
-        ratio = round(self.setting.model.opt.timestep / step)
-        setting = replace(self.setting, model=model, frame_skip=self.setting.frame_skip * ratio)
-        return Twin(setting, self.space, num_threads=self.num_threads, chunk_size=self._chunk, standing=self._standing)
+        if step not in self._finer:
+            model = applied(self.setting.model, [Placed(find_effect("integration"), None, (step,))])
+            ratio = round(self.setting.model.opt.timestep / step)
+            setting = replace(self.setting, model=model, frame_skip=self.setting.frame_skip * ratio)
+            self._finer[step] = Twin(
+                setting, self.space, num_threads=self.num_threads, chunk_size=self._chunk, warp=self._warp,
+                standing=self._standing, coarser=self,
+            )  # fmt: skip
+        return self._finer[step]
 
     def effects(self, variant: Variant) -> tuple[Placed, ...]:
         """Return all effects of a variant, those that every variant has among them."""
@@ -142,7 +149,8 @@ class Twin:
                 truth = np.concatenate([states[:, :, None, index], path[..., index]], 2)
                 for k, columns in zip(part, truth, strict=True):
                     out[k, rows], valid[k, rows] = self._shown(variants[k], columns, length)
-        self.simulated_transitions += num_k * num_w * length
+        for twin in filter(None, (self, self._coarser)):
+            twin.simulated_transitions += num_k * num_w * length
         return out, valid
 
     def settled(self, variant: Variant, commands: np.ndarray) -> np.ndarray:

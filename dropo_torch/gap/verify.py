@@ -30,7 +30,7 @@ from dropo_torch.simulators.mujoco import MujocoSimulator
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)
 #: Simulations from which the error that noise alone makes is estimated, at least, and their seed.
-DRAWS, SEED = 150, 5
+DRAWS, SEED = 100, 5
 #: ε relative to the smallest variance of the measurement.
 BELOW = 1e-3
 #: Most windows that are scored: single steps, and open-loop stretches.
@@ -46,12 +46,14 @@ class Held:
         rows: those of its transitions that are scored as single steps.
         rollouts: open-loop stretches.
         seconds: length of a stretch.
+        floor: open-loop error of each feature that noise alone makes under the hypothesis they were cut for, ``(m,)``.
     """
 
     log: Trajectories
     rows: np.ndarray
     rollouts: Windows
     seconds: float
+    floor: np.ndarray
 
 
 def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
@@ -80,17 +82,21 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
     rows = known[np.unique(np.linspace(0, len(known) - 1, MOST).astype(int))]
     positions = position_features(setting)
     size = _rms(feature_sizes(setting, observation.observed(log.observations[rows]))[positions])
-    chosen, seconds = spread(cut_windows(log, observation, 1, stride=1, since=since), MOST), timestep
-    for wanted in SECONDS:
+
+    def over(wanted: float) -> Held:
         length = min(max(1, round(wanted / timestep)), longest_episode(log))
-        stride = max(1, length // 3)
-        windows = spread(cut_windows(log, observation, length, stride=stride, since=since), MOST_ROLLOUTS)
-        if len(windows):
-            chosen, seconds = windows, length * timestep
-            floor = _rms(rollout_floor(evidence.on(windows), hypothesis)[positions])
-            if floor < evidence.rules.weighed.growth * size:
+        windows = cut_windows(log, observation, length, stride=max(1, length // 3), since=since)
+        windows = spread(windows, MOST_ROLLOUTS if wanted else MOST)
+        floor = rollout_floor(evidence.on(windows), hypothesis) if len(windows) else np.zeros(evidence.chart.size)
+        return Held(log, rows, windows, length * timestep, floor)
+
+    found = None
+    for wanted in SECONDS:
+        if len((held := over(wanted)).rollouts):
+            found = held
+            if _rms(held.floor[positions]) < evidence.rules.weighed.growth * size:
                 break
-    return Held(log, rows, chosen, seconds)
+    return found or over(0.0)
 
 
 def position_features(setting: Setting) -> np.ndarray:
@@ -106,20 +112,32 @@ def score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
     Single steps are those of a fit: the same simulator, the same covariance by the noise of start and end. One that
     diverges makes its error infinite, as it does an open-loop one: no model gains by diverging.
     """
+    return _score_of(evidence, held, hypothesis, *_one_step(evidence, held, hypothesis))
+
+
+def scores(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> tuple[Score, Score]:
+    """Return :func:`score`, and what a perfect model would have by the noise of start and end alone.
+
+    Args:
+        evidence: with the noise.
+        held: cut for this hypothesis.
+        hypothesis: what is scored.
+    """
     error, covariance = _one_step(evidence, held, hypothesis)
+    mse = float(np.mean(np.einsum("tmm->tm", covariance)))
+    floor = _score(evidence, mse, _log_likelihood(covariance, covariance.shape[-1]), held.floor)
+    return _score_of(evidence, held, hypothesis, error, covariance), floor
+
+
+def _score_of(
+    evidence: Evidence, held: Held, hypothesis: Hypothesis, error: np.ndarray, covariance: np.ndarray
+) -> Score:
+    """The scores of a hypothesis, from its errors of single steps and their covariance."""
     mse, likelihood = math.inf, -math.inf
     if np.isfinite(error).all() and np.isfinite(covariance).all():
         solved = np.linalg.solve(covariance, error[..., None])[..., 0]
         mse, likelihood = float(np.mean(error**2)), _log_likelihood(covariance, (error * solved).sum(1))
     return _score(evidence, mse, likelihood, _rollout(evidence.on(held.rollouts), hypothesis))
-
-
-def floor_score(evidence: Evidence, held: Held, hypothesis: Hypothesis) -> Score:
-    """Return the scores that a perfect model would have, by the noise of start and end alone."""
-    _, covariance = _one_step(evidence, held, hypothesis)
-    mse = float(np.mean(np.einsum("tmm->tm", covariance)))
-    likelihood = _log_likelihood(covariance, covariance.shape[-1])
-    return _score(evidence, mse, likelihood, rollout_floor(evidence.on(held.rollouts), hypothesis))
 
 
 def _score(evidence: Evidence, mse: float, likelihood: float, rollout: np.ndarray) -> Score:
@@ -213,9 +231,8 @@ def open_loop_error(
         most = longest * setting.signals.timestep
         raise InputError(f"open loop: no trajectory of {log.source} lasts {seconds:g} s; at most {most:g} s")
     windows = spread(cut_windows(log, setting.observation, length, stride=max(1, length // 3)), MOST_ROLLOUTS)
-    held = Held(log, np.zeros(0, int), windows, seconds)
     own = _rollout(evidence.on(windows), hypothesis)
-    return _rms(own[position_features(setting)]), constant_velocity(evidence, held)
+    return _rms(own[position_features(setting)]), constant_velocity(evidence, windows)
 
 
 def _after(rows: np.ndarray, evidence: Evidence) -> np.ndarray:
@@ -223,9 +240,9 @@ def _after(rows: np.ndarray, evidence: Evidence) -> np.ndarray:
     return rows.reshape(*rows.shape[:2], -1, evidence.chart.size)[:, :, 1:]
 
 
-def constant_velocity(evidence: Evidence, held: Held) -> float:
-    """Return the open-loop error of positions that go on with the velocity at the start."""
-    windows, setting = held.rollouts, evidence.twin.setting
+def constant_velocity(evidence: Evidence, windows: Windows) -> float:
+    """Return the open-loop error of positions that go on with the velocity at the start of windows."""
+    setting = evidence.twin.setting
     time = np.arange(windows.length + 1)[None, :, None] * setting.signals.timestep
     moved = evidence.chart.move(windows.measured[:, :1], _rates(evidence, windows)[:, None] * time)
     error = evidence.chart.difference(windows.measured, moved)[:, 1:]
@@ -254,7 +271,7 @@ def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     Draws of the noise from which a perfect model would diverge tell no size and are left out.
     """
     m, num_windows = evidence.chart.size, len(evidence.windows)
-    count = max(4, -(-DRAWS // num_windows))
+    count = max(2, -(-DRAWS // num_windows))
     draws = np.random.default_rng(SEED).standard_normal((count, num_windows, m))
     moved = np.concatenate([np.zeros((1, num_windows, m)), draws])
     found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)

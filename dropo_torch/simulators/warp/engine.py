@@ -37,10 +37,11 @@ class Batch:
     Attributes:
         theta: parameter vectors as θ, ``(K, P)``.
         states: initial states, ``(T, nq + nv)``.
-        controls: controls of every logged step, ``(T, lag, nu)``.
+        controls: controls of every logged step, ``(T, lag, nu)``; ``(T, lag, nu + nv)`` with ``applied``.
         skip: physics steps of a logged step.
         paired: whether each transition has a parameter vector of its own (``T = K``); otherwise each is simulated
             under all of them.
+        applied: whether generalised forces, which act besides, stand after the controls.
     """
 
     theta: torch.Tensor
@@ -48,6 +49,7 @@ class Batch:
     controls: torch.Tensor
     skip: int
     paired: bool = False
+    applied: bool = False
 
     @property
     def lag(self) -> int:
@@ -126,6 +128,7 @@ class Engine:
         }  # fmt: skip
         self._worlds: dict[tuple[int, bool], World] = {}
         self._free: list[dict[str, Any]] = []
+        self._last: dict[str, Any] | None = None
         self._lock = threading.RLock()  # one call at a time in the scratch memory
         self._loaded: set[str] = set()
 
@@ -198,8 +201,8 @@ class Engine:
 
     def _forward(self, batch: Batch, out: torch.Tensor, first: int, count: int, keep: bool) -> Trace:
         """Simulate a chunk into the rows ``out`` of its logged steps."""
-        worlds = count if keep else self._slots(count)
-        memory = self._trajectory(worlds * _period(batch, keep) * self.tables.nstage)
+        rows = (count if keep else self._slots(count)) * _period(batch, keep) * self.tables.nstage
+        memory = self._trajectory(rows) if keep else self._passing(rows)
         trace = Trace(first, count, memory, wp.empty(count, dtype=wp.int32, device=self.device))
         self._launch(
             kernel_forward.simulate_kernel, batch, trace, [*batch.arrays, trace.alive, wp.from_torch(out)], keep
@@ -246,6 +249,7 @@ class Engine:
                 "first": trace.first + local, "local": local, "nparam": len(batch.theta), "each": batch.each,
                 "lag": batch.lag, "skip": batch.skip, "period": _period(batch, keep), "slot": slot,
                 "slot_stride": int(not self.is_cpu), "keep": int(keep),
+                "applied": int(batch.applied),
             })  # fmt: skip
             wp.launch(kernel, dim=number, inputs=[self.tables, world, chunk, *arguments], device=self.device)
 
@@ -270,6 +274,12 @@ class Engine:
         if self.is_cpu:
             return contextlib.nullcontext()
         return wp.ScopedStream(wp.stream_from_torch(torch.cuda.current_stream(batch.states.device)))
+
+    def _passing(self, rows: int) -> dict[str, Any]:
+        """Memory of a number of stages that no backward asks for, made once."""
+        if self._last is None or len(self._last["held"]) != rows:
+            self._last = self._trajectory(rows)
+        return self._last
 
     def _trajectory(self, rows: int) -> dict[str, Any]:
         """Memory of a number of stages, from those that a backward has given back."""

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 
 import mujoco
@@ -16,8 +16,11 @@ import torch
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.layout import DIRECT, MIXED, PAIR
 from dropo_torch.simulators.warp.pairs import mixing
+from dropo_torch.support.threads import single_thread
 
 _INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature"})
+#: The fields that are read: name of the section, field, columns kept of each row (0: all).
+_READ = (*DIRECT, *((field, field, 0) for field in MIXED))
 _MINVAL = 1e-15
 _MINMU = 1e-5
 #: The numbers of a section by its name, ``(K, n, width)``.
@@ -39,20 +42,18 @@ class Fields:
     """
 
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> None:
-        base, columns, start = [], {}, 0
+        columns, start = {}, 0
         self._raw_sections = {}
-        for name, field, keep in (*DIRECT, *((f, f, 0) for f in MIXED)):
-            array = np.atleast_1d(read_field(model, field)).astype(np.float64)
+        for name, field, keep in _READ:
+            array = np.atleast_1d(read_field(model, field))
             kept = np.ones(array.shape, dtype=bool)
             if keep:
                 kept[:, keep:] = False
-            base.append(array[kept])
+            size = int(kept.sum())
             columns[field] = np.where(kept.ravel(), kept.cumsum() - 1 + start, -1)
-            self._raw_sections[name] = (start, base[-1].size, keep or int(np.prod(array.shape[1:], dtype=int)))
-            start += base[-1].size
-        self._raw = torch.from_numpy(np.concatenate(base))
-        if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
-            self._raw[:3] = 0.0
+            self._raw_sections[name] = (start, size, keep or int(np.prod(array.shape[1:], dtype=int)))
+            start += size
+        self._raw = torch.from_numpy(_raw(model))
         self.sections = {name: self._raw_sections[name][:2] for name, _f, _k in DIRECT}
         self._direct = self.size = sum(size for _, size in self.sections.values())
         widths = {f"pair_{name}": width * len(pairs) for name, width in PAIR.items()} | {"dof_invweight": model.nv}
@@ -61,8 +62,7 @@ class Fields:
             self.size += width
         self._targets(space, columns)
         self._derive: tuple[Callable[[Section], torch.Tensor], ...] = (_Mixing(model, pairs), _Weights(model, pairs))
-        with torch.no_grad():
-            self._constant = [derive(partial(self._section, self._raw[None])) for derive in self._derive]
+        self._constant = self._derived(self._raw[None])
 
     def _targets(self, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
         """Columns that the parameters write, and those of θ whose gradient is wanted."""
@@ -94,6 +94,15 @@ class Fields:
         """Return θ of the model itself, ``(1, P)``."""
         return torch.cat([self._raw[None, : self._direct], *self._constant], dim=1).numpy()
 
+    def of(self, models: Sequence[mujoco.MjModel]) -> torch.Tensor:
+        """Return θ ``(K, P)`` of models that differ from this one in fields of θ only."""
+        raw = torch.from_numpy(np.stack([_raw(model) for model in models]))
+        return torch.cat([raw[:, : self._direct], *self._derived(raw)], dim=1)
+
+    def _derived(self, raw: torch.Tensor) -> list[torch.Tensor]:
+        with torch.no_grad(), single_thread():  # waking other threads for a few small matrices takes milliseconds
+            return [derive(partial(self._section, raw)) for derive in self._derive]
+
     def _section(self, raw: torch.Tensor, name: str) -> torch.Tensor:
         start, size, width = self._raw_sections[name]
         return raw[:, start : start + size].reshape(len(raw), size // width, width)
@@ -107,6 +116,18 @@ class Fields:
             for derive, varies, constant in zip(self._derive, self._varies, self._constant, strict=True)
         ]
         return torch.cat([raw[:, : self._direct], *derived], dim=1)
+
+
+def _raw(model: mujoco.MjModel) -> np.ndarray:
+    """The model's own numbers, from which θ is made."""
+    parts = []
+    for _, field, keep in _READ:
+        array = np.atleast_1d(read_field(model, field))
+        parts.append((array[:, :keep] if keep else array).ravel())
+    raw = np.concatenate(parts, dtype=np.float64)
+    if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
+        raw[:3] = 0.0
+    return raw
 
 
 class _Mixing:

@@ -266,7 +266,9 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
 
 @wp.func(inline=True)
 def add_forces(m: Tables, w: World, r: int):
-    """Load from dampers, F = −v (b + p0 |v| + p1 v²), springs and actuators."""
+    """Load from dampers, F = −v (b + p0 |v| + p1 v²), springs, actuators and what is applied besides."""
+    for i in range(m.nv * w.applied):
+        w.load[w.t, i] -= w.ctrl[w.rc, w.ctrl.shape[1] - m.nv + i]
     for i in range(m.nv * m.has_damper):
         v = w.qvel[r, i]
         n = wp.abs(v)
@@ -280,6 +282,8 @@ def add_forces(m: Tables, w: World, r: int):
 @wp.func(inline=True)
 def forces_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_forces`."""
+    for i in range(m.nv * w.applied):
+        w.ctrl_bar[w.rb, w.ctrl.shape[1] - m.nv + i] -= w.lam[w.t, i]
     for i in range(m.nv * m.has_damper):
         v = w.qvel[r, i]
         n = wp.abs(v)

@@ -31,6 +31,7 @@ def adjoint_kernel(
     tr = world // chunk.nparam
     w.th = theta[world % chunk.nparam]
     w.ctrl = controls
+    w.applied = chunk.applied
     w.ctrl_bar = control_bar
     w.t = chunk.slot + tid * chunk.slot_stride
     base = i * chunk.period * m.nstage
@@ -46,7 +47,7 @@ def adjoint_kernel(
         w.pos_bar[w.t, j] = blank
         w.rate_bar[w.t, j] = blank
     for row in range(i * chunk.lag, (i + 1) * chunk.lag):
-        for k in range(m.nu):
+        for k in range(control_bar.shape[1]):
             control_bar[row, k] = blank
     if alive[i] != 0 and seen != ZERO:
         for back in range(chunk.lag):

@@ -25,6 +25,7 @@ def simulate_kernel(
     tr = world // chunk.each
     w.th = theta[world % chunk.nparam]
     w.ctrl = controls
+    w.applied = chunk.applied
     w.t = chunk.slot + tid * chunk.slot_stride
     base = wp.where(chunk.keep != 0, i, w.t) * chunk.period * m.nstage
     for j in range(m.nq):

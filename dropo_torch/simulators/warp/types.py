@@ -162,14 +162,16 @@ World: Any = _struct(
         "ctrl": Reals2,
         "ctrl_bar": Reals2,
         **dict.fromkeys(("t", "rc", "rb"), wp.int32),
+        "applied": wp.int32,  # whether the last nv controls are generalised forces
     },
 )
 
 #: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each`` and parameter
-#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``.
+#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``. ``applied``: see the world's.
 Chunk: Any = _struct(
     "Chunk",
     dict.fromkeys(
-        ("first", "local", "nparam", "each", "lag", "skip", "period", "slot", "slot_stride", "keep"), wp.int32
+        ("first", "local", "nparam", "each", "lag", "skip", "period", "slot", "slot_stride", "keep", "applied"),
+        wp.int32,
     ),
 )

@@ -1,6 +1,9 @@
-"""Open-loop simulation of models that differ from each other in anything, one model at a time."""
+"""Simulation of models that differ from each other in anything, together where they share a structure."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -10,16 +13,43 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.warp.engine import Batch, Engine
-from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.layout import FIELDS
-from dropo_torch.simulators.warp.pairs import candidate_pairs
 
 #: Engines that are kept.
 KEPT = 64
 
 
+@dataclass(frozen=True)
+class Worlds:
+    """Models that are simulated together, each in a number of rows.
+
+    Attributes:
+        engines: for each structure among the models its engine, the rows of its models, and their θ ``(r, P)``.
+    """
+
+    engines: tuple[tuple[Engine, np.ndarray, torch.Tensor], ...]
+
+    def rollout(self, starts: np.ndarray, controls: np.ndarray, skip: int, *, applied: bool = False) -> np.ndarray:
+        """Return the states after every logged step ``(R, S, nq + nv)``, NaN throughout where one diverged.
+
+        Args:
+            starts: initial states ``(R, nq + nv)``.
+            controls: controls of every logged step ``(R, S, nu)``, or with generalised forces ``(R, S, nu + nv)``.
+            skip: physics steps of a logged step.
+            applied: whether there are such forces.
+        """
+        out = np.empty((*controls.shape[:2], starts.shape[1]))
+        for engine, rows, theta in self.engines:
+            states, inputs = (torch.from_numpy(np.ascontiguousarray(x[rows])) for x in (starts, controls))
+            flat, _ = engine.simulate(Batch(theta, states, inputs, skip, paired=True, applied=applied), keep=False)
+            out[rows] = flat.numpy().reshape(len(rows), *out.shape[1:])
+        with np.errstate(invalid="ignore"):
+            out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
+        return out
+
+
 class Variants:
-    """Simulates variants of a model with Warp; an engine is made for every structure that comes along.
+    """Makes worlds of variants of a model on Warp; an engine is made for every structure that comes along.
 
     Args:
         space: parameters, whose fields may vary within one engine.
@@ -31,31 +61,32 @@ class Variants:
         self._space, self._device, self._threads = space, device, num_threads
         self._engines: dict[bytes, Engine | None] = {}
 
-    def rollout(self, model: mujoco.MjModel, starts: np.ndarray, controls: np.ndarray) -> np.ndarray | None:
-        """Return the states after every physics step ``(W, S, nq + nv)``, NaN throughout where one diverged.
-
-        Args:
-            model: the variant, with its derived constants.
-            starts: initial states ``(W, nq + nv)``.
-            controls: controls of every physics step ``(W, S, nu)``.
+    def worlds(self, models: Sequence[mujoco.MjModel], each: int) -> Worlds | None:
+        """Return worlds of variants, with their derived constants, each in ``each`` rows.
 
         Returns:
-            ``None`` for a model outside the subset that Warp simulates.
+            ``None`` where one of them is outside the subset that Warp simulates.
         """
-        structure = _structure(model)
+        members: dict[bytes, list[int]] = {}
+        for k, model in enumerate(models):
+            members.setdefault(_structure(model), []).append(k)
+        found = []
+        for structure, own in members.items():
+            engine = self._of(structure, models[own[0]])
+            if engine is None:
+                return None
+            rows = (np.array(own)[:, None] * each + np.arange(each)).ravel()
+            theta = engine.fields.of([models[k] for k in own]).repeat_interleave(each, 0)
+            found.append((engine, rows, theta))
+        return Worlds(tuple(found))
+
+    def _of(self, structure: bytes, model: mujoco.MjModel) -> Engine | None:
+        """The engine of a structure, as a model has it; ``None`` outside the subset."""
         if structure not in self._engines:
             if len(self._engines) >= KEPT:
                 self._engines.pop(next(iter(self._engines)))
             self._engines[structure] = self._engine(model)
-        engine = self._engines[structure]
-        if engine is None:
-            return None
-        theta = Fields(model, self._space, candidate_pairs(model)).constant()
-        values, states, inputs = (torch.from_numpy(np.ascontiguousarray(x)) for x in (theta, starts, controls))
-        flat, _ = engine.simulate(Batch(values, states, inputs, skip=1), keep=False)
-        out = flat.numpy().reshape(len(starts), controls.shape[1], starts.shape[1])
-        out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
-        return out
+        return self._engines[structure]
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
         try:
