@@ -1155,7 +1155,7 @@ def test_second_search_over_shorter_windows_goes_on_too(tmp_path: Path) -> None:
     gap = search(hidden("hysteresis"), names, lambda stage, _: stages.append(stage), checkpoint=store, resume=True)
     assert lasting(gap) == lasting(plain)
     assert gap.simulated_transitions == plain.simulated_transitions
-    assert set(stages) <= {"preparing", "verifying"}
+    assert not any(stage.startswith(("fitting", "screening", "refitting")) for stage in stages)
 
 
 def late_after(monkeypatch: pytest.MonkeyPatch, calls: int) -> None:
