@@ -56,14 +56,14 @@ PLAN = (
     PAIRS,
     Stage("refitting families", 1.0, visits=0.2, rounds=True),
     PART,
-    Stage("fitting friction", 6.0, visits=0.1, rounds=True),
+    Stage("fitting friction", 3.0, visits=0.5, rounds=True),
     Stage("refining", 2.4, visits=0.8, rounds=True),
     SWAPPING,
     EXPLAINED,
     CHECKING,
     Stage("judging on all windows", 1.0, visits=0.0),
     TIES,
-    Stage("fitting on all windows", 1.0),
+    Stage("fitting on all windows", 1.3),
     VERIFYING,
     Stage("proposing a motion", 1.0, visits=0.5),
     Stage("comparing forces", 2.0, visits=0.0),
@@ -172,11 +172,12 @@ class Remaining:
         first, last = PLAN.index(PART), PLAN.index(EXPLAINED)
         hard = any(v.stage in HARD for v in self.visits)
         partly = 0.0 if self.row >= last else 1.0 if hard else PARTLY
+        effects = self.effects + (hard and self.row < last)  # another one, where one does not explain all
         ahead = []
         for row, stage in enumerate(PLAN):
             visits = stage.visits * ((row > self.row) * (partly if first <= row < last else 1.0))
             if stage == TIES and row >= self.row:
-                visits = max(self.effects - sum(v.stage == TIES for v in self.visits), 0)
+                visits = max(effects - sum(v.stage == TIES for v in self.visits), 0)
             ahead.append((stage, visits + AGAIN * partly * stage.visits * stage.rounds))
         return ahead
 
