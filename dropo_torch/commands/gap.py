@@ -40,6 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo gap``, which writes ``gap.json``, ``report.html``, and the model and config with what was missing."""
     from dropo_torch.gap import add, find_gap, prepare
+    from dropo_torch.gap.remaining import Remaining
     from dropo_torch.problem import logged_data, make_problem
     from dropo_torch.report import write_gap_report
 
@@ -54,7 +55,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     problem = make_problem(config, general=True)
     check_first(logged_data(problem), console, force=given.force)
     store = out / "gap-progress.bin"
-    with StageProgress(console, "gap") as progress:
+    with StageProgress(console, "gap", Remaining(given.time_limit)) as progress:
         progress.show("preparing", 0.0)
         scene = prepare(problem)  # before an earlier run is moved aside
         prepare_folder(out, problem.model_path, resume=given.resume and store.exists())

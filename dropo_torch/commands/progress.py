@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+from rich.progress import BarColumn, Progress, ProgressColumn, SpinnerColumn, Task, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 if TYPE_CHECKING:
     from dropo_torch.fit import Fit, HistoryEntry
+    from dropo_torch.gap.remaining import Remaining
     from dropo_torch.optimizers import Progress as OptimizerProgress
     from dropo_torch.problem import Problem
 
@@ -22,10 +25,10 @@ INTERVAL = 10.0
 class _Live(Progress):
     """A bar with a status while it is entered: redrawn in place on a terminal, a line every ten seconds elsewhere."""
 
-    def __init__(self, console: Console, label: str) -> None:
+    def __init__(self, console: Console, label: str, *columns: ProgressColumn) -> None:
         super().__init__(
             SpinnerColumn(), TextColumn("{task.description}", markup=False), BarColumn(bar_width=20),
-            TextColumn("{task.fields[status]}", markup=False), TimeElapsedColumn(),
+            TextColumn("{task.fields[status]}", markup=False), *columns, TimeElapsedColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
         self._label, self._last = label, time.monotonic()
@@ -50,15 +53,37 @@ class FitProgress(_Live):
         self._show(f"{done}, about {_duration(left)} left", progress.fraction)
 
 
-class StageProgress(_Live):
-    """The stage of a run; elsewhere than on a terminal a line for every stage."""
+class _LeftColumn(ProgressColumn):
+    """The time left, as it is when it is drawn."""
 
-    _stage = ""
+    def __init__(self, words: Callable[[], str]) -> None:
+        super().__init__()
+        self._words = words
+
+    def render(self, task: Task) -> Text:
+        return Text(self._words())
+
+
+class StageProgress(_Live):
+    """The stage of a run, and the time left if stages have a plan; elsewhere than on a terminal a line a stage."""
+
+    def __init__(self, console: Console, label: str, remaining: Remaining | None = None) -> None:
+        super().__init__(console, label, _LeftColumn(self._left))
+        self._stage, self._remaining = "", remaining
 
     def show(self, stage: str, share: float) -> None:
-        """Show a stage and how much of it is done."""
-        self._show(stage, share, interval=math.inf if stage == self._stage else -math.inf)
+        """Show a stage, and how much is done: of it, or of the whole run if stages have a plan."""
+        if self._remaining is not None:
+            now = time.monotonic()
+            self._remaining = self._remaining.told(stage, share, now)
+            share = self._remaining.share(now)
+        words = stage if self.console.is_terminal else ", ".join(filter(None, (stage, self._left())))
+        self._show(words, share, interval=math.inf if stage == self._stage else -math.inf)
         self._stage = stage
+
+    def _left(self) -> str:
+        left = math.nan if self._remaining is None else self._remaining.left(time.monotonic())
+        return "" if math.isnan(left) else f"about {_duration(left)} left"
 
 
 class TrainProgress(_Live):

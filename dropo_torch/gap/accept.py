@@ -125,6 +125,7 @@ def swap(ground: Ground, state: State) -> State:
     for _ in range(2):
         before = state.current
         for index in range(len(before.hypothesis.placed)):
+            ground.report("swapping", 0.0)
             without = ground.refit(state.current.hypothesis.without(index))
             focus = ground.focus(without)
             here = refit(focus.evidence, state.current.hypothesis, iterations=0, slopes=False).cost.chi2

@@ -156,6 +156,7 @@ class Ground:
     def screened(self, fitted: Refit) -> list[Candidate]:
         """Return what all candidates promise beside a fitted hypothesis."""
         stage = f"screening {len(self.candidates)} candidates"
+        self.report(stage, 0.0)
         return screen(self.focus(fitted), self.candidates, self.rules.tried, lambda share: self.report(stage, share))
 
     @property

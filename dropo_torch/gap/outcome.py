@@ -13,6 +13,7 @@ from dropo_torch.effects.base import Placed, Quantity, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
+from dropo_torch.gap.ground import Report
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
@@ -44,33 +45,37 @@ UNSEEN = (
 MEDIAN = 0.455
 
 
-def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
+def make_result(scene: Scene, naming: Naming, started: float, report: Report = lambda stage, share: None) -> Gap:
     """Fit what was named on all windows, score it on held-out data, and put everything together.
 
     Args:
         scene: what the search worked on.
         naming: what it found.
         started: when it began, by ``time.perf_counter``.
+        report: called with a stage and its share done.
     """
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
     rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
     last, rest = None, naming.final
     if naming.named:
+        report("fitting on all windows", 0.0)
         last, rest = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
         evidence, noise = replace(evidence, noise=last.evidence.noise), last.evidence.noise
     final = naming.final if last is None else last.fit
+    report("verifying", 0.0)
     held = cut_held(evidence, scene.held, final.hypothesis)
-    constant, (after_score, floor) = (
-        constant_velocity(evidence, held.rollouts),
-        scores(evidence, held, final.hypothesis),
-    )
+    report("verifying", 0.4)
+    after_score, floor = scores(evidence, held, final.hypothesis)
+    report("verifying", 0.7)
     given = score(evidence, held, base) if naming.named else after_score
+    constant = constant_velocity(evidence, held.rollouts)
     astray = after_score.rollout_rmse / max(floor.rollout_rmse, 1e-300)
     if not naming.gap and astray > rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(astray))
     if naming.named and not has_skill(after_score, floor, constant, rules.sound):
-        return make_result(scene, _without_names(naming, after_score, constant), started)
+        return make_result(scene, _without_names(naming, after_score, constant), started, report)
     skill = has_skill(given, floor, constant, rules.sound)
+    report("verifying", 0.8)
     short, best = scene.short, final.hypothesis
     before = free_forces(twin, short, base.variant, noise)
     after = free_forces(twin, short, best.variant, noise) if naming.named else before
@@ -87,7 +92,7 @@ def make_result(scene: Scene, naming: Naming, started: float) -> Gap:
         before=given,
         after=after_score,
         noise_floor=floor,
-        next_experiment=_next_experiment(naming, final),
+        next_experiment=_next_experiment(naming, final, report),
         found=naming.gap,
         declared=dict(zip(problem.space.names, declared, strict=True)),
         noise=tuple(noise.tolist()),
@@ -301,13 +306,15 @@ def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[
     return tuple(kept)
 
 
-def _next_experiment(naming: Naming, final: Refit) -> str | None:
+def _next_experiment(naming: Naming, final: Refit, report: Report) -> str | None:
     """What motion would tell tied effects apart, the first that are told so, or would show what this log cannot."""
     rivals: list[tuple[int, Placed]] = [(i, other) for i, tied in enumerate(naming.ties) for other in tied]
     if not rivals:
         return excite(naming.first.silent)
     best, said = final.hypothesis, ""
-    for index, other in rivals[: 1 if naming.family else RIVALS]:
+    rivals = rivals[: 1 if naming.family else RIVALS]
+    for number, (index, other) in enumerate(rivals):
+        report("proposing a motion", number / len(rivals))
         advice = suggest(naming.evidence, best, best.instead(index, other), best.placed[index], other)
         if advice.tells:
             return advice.sentence

@@ -116,8 +116,7 @@ def find_gap(
     scene = _ruled(scene or prepare(problem, rules), rules)
     ground, end = replace(_ground(scene, effects), report=report), time.monotonic() + time_limit
     naming = _name(scene, ground, checkpoint, resume, end)
-    report("verifying", 0.0)
-    gap = make_result(scene, naming, started)
+    gap = make_result(scene, naming, started, report)
     if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
         return gap
     return _by_forces(scene, ground, gap, naming.final.hypothesis.placed if naming.named else (), started)
@@ -155,6 +154,8 @@ def _name(
     found, waiting = list[Ended](), list(searched(scene))
     while waiting and (not found or time.monotonic() < end):
         suffix, evidence = waiting.pop(0)
+        if found:
+            ground.report("searching over shorter windows", 0.0)
         path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
         ends = share_of(end, len(waiting))
         found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume, end=ends))

@@ -168,17 +168,22 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
     base = ground.refit(begin)
     noise = noise_beside(ground.evidence, ground.short, base)
     ground, base = with_base(ground.on(noise, since), base.hypothesis)
+    missing = significant(base.cost, ground.rules)
+    if not missing:
+        ground.report("what is left looks like noise", 0.0)
     if first is None:
         ranked, focus = ground.screened(base), ground.focus(base)
         degrees = focus.evidence.degrees(focus.fitted.linear)
         first = Screening(tuple(ranked), float((focus.residual**2).sum()), degrees)
-    missing = significant(base.cost, ground.rules)
     return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few)
 
 
 def step(ground: Ground, state: State) -> State:
     """Accept one or two more effects, and swap those accepted before for better ones."""
     found = add(ground, state)
+    if not found.done:
+        rest = significant(found.current.cost, ground.rules)
+        ground.report("part of it is explained" if rest else "all but noise is explained", 1.0)
     if state.number == 0:
         found = with_family(ground, state, found)
     if found.family:
@@ -208,6 +213,8 @@ def conclude(ground: Ground, state: State) -> Ended:
         return Ended(ground, state, unnamed)
     if state.family:
         return Ended(ground, state, conclude_family(ground, state, unnamed))
+    if count := len(state.current.hypothesis.placed):
+        ground.report(f"checking {count} effect{'s' if count > 1 else ''}", 0.0)
     pruned = prune(ground, state)
     return Ended(ground, pruned, judged(ground, pruned, state.current, unnamed))
 

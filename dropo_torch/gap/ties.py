@@ -36,6 +36,7 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
         index: of the effect among those that are named.
     """
     current = state.current
+    ground.report("looking for ties", 0.0)
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
     ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
