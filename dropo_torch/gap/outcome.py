@@ -184,13 +184,13 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
     told beside it once more, for what the model's own step leaves passes for noise.
     """
     own = refit(evidence, hypothesis, iterations=6)
-    final = resolved(evidence, own)
+    final = resolved(evidence, own, anew=True)
     if final.error.any():
         noise = noise_beside(final.evidence, short, final.fit)
         if moved(noise, evidence.noise, evidence.rules):
             evidence = replace(evidence, noise=noise)
             own = refit(evidence, own.hypothesis, iterations=2)
-            final = resolved(evidence, own)
+            final = resolved(evidence, own, anew=True)
     rest = final.fit
     for _ in range(ROUNDS):
         if final.fit.cost.reduced < evidence.rules.sound.model_error:
@@ -201,7 +201,7 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
         smooth[0] = 1.0
         evidence = replace(evidence, model_error=smooth.ravel())
         own = refit(evidence, own.hypothesis, iterations=6)
-        final = resolved(evidence, own)
+        final = resolved(evidence, own, anew=True)
     return final, rest
 
 

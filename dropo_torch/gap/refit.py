@@ -13,6 +13,7 @@ from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, robust_factors, robust_loss
 from dropo_torch.gap.log import blocks_of
+from dropo_torch.gap.rules import remains
 from dropo_torch.gap.twin import Twin
 from dropo_torch.optimizers.least_squares import bounded_step
 
@@ -32,6 +33,8 @@ FEW = 30.0
 STEP_FIELD = "opt.timestep"
 #: Simulations with a finer step in which numbers settle there.
 MOVES = 4
+#: Iterations of a fit with the derivatives of a finer step.
+ANEW = 8
 
 
 @dataclass(frozen=True)
@@ -309,7 +312,7 @@ class Resolved:
     error: np.ndarray
 
 
-def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
+def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolved:
     """Return a fit as it would be under an endlessly fine step, where a finer one explains the log better.
 
     Dry friction, ripples and stops are resolved by a step only to first order in it, which with little noise is more
@@ -319,6 +322,8 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
     Args:
         evidence: the windows, with the weights of the fit.
         fitted: the fit under the model's own step. Its derivatives serve for the finer ones, too.
+        anew: whether to fit with the derivatives of the finer steps where more than noise remains beside the others:
+            what a coarse step distorts may be far from where it is with a finer one.
     """
     effect, vector = find_effect("integration"), fitted.hypothesis.vector
     own = Resolved(fitted, evidence, np.zeros(len(vector)))
@@ -327,6 +332,8 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
         return own
     finest = effect.quantities(evidence.twin.setting, None)[0].low
     finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
+    if anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules):
+        finer, coarser = (_anew(last) for last in (finer, coarser))
     fine, limits = finer.fit, limits_of(fitted.hypothesis, evidence.twin)
     if fine.loss >= fitted.loss:
         return own
@@ -338,6 +345,12 @@ def resolved(evidence: Evidence, fitted: Refit) -> Resolved:
 def half_widths(last: Resolved) -> np.ndarray:
     """Return half-widths of the 90 % intervals of all numbers ``(q,)``, in their units."""
     return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes), last.error)
+
+
+def _anew(last: Resolved) -> Resolved:
+    """A fit under another step, fitted with the derivatives that it has there."""
+    there = refit(last.evidence, last.fit.hypothesis, linear=last.fit.linear, iterations=ANEW)
+    return replace(last, fit=there) if there.loss < last.fit.loss else last
 
 
 def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
