@@ -222,6 +222,49 @@ def test_dry_friction_slides_and_sticks() -> None:
     assert forces(slid)[-1] == pytest.approx(1.5, rel=1e-3)
 
 
+#: A cart of 2 kg on a rail, whose friction gives over a centimetre.
+PRESLIDING = {"effect": "joint_presliding", "target": "rail", "coulomb": 0.5, "displacement": 0.01}
+
+
+def bristled(push: np.ndarray, fine: int = 100) -> np.ndarray:
+    """Positions of the cart after each physics step, by small Euler steps of Dahl's equation in time."""
+    x = v = z = 0.0
+    found = []
+    for force in push:
+        for _ in range(fine):
+            v += STEP / fine * (force - 0.5 * z) / 2
+            x += STEP / fine * v
+            z += STEP / fine * (v - abs(v) * z) / 0.01
+        found.append(x)
+    return np.array(found)
+
+
+def test_presliding_gives_and_slides() -> None:
+    """As Dahl's equation has it, over many reversals; at rest a spring, and in motion dry friction."""
+    push = np.repeat(np.random.default_rng(1).uniform(-1, 1, 12), 50)
+    expected = bristled(push)
+    np.testing.assert_allclose(driven([PRESLIDING], push)[:, 0], expected, atol=0.02 * np.abs(expected).max())
+    light, spring = driven([PRESLIDING], np.full(200, 0.002))[:, 0], 0.002 / 50  # N by N/m, under 2 kg
+    np.testing.assert_allclose(light, spring * (1 - np.cos(5 * STEP * np.arange(1, 201))), atol=0.1 * spring)
+    assert forces(driven([PRESLIDING], np.full(400, 2.0)))[-1] == pytest.approx(2 - 0.5, rel=1e-3)
+
+
+def test_presliding_begins_as_the_joint_moves() -> None:
+    """A simulation that begins in motion has its friction at once; one that begins at rest has none."""
+    for speed, friction in ((1.0, -0.5), (-1.0, 0.5), (0.0, 0.0)):
+        first = forces(driven([PRESLIDING], np.zeros(1), start=(0.0, speed)), speed)[0]
+        assert first == pytest.approx(friction, abs=1e-3)
+
+
+def test_presliding_is_no_stiffer_than_a_physics_step_can_hold() -> None:
+    """A displacement of nothing is dry friction, which holds the cart."""
+    hard = {**PRESLIDING, "displacement": 0.0}
+    held = driven([hard], np.full(400, 0.2))
+    assert np.abs(held[:, 0]).max() < 1e-4
+    assert np.abs(held[-1, 1]) < 1e-4
+    assert forces(driven([hard], np.full(400, 2.0)))[-1] == pytest.approx(1.5, rel=1e-3)
+
+
 @pytest.mark.parametrize("speed", [-1.5, 0.5])
 def test_passive_forces_of_a_joint(speed: float) -> None:
     def passive(name: str, *values: float) -> float:

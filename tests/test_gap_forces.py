@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -10,9 +10,10 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+from scipy.interpolate import CubicSpline
 
 import dropo_torch as dropo
-from dropo_torch.effects import VOCABULARY, find_effect
+from dropo_torch.effects import VOCABULARY, Effect, find_effect
 from dropo_torch.gap import add, find_gap
 from dropo_torch.gap.forces import regression
 from dropo_torch.gap.forces.motion import has_forces, low_pass
@@ -49,12 +50,14 @@ JOINTS, GEARS = ("base", "shoulder", "elbow"), np.array([1.0, 2.0, 1.0])
 
 def recorded(
     seed: int, *, friction: tuple[float, ...] = (0, 0, 0), offset: float = 0.0, center: float = 0.0,
-    ripple: float = 0.03, dt: float = 0.005, seconds: float = 40.0,
+    ripple: float = 0.03, dt: float = 0.005, seconds: float = 40.0, gives: tuple[float, ...] = (0, 0, 0),
+    at_rest: float = 0.01,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return rows of positions and velocities, and torques, of joints that follow sines exactly.
 
     Nothing is simulated: the torques are those that the motion needs, with dry friction, less a constant force at the
     shoulder, with the fore arm's centre of mass elsewhere, and with ripple relative to each joint's largest torque.
+    Friction falls below a speed, or gives over a displacement before the joint slides.
     """
     draw, n = np.random.default_rng(seed), int(seconds / dt)
     times, speed = np.arange(2 * n + 1) * 0.5 * dt, 2 * np.pi * np.array([0.13, 0.29, 0.53])
@@ -68,12 +71,27 @@ def recorded(
     for row, at in enumerate(range(1, 2 * n, 2)):
         data.qpos[:], data.qvel[:], data.qacc[:] = position[at], velocity[at], acceleration[at]
         mujoco.mj_inverse(model, data)
-        torque[row] = data.qfrc_inverse + friction * np.tanh(velocity[at] / 0.01) - [0, offset, 0]
+        torque[row] = data.qfrc_inverse + friction * np.tanh(velocity[at] / at_rest) - [0, offset, 0]
+    for joint in np.flatnonzero(gives):
+        bent = dahl(position[:, joint], 0.5 * dt, gives[joint])[1::2]
+        torque[:, joint] += friction[joint] * (bent - np.tanh(velocity[1::2, joint] / at_rest))
     middle, waves = times[1::2, None], draw.uniform(0.3, 3, 12)
     noise = sum(draw.normal(0, 1, 3) * np.sin(2 * np.pi * f * middle + draw.uniform(0, 6, 3)) for f in waves) / 6**0.5
     rows = np.concatenate([position[::2] + draw.normal(0, 1e-5, (n + 1, 3)),
                            velocity[::2] + draw.normal(0, 1e-3, (n + 1, 3))], 1)  # fmt: skip
     return rows, (torque + ripple * np.abs(torque).max(0) * noise) / GEARS
+
+
+def dahl(position: np.ndarray, step: float, displacement: float, fine: int = 40) -> np.ndarray:
+    """Return the deflection of bristles along a path, by small Euler steps of Dahl's equation in time."""
+    times = np.arange(len(position)) * step
+    speed = np.gradient(CubicSpline(times, position)(np.arange(fine * len(times)) * step / fine), step / fine)
+    bent, found = 0.0, np.empty(len(position))
+    for i, v in enumerate(speed):
+        if i % fine == 0:
+            found[i // fine] = bent
+        bent += step / fine * (v - abs(v) * bent) / displacement
+    return found
 
 
 def problem_of(folder: Path, seed: int, model: str = ARM, **truth: Any) -> Problem:
@@ -88,10 +106,10 @@ def problem_of(folder: Path, seed: int, model: str = ARM, **truth: Any) -> Probl
     return dropo.make_problem(dropo.load_config(folder / "arm.yaml"), general=True)
 
 
-def view_of(problem: Problem) -> ForceView | None:
+def view_of(problem: Problem, effects: Sequence[Effect] = tuple(VOCABULARY.values())) -> ForceView | None:
     log = problem.trajectories
     train, held = hold_out(replace(log, dt=log.dt or problem.simulator.timestep))
-    return force_view(make_setting(problem, train), train, held, list(VOCABULARY.values()), Forces())
+    return force_view(make_setting(problem, train), train, held, effects, Forces())
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -106,6 +124,30 @@ def test_friction_offset_and_center_are_named(tmp_path: Path, seed: int) -> None
     assert found["actuator_bias", "m2"] == pytest.approx(0.2, abs=0.02)
     assert found["center_of_mass", "fore"][2] == pytest.approx(0.05, abs=0.005)
     assert (view.after < 0.2 * view.before).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_friction_that_gives_is_named_with_its_displacement(tmp_path: Path, seed: int) -> None:
+    """Where it gives, and nowhere else, also beside other effects."""
+    truth = {"friction": (0.5, 0.8, 0.3), "gives": (0.02, 0, 0.03), "offset": 0.4, "ripple": 0.02}
+    view = view_of(problem_of(tmp_path, seed, **truth))
+    found = {p.key: np.array(p.values) for p in view.placed if p.effect.kind == "joint"}
+    assert {*found} == {("joint_presliding", "base"), ("joint_friction", "shoulder"), ("joint_presliding", "elbow")}
+    assert found["joint_presliding", "base"][0] == pytest.approx(0.5, rel=0.03)
+    assert found["joint_presliding", "elbow"][0] == pytest.approx(0.3, rel=0.03)
+    for joint, displacement in (("base", 0.02), ("elbow", 0.03)):
+        assert found["joint_presliding", joint][1] == pytest.approx(displacement, rel=0.1)
+    sharp = [e for e in VOCABULARY.values() if e.name != "joint_presliding"]
+    problem = problem_of(tmp_path, seed, **truth)
+    assert (view.after < view_of(problem, sharp).after)[[0, 2]].all()
+
+
+@pytest.mark.parametrize("at_rest", [0.01, 0.1])
+def test_friction_that_depends_on_the_velocity_does_not_give(tmp_path: Path, at_rest: float) -> None:
+    """However slowly it builds up with the velocity."""
+    view = view_of(problem_of(tmp_path, 2, friction=(0.5, 0.8, 0.3), at_rest=at_rest, ripple=0.02))
+    assert {p.key for p in view.placed} >= {("joint_friction", j) for j in JOINTS}
+    assert "joint_presliding" not in {p.effect.name for p in view.placed}
 
 
 def test_intervals_hold_the_truth(tmp_path: Path) -> None:

@@ -38,6 +38,7 @@ from dropo_torch.rl import (
     load_source,
     load_task,
 )
+from dropo_torch.rl.stepper import MujocoStepper
 from dropo_torch.simulators import make_simulator
 
 MASSES = ParameterSpace(SIM.model, SIM.parameters)
@@ -551,6 +552,10 @@ CASES: dict[str, tuple[list[dict], Mapping[str, Mapping[str, Any]]]] = {
         [{"effect": "joint_stribeck", "target": "slide", "coulomb": 1.0, "static": 2.0}],
         {"x": {"effect": "joint_stribeck", "name": "slide", "index": "velocity", "bounds": [0.05, 0.5]}},
     ),
+    "presliding": (
+        [{"effect": "joint_presliding", "target": "slide", "coulomb": 1.0}],
+        {"x": {"effect": "joint_presliding", "name": "slide", "index": "displacement", "bounds": [0.002, 0.05]}},
+    ),
     "wrench": (
         [{"effect": "external_force", "target": "cart", "y": 0.0, "z": 0.0}],
         {"x": {"effect": "external_force", "name": "cart", "index": "x", "bounds": [-3.0, 3.0]}},
@@ -779,6 +784,23 @@ def test_a_state_in_memory_is_a_snapshot() -> None:
     again, _ = driven(env, actions, td=td.clone())
     for a, b in zip(first, again, strict=True):
         assert torch.equal(a["next", "observation"], b["next", "observation"])
+
+
+def test_a_snapshot_has_what_forces_remember() -> None:
+    """Bristles that are bent stay so: the forces after a snapshot are those that follow it, whatever came between."""
+    space = ParameterSpace.empty(CartPole().model)
+    given = [{"effect": "joint_presliding", "target": "slide", "coulomb": 1.0, "displacement": 0.01}]
+    stepper = MujocoStepper(space, 2, frame_skip=2, effects=effects_on(space, given, 2, RAIL), num_threads=1)
+    rows, none, push = torch.arange(2), torch.zeros(2, 0, dtype=torch.float64), torch.full((2, 1, 1), 0.2)
+    stepper.reset(rows, torch.zeros(2, 4, dtype=torch.float64), none)
+    for _ in range(10):
+        stepper.step(push)
+    kept = stepper.state_dict()
+    first = [stepper.step(-push) for _ in range(5)]
+    stepper.reset(rows, torch.ones(2, 4, dtype=torch.float64), none)
+    stepper.load_state_dict(kept, none)
+    for expected in first:
+        assert torch.equal(stepper.step(-push), expected)
 
 
 def test_a_space_over_another_model_brings_its_bounds_and_its_time() -> None:

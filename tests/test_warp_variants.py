@@ -101,3 +101,10 @@ def test_pushes_are_those_of_mujoco() -> None:
     pushed, same = (simulated(engine, variants, pushes=pushes) for engine in (ours, theirs))
     np.testing.assert_allclose(pushed, same, rtol=0, atol=1e-8)
     assert np.abs(pushed - simulated(ours, variants)).max() > 1e-3
+
+
+def test_a_force_that_is_there_twice_acts_twice() -> None:
+    one, two = (("joint_cogging", "elbow", (a, 3.0, 0.2)) for a in (0.25, 0.5))
+    for engine in engines():
+        twice, once = simulated(engine, [variant((one, one), 0.7), variant((two,), 0.7)])
+        np.testing.assert_allclose(twice, once, rtol=0, atol=1e-12)

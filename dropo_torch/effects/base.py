@@ -211,6 +211,22 @@ class Effect(abc.ABC):
         """Return generalised forces ``(R, nv)`` at states ``(R, nq)`` and ``(R, nv)``."""
         return np.zeros_like(velocity)
 
+    def recall(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        """Return what a force remembers of the past where a simulation begins, ``(R, k)``; by default, nothing."""
+        return np.zeros((len(position), 0))
+
+    def force_after(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        memory: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Return :meth:`force` with what it remembers of the states before, and what it remembers then, ``(R, k)``.
+
+        It is called once in every physics step, first with :meth:`recall`. By default, a force remembers nothing.
+        """
+        return self.force(setting, target, values, position, velocity), memory
+
     def wrench(self, setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray:
         """Return constant world-frame forces and torques on the bodies' centres ``(nbody, 6)``, of values ``(p,)``."""
         return np.zeros((setting.model.nbody, 6))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import copy
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import mujoco
 import mujoco.batch
@@ -36,23 +36,35 @@ class Variant:
         return any(p.effect.has(m) for p in self.placed for m in methods)
 
 
+@dataclass
+class Memory:
+    """What a force remembers in its rows, ``(R, k)``; ``None`` before the first physics step of a simulation."""
+
+    now: np.ndarray | None = None
+
+
 @dataclass(frozen=True)
 class Force:
-    """An effect that is a force, and the rows on which it acts, with their numbers ``(R, p)`` or ``(1, p)``."""
+    """An effect that is a force, and the rows on which it acts, with their numbers ``(R, p)`` or ``(1, p)``.
+
+    It lasts for one simulation, whose past is in ``memory``.
+    """
 
     effect: Effect
     target: str | None
     values: np.ndarray
     rows: slice | np.ndarray
+    memory: Memory = field(default_factory=Memory)
 
 
 def forces_of(variants: Sequence[Variant], each: int) -> list[Force]:
     """Return the forces of variants, each in ``each`` rows; those of one effect at one target together."""
     acting: dict[tuple, list[tuple[int, Placed]]] = {}
     for k, variant in enumerate(variants):
-        for p in variant.placed:
-            if p.effect.has("force"):
-                acting.setdefault((*p.key, len(p.values)), []).append((k, p))
+        own = [p for p in variant.placed if p.effect.has("force")]
+        for i, p in enumerate(own):  # one that is there twice acts twice
+            twice = sum(p.key == other.key for other in own[:i])
+            acting.setdefault((*p.key, twice), []).append((k, p))
     found = []
     for group in acting.values():
         members, first = np.array([k for k, _ in group]), group[0][1]
@@ -90,8 +102,11 @@ class Forces:
         ahead[:, self._position] += 0.5 * step * velocity[:, self._velocity]
         then, out = velocity + 0.5 * (velocity - before), np.zeros_like(velocity)
         for f in acting:
+            own = self._setting, f.target, f.values
             with np.errstate(all="ignore"):
-                found = f.effect.force(self._setting, f.target, f.values, ahead[f.rows], then[f.rows])
+                if f.memory.now is None:
+                    f.memory.now = f.effect.recall(*own, position[f.rows], velocity[f.rows])
+                found, f.memory.now = f.effect.force_after(*own, ahead[f.rows], then[f.rows], f.memory.now)
             out[f.rows] += np.nan_to_num(found)
         return out
 

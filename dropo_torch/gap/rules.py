@@ -233,6 +233,8 @@ class Forces:
         blocks: stretches of the log that count as independent, at least and at most.
         sampled: change of the logarithm of a joint's missing force, where every second row of the log is left out, from
             which on sampling makes too much of it.
+        gives: share of what friction leaves that depends on the velocity alone, at its joint, that friction which gives
+            before it slides may leave to take its place.
     """
 
     left: float = 0.25
@@ -241,6 +243,7 @@ class Forces:
     error: float = 0.05
     blocks: tuple[int, int] = (8, 20)
     sampled: float = 0.2
+    gives: float = 0.9
 
 
 @dataclass(frozen=True)

@@ -23,6 +23,7 @@ _NOUNS = {
     "joint_friction": "dry (Coulomb) friction in {0}",
     "joint_stribeck": "dry friction in {0} that is larger at rest than in motion (Stribeck)",
     "joint_soft_friction": "dry (Coulomb) friction in {0} that creeps at rest",
+    "joint_presliding": "dry friction in {0} that gives elastically before it slides",
     "joint_friction_slope": "dry friction in {0} that changes along its range",
     "joint_stiffness": "a spring at {0}",
     "joint_cogging": "a force at {0} that is periodic in its position (cogging)",

@@ -4,6 +4,7 @@ wrenches), and outside them, from step to step (what reaches the actuators, and 
 from __future__ import annotations
 
 import copy
+import itertools
 import math
 from typing import Any, Literal
 
@@ -14,10 +15,10 @@ import torch
 from torch.nn.functional import pad
 
 from dropo_torch.data.observation import parse_observation
-from dropo_torch.effects.engine import Force, Forces, ModelRefused, Variant, VariantEngine
+from dropo_torch.effects.engine import Force, Forces, Memory, ModelRefused, Variant, VariantEngine
 from dropo_torch.effects.filters import extended, filters_of, observed_rates, rate_columns, sensed
 from dropo_torch.effects.path import SensedPath
-from dropo_torch.effects.placing import EffectSet, plain_setting
+from dropo_torch.effects.placing import EffectSet, Entry, plain_setting
 from dropo_torch.effects.simulator import LONGEST_HISTORY, apply_native, finer_steps, overlap
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
@@ -131,6 +132,7 @@ class RowForces:
     Attributes:
         any: whether there are forces that depend on the state.
         before: velocities one physics step ago, ``(N, nv)``.
+        memory: what the forces remember, ``(N, k)``.
     """
 
     def __init__(self, batch: mujoco.batch.Batch, effects: EffectSet) -> None:
@@ -141,6 +143,14 @@ class RowForces:
         self._values = [np.full((batch.nsim, len(e.fixed)), e.fixed) for e in self._entries]
         self.any = bool(self._entries)
         self.before = np.zeros_like(self._qvel)
+        remembered = [self._recalled(e, own) for e, own in zip(self._entries, self._values, strict=True)]
+        self.memory = np.concatenate([np.zeros((batch.nsim, 0)), *remembered], 1)
+        ends = np.cumsum([0, *(part.shape[1] for part in remembered)]).tolist()
+        self._parts = [self.memory[:, a:b] for a, b in itertools.pairwise(ends)]
+
+    def _recalled(self, entry: Entry, values: np.ndarray, ids: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """What a force remembers where episodes begin in the states in place, ``(k, n)``."""
+        return entry.effect.recall(self._setting, entry.target, values, self._qpos[ids], self._qvel[ids])
 
     def write(self, ids: np.ndarray, values: np.ndarray) -> None:
         """Give simulations ``ids`` the numbers in values ``(k, d)``."""
@@ -150,6 +160,8 @@ class RowForces:
     def restart(self, ids: np.ndarray, values: np.ndarray) -> None:
         """Begin episodes in simulations whose states have just been set, with values ``(k, d)``."""
         self.before[ids] = self._qvel[ids]
+        for entry, own, part in zip(self._entries, self._values, self._parts, strict=True):
+            part[ids] = self._recalled(entry, own[ids], ids)
         for row, vector in zip(ids, values, strict=True) if self._wrenches else ():
             self._wrench[row] = sum(
                 e.effect.wrench(self._setting, e.target, e.values(vector[None])[0]) for e in self._wrenches
@@ -159,10 +171,12 @@ class RowForces:
         """Set the forces that act in the next physics step of simulations ``ids``."""
         step, velocity = float(self._setting.model.opt.timestep) / finer, self._qvel[ids]
         acting = [
-            Force(e.effect, e.target, own[ids] if e.varies else own[:1], slice(None))
-            for e, own in zip(self._entries, self._values, strict=True)
+            Force(e.effect, e.target, own[ids] if e.varies else own[:1], slice(None), Memory(part[ids]))
+            for e, own, part in zip(self._entries, self._values, self._parts, strict=True)
         ]
         self._force[ids] = self._forces(acting, self._qpos[ids], velocity, self.before[ids], step)
+        for force, part in zip(acting, self._parts, strict=True):
+            part[ids] = force.memory.now
         self.before[ids] = velocity
 
 

@@ -148,7 +148,8 @@ class MujocoStepper(BatchStepper):
 
     def _kept(self) -> dict[str, np.ndarray]:
         """What the next steps depend on, as live arrays of a row for each environment."""
-        return {"rows": self._batch.state, "failed": self._failed, "before": self._forces.before}
+        kept = {"rows": self._batch.state, "failed": self._failed, "before": self._forces.before}
+        return {**kept, "memory": self._forces.memory} if self._forces.memory.size else kept
 
 
 def make_stepper(

@@ -350,6 +350,8 @@ def _acts(case: EffectCase, target: str | None) -> dict[str, Callable[[], list[t
     if effect.has("force"):
         q, v = (x.contiguous().numpy() for x in (case.states[:, :nq], case.states[:, nq:]))
         acts["force"] = lambda: kept(effect.force, setting, target, rows.numpy(), q, v)
+        memory = effect.recall(setting, target, rows.numpy(), q, v)
+        acts["force_after"] = lambda: kept(effect.force_after, setting, target, rows.numpy(), -q, v, memory)
     if effect.has("wrench"):
         acts["wrench"] = lambda: kept(effect.wrench, setting, target, values)
     if effect.has("command"):
@@ -400,7 +402,13 @@ def _row_by_row(case: EffectCase, target: str | None, rows: torch.Tensor) -> lis
         def force(part: slice, values: torch.Tensor) -> torch.Tensor:
             return torch.from_numpy(effect.force(setting, target, values.numpy(), q[part], v[part]))
 
+        def later(part: slice, values: torch.Tensor) -> torch.Tensor:
+            own = setting, target, values.numpy()
+            return torch.cat([torch.from_numpy(x) for x in effect.force_after(
+                *own, 0.9 * q[part], -v[part], effect.recall(*own, q[part], v[part]))], 1)  # fmt: skip
+
         found.append(("force", lambda values: force(slice(None), values), force))
+        found.append(("force_after", lambda values: later(slice(None), values), later))
     if effect.has("command"):
 
         def command(part: slice, values: torch.Tensor) -> torch.Tensor:
@@ -414,6 +422,17 @@ def _row_by_row(case: EffectCase, target: str | None, rows: torch.Tensor) -> lis
 
         found.append(("sense", lambda values: sense(slice(None), values), sense))
     return found
+
+
+def _a_force_without_a_past_is_that_of_its_state(case: EffectCase) -> None:
+    _needs(case, "force")
+    effect, nq = case.effect, case.setting.model.nq
+    q, v = case.states[:, :nq].numpy(), case.states[:, nq:].numpy()
+    for target in case.places:
+        own = case.setting, target, case.rows(target).numpy()
+        found, expected = effect.force_after(*own, q, v, effect.recall(*own, q, v))[0], effect.force(*own, q, v)
+        where = f"force_after of what is recalled at {target}"
+        _require_close(torch.from_numpy(found), torch.from_numpy(expected), _SAME_SIGNAL, where, "the force")
 
 
 def _commands_in_pieces_are_those_in_one(case: EffectCase) -> None:
@@ -524,6 +543,7 @@ LAWS: Sequence[Callable[[EffectCase], None]] = (
     _it_is_kept_by_its_name,
     _the_same_numbers_do_the_same_and_nothing_given_is_changed,
     _rows_do_not_depend_on_each_other,
+    _a_force_without_a_past_is_that_of_its_state,
     _commands_in_pieces_are_those_in_one,
     _a_settled_filter_is_steady,
     _what_lies_beyond_its_memory_does_not_matter,

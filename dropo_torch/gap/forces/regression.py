@@ -157,11 +157,15 @@ def chances(regression: Regression, chosen: np.ndarray, parts: Iterable[np.ndarr
     whole = unseen(regression, chosen)
     size, found = whole.mean(0), []
     for part in parts:
-        gains = ((unseen(regression, chosen & ~part) - whole) / size).sum(1)
-        spread = max(float(gains.std(ddof=1)), 1e-300) / np.sqrt(len(gains))
-        by_size = float(stats.t.sf(gains.mean() / spread, len(gains) - 1))
-        found.append(min(1.0, 2 * min(by_size, p_of_ranks(gains))))
+        found.append(chance_of(((unseen(regression, chosen & ~part) - whole) / size).sum(1)))
     return found
+
+
+def chance_of(gains: np.ndarray) -> float:
+    """Return how likely chance alone makes the blocks gain as much, ``(B,)``, in the mean or in ranks."""
+    spread = max(float(gains.std(ddof=1)), 1e-300) / np.sqrt(len(gains))
+    by_size = float(stats.t.sf(gains.mean() / spread, len(gains) - 1))
+    return min(1.0, 2 * min(by_size, p_of_ranks(gains)))
 
 
 def half_widths(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:

@@ -15,6 +15,8 @@ from dropo_torch.gap.forces.motion import Stretch
 
 #: The effects in whose numbers the forces are linear.
 FRICTION, OFFSET, CENTER = "joint_friction", "actuator_bias", "center_of_mass"
+#: Friction that gives before it slides: linear, too, once its displacement is known.
+PRESLIDING = "joint_presliding"
 LINEAR = (FRICTION, "joint_damping", OFFSET, CENTER, "armature")
 #: Speed, by a joint's root mean square, at which dry friction is three quarters of what it is in full motion.
 AT_REST = 0.02
@@ -93,10 +95,7 @@ def _columns(setting: Setting, part: Stretch, placed: Placed) -> list[np.ndarray
     """Forces ``(N, nv)`` that a unit of each of an effect's numbers needs."""
     model, zero = setting.model, np.zeros(part.velocity.shape)
     if placed.effect.name == FRICTION:
-        dof = setting.dof(placed.target)
-        at_rest = AT_REST * max(float(setting.signals.speed[dof]), 1e-12)
-        zero[:, dof] = np.tanh(part.velocity[:, dof] / at_rest)
-        return [zero]
+        return [_against(setting, part, placed.target, AT_REST)]
     if placed.effect.name == OFFSET:  # a force that is there and not logged: so much less is missing
         actuator = object_number(model, "actuator", placed.target)
         joint = driven_joint(model, actuator)
@@ -104,6 +103,18 @@ def _columns(setting: Setting, part: Stretch, placed: Placed) -> list[np.ndarray
         zero[:, model.jnt_dofadr[joint]] = -model.actuator_gear[actuator, 0]
         return [zero]
     return [_slope(setting, part, placed, i) for i in range(len(placed.values))]
+
+
+def sharp(setting: Setting, parts: Sequence[Stretch], joint: str | None, at_rest: float) -> np.ndarray:
+    """Return the forces ``(N, nv)`` that a unit of friction needs which falls below a share of the joint's speed."""
+    return np.concatenate([part.compared(_against(setting, part, joint, at_rest)) for part in parts])
+
+
+def _against(setting: Setting, part: Stretch, joint: str | None, at_rest: float) -> np.ndarray:
+    """Forces ``(N, nv)`` that a unit of dry friction needs."""
+    found, dof = np.zeros(part.velocity.shape), setting.dof(joint)
+    found[:, dof] = np.tanh(part.velocity[:, dof] / (at_rest * max(float(setting.signals.speed[dof]), 1e-12)))
+    return found
 
 
 def _slope(setting: Setting, part: Stretch, placed: Placed, number: int) -> np.ndarray:

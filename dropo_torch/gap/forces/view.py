@@ -12,10 +12,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dropo_torch.data.trajectory import Trajectories
-from dropo_torch.effects.base import Effect, Placed, Setting
+from dropo_torch.effects.base import Effect, Placed, Setting, find_effect
 from dropo_torch.gap.forces.motion import FORCES, KEPT, has_forces, highest_frequency, stretches
+from dropo_torch.gap.forces.presliding import displacements, giving, halves
 from dropo_torch.gap.forces.regression import GAIN, Regression, chances, fit, half_widths, score, select, unseen
-from dropo_torch.gap.forces.terms import CENTER, Terms, linear_effects, needed, terms
+from dropo_torch.gap.forces.terms import CENTER, FRICTION, PRESLIDING, Terms, linear_effects, needed, terms
 from dropo_torch.gap.rules import Forces
 
 #: Rows in half an oscillation at the highest frequency of the motion, which count as one observation.
@@ -90,23 +91,36 @@ def force_view(
     blocks = _blocks(seen.episodes, rules)
     if blocks is None:
         return None
-    regression, unknown = _regression(seen, blocks), _regression(last, last.episodes)
-    chosen = _sure(seen, regression, select(regression, seen.owner, _families(seen)), rules)
-    found, theirs = fit(regression, chosen), _coefficients(placed, last.owner, rival)
+    regression, theirs = _regression(seen, blocks), _coefficients(placed, last.owner, rival)
+    left_by_rival = None if theirs is None else _regression(last, last.episodes).left(theirs)
+    chosen = select(regression, seen.owner, _families(seen))
+    given = displacements(setting, parts, seen, regression, chosen, rules) if find_effect(PRESLIDING) in known else {}
+    if given:
+        seen, last = giving(setting, parts, seen, given), giving(setting, others, last, given)
+        regression = _regression(seen, blocks)
+        chosen = select(regression, seen.owner, _families(seen))
+    chosen = _sure(seen, regression, chosen, rules)
+    found = fit(regression, chosen)
     named = ForceView(
-        np.concatenate([part.compared(part.velocity) for part in others]), last.missing, unknown.left(found),
-        None if theirs is None else unknown.left(theirs),
+        np.concatenate([part.compared(part.velocity) for part in others]), last.missing,
+        _regression(last, last.episodes).left(found), left_by_rival,
     )  # fmt: skip
     if not chosen.any() or named.share(named.left) > rules.left:
         return replace(named, left=last.missing)
-    members, halves = np.unique(seen.owner[chosen]), half_widths(regression, chosen, found)
     return replace(
         named,
-        placed=tuple(placed[i].at(np.array(placed[i].values) + found[seen.owner == i]) for i in members),
-        halves=tuple(halves[seen.owner == i] for i in members),
+        placed=tuple(_moved(seen.placed[i], found[seen.owner == i]) for i in np.unique(seen.owner[chosen])),
+        halves=tuple(halves(setting, parts, seen, regression, chosen, found)),
         shares=_shares(regression, chosen, seen.owner),
         ties=_ties(seen, regression, chosen),
     )
+
+
+def _moved(placed: Placed, numbers: np.ndarray) -> Placed:
+    """An effect whose first numbers, those in which forces are linear, are away from their neutral values."""
+    values = np.array(placed.values)
+    values[: len(numbers)] += numbers
+    return placed.at(values)
 
 
 def _coefficients(placed: Sequence[Placed], owner: np.ndarray, rival: Sequence[Placed]) -> np.ndarray | None:
@@ -150,8 +164,8 @@ def _regression(found: Terms, blocks: np.ndarray) -> Regression:
 
 
 def _families(found: Terms) -> np.ndarray:
-    """The kind of effect of each column, ``(P,)``."""
-    names = [p.effect.name for p in found.placed]
+    """The kind of effect of each column, ``(P,)``; friction is of one kind, whether or not it gives."""
+    names = [FRICTION if p.effect.name == PRESLIDING else p.effect.name for p in found.placed]
     kinds = {name: number for number, name in enumerate(dict.fromkeys(names))}
     return np.array([kinds[n] for n in names])[found.owner]
 

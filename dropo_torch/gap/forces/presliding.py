@@ -1,0 +1,136 @@
+"""Where dry friction gives before it slides, and over which motion it builds up: what unseen blocks say."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from dropo_torch.effects.base import Placed, Setting, find_effect
+from dropo_torch.effects.presliding import PAST, bristle_after
+from dropo_torch.gap.forces.motion import Stretch
+from dropo_torch.gap.forces.regression import Regression, chance_of, half_widths, unseen
+from dropo_torch.gap.forces.terms import AT_REST, FRICTION, PRESLIDING, Terms, sharp
+from dropo_torch.gap.rules import Forces
+
+#: Displacements that are tried, by the measured range of the joint.
+SHARES = tuple(1e-4 * 2.0**n for n in range(10))
+#: Factors that are tried next to the best of them, in turn.
+FINER = ((2.0**-0.5, 2.0**0.5), (2.0**-0.25, 2.0**0.25), (2.0**-0.125, 2.0**0.125))
+#: Speeds below which friction that depends on the velocity alone may fall, by the joint's root mean square.
+SPEEDS = (AT_REST, 0.05, 0.1, 0.2)
+#: Relative step of the derivative by a displacement.
+STEP = 0.1
+
+
+def bristles(position: np.ndarray, displacement: float, speed: float) -> np.ndarray:
+    """Return the share of a joint's friction that is built up, -1 to 1, ``(N,)``.
+
+    Args:
+        position: of the joint, row by row, ``(N,)``.
+        displacement: see :func:`~dropo_torch.effects.presliding.bristle_after`.
+        speed: velocity at the first row.
+    """
+    moved = np.diff(position, prepend=position[0] - PAST * speed)
+    found, now = np.empty(len(position)), np.zeros(1)
+    for row in range(len(position)):
+        now = bristle_after(now, moved[row : row + 1], displacement)
+        found[row] = now[0]
+    return found
+
+
+def built_up(setting: Setting, parts: Sequence[Stretch], joint: str | None, displacement: float) -> np.ndarray:
+    """Return the forces ``(N, nv)`` that a unit of friction needs which builds up over a displacement."""
+    dof, found = setting.dof(joint), []
+    for part in parts:
+        column = np.zeros(part.velocity.shape)
+        column[:, dof] = bristles(part.position[:, dof], displacement, float(part.velocity[0, dof]))
+        found.append(part.compared(column))
+    return np.concatenate(found)
+
+
+def displacements(
+    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces
+) -> dict[int, float]:
+    """Return the displacement of each friction, by the number of its effect, that gives before it slides.
+
+    It must leave clearly less of unseen blocks than friction that depends on the velocity alone, however steeply: at
+    all such joints together by more than chance explains, and then at each.
+
+    Args:
+        setting: the model.
+        parts: the motion.
+        found: the terms, with friction that does not give.
+        regression: of these.
+        chosen: the columns that explain unseen blocks, ``(P,)`` bool.
+        rules: thresholds.
+    """
+    given, gains = {}, np.zeros(len(regression.names))
+    for number in np.unique(found.owner[chosen]).tolist():
+        if found.placed[number].effect.name == FRICTION:
+            displacement, less = _displacement(setting, parts, found, regression, chosen, number)
+            if less.mean() > 1 - rules.gives:
+                given[number], gains = (displacement, chance_of(less)), gains + less
+    together = chance_of(gains) if given else 1.0
+    return {n: displacement for n, (displacement, chance) in given.items() if max(together, chance) <= rules.error}
+
+
+def _displacement(
+    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, number: int
+) -> tuple[float, np.ndarray]:
+    """The best displacement of a friction, and how much less of its joint it leaves in each unseen block ``(B,)``.
+
+    This is relative to the mean square that the best friction leaves which depends on the velocity alone.
+    """
+    joint, column = found.placed[number].target, int(np.flatnonzero(found.owner == number)[0])
+    dof, width = setting.dof(joint), float(np.ptp(setting.signals.position[setting.coordinate(joint)]))
+
+    def left(values: np.ndarray) -> np.ndarray:
+        columns = regression.columns.copy()
+        columns[column] = values
+        return np.asarray(unseen(replace(regression, columns=columns), chosen)[:, dof])
+
+    plain = min((left(sharp(setting, parts, joint, speed)) for speed in SPEEDS), key=np.mean)
+    tried: dict[float, np.ndarray] = {}
+    best, near = width, SHARES
+    for nearer in (*FINER, ()):
+        tried |= {best * share: left(built_up(setting, parts, joint, best * share)) for share in near}
+        best, near = min(tried, key=lambda d: float(tried[d].mean())), nearer
+    return best, (plain - tried[best]) / max(float(plain.mean()), 1e-300)
+
+
+def giving(setting: Setting, parts: Sequence[Stretch], found: Terms, given: Mapping[int, float]) -> Terms:
+    """Return terms in which some frictions, by the number of their effect, build up over displacements."""
+    placed, columns, low = list(found.placed), found.columns.copy(), found.low.copy()
+    for number, displacement in given.items():
+        joint, at = placed[number].target, found.owner == number
+        placed[number] = Placed(find_effect(PRESLIDING), joint, (0.0, displacement))
+        columns[at], low[at] = built_up(setting, parts, joint, displacement), 0.0
+    return replace(found, placed=tuple(placed), columns=columns, low=low)
+
+
+def halves(
+    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray,
+    coefficients: np.ndarray,
+) -> list[np.ndarray]:  # fmt: skip
+    """Return half-widths of the 90 % intervals of each chosen effect's numbers, displacements among them.
+
+    A displacement's are those of a coefficient of the derivative by it.
+    """
+    members = np.unique(found.owner[chosen]).tolist()
+    bent = [n for n in members if found.placed[n].effect.name == PRESLIDING]
+    slopes = []
+    for number in bent:
+        joint, size = found.placed[number].target, coefficients[found.owner == number][0]
+        ends = [built_up(setting, parts, joint, found.placed[number].values[1] * (1 + s)) for s in (-STEP, STEP)]
+        slopes.append(size * (ends[1] - ends[0]) / (2 * STEP * found.placed[number].values[1]))
+    extra = np.full(len(bent), np.inf)
+    wider = replace(
+        regression, columns=np.concatenate([regression.columns, *(s[None] for s in slopes)]),
+        low=np.append(regression.low, -extra), high=np.append(regression.high, extra),
+        prior=np.append(regression.prior, extra),
+    )  # fmt: skip
+    picked, owner = np.append(chosen, extra > 0), np.append(found.owner, np.array(bent, dtype=int))
+    widths = half_widths(wider, picked, np.append(coefficients, np.zeros(len(bent))))
+    return [widths[owner == n] for n in members]
