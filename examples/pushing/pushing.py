@@ -5,8 +5,8 @@
 FOLDER holds the measured pushes (see docs/real-robots.md): bigrect_3pts and bigrect_ridge, each with three conditions.
 Friction of the fingers and of turning, softness and size of the contact, and how late the camera is are fitted to two
 conditions; the table has the errors of predictions of the third, each push from its first pose to its end. Then last
-poses are predicted as distributions: the parameters with an error term, with ε by several rules, and from all of their
-box. Nothing of a prediction but the ε that is named so is chosen by the condition that it predicts.
+poses are predicted as distributions: by the parameters with an error term, with ε by several rules, and drawn from all
+of their box. Only the ε said to be known afterwards is chosen by the condition that it predicts.
 """
 
 from __future__ import annotations
