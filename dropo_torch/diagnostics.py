@@ -141,7 +141,8 @@ def _standard_errors(
     the other, and one trajectory after the other of many: the windows may pull harder than Σ expects, and together. A
     measurement that ends a window and begins the next pulls in both: what this adds or takes is counted, too. Where no
     measurement is shared, they are at least those under variances of the parameters one standard error above the
-    fitted ones, for these are estimates, too: where σ came out too small, μ would seem too sure.
+    fitted ones, for these are estimates, too: where σ came out too small, μ would seem too sure. What the log
+    does not tell is known by a normal of the search box's width: beyond the box it stands for nothing else.
 
     Args:
         objective: gives the floor of σ.
@@ -157,13 +158,16 @@ def _standard_errors(
     drawn = torch.as_tensor(distribution.std) * (second - first**2).clamp(min=0).sqrt()
     shared = torch.eye(len(drawn)) if distribution.correlation is None else torch.as_tensor(distribution.correlation)
     spread = shared * torch.outer(drawn, drawn)
-    grouped = _groups(objective.transitions.episodes)
-    variance, correlation, gram = _of_means(covariance, jacobian, spread, residual, together, grouped)
+    grouped, width = _groups(objective.transitions.episodes), torch.as_tensor(objective.box.width)
+    variance, correlation, gram = _of_means(covariance, jacobian, spread, residual, together, grouped, width)
     if together is None:
         most = torch.maximum(torch.as_tensor(objective.box.max_std), drawn)
-        unsure = torch.from_numpy(estimates(0.5 * gram.square().sum(0).numpy())[0])
+        of_variance = 0.5 * gram.square().sum(0) + torch.diag(width**-4)
+        unsure = torch.from_numpy(estimates(of_variance.numpy())[0])
         wider = (drawn.square() + unsure).sqrt().minimum(most)
-        above, _, _ = _of_means(covariance, jacobian, shared * torch.outer(wider, wider), residual, None, grouped)
+        above, _, _ = _of_means(
+            covariance, jacobian, shared * torch.outer(wider, wider), residual, None, grouped, width
+        )
         variance = torch.maximum(variance, above)
     std_error = np.full(len(drawn), np.nan)
     free = distribution.std > 2 * objective.box.min_std
@@ -175,13 +179,13 @@ def _standard_errors(
 
 def _of_means(
     covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tensor, residual: torch.Tensor,
-    together: torch.Tensor | None, grouped: Sequence[torch.Tensor],
+    together: torch.Tensor | None, grouped: Sequence[torch.Tensor], width: torch.Tensor,
 ) -> tuple[torch.Tensor, np.ndarray, torch.Tensor]:  # fmt: skip
     """Variances of μ ``(d,)`` and their correlations under a covariance of the parameters, and AΣ⁻¹Aᵀ ``(T, d, d)``."""
     total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
     pull = torch.linalg.solve(total, jacobian.mT)  # Σ⁻¹ Aᵀ, (T, m, d)
     gram = jacobian @ pull
-    information = gram.sum(0)
+    information = gram.sum(0) + torch.diag(width**-2)
     error, correlation = estimates(information.numpy())
     bounded = np.minimum(error, 1e100)
     inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))

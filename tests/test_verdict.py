@@ -187,6 +187,19 @@ def test_standard_errors_count_what_windows_of_a_trajectory_have_in_common() -> 
     assert np.mean(told) == pytest.approx(np.std(scatter), rel=0.25)
 
 
+def test_a_parameter_without_effect_within_its_bounds_leaves_the_errors_of_others_what_they_are() -> None:
+    """Another that acts as the first does, a million times less, cannot stand for it."""
+    measured, told = 1.3 + np.random.default_rng(0).normal(0, 0.1, (100, 1)), []
+    for effect in ([[1.0, 0.0]], [[1.0, 1e-6]]):
+        simulator = LinearSimulator(space_of(a=[0, 3], b=[0, 2]), np.array(effect))
+        objective = linear_objective(simulator, measured, epsilon=0.01)
+        point = Distribution.over(objective.simulator.parameters, [measured.mean(), 1.0], objective.box.min_std)
+        told.append(diagnose(objective, point, samples=4).standard_error)
+    assert told[1][0] == pytest.approx(told[0][0], rel=0.01)
+    assert told[0][0] == pytest.approx(0.01, rel=0.2)
+    assert (np.array(told)[:, 1] > 1.9).all()
+
+
 def test_standard_errors_of_sigma_are_the_scatter_of_its_estimates() -> None:
     found = [(o, fit(o, FitSettings(samples=10)).distribution) for o in (varying_objective(s, 0.3) for s in range(40))]
     told = [diagnose(o, d, samples=4).std_error for o, d in found]
