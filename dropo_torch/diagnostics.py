@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,6 +16,8 @@ from dropo_torch.support.random import draw_uniforms
 
 #: Windows that follow on each other in what is judged of a log that is too long to be judged whole.
 RUN = 20
+#: Trajectories from which on windows of one trajectory are left out together to tell how sure an estimate is.
+MANY = 10
 #: Two parameters whose estimates are correlated more than this cannot be told apart on the log.
 CONFOUNDED = 0.95
 
@@ -134,11 +137,12 @@ def _standard_errors(
     """Standard errors of μ and their correlations, and standard errors of σ, in coordinates.
 
     They are the Fisher information's of N(s̄(μ), A Σ_ξ Aᵀ + C), with C of ε and noise: AᵀΣ⁻¹A for μ, and
-    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ. Those of μ are the jackknife's, which leaves out one window after the other, where
-    that is larger: where the windows pull harder than Σ expects. A measurement that ends a window and begins the next
-    pulls in both: what this adds or takes is counted, too. Where no measurement is shared, they are at least those
-    under variances of the parameters one standard error above the fitted ones, for these are estimates, too: where σ
-    came out too small, μ would seem too sure.
+    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ. Those of μ are the jackknife's where that is larger. It leaves out one window after
+    the other, and one trajectory after the other of many: the windows may pull harder than Σ expects, and together. A
+    measurement that ends a window and begins the next pulls in both: what this adds or takes is counted, too. Where no
+    measurement is shared, they are at least those under variances of the parameters one standard error above the
+    fitted ones, for these are estimates, too: where σ came out too small, μ would seem too sure. What the log
+    does not tell is known by a normal of the search box's width: beyond the box it stands for nothing else.
 
     Args:
         objective: gives the floor of σ.
@@ -154,12 +158,16 @@ def _standard_errors(
     drawn = torch.as_tensor(distribution.std) * (second - first**2).clamp(min=0).sqrt()
     shared = torch.eye(len(drawn)) if distribution.correlation is None else torch.as_tensor(distribution.correlation)
     spread = shared * torch.outer(drawn, drawn)
-    variance, correlation, gram = _of_means(covariance, jacobian, spread, residual, together)
+    grouped, width = _groups(objective.transitions.episodes), torch.as_tensor(objective.box.width)
+    variance, correlation, gram = _of_means(covariance, jacobian, spread, residual, together, grouped, width)
     if together is None:
         most = torch.maximum(torch.as_tensor(objective.box.max_std), drawn)
-        unsure = torch.from_numpy(estimates(0.5 * gram.square().sum(0).numpy())[0])
+        of_variance = 0.5 * gram.square().sum(0) + torch.diag(width**-4)
+        unsure = torch.from_numpy(estimates(of_variance.numpy())[0])
         wider = (drawn.square() + unsure).sqrt().minimum(most)
-        above, _, _ = _of_means(covariance, jacobian, shared * torch.outer(wider, wider), residual, None)
+        above, _, _ = _of_means(
+            covariance, jacobian, shared * torch.outer(wider, wider), residual, None, grouped, width
+        )
         variance = torch.maximum(variance, above)
     std_error = np.full(len(drawn), np.nan)
     free = distribution.std > 2 * objective.box.min_std
@@ -171,26 +179,45 @@ def _standard_errors(
 
 def _of_means(
     covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tensor, residual: torch.Tensor,
-    together: torch.Tensor | None,
+    together: torch.Tensor | None, grouped: Sequence[torch.Tensor], width: torch.Tensor,
 ) -> tuple[torch.Tensor, np.ndarray, torch.Tensor]:  # fmt: skip
     """Variances of μ ``(d,)`` and their correlations under a covariance of the parameters, and AΣ⁻¹Aᵀ ``(T, d, d)``."""
     total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
     pull = torch.linalg.solve(total, jacobian.mT)  # Σ⁻¹ Aᵀ, (T, m, d)
     gram = jacobian @ pull
-    information = gram.sum(0)
+    information = gram.sum(0) + torch.diag(width**-2)
     error, correlation = estimates(information.numpy())
     bounded = np.minimum(error, 1e100)
     inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))
     score = torch.nan_to_num((pull.mT @ residual[..., None])[..., 0])
-    without = torch.eye(len(spread), dtype=torch.float64) - gram @ inverse  # share that the other windows know
-    left = torch.linalg.lstsq(without, score[..., None], driver="gelsd").solution[..., 0]
+    windows, *trajectories = (_scatter(gram, score, inverse, group) for group in grouped)
     shared_pull = torch.zeros_like(information)
     if together is not None:
         half = (pull[:-1].mT @ together @ pull[1:]).sum(0)
         shared_pull = half + half.T
-    ways = [inverse @ (scatter - shared_pull) @ inverse for scatter in (information, left.T @ left)]
+    scatters = [information - shared_pull, windows - shared_pull, *trajectories]  # which share no measurement
+    ways = [inverse @ scatter @ inverse for scatter in scatters]
     variance, least = torch.stack([torch.diagonal(way) for way in ways]).amax(0), torch.diagonal(inverse)
     return torch.where(variance > 1e-4 * least, variance, least), correlation, gram
+
+
+def _groups(episodes: np.ndarray) -> list[torch.Tensor]:
+    """Number of the group of each window that is left out at once, ``(T,)``: each alone, and by trajectory of many."""
+    by_episode = np.unique(episodes, return_inverse=True)[1]
+    groups = [np.arange(len(episodes))]
+    if MANY <= by_episode.max(initial=0) + 1 < len(episodes):
+        groups.append(by_episode)
+    return [torch.from_numpy(group) for group in groups]
+
+
+def _scatter(gram: torch.Tensor, score: torch.Tensor, inverse: torch.Tensor, group: torch.Tensor) -> torch.Tensor:
+    """Sum of the squared pulls of groups of windows on an estimate from the other ones, ``(d, d)``."""
+    count, d = int(group.max()) + 1, score.shape[-1]
+    known = torch.zeros(count, d, d, dtype=gram.dtype).index_add(0, group, gram)
+    pulls = torch.zeros(count, d, dtype=score.dtype).index_add(0, group, score)
+    without = torch.eye(d, dtype=gram.dtype) - known @ inverse  # share that the other groups know
+    left = torch.linalg.lstsq(without, pulls[..., None], driver="gelsd").solution[..., 0]
+    return left.T @ left
 
 
 def _simulate(

@@ -10,7 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -438,28 +438,49 @@ def test_pushes(tmp_path: Path) -> None:
     assert turned < 1.5
 
 
-def shared_errors(rng: np.random.Generator, pushes: int) -> tuple[np.ndarray, list[tuple[str, int]]]:
-    """Errors of five repeats of each push, mostly those that its repeats have in common."""
+def shared_errors(
+    rng: np.random.Generator, pushes: int, power: Sequence[float] = (0, 0, 0)
+) -> tuple[np.ndarray, list[tuple[str, int]], np.ndarray]:
+    """Errors of five repeats of each push, mostly those that its repeats have in common, and how far each went."""
+    distance = np.repeat(rng.uniform(0.03, 0.15, pushes), 5)
     shared = np.repeat(rng.normal(size=(pushes, 3)) * [3, 2, 1], 5, axis=0)
-    return shared + rng.normal(size=shared.shape) * [1, 1, 0.5], [("push", n) for n in np.repeat(np.arange(pushes), 5)]
+    off = shared + rng.normal(size=shared.shape) * [1, 1, 0.5]
+    return off * distance[:, None] ** power, [("push", n) for n in np.repeat(np.arange(pushes), 5)], distance
 
 
 def test_an_error_term_holds_what_repeats_have_in_common() -> None:
-    example, rng = load_example(ROOT / "examples" / "pushing" / "pushing.py"), np.random.default_rng(0)
-    term = example.error_term(*shared_errors(rng, 400), rng)
+    example, rng = load_example(ROOT / "examples" / "pushing" / "error_term.py"), np.random.default_rng(0)
+    term = example.error_term(*shared_errors(rng, 400))
     assert term.scale**2 == pytest.approx([9 + 1.2, 4 + 1.2, 1 + 0.3], rel=0.15)
-    draws = term.draws * 1e-3
-    assert example.energy_score(draws, np.zeros(3)) < example.energy_score(draws, np.full(3, 0.02))
+    assert not term.power.any()
+
+
+def test_an_error_term_grows_as_the_errors_do() -> None:
+    example, rng = load_example(ROOT / "examples" / "pushing" / "error_term.py"), np.random.default_rng(0)
+    term = example.error_term(*shared_errors(rng, 50, power=(1, 1, 0)))
+    assert term.power.tolist() == [1, 1, 0]
+    assert term.scales(0.2) == pytest.approx([2, 2, 1] * term.scales(0.1))
 
 
 def test_an_error_term_of_few_pushes_holds_nine_in_ten_others() -> None:
-    example, rng = load_example(ROOT / "examples" / "pushing" / "pushing.py"), np.random.default_rng(1)
-    others, _ = shared_errors(rng, 100)
-    held = [
-        np.mean([term.holds(off) for off in others[::5]])
-        for term in (example.error_term(*shared_errors(rng, 8), rng) for _ in range(100))
-    ]
+    example, rng = load_example(ROOT / "examples" / "pushing" / "error_term.py"), np.random.default_rng(1)
+    others, _, distance = shared_errors(rng, 100, power=(1, 1, 0))
+    held = []
+    for _ in range(40):
+        term = example.error_term(*shared_errors(rng, 8, power=(1, 1, 0)))
+        draws = term.draw(rng)[:4000]
+        held += [example.holds(draws, off / term.scales(d)) for off, d in zip(others[::5], distance[::5], strict=True)]
     assert np.mean(held) == pytest.approx(0.9, abs=0.05)
+
+
+def test_energy_scores_are_those_of_a_normal() -> None:
+    """Of three independent axes of 1 mm, for its middle: 2 √(2/π) (1 − √½)."""
+    example = load_example(ROOT / "examples" / "pushing" / "error_term.py")
+    draws = example.point([1e-3, 1e-3, 1e-3 / example.ARM])
+    scores = example.energy_scores(draws.draw(np.random.default_rng(0)) * draws.scale, np.zeros(3))
+    assert scores.mean() == pytest.approx(2 * np.sqrt(2 / np.pi) * (1 - np.sqrt(0.5)), abs=3e-3)
+    far = example.energy_scores(draws.draw(np.random.default_rng(0)) * draws.scale, np.full(3, 0.02))
+    assert (far > 10 * scores).all()
 
 
 def test_a_twin_of_a_log_has_its_commands_and_noise() -> None:

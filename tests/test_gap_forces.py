@@ -16,7 +16,7 @@ import dropo_torch as dropo
 from dropo_torch.effects import VOCABULARY, Effect, find_effect
 from dropo_torch.gap import add, find_gap
 from dropo_torch.gap.forces import regression
-from dropo_torch.gap.forces.motion import has_forces, low_pass
+from dropo_torch.gap.forces.motion import has_forces, highest_frequency, low_pass
 from dropo_torch.gap.forces.terms import LINEAR
 from dropo_torch.gap.forces.view import ForceView, force_view
 from dropo_torch.gap.log import make_setting
@@ -187,6 +187,17 @@ def test_a_log_of_short_episodes_says_nothing(tmp_path: Path) -> None:
     assert view_of(replace(problem, trajectories=replace(log, terminals=ends))) is None
     resting = replace(log, observations=0 * log.observations, next_observations=0 * log.next_observations)
     assert view_of(replace(problem, trajectories=resting)) is None
+
+
+def test_a_joint_that_turns_steadily_is_slow(tmp_path: Path) -> None:
+    """Over a short stretch a slow motion is a steady one: its frequency is not that of the noise beside it."""
+    problem = problem_of(tmp_path, 0, seconds=8.0)
+    log, setting = problem.trajectories, make_setting(problem, problem.trajectories)
+    turned = 0.5 * 0.005 * np.arange(len(log.terminals) + 1)[:, None]
+    path = turned + np.random.default_rng(0).normal(0, 2e-5, (len(turned), 3))
+    columns = np.hstack([path, np.full_like(path, 0.5)])
+    steady = replace(log, observations=columns[:-1], next_observations=columns[1:])
+    assert 0 < highest_frequency(steady, setting) < 1
 
 
 def test_only_logs_with_all_forces_are_judged(tmp_path: Path) -> None:

@@ -173,6 +173,33 @@ def test_standard_errors_are_the_scatter_of_the_estimates(sigma: float) -> None:
     assert np.mean(told, axis=0) == pytest.approx(np.std(scatter, axis=0), rel=0.25)
 
 
+def test_standard_errors_count_what_windows_of_a_trajectory_have_in_common() -> None:
+    """Of twenty trajectories of ten windows with one error each: the scatter of the estimates, not a third of it."""
+    episodes, scatter, told = np.repeat(np.arange(20), 10), [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        measured = 1.3 + np.repeat(rng.normal(0, 0.1, (20, 1)), 10, axis=0) + rng.normal(0, 1e-3, (200, 1))
+        objective = linear_objective(LinearSimulator(space_of(a=[0, 3]), np.eye(1)), measured, epsilon=1e-6)
+        objective = objective.on(replace(objective.transitions, episodes=episodes))
+        point = Distribution.over(objective.simulator.parameters, measured.mean(0), objective.box.min_std)
+        scatter.append(measured.mean())
+        told.append(diagnose(objective, point, samples=4).standard_error[0])
+    assert np.mean(told) == pytest.approx(np.std(scatter), rel=0.25)
+
+
+def test_a_parameter_without_effect_within_its_bounds_leaves_the_errors_of_others_what_they_are() -> None:
+    """Another that acts as the first does, a million times less, cannot stand for it."""
+    measured, told = 1.3 + np.random.default_rng(0).normal(0, 0.1, (100, 1)), []
+    for effect in ([[1.0, 0.0]], [[1.0, 1e-6]]):
+        simulator = LinearSimulator(space_of(a=[0, 3], b=[0, 2]), np.array(effect))
+        objective = linear_objective(simulator, measured, epsilon=0.01)
+        point = Distribution.over(objective.simulator.parameters, [measured.mean(), 1.0], objective.box.min_std)
+        told.append(diagnose(objective, point, samples=4).standard_error)
+    assert told[1][0] == pytest.approx(told[0][0], rel=0.01)
+    assert told[0][0] == pytest.approx(0.01, rel=0.2)
+    assert (np.array(told)[:, 1] > 1.9).all()
+
+
 def test_standard_errors_of_sigma_are_the_scatter_of_its_estimates() -> None:
     found = [(o, fit(o, FitSettings(samples=10)).distribution) for o in (varying_objective(s, 0.3) for s in range(40))]
     told = [diagnose(o, d, samples=4).std_error for o, d in found]

@@ -4,8 +4,9 @@
 
 FOLDER holds the measured pushes (see docs/real-robots.md): bigrect_3pts and bigrect_ridge, each with three conditions.
 Friction of the fingers and of turning, softness and size of the contact, and how late the camera is are fitted to two
-conditions; the table has the errors of predictions of the third, each push from its first pose to its end. Then the
-regions that predictions with an error term give to the last poses are compared with what repeats of the push did.
+conditions; the table has the errors of predictions of the third, each push from its first pose to its end. Then last
+poses are predicted as distributions: by the parameters with an error term, with ε by several rules, and drawn from all
+of their box. Only the ε said to be known afterwards is chosen by the condition that it predicts.
 """
 
 from __future__ import annotations
@@ -15,12 +16,17 @@ import csv
 import sys
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import torch
 from scipy.signal import medfilt
+from scipy.stats.qmc import LatinHypercube
+
+sys.path.insert(0, str(Path(__file__).parent))
+
+from error_term import SAMPLES, ErrorTerm, energy_scores, error_term, holds, point
 
 import dropo_torch as dropo
 from dropo_torch.problem import Problem
@@ -35,10 +41,10 @@ OUTLIERS, MEDIAN = (3e-3, 3e-3, 0.1), 7
 WINDOW, WAITS = 3.15, (0.0, 1.05, 2.1)
 #: s between the commands of a prediction.
 STEP = 0.03
-#: Standard deviations of a prediction without an error term, in m, m and rad.
-EPSILON = (1e-3, 1e-3, 0.017)
-#: m from the centre at which an angle counts as a distance; draws from the box of parameters, and of a prediction.
-ARM, DRAWS, SAMPLES = 0.025, 20, 4000
+#: ε that suits the errors as they turned out, in m, m and rad; m up to which a rectangle has not moved.
+HINDSIGHT, STILL = (1e-3, 1e-3, 0.017), 1e-4
+#: Draws from the box of parameters.
+DRAWS = 40
 
 
 @dataclass(frozen=True)
@@ -159,40 +165,21 @@ def last_errors(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarr
     return np.stack(found, 1)
 
 
-@dataclass(frozen=True)
-class ErrorTerm:
-    """An error of predictions: the scale of each axis, ``(3,)``, and draws, ``(SAMPLES, 3)``."""
-
-    scale: np.ndarray
-    draws: np.ndarray
-
-    def holds(self, off: np.ndarray) -> bool:
-        """Return whether an error ``(3,)`` lies in the ellipsoid of 90 % of the draws."""
-        far = ((self.draws / self.scale) ** 2).sum(1)
-        return bool(((off / self.scale) ** 2).sum() <= np.quantile(far, 0.9))
+def distances(poses: Sequence[np.ndarray]) -> np.ndarray:
+    """Return how far predictions go, in m, ``(P,)``, each by the first of its vectors."""
+    return np.array([np.nansum(np.linalg.norm(np.diff(pose[0, :, :2], axis=0), axis=1)) for pose in poses])
 
 
-def error_term(off: np.ndarray, groups: Sequence[tuple[str, int]], rng: np.random.Generator) -> ErrorTerm:
-    """Return the error of a push that was not seen, from the errors ``(P, 3)`` of those that were.
-
-    What repeats of a push have in common is no noise: it is the model's own error. So a group of repeats is one draw of
-    it, and what differs between them is the second part. So few groups say nothing of how the axes go together, and of
-    each axis' size no more than Student's t of as many degrees of freedom.
-    """
-    names = sorted(set(groups))
-    parts = [off[[g == name for g in groups]] for name in names]
-    means = np.array([part.mean(0) for part in parts])
-    within = np.concatenate([part - part.mean(0) for part in parts])
-    free = max(len(within) - len(parts), 1)
-    scale = np.sqrt((means**2).mean(0) + (within**2).sum(0) / free)
-    return ErrorTerm(scale, scale * rng.standard_t(len(names), (SAMPLES, len(scale))))
-
-
-def energy_score(samples: np.ndarray, off: np.ndarray) -> float:
-    """Return the energy score of errors drawn, ``(N, 3)``, for one that came, ``(3,)``: in mm, an angle by its arc."""
-    scale = 1e3 * np.array([1.0, 1.0, ARM])
-    near = np.linalg.norm((samples - off) * scale, axis=1).mean()
-    return float(near - 0.5 * np.linalg.norm((samples - samples[::-1]) * scale, axis=1).mean())
+def sensor_noise(pushes: Sequence[Push], poses: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the standard deviation of poses of a rectangle that no prediction has moved yet, ``(3,)``."""
+    still = []
+    for push, pose in zip(pushes, poses, strict=True):
+        begin = int(np.flatnonzero(push.seen)[0])
+        moved = np.linalg.norm(pose[0, :, :2] - pose[0, begin, :2], axis=1)
+        rows = push.object[push.seen & (moved < STILL)]
+        still.append(rows - rows.mean(0))
+    every = np.concatenate(still)
+    return np.asarray(np.sqrt((every**2).sum(0) / (len(every) - len(still))))
 
 
 def fit(pushes: Sequence[Push], out: Path) -> tuple[Problem, np.ndarray]:
@@ -212,30 +199,53 @@ def chosen(pushes: Sequence[Push], repeats: int) -> list[Push]:
     return found
 
 
-def regions(
-    problem: Problem, seen: Sequence[Push], unseen: Sequence[Push], best: np.ndarray, rng: np.random.Generator
-) -> tuple[list[bool], dict[str, list[float]]]:
-    """Return which unseen last poses lie in the 90 % region of the error term, and energy scores of three predictions.
+@dataclass
+class Tally:
+    """How a kind of prediction fared: energy scores ``(BATCHES,)``, and whether its 90 % region held, by push."""
 
-    Those are of the parameters with the error term, of the parameters with ε, and of parameters drawn from all of
-    their box with ε.
-    """
-    term = error_term(last_errors(seen, predict(problem, seen, best))[0], [p.group for p in seen], rng)
-    boxes = rng.uniform(problem.space.low, problem.space.high, (DRAWS, len(best)))
-    off = last_errors(unseen, predict(problem, unseen, np.vstack([best, boxes])))
-    epsilon = rng.normal(size=(SAMPLES, len(EPSILON))) * EPSILON
-    scores: dict[str, list[float]] = {"with an error term": [], "with ε": [], "drawn from the box (UDR)": []}
-    inside = []
-    for own, *others in off.swapaxes(0, 1):
-        inside.append(term.holds(own))
-        drawn = {
-            "with an error term": term.draws,
-            "with ε": epsilon,
-            "drawn from the box (UDR)": own - np.array(others)[rng.integers(len(others), size=SAMPLES)] + epsilon,
-        }
-        for name, samples in drawn.items():
-            scores[name].append(energy_score(samples, own))
-    return inside, scores
+    scores: list[np.ndarray] = field(default_factory=list)
+    held: list[bool] = field(default_factory=list)
+
+    def row(self, label: str) -> str:
+        """Return the row of the table."""
+        batches = np.mean(self.scores, axis=0)
+        error = batches.std(ddof=1) / np.sqrt(len(batches))
+        inside = f"{sum(self.held)} of {len(self.held)}" if self.held else ""
+        return f"{label:<46}{batches.mean():>8.3f} ± {error:.3f}{inside:>14}"
+
+
+def error_terms(seen: Sequence[Push], poses: Sequence[np.ndarray]) -> dict[str, ErrorTerm]:
+    """Return what may be added to the fitted parameters' predictions, from pushes that were fitted."""
+    off = last_errors(seen, poses)[0]
+    return {
+        "with an error term": error_term(off, [p.group for p in seen], distances(poses)),
+        "with ε, the likeliest for what was fitted": point(np.sqrt((off**2).mean(0))),
+        "with ε of the camera's noise": point(sensor_noise(seen, poses)),
+        "with ε of 1 mm and 1°, known afterwards": point(HINDSIGHT),
+    }
+
+
+def regions(
+    problem: Problem, seen: Sequence[Push], unseen: Sequence[Push], best: np.ndarray, tallies: dict[str, Tally]
+) -> None:
+    """Add to tallies how predictions of the last poses of unseen pushes fare."""
+    rng = np.random.default_rng(0)
+    shares = LatinHypercube(len(best), rng=0).random(DRAWS)
+    boxes = problem.space.low + shares * (problem.space.high - problem.space.low)
+    poses = predict(problem, unseen, np.vstack([best, boxes]))
+    off, far = last_errors(unseen, poses), distances(poses)
+    terms = error_terms(seen, predict(problem, seen, best))
+    for label, term in terms.items():
+        draws, tally = term.draw(rng), tallies.setdefault(label, Tally())
+        for own, distance in zip(off[0], far, strict=True):
+            scales = term.scales(distance)
+            tally.scores.append(energy_scores(draws * scales, own))
+            tally.held.append(holds(draws, own / scales))
+    likely = terms["with ε, the likeliest for what was fitted"]
+    epsilon, which = likely.draw(rng) * likely.scale, rng.integers(len(boxes), size=SAMPLES)
+    udr = tallies.setdefault("drawn from all of their box (UDR), with that ε", Tally())
+    for own, others in zip(off[0], off[1:].swapaxes(0, 1), strict=True):
+        udr.scores.append(energy_scores(own - others[which] + epsilon, own))
 
 
 def _row(label: str, found: np.ndarray) -> str:
@@ -256,7 +266,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     every = {c: list(read(given.folder, c)) for c in CONDITIONS}
     if missing := [c for c, pushes in every.items() if not pushes]:
         parser.error(f"{given.folder}: no pushes of {missing[0]}; expected the folder that holds bigrect_3pts")
-    inside, scores, rng = list[bool](), dict[str, list[float]](), np.random.default_rng(0)
+    tallies: dict[str, Tally] = {}
     table = [f"{'root mean square error over unseen pushes':<46}{'mm':>8}{'degrees':>9}"]
     all_errors: dict[str, list[np.ndarray]] = {"as given": [], "as fitted to the others": []}
     for left_out in given.conditions:
@@ -268,15 +278,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
         for (label, every_error), values in zip(all_errors.items(), (as_given, best), strict=True):
             every_error.append(errors(unseen, [p[0] for p in predict(problem, unseen, values)]))
             table.append(_row(f"{left_out}, {label}", every_error[-1]))
-        here, own = regions(problem, seen, unseen, best, rng)
-        inside += here
-        for name, values_of in own.items():
-            scores.setdefault(name, []).extend(values_of)
+        regions(problem, seen, unseen, best, tallies)
     table += [_row(f"all, {label}", np.concatenate(of)) for label, of in all_errors.items()]
     print("", *table, sep="\n")
-    print(f"\nlast poses of unseen pushes in the 90 % region of the error term: {sum(inside)} of {len(inside)}")
-    for name, of in scores.items():
-        print(f"energy score {name:<26}{np.mean(of):>8.2f} mm")
+    print(f"\n{'last poses of unseen pushes':<46}{'energy score, mm':>16}{'in 90 % region':>16}")
+    print(*(tally.row(label) for label, tally in tallies.items()), sep="\n")
 
 
 if __name__ == "__main__":

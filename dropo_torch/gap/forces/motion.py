@@ -72,7 +72,7 @@ def highest_frequency(log: Trajectories, setting: Setting) -> float:
     frequencies, powers = [], []
     for path, _ in _paths(log, setting):
         speed, rate = np.diff(path, axis=0), 1 / setting.signals.timestep
-        frequency, power = signal.periodogram(speed, rate, window="hann", axis=0)
+        frequency, power = signal.periodogram(speed, rate, window="hann", detrend=False, axis=0)
         frequencies.append(frequency)
         powers.append(power * len(path))
     at, power = np.concatenate(frequencies), np.concatenate(powers)
