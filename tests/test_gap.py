@@ -41,9 +41,9 @@ from dropo_torch.gap.remaining import Remaining
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears
-from dropo_torch.gap.scene import short_windows
+from dropo_torch.gap.scene import searched, short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
-from dropo_torch.gap.search import Naming
+from dropo_torch.gap.search import Ended, Naming, believed, start
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.twin import Windows, secants
 from dropo_torch.gap.verify import cut_held, hold_out, rollout_floor, score, scores
@@ -176,8 +176,8 @@ def test_coupling_of_joints_cannot_push_them_apart() -> None:
 def test_friction_that_is_larger_at_rest_is_found_from_plain_friction() -> None:
     stribeck, setting = find_effect("joint_stribeck"), scene_of().setting
     assert stribeck.extends(setting, placed("joint_damping", 0.3)) == []
-    for start in stribeck.extends(setting, placed("joint_friction", 0.3)):
-        assert start[0] < 0.3 < start[1]
+    for begun in stribeck.extends(setting, placed("joint_friction", 0.3)):
+        assert begun[0] < 0.3 < begun[1]
     truth = Effect("joint_stribeck", "rail", {"coulomb": 0.2, "static": 0.45, "velocity": 0.3})
     gap = search(simulate_truth(CART_POLE, [truth], 3, **SIZE), ("joint_friction", "joint_damping", "joint_stribeck"))
     assert [e.effect for e in gap.effects] == ["joint_stribeck"]
@@ -857,12 +857,13 @@ def test_what_promises_no_number_comes_last() -> None:
     assert sorted([3.0, promised(float("nan")), 1.0, promised(2.0)]) == [1.0, 2.0, 3.0, np.inf]
 
 
-def naming(scene: Scene, excess: float, *, partial: bool = False, named: bool = True) -> Naming:
-    """An answer whose rest has a number of times its degrees of freedom as χ²."""
+def ended(scene: Scene, excess: float, *, partial: bool = False, named: bool = True) -> Any:
+    """The end of a search whose answer leaves a number of times its degrees of freedom as χ²."""
     base = refit(scene.evidence, scene.begin, iterations=0)
     cost = Cost(np.array([excess * 1e3]), np.zeros(1), 1e3)
     final = dataclasses.replace(base, cost=cost)
-    return Naming(scene.evidence, base, Screening((), 1.0, 1.0), final, gap=True, named=named, partial=partial)
+    found = Naming(scene.evidence, base, Screening((), 1.0, 1.0), final, gap=True, named=named, partial=partial)
+    return SimpleNamespace(naming=found)
 
 
 @pytest.mark.parametrize(
@@ -882,12 +883,38 @@ def test_names_that_leave_nothing_are_believed_before_others(
     scene = scene_of("joint_damping")
     signals = dataclasses.replace(scene.setting.signals, contacts=np.array([True]))
     scene = dataclasses.replace(scene, setting=dataclasses.replace(scene.setting, signals=signals))
-    ready = [naming(scene, excess, partial=partial, named=named) for excess, partial, named in answers]
-    waiting = iter(ready)
+    ready = [ended(scene, excess, partial=partial, named=named) for excess, partial, named in answers]
+    waiting, sure = iter(ready), ended(scene, 1.0)
     monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: next(waiting))
     monkeypatch.setattr("dropo_torch.gap.run.searched", lambda scene: ((str(n), scene.evidence) for n in range(2)))
-    assert gap_package.name(scene).final is ready[chosen].final
+    monkeypatch.setattr("dropo_torch.gap.run.with_ties", lambda end: end.naming)
+    monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: None)
+    assert gap_package.name(scene).final is ready[chosen].naming.final
     assert len(list(waiting)) == len(ready) - asked
+    if asked == 2 and answers[0][2]:  # names that leave a rest are asked on shorter windows before these are searched
+        waiting = iter(ready)
+        monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: sure)
+        assert gap_package.name(scene).final is sure.naming.final
+        assert len(list(waiting)) == 1
+
+
+def test_names_are_believed_on_other_windows_only_if_they_leave_nothing_there() -> None:
+    """The right name is, a wrong one and one that is not needed are not."""
+    names = ("joint_damping",)
+    scene, case = scene_of(*names), hidden(*names)
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in FEW), short=scene.noisy)
+    shorter = dataclasses.replace(ground, evidence=dict(searched(scene))["-shorter"])
+    state = start(ground, scene.begin)
+
+    def believes(hypothesis: Hypothesis) -> bool:
+        found = dataclasses.replace(state, current=ground.refit(hypothesis))
+        known = Naming(scene.evidence, state.base, state.first, found.current, gap=True, named=True)
+        return believed(shorter, scene.begin, Ended(ground, found, known)) is not None
+
+    right, wrong = true(case), scene.begin.with_effects([Placed(VOCABULARY["actuator_lag"], "push", (0.02,))])
+    assert believes(right)
+    assert not believes(wrong)
+    assert not believes(right.with_effects(wrong.placed))
 
 
 # --- fits and screening ---------------------------------------------------------------------------------------
