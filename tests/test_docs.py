@@ -400,11 +400,19 @@ def test_panda(tmp_path: Path) -> None:
     scene = prepare(problem)
     effects = list(VOCABULARY.values())
     view = force_view(scene.setting, scene.train, scene.held, effects, scene.rules.forces)
-    friction = [p.values[0] for p in view.placed if p.effect.name == "joint_friction"]
-    assert friction == pytest.approx([0.30, 0.28, 0.27, 0.57, 0.28, 0.16, 0.27], abs=0.05)
-    assert {"joint_friction", "actuator_bias", "center_of_mass"} == {p.effect.name for p in view.placed}
+    friction = {p.target: p for p in view.placed if p.effect.kind == "joint"}
+    sizes = [friction[f"joint{n}"].values[0] for n in range(1, 8)]
+    assert sizes == pytest.approx([0.31, 0.29, 0.27, 0.59, 0.28, 0.16, 0.28], abs=0.05)
+    gives = {j: 1e3 * p.values[1] for j, p in friction.items() if p.effect.name == "joint_presliding"}
+    expected = {"joint1": 19, "joint2": 6.7, "joint4": 4.4, "joint5": 2.2, "joint6": 8.8, "joint7": 2.2}
+    assert gives == pytest.approx(expected, rel=0.3)
+    assert {p.effect.name for p in view.placed} == {"joint_friction", "joint_presliding", "actuator_bias",
+                                                    "center_of_mass"}  # fmt: skip
     assert (view.after <= example.published(problem)).all()
-    assert np.mean(view.after**2) < np.mean(view.before**2) / 9
+    assert np.mean(view.after**2) < np.mean(view.before**2) / 15
+    plain = [e for e in effects if e.name != "joint_presliding"]
+    sharp = force_view(scene.setting, scene.train, scene.held, plain, scene.rules.forces)
+    assert np.mean(view.after**2) < 0.8 * np.mean(sharp.after**2)
 
 
 def test_tosses(tmp_path: Path) -> None:

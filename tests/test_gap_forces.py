@@ -308,3 +308,21 @@ def test_forces_overrule_what_predictions_reward(tmp_path: Path) -> None:
     assert model.dof_frictionloss == pytest.approx([friction[j].value for j in JOINTS], rel=1e-4)
     write_gap_report(tmp_path / "report.html", gap)
     assert "Unexplained force at the joints" in (tmp_path / "report.html").read_text()
+
+
+def test_friction_that_gives_is_told_and_written(tmp_path: Path) -> None:
+    """With both its numbers; and the config that is written simulates it."""
+    truth = {"friction": (0.5, 0.8, 0.3), "gives": (0.02, 0.02, 0.03), "ripple": 0.02, "seconds": 20}
+    problem = problem_of(tmp_path, 5, **truth)
+    gap = find_gap(problem, effects=[find_effect(name) for name in ("joint_friction", "joint_presliding", "armature")])
+    assert {(e.effect, e.target) for e in gap.effects} == {("joint_presliding", joint) for joint in JOINTS}
+    base = next(e.parameters for e in gap.effects if e.target == "base")
+    assert base["coulomb"].value == pytest.approx(0.5, rel=0.03)
+    assert base["displacement"].low < base["displacement"].value < base["displacement"].high
+    assert base["displacement"].value == pytest.approx(0.02, rel=0.15)
+    assert base["displacement"].unit == "rad"
+    assert any("dry friction in base that gives elastically before it slides" in item for item in answer(gap)[1])
+    add(problem, gap, tmp_path)
+    written = dropo.make_problem(dropo.load_config(tmp_path / "config.yaml"))
+    assert {e.effect.name for e in written.effects.entries} == {"joint_presliding"}
+    assert gap.after.rollout_rmse < 0.1 * gap.before.rollout_rmse
