@@ -22,6 +22,7 @@ from arm import Folder
 
 import dropo_torch as dropo
 import dropo_torch.gap as gap_package
+from benchmarks.hidden.cases import cases, select
 from benchmarks.hidden.systems import CART_POLE, FURUTA, SERVO_ARM, TORQUE_ARM, Command, Scale, System, coarse, mass
 from benchmarks.hidden.truths import Before, Case, Effect, make_case, make_recording, simulate_truth
 from dropo_torch.commands.cli import main
@@ -29,7 +30,7 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
-from dropo_torch.gap.accept import imitates, is_done, is_needed
+from dropo_torch.gap.accept import extend, imitates, is_done, is_needed
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
@@ -896,6 +897,22 @@ def test_names_that_leave_nothing_are_believed_before_others(
         monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: sure)
         assert gap_package.name(scene).final is sure.naming.final
         assert len(list(waiting)) == 1
+
+
+@pytest.mark.whole
+def test_what_the_own_step_distorts_is_fitted_with_a_finer_one() -> None:
+    """Friction that is larger near rest: with the model's step, where it fits best is not where it is."""
+    (spec,) = select(cases(251623, "all"), "single-torque_arm-joint_stribeck", None)
+    scene, plain = prepare(load(spec.make())), find_effect("joint_friction")
+    ground = Ground(scene.evidence, (plain, find_effect("joint_stribeck")), short=scene.noisy, few=16)
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    rough = ground.refit(scene.begin.with_effects([Placed(plain, "elbow", (0.06,))]))
+    refined = extend(ground, dataclasses.replace(state, current=rough)).current
+    assert [p.key for p in refined.hypothesis.placed] == [("joint_stribeck", "elbow")]
+    finer = resolved(ground.part, refined, anew=True).fit
+    assert finer.cost.reduced < 1.5 < resolved(ground.part, refined).fit.cost.reduced
+    assert finer.hypothesis.placed[0].values == pytest.approx((0.06, 0.0975, 0.303), rel=0.1)
 
 
 def test_names_are_believed_on_other_windows_only_if_they_leave_nothing_there() -> None:
