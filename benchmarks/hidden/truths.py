@@ -528,6 +528,8 @@ def _added_bodies(spec: mujoco.MjSpec, base: mujoco.MjModel, effects: Sequence[E
         elif e.name == "inertia" and x["factor"] > 1:
             own = base.body(e.target)
             inertia = (x["factor"] - 1) * own.inertia
+            largest = int(inertia.argmax())  # of a flat body the sum of the others, which rounding may make too little
+            inertia[largest] = min(inertia[largest], (1 - 1e-12) * (inertia.sum() - inertia[largest]))
             _weld(spec, e.target, f"inertia{n}", own.ipos, 1e-9, inertia, quat=own.iquat)
         elif e.name == "slosh":
             place = [x["x"], x["y"], x["z"]]
