@@ -69,7 +69,7 @@ def intervals_of_fits(problem: Problem, together: int) -> Iterator[Intervals]:
         lost = fit.diverged / (len(objective) * fit.samples)
         said = judge(fit.distribution, fit.method, diagnostics, lost)
         print(f"{len(objective)} windows, {fit.seconds:.0f} s: {said.reason}", flush=True)
-        errors = {name: entry["mean"] or 0.0 for name, entry in said.standard_errors.items()}
+        errors = {name: entry["mean"] for name, entry in said.standard_errors.items()}
         yield {
             (name,): (center - NINETY * errors[name], center + NINETY * errors[name])
             for name, center in zip(fit.distribution.names, fit.distribution.center, strict=True)
@@ -126,11 +126,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("config", type=Path)
     parser.add_argument("--fit", action="store_true", help="fit the config's parameters, and name nothing")
-    parser.add_argument("--blocks", type=int, default=8, help="into which each of a few trajectories is cut")
-    parser.add_argument("--together", type=int, default=1, help="trajectories in a row that share rows")
+    parser.add_argument("--blocks", type=int, default=8, help="into which each of a few trajectories is cut, for names")
+    parser.add_argument("--together", type=int, default=1, help="trajectories in a row that stay in one half")
     given, rest = parser.parse_known_args(arguments)
     problem = dropo.make_problem(dropo.load_config(given.config, parse_overrides(rest)), general=not given.fit)
     if given.fit:
+        if problem.trajectories.num_episodes <= given.together:
+            parser.error(f"--fit deals out trajectories, and {given.config} has too few of them for two halves")
         compare_intervals(*intervals_of_fits(problem, given.together))
         return
     gaps = []

@@ -142,7 +142,7 @@ def _standard_errors(
     measurement that ends a window and begins the next pulls in both: what this adds or takes is counted, too. Where no
     measurement is shared, they are at least those under variances of the parameters one standard error above the
     fitted ones, for these are estimates, too: where σ came out too small, μ would seem too sure. What the log
-    does not tell is known by a normal of the search box's width: beyond the box it stands for nothing else.
+    does not tell is known by a normal of the search box's width, so that it cannot make up for others beyond its box.
 
     Args:
         objective: gives the floor of σ.

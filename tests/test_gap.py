@@ -892,6 +892,12 @@ def test_names_that_leave_nothing_are_believed_before_others(
     monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: None)
     assert gap_package.name(scene).final is ready[chosen].naming.final
     assert len(list(waiting)) == len(ready) - asked
+    late = dataclasses.replace(ready[0].naming, unfinished="refitting")
+    monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: SimpleNamespace(naming=late))
+    monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: sure)
+    if asked == 2 and answers[0][2]:
+        assert gap_package.name(scene).unfinished == "refitting"
+    monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: next(waiting))
     if asked == 2 and answers[0][2]:  # names that leave a rest are asked on shorter windows before these are searched
         waiting = iter(ready)
         monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: sure)

@@ -193,11 +193,15 @@ def test_a_joint_that_turns_steadily_is_slow(tmp_path: Path) -> None:
     """Over a short stretch a slow motion is a steady one: its frequency is not that of the noise beside it."""
     problem = problem_of(tmp_path, 0, seconds=8.0)
     log, setting = problem.trajectories, make_setting(problem, problem.trajectories)
-    turned = 0.5 * 0.005 * np.arange(len(log.terminals) + 1)[:, None]
-    path = turned + np.random.default_rng(0).normal(0, 2e-5, (len(turned), 3))
-    columns = np.hstack([path, np.full_like(path, 0.5)])
-    steady = replace(log, observations=columns[:-1], next_observations=columns[1:])
-    assert 0 < highest_frequency(steady, setting) < 1
+    time = 0.005 * np.arange(len(log.terminals) + 1)[:, None]
+
+    def turned(path: np.ndarray) -> float:
+        path = path + np.random.default_rng(0).normal(0, 2e-5, (len(time), 3))
+        columns = np.hstack([path, np.full_like(path, 0.5)])
+        return highest_frequency(replace(log, observations=columns[:-1], next_observations=columns[1:]), setting)
+
+    assert 0 < turned(0.5 * time) < 1
+    assert 1.9 < turned(3 * time - 0.02 * np.cos(4 * np.pi * time)) < 2.6  # and what it does besides is a motion
 
 
 def test_only_logs_with_all_forces_are_judged(tmp_path: Path) -> None:

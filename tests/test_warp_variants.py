@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 import pytest
+import torch
 
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import Placed, find_effect
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.placing import plain_setting
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.variants import Variants, Worlds
 from dropo_torch.testing.effects import RIG
 
@@ -32,6 +36,7 @@ FORCED: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
     (("joint_cogging", "elbow", (0.5, 3.0, 0.2)),),
     (("joint_cogging", "elbow", (0.3, 2.0, 0.0)), ("joint_stribeck", "rail", (0.1, 0.3, 0.2))),
     (("joint_stribeck", "elbow", (0.05, 0.1, 0.5)), ("integration", None, (0.0025,))),
+    (("joint_presliding", "rail", (0.3, 0.01)),),
 ]
 
 
@@ -101,6 +106,34 @@ def test_pushes_are_those_of_mujoco() -> None:
     pushed, same = (simulated(engine, variants, pushes=pushes) for engine in (ours, theirs))
     np.testing.assert_allclose(pushed, same, rtol=0, atol=1e-8)
     assert np.abs(pushed - simulated(ours, variants)).max() > 1e-3
+
+
+def test_forces_keep_to_their_rows() -> None:
+    """Whatever variants lie between those of one effect, and whatever it remembers."""
+    cogging, presliding = ((FORCED[i][0],) for i in (0, 3))
+    mixed = [variant(effects, mass) for effects, mass in ((presliding, 0.7), (cogging, 0.7), (presliding, 1.1))]
+    for engine in engines():
+        together = simulated(engine, mixed)
+        alone = np.concatenate([simulated(engine, [one]) for one in mixed])
+        np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
+
+
+def test_applied_forces_have_gradients() -> None:
+    """Of all that stands in the controls, by central differences."""
+    model = mujoco.MjModel.from_xml_string(ROUND)
+    engine = Engine(model, ParameterSpace(model, MASS), skip=SKIP, chunk_size=8, num_threads=1, device="cpu")
+    theta, width, rng = engine.fields.of([model]), model.nu + model.nv, np.random.default_rng(2)
+    state = torch.from_numpy(np.concatenate([model.qpos0, rng.normal(0, 0.3, model.nv)])[None])
+    controls = torch.from_numpy(rng.normal(0, 0.3, (1, 2, width)))
+
+    batch = Batch(theta, state, controls, SKIP, applied=True)
+    _, traces = engine.simulate(batch, True)
+    _, _, bar = engine.adjoint(batch, torch.ones(2, state.shape[1], dtype=torch.float64), traces)
+    for k in range(width):
+        shift = torch.zeros_like(controls)
+        shift[0, 0, k] = 1e-5
+        there, back = (engine.simulate(replace(batch, controls=controls + s * shift), False)[0] for s in (1, -1))
+        assert float((there - back).sum() / 2e-5) == pytest.approx(float(bar[0, 0, k]), rel=1e-4, abs=1e-6)
 
 
 def test_a_force_that_is_there_twice_acts_twice() -> None:

@@ -186,7 +186,7 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
     if not more or gained < min(least, rules.most * own.cost.above(here.cost)):
         if not more and not remains(own.cost, rules):
             return False
-        own, here = (resolved(ground.part, r, anew=r is here).fit for r in (own, here))
+        own, here = (resolved(ground.part, r, anew=True).fit for r in (own, here))
         if here.cost.left_of(own.cost) > 1 - rules.most:
             return False
     return beats(ground, here, own)

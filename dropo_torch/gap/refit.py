@@ -322,8 +322,8 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
     Args:
         evidence: the windows, with the weights of the fit.
         fitted: the fit under the model's own step. Its derivatives serve for the finer ones, too.
-        anew: whether to fit with the derivatives of the finer steps where more than noise remains beside the others:
-            what a coarse step distorts may be far from where it is with a finer one.
+        anew: whether to fit with the derivatives of the finer steps where more than noise remains with the others:
+            what a coarse step distorts may be far from where it is with a finer one. Such fits are not extrapolated.
     """
     effect, vector = find_effect("integration"), fitted.hypothesis.vector
     own = Resolved(fitted, evidence, np.zeros(len(vector)))
@@ -332,13 +332,15 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
         return own
     finest = effect.quantities(evidence.twin.setting, None)[0].low
     finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
-    if anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules):
+    anew = anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules)
+    if anew:
         finer, coarser = (_anew(last) for last in (finer, coarser))
     fine, limits = finer.fit, limits_of(fitted.hypothesis, evidence.twin)
     if fine.loss >= fitted.loss:
         return own
     change = fine.hypothesis.vector - coarser.fit.hypothesis.vector
-    there = fine.hypothesis.at(np.clip(fine.hypothesis.vector + change, limits.low, limits.high))
+    ahead = fine.hypothesis.vector if anew else fine.hypothesis.vector + change
+    there = fine.hypothesis.at(np.clip(ahead, limits.low, limits.high))
     return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change))
 
 

@@ -62,6 +62,7 @@ PLAN = (
     EXPLAINED,
     CHECKING,
     Stage("judging on all windows", 1.0, visits=0.0),
+    Stage("trying the names", 1.0, visits=0.0),
     TIES,
     Stage("fitting on all windows", 1.3),
     VERIFYING,

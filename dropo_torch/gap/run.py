@@ -163,9 +163,12 @@ def _name(
         doubtful = touches and remains(last.final.cost, ground.rules)
         if not found[0].naming.gap or (last.named and not doubtful):
             return with_ties(found[-1])
-        for _, other in waiting if last.named and time.monotonic() < end else ():
-            if sure := believed(replace(ground, evidence=other), scene.begin, found[-1]):
-                return with_ties(sure)
+        for _, other in waiting if last.named else ():
+            sure = None
+            if time.monotonic() < end:
+                sure = believed(replace(ground, evidence=other), scene.begin, found[-1])
+            if sure is not None:
+                return replace(with_ties(sure), unfinished=last.unfinished)
     best = min(found, key=lambda e: (not e.naming.named, not e.naming.partial))
     for ended in () if best.naming.named else found:
         if time.monotonic() < end and (resorted := resort(ground, ended.naming)).named:

@@ -129,19 +129,25 @@ def search(
 
 
 def believed(ground: Ground, begin: Hypothesis, known: Ended) -> Ended | None:
-    """Return the end of a search on other windows with the names of an earlier one, if nothing remains there.
+    """Return the end of a search on other windows with the names of an earlier one, if these leave nothing there.
+
+    In most of the log at least, where windows may part into right and wrong.
 
     Args:
         ground: what the search would stand on.
         begin: the declared parameters' values.
         known: where the earlier one ended, with names.
     """
+    report = ground.report
+    report("trying the names on other windows", 0.0)
+    ground = replace(ground, report=lambda stage, share: None)  # its parts are no stages of a search
     state = start(ground, begin, known.naming.first)
     if state.done:
         return None
-    current = ground.at(state).refit(known.naming.final.hypothesis)
-    state = renewed(ground, replace(state, current=current, number=1, attempts=known.state.attempts))
-    ended = conclude(ground.at(state), state)
+    here = ground.at(state)
+    current = here.refit(known.naming.final.hypothesis)
+    state = renewed(here, replace(state, current=current, number=1, attempts=known.state.attempts))
+    ended = conclude(replace(ground.at(state), report=report), state)
     cost, same = ended.naming.final.cost, len(ended.state.current.hypothesis.placed) == len(current.hypothesis.placed)
     return ended if same and ended.naming.named and (ended.naming.partial or not remains(cost, ground.rules)) else None
 

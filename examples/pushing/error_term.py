@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+#: m that a push counts for at least.
+LEAST = 1e-4
 #: Powers of the pushed distance that an error may grow with, and the axes that have one in common.
 POWERS, TOGETHER = (0.0, 0.5, 1.0), ((0, 1), (2,))
 #: Draws of a prediction, and batches of them, whose scatter says how exact an energy score is.
@@ -57,6 +59,7 @@ def error_term(off: np.ndarray, groups: Groups, distance: np.ndarray) -> ErrorTe
         groups: which push each of them is a repeat of.
         distance: m that each of them went, ``(P,)``.
     """
+    distance = np.maximum(distance, LEAST)
     power = likeliest_power(off, groups, distance)
     parts = _grouped(off / distance[:, None] ** power, groups)
     means = np.array([part.mean(0) for part in parts])

@@ -18,6 +18,8 @@ from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting
 from dropo_torch.gap.log import episode_bounds
 
+#: Power of a frequency, relative to that of noise, from which on it is motion: chance makes as much once in 20,000.
+ABOVE = 10.0
 #: Share of the velocities' power that lies below the highest frequency of the motion.
 POWER = 0.99
 #: Cut-off of forces by that frequency, and of positions by the former.
@@ -68,18 +70,26 @@ def has_forces(setting: Setting) -> bool:
 
 
 def highest_frequency(log: Trajectories, setting: Setting) -> float:
-    """Return the frequency in Hz below which the joints move, by the power of their velocities; 0 if none does."""
-    frequencies, powers = [], []
+    """Return the frequency in Hz below which the joints move, by the power of their velocities; 0 if none does.
+
+    White noise of the positions is no motion: over a short stretch, where a slow motion is a steady one, it would be
+    most of what there is besides. The frequency of a steady motion is the lowest that a stretch can show.
+    """
+    frequencies, powers, turning = [], [], []
     for path, _ in _paths(log, setting):
         speed, rate = np.diff(path, axis=0), 1 / setting.signals.timestep
-        frequency, power = signal.periodogram(speed, rate, window="hann", detrend=False, axis=0)
+        frequency, power = signal.periodogram(speed, rate, window="hann", axis=0)
+        shape = np.sin(np.pi * frequency / rate)[:, None] ** 2  # of the velocities, where positions are noisy
+        upper = frequency > rate / 4
+        noise = np.median(power[upper] / shape[upper], axis=0) / np.log(2) * shape
         frequencies.append(frequency)
-        powers.append(power * len(path))
+        powers.append(np.where(power > ABOVE * noise, power, 0.0) * len(path))
+        turning += [frequency[1]] * bool(speed.any())
     at, power = np.concatenate(frequencies), np.concatenate(powers)
     order = np.argsort(at)
     below = np.cumsum(power[order], axis=0) / np.maximum(power.sum(0), 1e-300)
     moving = [at[order][np.searchsorted(column, POWER)] for column in below.T if column[-1] > 0]
-    return float(max(moving, default=0.0))
+    return float(max(moving, default=min(turning, default=0.0)))
 
 
 def stretches(log: Trajectories, setting: Setting, highest: float, rows: int = 1) -> list[Stretch]:

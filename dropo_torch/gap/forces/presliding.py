@@ -55,8 +55,8 @@ def displacements(
 ) -> dict[int, float]:
     """Return the displacement of each friction, by the number of its effect, that gives before it slides.
 
-    It must leave clearly less of unseen blocks than friction that depends on the velocity alone, however steeply: at
-    all such joints together by more than chance explains, and then at each.
+    It must leave clearly less of unseen blocks than friction that depends on the velocity alone: at all joints with
+    friction together by more than chance explains, and then at each. Displacements are the best on the same blocks.
 
     Args:
         setting: the model.
@@ -70,8 +70,9 @@ def displacements(
     for number in np.unique(found.owner[chosen]).tolist():
         if found.placed[number].effect.name == FRICTION:
             displacement, less = _displacement(setting, parts, found, regression, chosen, number)
+            gains += less
             if less.mean() > 1 - rules.gives:
-                given[number], gains = (displacement, chance_of(less)), gains + less
+                given[number] = displacement, chance_of(less)
     together = chance_of(gains) if given else 1.0
     return {n: displacement for n, (displacement, chance) in given.items() if max(together, chance) <= rules.error}
 

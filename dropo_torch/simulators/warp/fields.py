@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -164,7 +165,8 @@ class _Weights:
     """``body_invweight0`` (translation) of pairs and ``dof_invweight0`` as functions of the inertial parameters."""
 
     def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
-        data = mujoco.MjData(model)
+        model, data = copy.copy(model), mujoco.MjData(model)
+        model.body_mass[:], model.body_ipos[:] = 1.0, 0.0  # Jacobians go by centres of mass, and would round by them
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         jac = np.zeros((2, model.nbody, 3, model.nv))
