@@ -83,6 +83,7 @@ def highest_frequency(log: Trajectories, setting: Setting) -> float:
         upper = frequency > rate / 4
         noise = np.median(power[upper] / shape[upper], axis=0) / np.log(2) * shape
         frequencies.append(frequency)
+        power[0] = 0.0  # a mean that was taken out
         powers.append(np.where(power > ABOVE * noise, power, 0.0) * len(path))
         turning += [frequency[1]] * bool(speed.any())
     at, power = np.concatenate(frequencies), np.concatenate(powers)
