@@ -472,6 +472,16 @@ class OneForAll(Drag):
         return super().force(setting, target, values[:1], position, velocity)
 
 
+class Sudden(Drag):
+    """Once it has a past, if only of an instant, it is another force."""
+
+    def force_after(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        memory: np.ndarray,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        return 2 * self.force(setting, target, values, position, velocity), memory
+
+
 class Amnesic(Smoothed):
     """What it remembers is lost between two calls."""
 
@@ -525,6 +535,7 @@ BROKEN_EFFECTS: dict[str, Effect] = {
     "it is kept by its name": Twin(),
     "the same numbers do the same and nothing given is changed": Rough(),
     "rows do not depend on each other": OneForAll(),
+    "a force without a past is that of its state": Sudden(),
     "commands in pieces are those in one": Amnesic(),
     "a settled filter is steady": Unsettled(),
     "what lies beyond its memory does not matter": LongMemory(),
