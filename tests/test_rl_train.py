@@ -367,6 +367,16 @@ def test_a_policy_is_loaded_in_three_lines_and_takes_arrays_and_tensors(folder: 
         load_policy(tmp_path / "absent.pt")
 
 
+@pytest.mark.parametrize("number", [float("nan"), 3e38])
+def test_a_policy_whose_actions_are_no_numbers_is_refused(tmp_path: Path, number: float) -> None:
+    shape = {"num_observations": 3, "num_actions": 1, "hidden": [4], "activation": "tanh", "head": "normal"}
+    policy = Policy({**shape, "initial_std": 0.5}, config={}, distribution={})
+    policy.low, policy.high = -policy.high * number, policy.high * number
+    policy.save(tmp_path / "policy.pt")
+    with pytest.raises(InputError, match=r"policy\.pt is damaged: its actions are no numbers"):
+        load_policy(tmp_path / "policy.pt")
+
+
 RESULTS = {"train.json", "report.html", "policy.pt", "train-progress.bin"}
 
 

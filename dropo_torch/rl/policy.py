@@ -203,4 +203,8 @@ def load_policy(path: str | Path) -> Policy:
             raise InputError(f"policy: {path} is of schema {content['schema']!r}; expected {SCHEMA!r}")
         policy = Policy(content["architecture"], config=content["config"], distribution=content["distribution"])
         policy.load_state_dict(content["weights"])
-    return policy.eval()
+    policy.eval()
+    numbers = [*policy.state_dict().values(), policy(torch.zeros(policy.num_observations))]
+    if not all(bool(torch.isfinite(x).all()) for x in numbers):
+        raise InputError(f"policy: {path} is damaged: its actions are no numbers; train it again, or take a copy")
+    return policy
