@@ -44,7 +44,10 @@ LIGHT = 0.75
 NOISE = (2e-5, 5e-4)
 FINER = Placed(find_effect("integration"), None, (STEP / 8,))
 #: Numbers at which an effect acts on the rig, beside those from which a search begins.
-NUMBERS = {"joint_limit": {"lower": 0.4, "upper": -0.4}, "actuator_saturation": {"limit": 0.3}}
+NUMBERS = {
+    "joint_limit": {"lower": 0.4, "upper": -0.4}, "actuator_saturation": {"limit": 0.3},
+    "actuator_delay": {"delay": 2.375 * STEP}, "sensor_delay": {"delay": 1.375 * STEP},
+}  # fmt: skip
 PENDULUM = """
 <mujoco>
   <option timestep="0.005"/>
@@ -55,6 +58,7 @@ PENDULUM = """
     </body>
   </worldbody>
 </mujoco>"""
+DRIVEN = PENDULUM.replace("</mujoco>", '<actuator><motor name="drive" joint="swing"/></actuator></mujoco>')
 TASK = """
 import mujoco, torch
 from pathlib import Path
@@ -249,6 +253,31 @@ def require_same_everywhere(names: tuple[str, ...], tmp_path: Path) -> None:
         size = ours[0, :, 1].std(0)
         assert (np.median(np.abs(np.array(theirs) - ours[0, :, 1]), axis=0) <= 1e-4 * np.maximum(size, 1e-2)).all()
         assert (steps > SKIP) == ("integration" in names)
+
+
+@pytest.mark.parametrize("warp", [False, True])
+def test_a_late_command_acts_within_a_step_that_was_made_finer(warp: bool) -> None:
+    model = mujoco.MjModel.from_xml_string(DRIVEN)
+    setting = plain_setting(model, parse_observation(model, None), SKIP)
+    rng, late = np.random.default_rng(0), 3
+    commands = rng.uniform(-1, 1, (1, ROWS + 1, 1))
+    windows = Windows(np.zeros((1, ROWS + 1, 2)), np.zeros((1, 2)), np.array([0]), np.array([0]), commands)
+    delay = Placed(find_effect("actuator_delay"), "drive", (late * STEP / 8,))
+    twin = Twin(setting, ParameterSpace.empty(model), num_threads=1, warp=warp)
+    others = [Variant((), placed) for placed in ((), (FINER,), (delay,), (FINER, delay))]
+    found, known = twin.predict(others, windows)
+    assert known.all()
+    assert twin.simulated_transitions == len(others) * ROWS
+    alone = [twin.predict([variant], windows)[0][0] for variant in others]
+    np.testing.assert_array_equal(found, alone)
+    model.opt.timestep, model.opt.integrator = STEP / 8, mujoco.mjtIntegrator.mjINT_RK4
+    data, truth, fine = mujoco.MjData(model), [], np.repeat(commands[0, :-1], 8 * SKIP, axis=0)
+    for command in np.concatenate([fine[:1]] * late + [fine[:-late]]):
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data)
+        truth.append(np.concatenate([data.qpos, data.qvel]))
+    np.testing.assert_allclose(found[3, 0, 1:], truth[8 * SKIP - 1 :: 8 * SKIP], rtol=1e-9, atol=1e-12)
+    assert np.abs(found[3] - found[1]).max() > 1e-3
 
 
 @pytest.mark.parametrize("passive", [False, True])

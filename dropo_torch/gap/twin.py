@@ -10,7 +10,7 @@ import numpy as np
 import torch
 
 from dropo_torch.effects.base import Placed, Setting, applied, find_effect
-from dropo_torch.effects.engine import Variant, VariantEngine, parts
+from dropo_torch.effects.engine import Variant, VariantEngine, parts, whole_ratio
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -129,6 +129,8 @@ class Twin:
             What the sensors would show, ``(K, W, L + 1, n)``, NaN where a simulation diverged, and which entries
             the simulation can know, of the same shape.
         """
+        if any(twins := [self._filtering(v) for v in variants]):
+            return self._predict_apart(twins, variants, windows, starts, pushes)
         num_k, num_w, length = len(variants), len(windows), windows.length
         variants = [replace(v, placed=self.effects(v)) for v in variants]
         shown = windows.measured[:, 0] if starts is None else starts
@@ -151,6 +153,30 @@ class Twin:
                     out[k, rows], valid[k, rows] = self._shown(variants[k], columns, length)
         for twin in filter(None, (self, self._coarser)):
             twin.simulated_transitions += num_k * num_w * length
+        return out, valid
+
+    def _filtering(self, variant: Variant) -> Twin | None:
+        """The twin with the finer step under which a variant's filters act; ``None`` where that is this one."""
+        placed = self.effects(variant)
+        step = next((p.values[0] for p in placed if p.effect.name == "integration"), None)
+        if step is None or step == self.setting.model.opt.timestep:
+            return None
+        if not any(p.effect.has("command") or p.effect.has("sense") for p in placed):
+            return None  # physics alone is stepped finer by the engine, with other variants
+        return self.finer(step) if whole_ratio(self.setting.model.opt.timestep, step) else None
+
+    def _predict_apart(
+        self, twins: Sequence[Twin | None], variants: Sequence[Variant], windows: Windows, starts: np.ndarray | None,
+        pushes: np.ndarray | None,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """:meth:`predict` where some variants have twins of their own."""
+        out = np.full((len(variants), *windows.measured.shape), np.nan)
+        valid = np.ones(out.shape, dtype=bool)
+        for twin in dict.fromkeys(twins):
+            rows = [k for k, own in enumerate(twins) if own is twin]
+            shown = starts[rows] if starts is not None and starts.ndim == 3 else starts
+            given = [variants[k] for k in rows], windows, shown, None if pushes is None else pushes[rows]
+            out[rows], valid[rows] = (twin or self).predict(*given)
         return out, valid
 
     def settled(self, variant: Variant, commands: np.ndarray) -> np.ndarray:
