@@ -211,7 +211,7 @@ REFUSED = """<mujoco><option solver="CG" integrator="implicit" noslip_iterations
 <body name="w" pos="3 0 0"><freejoint name="free"/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody>
 <tendon><fixed name="string" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>
 <equality><weld name="glue" body1="w"/></equality>
-<actuator><motor name="ball_motor" joint="k"/><general name="filtered" joint="j" dyntype="filter" dynprm="1"/>
+<actuator><position name="ball_motor" joint="k" kp="1"/><general name="filtered" joint="j" dyntype="filter" dynprm="1"/>
 <position name="damped" joint="j" kp="1"/><motor name="on_string" tendon="string"/></actuator></mujoco>"""
 
 

@@ -155,6 +155,11 @@ SERVOS = """<position name="pa" joint="ja" kp="20" kv="1.5" ctrlrange="-.6 .6" f
 <general name="gc" joint="jc" gaintype="affine" biastype="affine" gainprm="2 .5 -.3" biasprm=".2 -1 -.5" gear="1.5"/>"""
 
 
+TURNED = """<motor name="turn" joint="jb" gear="1 .5 -.3" forcerange="-.4 .4"/>
+<general name="damp" joint="jb" gaintype="affine" biastype="affine" gainprm="2 0 -.3" biasprm=".2 0 -.5" gear=".3 0 1"/>
+<position name="pa" joint="ja" kp="20" kv="1.5"/>"""
+
+
 def arm(**changes: str) -> str:
     settings = {"integrator": "Euler", "option": "", "loss": "0", "second": "hinge", "limit": "", "extra": "",
                 "actuators": SERVOS} | changes  # fmt: skip
@@ -228,6 +233,17 @@ TREES = [
         },
     ),
     Case(
+        "ball driven",
+        arm(second="ball", actuators=TURNED),
+        {
+            "gear": p("actuator_gear", "turn", 1),
+            "damp_gear": p("actuator_gear", "damp", 2),
+            "bias2": p("actuator_biasprm", "damp", 2),
+            "gain2": p("actuator_gainprm", "damp", 2),
+            "forcerange": p("actuator_forcerange", "turn", 1),
+        },
+    ),
+    Case(
         "drag",
         arm(option='density="200" viscosity="2" wind="1 2 -3"'),
         DRAG | {"mass": p("body_mass", "b"), "inertia": p("body_inertia", "b", 2), "ipos": p("body_ipos", "b", 0)},
@@ -270,6 +286,17 @@ def scene(bodies: str, **changes: str) -> str:
     return SCENE.format(bodies=bodies, **settings)
 
 
+#: A body that floats, is pushed and turned, beside a joint with a range of its own.
+AFLOAT = """<body name="raft" pos="0 0 2"><freejoint name="root"/><geom type="box" size=".3 .2 .1" density="100"/>
+<body pos=".1 0 0"><joint name="hinge" axis="0 1 .2" {range}/><geom type="capsule" fromto="0 0 0 .4 .1 0" size=".04"/>
+</body></body>"""
+PUSHED = """<actuator><motor name="push" joint="root" gear="3 .5 0 .1 0 -.2"/>
+<general name="brake" joint="root" gaintype="affine" biastype="affine" gainprm="1 .7 -.1" biasprm=".1 .8 -.4"
+gear="0 1 .5 0 .2 .1" ctrlrange="-.5 .5"/><motor joint="hinge"/></actuator>"""
+RAFT = {
+    "gear": p("actuator_gear", "push", 0), "gear4": p("actuator_gear", "brake", 4), "mass": p("body_mass", "raft"),
+    "gain2": p("actuator_gainprm", "brake", 2), "bias2": p("actuator_biasprm", "brake", 2),
+}  # fmt: skip
 BOX = free("box", "0 0 .11", 'type="box" size=".15 .1 .1"')
 CYLINDER = free("cylinder", "0 0 .13", 'type="cylinder" size=".1 .12"', "0.9 0.2 0 0.1")
 ELLIPSOID = free("ellipsoid", "0 0 .1", 'type="ellipsoid" size=".15 .1 .08"', "0.9 0.2 0.1 0.1")
@@ -298,6 +325,8 @@ def contact_parameters(body: str) -> dict:
 
 
 CONTACTS = [
+    Case("afloat", scene(AFLOAT.format(range=""), extra=PUSHED), RAFT),
+    Case("afloat RK4", scene(AFLOAT.format(range='actuatorfrcrange="-.1 .1"'), extra=PUSHED, integrator="RK4"), RAFT),
     Case("box slides", scene(BOX), contact_parameters("box"), length=40),
     Case("box, elliptic", scene(BOX, cone="elliptic", impratio="3"), contact_parameters("box"), length=40, states=1e-8),
     Case("box, condim 4", scene(BOX, condim="4"), contact_parameters("box"), length=40),

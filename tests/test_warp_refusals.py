@@ -48,7 +48,10 @@ def test_the_sound_model_is_simulated() -> None:
         ({"body": 'gravcomp="1"', "second": 'actuatorgravcomp="true"'}, "actuatorgravcomp on body 'b'"),
         ({"world": '<body name="m" mocap="true"/>'}, "mocap body (1)"),
         ({"actuator": '<general name="g" joint="k" gaintype="user"/>'}, "actuator 'g': gain user"),
-        ({"actuator": '<motor name="g" joint="root"/>'}, "actuator 'g': transmission to a free or ball joint"),
+        (
+            {"actuator": '<motor name="g" jointinparent="root"/>'},
+            "actuator 'g': transmission in the parent's frame of a free or ball joint",
+        ),
         ({"extra": '<equality><connect name="e" body1="a" body2="b" anchor="0 0 0"/></equality>'},
          "equality 'e': connect"),
     ],

@@ -131,29 +131,44 @@ def control_adjoint(m: Tables, w: World, i: int, bar: f64):
 
 
 @wp.func(inline=True)
+def actuator_length(m: Tables, w: World, r: int, i: int) -> f64:
+    """Length of an actuator: gear · q of a hinge or slide; of a free joint it is none, of a ball it is not needed."""
+    y = ZERO
+    if m.act_ndof[i] == 1:
+        y = w.th[m.o_gear + 6 * i] * w.qpos[r, m.act_qpos[i]]
+    return y
+
+
+@wp.func(inline=True)
+def actuator_rate(m: Tables, w: World, r: int, i: int) -> f64:
+    """Velocity of an actuator, gear · q̇, over all dofs of its joint."""
+    y = ZERO
+    for k in range(m.act_ndof[i]):
+        y += w.th[m.o_gear + 6 * i + k] * w.qvel[r, m.act_dof[i] + k]
+    return y
+
+
+@wp.func(inline=True)
 def actuator_force(m: Tables, w: World, r: int, i: int) -> f64:
-    """gain(jl, jl̇) u + bias(jl, jl̇) with the gear's jl and jl̇, before the force range."""
-    gear = w.th[m.o_gear + i]
-    length = gear * w.qpos[r, m.act_qpos[i]]
-    rate = gear * w.qvel[r, m.act_dof[i]]
+    """gain(l, l̇) u + bias(l, l̇) with length l and velocity l̇, before the force range."""
     og = m.o_gain + 3 * i
     ob = m.o_bias + 3 * i
     gain = w.th[og]
     if m.act_affine_gain[i] != 0:
-        gain += w.th[og + 1] * length + w.th[og + 2] * rate
+        gain += w.th[og + 1] * actuator_length(m, w, r, i) + w.th[og + 2] * actuator_rate(m, w, r, i)
     force = gain * control(m, w, i)
     if m.act_affine_bias[i] != 0:
-        force += w.th[ob] + w.th[ob + 1] * length + w.th[ob + 2] * rate
+        force += w.th[ob] + w.th[ob + 1] * actuator_length(m, w, r, i) + w.th[ob + 2] * actuator_rate(m, w, r, i)
     return force
 
 
 @wp.func(inline=True)
-def joint_force(m: Tables, w: World, r: int, i: int) -> f64:
-    """What an actuator exerts on its joint: gear · force, within the force range."""
+def ranged_force(m: Tables, w: World, r: int, i: int) -> f64:
+    """:func:`actuator_force` within the force range; times the gear, it acts on the joint."""
     f = actuator_force(m, w, r, i)
     if m.act_frclimited[i] != 0:
         f = clamp(w, m.o_forcerange + 2 * i, f)
-    return w.th[m.o_gear + i] * f
+    return f
 
 
 @wp.func(inline=True)
@@ -162,7 +177,9 @@ def sum_forces(m: Tables, w: World, r: int):
     for i in range(m.nv):
         w.work[w.t, i] = ZERO
     for i in range(m.nu):
-        w.work[w.t, m.act_dof[i]] += joint_force(m, w, r, i)
+        f = ranged_force(m, w, r, i)
+        for k in range(m.act_ndof[i]):
+            w.work[w.t, m.act_dof[i] + k] += w.th[m.o_gear + 6 * i + k] * f
 
 
 @wp.func(inline=True)
@@ -170,16 +187,17 @@ def add_actuators(m: Tables, w: World, r: int):
     """Load from actuators, clamped per joint where the joint says so."""
     if m.has_frclimit == 0:
         for i in range(m.nu):
-            w.load[w.t, m.act_dof[i]] -= joint_force(m, w, r, i)
+            f = ranged_force(m, w, r, i)
+            for k in range(m.act_ndof[i]):
+                w.load[w.t, m.act_dof[i] + k] -= w.th[m.o_gear + 6 * i + k] * f
     else:
         sum_forces(m, w, r)
         for j in range(m.nlink):
-            if m.link_ndof[j] == 1:
-                d = m.link_dof[j]
-                f = w.work[w.t, d]
-                if m.link_frclimited[j] != 0:
-                    f = clamp(w, m.o_actfrcrange + 2 * m.link_jnt[j], f)
-                w.load[w.t, d] -= f
+            d = m.link_dof[j]
+            if m.link_frclimited[j] != 0:
+                w.work[w.t, d] = clamp(w, m.o_actfrcrange + 2 * m.link_jnt[j], w.work[w.t, d])
+        for i in range(m.nv):
+            w.load[w.t, i] -= w.work[w.t, i]
 
 
 @wp.func(inline=True)
@@ -191,8 +209,9 @@ def actuators_adjoint(m: Tables, w: World, r: int):
             d = m.link_dof[j]
             if m.link_frclimited[j] != 0:
                 w.work[w.t, d] = clamp_adjoint(w, m.o_actfrcrange + 2 * m.link_jnt[j], w.work[w.t, d], -w.lam[w.t, d])
-            elif m.link_ndof[j] == 1:
-                w.work[w.t, d] = -w.lam[w.t, d]
+            else:
+                for k in range(m.link_ndof[j]):
+                    w.work[w.t, d + k] = -w.lam[w.t, d + k]
     else:
         for i in range(m.nv):
             w.work[w.t, i] = -w.lam[w.t, i]
@@ -200,42 +219,46 @@ def actuators_adjoint(m: Tables, w: World, r: int):
         d = m.act_dof[i]
         og = m.o_gain + 3 * i
         ob = m.o_bias + 3 * i
-        q = w.qpos[r, m.act_qpos[i]]
-        v = w.qvel[r, d]
-        gear = w.th[m.o_gear + i]
+        oe = m.o_gear + 6 * i
+        length = actuator_length(m, w, r, i)
+        rate = actuator_rate(m, w, r, i)
         u = control(m, w, i)
         f = actuator_force(m, w, r, i)
-        fbar = gear * w.work[w.t, d]  # ∂/∂force
+        fbar = ZERO  # ∂/∂force
+        for k in range(m.act_ndof[i]):
+            fbar += w.th[oe + k] * w.work[w.t, d + k]
         if m.act_frclimited[i] != 0:
             fbar = clamp_adjoint(w, m.o_forcerange + 2 * i, f, fbar)
             f = clamp(w, m.o_forcerange + 2 * i, f)
-        w.grad[w.t, m.o_gear + i] += f * w.work[w.t, d]
         gain = w.th[og]
         slope_l = ZERO
         slope_v = ZERO
         w.grad[w.t, og] += fbar * u
         if m.act_affine_gain[i] != 0:
-            gain += w.th[og + 1] * gear * q + w.th[og + 2] * gear * v
+            gain += w.th[og + 1] * length + w.th[og + 2] * rate
             slope_l += w.th[og + 1] * u
             slope_v += w.th[og + 2] * u
-            w.grad[w.t, og + 1] += fbar * u * gear * q
-            w.grad[w.t, og + 2] += fbar * u * gear * v
+            w.grad[w.t, og + 1] += fbar * u * length
+            w.grad[w.t, og + 2] += fbar * u * rate
         if m.act_affine_bias[i] != 0:
             slope_l += w.th[ob + 1]
             slope_v += w.th[ob + 2]
             w.grad[w.t, ob] += fbar
-            w.grad[w.t, ob + 1] += fbar * gear * q
-            w.grad[w.t, ob + 2] += fbar * gear * v
-        w.tangent[w.t, d] += fbar * slope_l * gear
-        w.vel_bar[w.t, d] += fbar * slope_v * gear
-        w.grad[w.t, m.o_gear + i] += fbar * (slope_l * q + slope_v * v)
+            w.grad[w.t, ob + 1] += fbar * length
+            w.grad[w.t, ob + 2] += fbar * rate
+        if m.act_ndof[i] == 1:
+            w.tangent[w.t, d] += fbar * slope_l * w.th[oe]
+            w.grad[w.t, oe] += fbar * slope_l * w.qpos[r, m.act_qpos[i]]
+        for k in range(m.act_ndof[i]):
+            w.vel_bar[w.t, d + k] += fbar * slope_v * w.th[oe + k]
+            w.grad[w.t, oe + k] += f * w.work[w.t, d + k] + fbar * slope_v * w.qvel[r, d + k]
         control_adjoint(m, w, i, fbar * gain)
 
 
 @wp.func(inline=True)
 def actuator_slope(m: Tables, w: World, r: int, a: int) -> f64:
-    """gear² (bias_v + gain_v u): ∂τ/∂q̇ of an actuator, or zero where the force is clamped."""
-    gear = w.th[m.o_gear + a]
+    """gear² (bias_v + gain_v u): ∂τ/∂q̇ of an actuator on a hinge or slide, or zero where the force is clamped."""
+    gear = w.th[m.o_gear + 6 * a]
     y = ZERO
     if m.act_affine_bias[a] != 0:
         y += w.th[m.o_bias + 3 * a + 2]
@@ -254,8 +277,8 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
     """Adjoint of :func:`actuator_slope` (which does not see the position)."""
     slope = actuator_slope(m, w, r, a)
     if slope != ZERO:
-        gear = w.th[m.o_gear + a]
-        w.grad[w.t, m.o_gear + a] += bar * TWO * slope / gear
+        gear = w.th[m.o_gear + 6 * a]
+        w.grad[w.t, m.o_gear + 6 * a] += bar * TWO * slope / gear
         if m.act_affine_bias[a] != 0:
             w.grad[w.t, m.o_bias + 3 * a + 2] += bar * gear * gear
         if m.act_affine_gain[a] != 0:

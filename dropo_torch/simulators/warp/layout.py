@@ -11,7 +11,7 @@ DIRECT = (
     ("jnt_solref", "jnt_solref", 0), ("jnt_solimp", "jnt_solimp", 0), ("actfrcrange", "jnt_actfrcrange", 0),
     ("damping", "dof_damping", 0), ("dampingpoly", "dof_dampingpoly", 0), ("armature", "dof_armature", 0),
     ("frictionloss", "dof_frictionloss", 0), ("dof_solref", "dof_solref", 0), ("dof_solimp", "dof_solimp", 0),
-    ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 1),
+    ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 0),
     ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 5),
     ("eq_solref", "eq_solref", 0), ("eq_solimp", "eq_solimp", 0),
 )  # fmt: skip

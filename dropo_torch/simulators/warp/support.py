@@ -10,7 +10,7 @@ import numpy as np
 from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
-from dropo_torch.simulators.warp.tables import KINDS, link_table
+from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table
 from dropo_torch.simulators.warp.types import BALL
 
 #: Fields of which only the first columns act, and how many.
@@ -34,7 +34,7 @@ def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tupl
         UnsupportedModel: the list of all offending elements.
     """
     reasons = [
-        *_options(model), *_structure(model), *_joints(model), *_actuators(model), *_equalities(model),
+        *_options(model), *_structure(model), *_joints(model), *_actuators(model, space), *_equalities(model),
         *_contacts(model, pairs), *_parameters(model, space),
     ]  # fmt: skip
     if reasons:
@@ -115,16 +115,17 @@ def _joints(model: mujoco.MjModel) -> Iterator[str]:
             yield f"negative frictionloss of dof {i}"
 
 
-def _actuators(model: mujoco.MjModel) -> Iterator[str]:
+def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[str]:
     if model.nu != model.nactuator:
         return
+    varied = {(t.field, t.index) for p in space.parameters for t in p.targets}
     names = object_names(model, "actuator")
     for i in range(model.nu):
         where = f"actuator {names[i]!r}"
         if model.actuator_trntype[i] not in _TRANSMISSIONS:
             yield f"{where}: transmission {mujoco.mjtTrn(model.actuator_trntype[i]).name[6:].lower()}"
         elif model.jnt_type[model.actuator_trnid[i, 0]] in (_FREE, _BALL):
-            yield f"{where}: transmission to a free or ball joint"
+            yield from (f"{where}: {what} of a free or ball joint" for what in _beyond_moments(model, i, varied))
         if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
             yield f"{where}: dynamics {mujoco.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()}"
         if model.actuator_gaintype[i] not in _GAINS:
@@ -133,6 +134,25 @@ def _actuators(model: mujoco.MjModel) -> Iterator[str]:
             yield f"{where}: bias {mujoco.mjtBias(model.actuator_biastype[i]).name[7:].lower()}"
         if model.actuator_damping[i] or model.actuator_dampingpoly[i].any() or model.actuator_armature[i]:
             yield f"{where}: damping or armature"
+
+
+def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str, int]]) -> Iterator[str]:
+    """What of an actuator on a free or ball joint is more than a force by constant moments, its gears."""
+    if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINTINPARENT:
+        yield "transmission in the parent's frame"
+    affine = {"actuator_gainprm": model.actuator_gaintype, "actuator_biasprm": model.actuator_biastype}
+    kinds = {"actuator_gainprm": mujoco.mjtGain.mjGAIN_AFFINE, "actuator_biasprm": mujoco.mjtBias.mjBIAS_AFFINE}
+    ball = model.jnt_type[model.actuator_trnid[actuator, 0]] == _BALL
+    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    for field, types in affine.items():
+        if types[actuator] != kinds[field]:
+            continue
+        own = read_field(model, field)[actuator]
+        by_length, by_velocity = (own[k] != 0 or (field, actuator * len(own) + k) in varied for k in (1, 2))
+        if ball and by_length:
+            yield "a force by the length"
+        if implicit and by_velocity:
+            yield "a force by the velocity under implicitfast"
 
 
 def _equalities(model: mujoco.MjModel) -> Iterator[str]:
@@ -177,6 +197,10 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
     column = index % width
     if column >= _KEPT.get(field, width):
         return f"{field}[{column}] does not act, only " + ", ".join(f"{field}[{i}]" for i in range(_KEPT[field]))
+    if field == "actuator_gear" and model.actuator_trntype[index // width] in _TRANSMISSIONS:
+        dofs = int(joint_dofs(model)[model.actuator_trnid[index // width, 0]])
+        if column >= dofs:
+            return f"{field}[{column}] does not act, only " + ", ".join(f"{field}[{i}]" for i in range(dofs))
     if field == "qpos_spring":
         kinds, _joints, _dofs, starts = link_table(model)
         if ((kinds == BALL) & (starts <= index) & (index < starts + 4)).any():

@@ -142,11 +142,17 @@ def _origin(model: mujoco.MjModel, links: dict[str, Any]) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
+    """Return how many dofs each joint has, ``(njnt,)``."""
+    return np.array([6, 3, 1, 1])[model.jnt_type]
+
+
 def _actuators(model: mujoco.MjModel) -> dict[str, Any]:
     acting = not _disabled(model, _DISABLE.mjDSBL_ACTUATION)
     joints = model.actuator_trnid[:, 0]
     return {
         "nu": model.nu if acting else 0, "act_dof": model.jnt_dofadr[joints], "act_qpos": model.jnt_qposadr[joints],
+        "act_ndof": joint_dofs(model)[joints],
         "act_affine_gain": model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE,
         "act_affine_bias": model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
         "act_ctrllimited": model.actuator_ctrllimited * (not _disabled(model, _DISABLE.mjDSBL_CLAMPCTRL)),

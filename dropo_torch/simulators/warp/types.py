@@ -81,7 +81,7 @@ _INDICES = (
     "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive",
     "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
     "dof_body",
-    "act_dof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
+    "act_dof", "act_ndof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
     "geom_body",
