@@ -22,6 +22,7 @@ from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.effects import VOCABULARY, Effect, Placed, find_effect, register
 from dropo_torch.effects.actuator import ActuatorDeadband
 from dropo_torch.effects.base import Quantity, Setting
+from dropo_torch.effects.base import applied as with_effects
 from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.export import write_model
 from dropo_torch.effects.filters import Filter, extended, filtered, observed_rates, sensed, settled_after
@@ -112,7 +113,7 @@ def placements() -> list[Any]:
 IDLE: dict[str, tuple[str, ...]] = {
     "center_of_mass": ("cart",), "inertia": ("cart",),
     "sensor_bias": ("root.position[x]", "root.position[y]", "rail.position"),
-    **dict.fromkeys(("contact_friction", "contact_stiffness", "contact_margin"), ("upper", "lower", "cart")),
+    **dict.fromkeys(("contact_friction", "contact_stiffness", "contact_margin", "contact_sole"), ("upper", "lower", "cart")),
 }  # fmt: skip
 #: Numbers at which an effect acts on the rig, where those from which a search begins are too small for it.
 NUMBERS = {"joint_limit": {"lower": 0.8, "upper": -0.8}}
@@ -289,6 +290,51 @@ def test_inertia_and_centre_and_stops() -> None:
     np.testing.assert_allclose(model.body("lower").ipos - general().body("lower").ipos, [0.01, 0.02, -0.03], atol=1e-12)
     model, _ = applied(RIG, "joint_limit", "shoulder", 0.2, -0.1)
     np.testing.assert_allclose(model.joint("shoulder").range, np.deg2rad([-60, 60]) + [0.2, -0.1])
+
+
+FEET = """<mujoco><option timestep="0.002"/><worldbody><geom name="floor" type="plane" size="5 5 1" quat=".99 .1 0 0"/>
+<body pos="0 0 {height}"><freejoint/><geom name="foot" {foot} friction=".4"/></body>{other}</worldbody></mujoco>"""
+OTHER = '<body pos="1 0 .2"><freejoint/><geom name="other" size=".1"/></body>'
+
+
+@pytest.mark.parametrize(
+    ("foot", "larger", "sinks"),
+    [
+        ('type="sphere" size=".1" mass="1"', 'type="sphere" size=".11" mass="1"', 0.0),
+        ('type="capsule" size=".1 .2" mass="1"', 'type="capsule" size=".11 .2" mass="1"', 0.0),
+        ('type="box" size=".1 .2 .1" mass="1"', 'type="box" size=".1 .2 .1" mass="1" margin=".02"', 0.01),
+        ('type="cylinder" size=".1 .1" mass="1"', 'type="cylinder" size=".1 .1" mass="1" margin=".02"', 0.01),
+    ],
+)
+def test_a_sole_touches_where_its_surface_is(foot: str, larger: str, sinks: float) -> None:
+    def simulate(model: mujoco.MjModel) -> np.ndarray:
+        data = mujoco.MjData(model)
+        data.qvel[:3] = 0.8, 0.3, -0.2
+        mujoco.mj_step(model, data, 150)
+        return np.concatenate([data.qpos, data.qvel])
+
+    sole = find_effect("contact_sole")
+    plain = mujoco.MjModel.from_xml_string(FEET.format(foot=foot, height=0.115, other=""))
+    truth = mujoco.MjModel.from_xml_string(FEET.format(foot=larger, height=0.115, other=""))
+    truth.body_mass[:], truth.body_inertia[:] = plain.body_mass, plain.body_inertia
+    normal = np.zeros(3)
+    mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), truth.geom_quat[0])
+    truth.geom_pos[0] -= sinks * normal
+    for model in (plain, truth):
+        mujoco.mj_setConst(model, mujoco.MjData(model))
+    here = with_effects(plain, [Placed(sole, "foot", (0.01,))])
+    np.testing.assert_allclose(simulate(here), simulate(truth), rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(simulate(with_effects(plain, [Placed(sole, "foot", (0.0,))])), simulate(plain))
+    raised = with_effects(plain, [Placed(sole, "floor", (0.01,))])
+    np.testing.assert_allclose(raised.geom_pos[0], 0.01 * normal, atol=1e-15)
+
+
+def test_planes_sink_only_under_a_geom_that_alone_touches_them() -> None:
+    for other, targets in (("", ["floor", "foot"]), (OTHER, ["floor", "other"])):
+        model = mujoco.MjModel.from_xml_string(
+            FEET.format(foot='type="box" size=".1 .2 .1"', height=0.115, other=other)
+        )
+        assert find_effect("contact_sole").targets(setting_of(model)) == targets
 
 
 def test_a_geom_alone_decides_its_friction_and_softness() -> None:

@@ -8,7 +8,7 @@ import itertools
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Quantity, Setting, object_number
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, object_number
 
 
 class ContactEffect(Effect):
@@ -123,3 +123,64 @@ class ContactMargin(ContactEffect):
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         model.geom_margin[object_number(model, "geom", target)] += values[0]
+
+
+_PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
+#: Geoms that grow by their radius.
+_ROUND = (int(mujoco.mjtGeom.mjGEOM_SPHERE), int(mujoco.mjtGeom.mjGEOM_CAPSULE))
+
+
+class ContactSole(ContactMargin):
+    """A geom that is larger than in the model, by a sole or a coating: contacts act where the surface of that is.
+
+    MuJoCo's margin has them act halfway between two geoms. Spheres and capsules grow, and a plane rises. Under any
+    other geom, which may touch planes only, these sink by as much, and its margin is twice as large.
+    """
+
+    name = "contact_sole"
+    known_as = ContactMargin.name
+    alone = False
+    contains = (ContactMargin.name,)
+    sentence = "{target} is larger than in the model, as by a sole or a coating"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        model, touches = setting.model, setting.signals.contacts
+        planes = model.geom_type == _PLANE
+        fits = planes | np.isin(model.geom_type, _ROUND)
+        alone = bool((touches & ~planes).sum() == 1)  # all that it touches are planes, which nothing else touches
+        names = setting.names("geom")
+        return [t for t in super().targets(setting) if fits[names.index(str(t))] or alone]
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        margin = simpler.effect.name == ContactMargin.name and simpler.target in self.targets(setting)
+        return [np.array(simpler.values)] if margin else []
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        geom, by = object_number(model, "geom", target), values[0]
+        if model.geom_type[geom] == _PLANE:
+            _raise(model, geom, by)
+        elif model.geom_type[geom] in _ROUND:
+            _grow(model, geom, by)
+        else:
+            model.geom_margin[geom] += 2 * by
+            for plane in self.partners(model, geom):
+                if model.geom_type[plane] == _PLANE:
+                    _raise(model, plane, -by)
+
+
+def _raise(model: mujoco.MjModel, plane: int, by: float) -> None:
+    """Move a plane along its normal."""
+    normal = np.zeros(3)
+    mujoco.mju_rotVecQuat(normal, np.array([0.0, 0.0, 1.0]), model.geom_quat[plane])
+    model.geom_pos[plane] += by * normal
+    model.geom_sameframe[plane] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
+
+
+def _grow(model: mujoco.MjModel, geom: int, by: float) -> None:
+    """Let a sphere or a capsule have a larger radius, and all that bounds it."""
+    model.geom_size[geom, 0] += by
+    model.geom_rbound[geom] += by
+    model.geom_aabb[geom, 3:] += by
+    body = model.geom_bodyid[geom]
+    first = model.body_bvhadr[body]
+    model.bvh_aabb[first : first + model.body_bvhnum[body], 3:] += by

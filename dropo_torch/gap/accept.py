@@ -42,12 +42,18 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
 
 
 def matters(ground: Ground, base: Refit, whole: Refit, without: Refit) -> bool:
-    """Return whether an effect removes enough of the first excess, or all that is left where that is a small part."""
+    """Return whether an effect removes enough of the first excess, or all that is left where that is a small part.
+
+    What the model's own step leaves is no part of what is left.
+    """
     rules = ground.rules
     if without.cost.excess - whole.cost.excess >= rules.least * base.cost.above(whole.cost):
         return True
-    clears = significant(without.cost, rules) and not significant(whole.cost, rules)
-    return clears and whole.cost.left_of(without.cost) <= 1 - rules.most
+    if not significant(without.cost, rules) or whole.cost.left_of(without.cost) > 1 - rules.most:
+        return False
+    if not significant(whole.cost, rules):
+        return True
+    return not significant(resolved(ground.part, whole, anew=True).fit.cost, rules)
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:

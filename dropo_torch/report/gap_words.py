@@ -52,6 +52,7 @@ _NOUNS = {
     "contact_friction": "a different sliding friction of {0}",
     "contact_stiffness": "softer or stiffer contacts of {0}",
     "contact_margin": "contacts of {0} that act at a distance (margin)",
+    "contact_sole": "a sole or coating on {0}",
 }
 #: Whole clauses where "Your model lacks" does not fit.
 _CLAUSES = {
@@ -68,6 +69,7 @@ _CLAUSES = {
     "contact_friction": "The sliding friction of {0} is not that of your model",
     "contact_stiffness": "The contacts of {0} are softer or stiffer than in your model",
     "contact_margin": "The margin of contacts of {0} is not that of your model",
+    "contact_sole": "The surface of {0}, where contacts act, is not where your model has it",
 }
 #: Effects whose first number, if negative, says that the model has too much of them.
 _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_stiffness", "armature",
