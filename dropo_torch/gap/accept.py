@@ -219,8 +219,8 @@ def prune(ground: Ground, state: State) -> State:
     """Drop effects that are not needed, the least needed first."""
     current = state.current
     while current.hypothesis.placed:
-        placed = current.hypothesis.placed
-        without = [ground.refit(current.hypothesis.without(i)) for i in range(len(placed))]
+        count = len(current.hypothesis.placed)
+        without = [ground.refit(current.hypothesis.without(i)) if count > 1 else state.base for i in range(count)]
         idle = [r for r in without if not is_needed(ground, state, current, r)]
         if not idle:
             break

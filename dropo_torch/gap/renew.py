@@ -15,7 +15,7 @@ from dropo_torch.gap.evidence import Evidence, caps_of
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit
+from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.twin import Windows
 
@@ -46,7 +46,7 @@ def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:
     base = ground.refit(hypothesis, iterations=4)
     if not ground.evidence.robust:
         ground = replace(ground, caps=caps_of(base.cost.windows, base.cost.degrees, ground.rules.weighed.cap))
-        base = ground.refit(base.hypothesis, iterations=4)
+        base = refit(ground.part, base.hypothesis, linear=base.linear, iterations=4)  # caps bend nothing
     return ground, base
 
 
