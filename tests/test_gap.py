@@ -29,7 +29,7 @@ from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, Scene, add, find_gap, prepare
+from dropo_torch.gap import Gap, Scene, accept, add, find_gap, prepare
 from dropo_torch.gap.accept import extend, imitates, is_done, is_needed
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
@@ -154,6 +154,21 @@ def test_many_numbers_account_for_nothing_while_much_remains(
     )
     wrong = dataclasses.replace(base, cost=Cost(np.array([1e9]), np.zeros(1), 1e3))
     assert accounts(named, wrong, Rules()) == enough
+
+
+@pytest.mark.parametrize(("own", "finest", "enough"), [(1.0, 1.0, True), (40.0, 1.0, True), (40.0, 30.0, False)])
+def test_a_rest_of_the_own_step_hides_no_small_effect(
+    own: float, finest: float, enough: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A late sensor explains two thousandths of a gap, which is all that friction leaves but for the model's step."""
+
+    def fitted(reduced: float) -> SimpleNamespace:
+        return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3))
+
+    monkeypatch.setattr(accept, "resolved", lambda *_, **__: SimpleNamespace(fit=fitted(finest)))
+    ground = SimpleNamespace(rules=Rules(), part=None)
+    assert accept.matters(ground, fitted(180_000), fitted(own), fitted(500)) == enough
+    assert not accept.matters(ground, fitted(180_000), fitted(400), fitted(500))
 
 
 def test_many_numbers_that_leave_more_than_the_step_imitate() -> None:
