@@ -336,7 +336,11 @@ def test_planes_sink_only_under_a_geom_that_alone_touches_them() -> None:
         model = mujoco.MjModel.from_xml_string(
             FEET.format(foot='type="box" size=".1 .2 .1"', height=0.115, other=other)
         )
-        assert find_effect("contact_sole").targets(setting_of(model)) == targets
+        sole, setting = find_effect("contact_sole"), setting_of(model)
+        assert sole.targets(setting) == targets
+        for name, starts in (("contact_margin", [[0.01]]), ("contact_friction", [])):
+            assert np.array_equal(sole.extends(setting, Placed(find_effect(name), "floor", (0.01,))), starts)
+        assert sole.extends(setting, Placed(find_effect("contact_margin"), "nothing", (0.01,))) == []
 
 
 def test_a_geom_alone_decides_its_friction_and_softness() -> None:
