@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY, Effect, Placed
-from dropo_torch.gap.forces.view import force_view
+from dropo_torch.gap.forces.motion import has_forces
+from dropo_torch.gap.forces.view import ForceView, force_view
 from dropo_torch.gap.ground import Ground, Report
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.locate import places
@@ -22,7 +23,8 @@ from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, prepare, searched
 from dropo_torch.gap.search import Ended, Naming, believed, kept, resort, search, start, with_ties
-from dropo_torch.gap.verify import cut_held, open_loop_error, scores
+from dropo_torch.gap.sound import has_skill
+from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
 
 
@@ -115,39 +117,59 @@ def find_gap(
     report("preparing", 0.0)
     scene = _ruled(scene or prepare(problem, rules), rules)
     ground, end = replace(_ground(scene, effects), report=report), time.monotonic() + time_limit
-    naming = _name(scene, ground, checkpoint, resume, end)
+    views: dict[tuple[Placed, ...], ForceView | None] = {}
+
+    def view(named: tuple[Placed, ...]) -> ForceView | None:
+        if named not in views:
+            views[named] = _view(scene, ground, named)
+        return views[named]
+
+    def forces_decide(naming: Naming) -> bool:
+        return has_forces(scene.setting) and not _has_skill(scene, naming) and view(()) is not None
+
+    naming = _name(scene, ground, checkpoint, resume, end, forces_decide)
     gap = make_result(scene, naming, started, report)
     if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
         return gap
-    return _by_forces(scene, ground, gap, naming.final.hypothesis.placed if naming.named else (), started)
+    if (decided := view(naming.final.hypothesis.placed if naming.named else ())) is None:
+        return gap
+    return replace(with_forces(scene, gap, decided), seconds=time.perf_counter() - started)
 
 
-def _by_forces(scene: Scene, ground: Ground, gap: Gap, named: Sequence[Placed], started: float) -> Gap:
-    """Where no prediction of the model as it is has skill, let the forces at the joints decide, if the log has them.
+def _view(scene: Scene, ground: Ground, named: Sequence[Placed]) -> ForceView | None:
+    """What the forces at the joints say, if the log has them, and they say more than the names that predictions gave.
 
-    Errors of such predictions grow so fast that what slows all motion down, such as inertia, makes them smaller. Names
-    that predictions gave stay unless forces have others, which leave clearly less unexplained.
+    They decide where no prediction of the model as it is has skill: errors then grow so fast that what slows all motion
+    down, such as inertia, makes them smaller. Names of predictions stay unless forces leave clearly less unexplained.
     """
     problem = scene.problem
     if problem.effects is not None:  # a delay or a late sensor of the config's would have to be undone first
-        return gap
+        return None
     ground.report("comparing forces", 0.0)
     setting = replace(scene.setting, model=problem.space.apply(np.array(scene.begin.declared)))
     rules = scene.rules.forces
     view = force_view(setting, scene.train, scene.held, ground.effects, rules, named)
-    if view is None or not view.placed or (named and not view.beats_rival(rules)):
-        return gap
-    return replace(with_forces(scene, gap, view), seconds=time.perf_counter() - started)
+    return None if view is None or not view.placed or (named and not view.beats_rival(rules)) else view
+
+
+def _has_skill(scene: Scene, naming: Naming) -> bool:
+    """Return whether open-loop predictions of the declared parameters alone beat constant velocity on unseen data."""
+    evidence, hypothesis = naming.evidence, naming.base.hypothesis
+    held = cut_held(evidence, scene.held, hypothesis)
+    after, floor = scores(evidence, held, hypothesis)
+    return has_skill(after, floor, constant_velocity(evidence, held.rollouts), scene.rules.sound)
 
 
 def _name(
-    scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False, end: float = math.inf
-) -> Naming:
+    scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False, end: float = math.inf,
+    decided: Callable[[Naming], bool] = lambda naming: False,
+) -> Naming:  # fmt: skip
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly.
 
     Where there are contacts, long windows bend, and what is most of the gap there may be an effect of the wrong kind:
     names that leave a rest are then believed only if they leave none in shorter windows, in most of the log at least,
-    or if these find no others that do. Where no search has names, the base family of all joints is the last resort.
+    or if these find no others that do. Where no search has names, the base family of all joints is the last resort;
+    where something else has ``decided`` by then, there are no more searches.
     """
     touches = bool(scene.setting.signals.contacts.any())
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
@@ -163,6 +185,8 @@ def _name(
         doubtful = touches and remains(last.final.cost, ground.rules)
         if not found[0].naming.gap or (last.named and not doubtful):
             return with_ties(found[-1])
+        if not last.named and decided(last):
+            return last
         for _, other in waiting if last.named else ():
             sure = None
             if time.monotonic() < end:

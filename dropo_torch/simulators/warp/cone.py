@@ -165,6 +165,52 @@ def cone_hessian(cone: Cone, w: vec6):
 
 
 @wp.func
+def cone_slopes(cone: Cone, w: vec6, y: vec6):
+    """First and second derivative of the cost at ``w`` along ``y``."""
+    d = cone.d
+    first = ZERO
+    second = ZERO
+    if cone.dim == 1:
+        if w[0] < ZERO:
+            first = d * w[0] * y[0]
+            second = d * y[0] * y[0]
+    elif cone.elliptic == 0:
+        for k in range(1, cone.dim):
+            mu = cone.mu[k - 1]
+            plus = w[0] + mu * w[k]
+            minus = w[0] - mu * w[k]
+            if plus < ZERO:
+                along = y[0] + mu * y[k]
+                first += d * plus * along
+                second += d * along * along
+            if minus < ZERO:
+                along = y[0] - mu * y[k]
+                first += d * minus * along
+                second += d * along * along
+    else:
+        piece = cone_piece(cone, w)
+        inner = ZERO  # Σ μ² w y
+        square = ZERO  # Σ μ² y²
+        for k in range(1, cone.dim):
+            mu = cone.mu[k - 1]
+            inner += mu * mu * w[k] * y[k]
+            square += mu * mu * y[k] * y[k]
+        if piece == 1:
+            scale = cone.impratio / (cone.mu[0] * cone.mu[0])
+            first = d * (w[0] * y[0] + scale * inner)
+            second = d * (y[0] * y[0] + scale * square)
+        elif piece == CURVED:
+            reg = cone.mu[0] / wp.sqrt(cone.impratio)
+            tan = _tangential(cone, w)
+            dm = d / (ONE + reg * reg)  # of N/μ − T, with μ² taken in
+            e = w[0] - tan
+            along = inner / tan
+            first = dm * e * (y[0] - along)
+            second = dm * ((y[0] - along) * (y[0] - along) - e * (square - along * along) / tan)
+    return first, second
+
+
+@wp.func
 def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f64:
     """f · Jλ of an elliptic cone."""
     reg = mu[0] / wp.sqrt(impratio)

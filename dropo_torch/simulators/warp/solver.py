@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_of, cone_piece
+from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_of, cone_piece, cone_slopes
 from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.rows import row_add, row_dot, row_force, row_state
 from dropo_torch.simulators.warp.types import ONE, ZERO, Reals2, Tables, World, f64, mat33, vec3, vec6
@@ -170,26 +170,25 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
             d2 += w.row_d[w.t, n] * y * y
     for c in range(ncon):
         cone = cone_of(m, w, w.con_pair[w.t, c], w.con_d[w.t, c])
-        dw = w.con_dir[w.t, c]
-        jar6 = w.con_jar[w.t, c] + dw * alpha
-        if cone_piece(cone, jar6) != 0:
-            d1 -= wp.dot(cone_force(cone, jar6), dw)
-            ll, la, aa = cone_hessian(cone, jar6)
-            yl = wp.spatial_top(dw)
-            ya = wp.spatial_bottom(dw)
-            d2 += wp.dot(yl, ll * yl) + f64(2.0) * wp.dot(yl, la * ya) + wp.dot(ya, aa * ya)
+        y6 = w.con_dir[w.t, c]
+        c1, c2 = cone_slopes(cone, w.con_jar[w.t, c] + y6 * alpha, y6)
+        d1 += c1
+        d2 += c2
     return d1, d2
 
 
 @wp.func(inline=True)
 def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
-    """The root of φ' along the step: Newton's iteration kept in a bracket."""
+    """The root of φ' along the step: Newton's iteration kept in a bracket, roughly where cones are curved."""
     mass_mul(m, w, w.step, w.t, w.work, w.t)
     linear = ZERO
     quad = ZERO
     for i in range(m.nv):
         linear += w.product[w.t, i] * w.step[w.t, i]
         quad += w.work[w.t, i] * w.step[w.t, i]
+    enough = f64(1.0e-15)
+    if m.elliptic != 0:
+        enough = f64(1.0e-3)
     start = f64(0.0)
     low = ZERO
     high = f64(-1.0)
@@ -200,7 +199,7 @@ def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
         if k == 0:
             start = d1
         else:
-            if wp.abs(d1) <= f64(1.0e-15) * wp.abs(start):
+            if wp.abs(d1) <= enough * wp.abs(start):
                 break
             if d1 < ZERO:
                 low = alpha
