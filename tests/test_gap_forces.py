@@ -14,13 +14,16 @@ from scipy.interpolate import CubicSpline
 
 import dropo_torch as dropo
 from dropo_torch.effects import VOCABULARY, Effect, find_effect
-from dropo_torch.gap import add, find_gap
+from dropo_torch.gap import add, find_gap, run
 from dropo_torch.gap.forces import regression
 from dropo_torch.gap.forces.motion import has_forces, highest_frequency, low_pass
 from dropo_torch.gap.forces.terms import LINEAR
 from dropo_torch.gap.forces.view import ForceView, force_view
+from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.rules import Forces
+from dropo_torch.gap.search import Ended, Naming, start
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
 from dropo_torch.report import write_gap_report
@@ -312,6 +315,28 @@ def test_forces_overrule_what_predictions_reward(tmp_path: Path) -> None:
     assert model.dof_frictionloss == pytest.approx([friction[j].value for j in JOINTS], rel=1e-4)
     write_gap_report(tmp_path / "report.html", gap)
     assert "Unexplained force at the joints" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("forces", [True, False])
+def test_forces_decide_before_shorter_windows_are_searched(
+    forces: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where predictions have no skill and the first search no names; without forces, shorter windows are next."""
+    lengths = []
+
+    def fruitless(ground: Ground, begin: Hypothesis, *_: Any, **__: Any) -> Ended:
+        lengths.append(ground.evidence.windows.length)
+        state = start(ground, begin)
+        return Ended(ground, state, Naming(ground.evidence, state.base, state.first, state.base, gap=True))
+
+    monkeypatch.setattr(run, "search", fruitless)
+    if not forces:
+        monkeypatch.setattr(run, "force_view", lambda *_: None)
+    gap = find_gap(
+        problem_of(tmp_path, 5, friction=(0.5, 0.8, 0.3), seconds=20), effects=[find_effect("joint_friction")]
+    )
+    assert len(lengths) == (1 if forces else 2)
+    assert [e.effect for e in gap.effects] == ["joint_friction" if forces else "unnamed"]
 
 
 def test_friction_that_gives_is_told_and_written(tmp_path: Path) -> None:
