@@ -270,7 +270,7 @@ def _unnamed(setting: Setting, free: FreeForces) -> NamedEffect:
 
 def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffect, ...]:
     """The named effects, the strongest first."""
-    final, halves = last.fit, half_widths(last) * last.evidence.rules.chance.chosen
+    final, halves = last.fit, half_widths(last)
     own, found = iter(halves[len(final.hypothesis.declared) :]), []
     for placed, tied, excess in zip(final.hypothesis.placed, naming.ties, naming.shares, strict=True):
         quantities = placed.effect.quantities(setting, placed.target)

@@ -26,14 +26,12 @@ class Chance:
         open: level up to which an effect that misses ``error`` on the windows that refits use is judged on all.
         blocks: stretches of the log that count as independent, at least, where it has as many windows: of fewer than
             about 15, no ranks are sure enough among hundreds of candidates.
-        chosen: by how much the half-widths of named numbers grow because their effects were chosen to fit.
     """
 
     error: float = 0.01
     explore: float = 0.05
     open: float = 1.0
     blocks: int = 20
-    chosen: float = 1.08
 
 
 @dataclass(frozen=True)
