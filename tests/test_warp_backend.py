@@ -102,6 +102,7 @@ def test_gradient_through_a_lag_is_the_chain_of_single_steps(space, model, probl
 def test_results_do_not_depend_on_threads_chunks_or_memory(space, model, problem, rollout, monkeypatch):
     plain = WarpSimulator(model, parameters=space, frame_skip=4, num_threads=1)
     expected, grads = plain.simulate(*problem), gradients(plain, problem, rollout=rollout)
+    monkeypatch.setattr(engine, "ALONE", 0)
     for threads, chunk in ((2, 4096), (1, 7), (3, 13), (2, 1)):
         other = WarpSimulator(model, parameters=space, frame_skip=4, num_threads=threads, chunk_size=chunk)
         assert torch.equal(other.simulate(*problem), expected)

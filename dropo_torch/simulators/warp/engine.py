@@ -28,6 +28,8 @@ from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJEC
 
 #: Stages kept from the forward for the backward, at most; beyond it the backward simulates again, chunk by chunk.
 KEEP_BYTES = 1 << 30
+#: Physics steps of all worlds times degrees of freedom below which threads cost a launch more than they save.
+ALONE = 8000
 
 
 @dataclass(frozen=True)
@@ -253,7 +255,8 @@ class Engine:
             })  # fmt: skip
             wp.launch(kernel, dim=number, inputs=[self.tables, world, chunk, *arguments], device=self.device)
 
-        threads = slots if self.is_cpu else 1
+        work = trace.count * batch.lag * batch.skip * self.tables.nv
+        threads = slots if self.is_cpu and work >= ALONE else 1
         if threads == 1:
             launch(0, trace.count, 0)
             return
