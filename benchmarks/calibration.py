@@ -55,8 +55,8 @@ METHODS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def problem_of(folder: Path, name: str, transitions: int, threads: int) -> dropo.Problem:
-    """The pendulum fitted by a method; the log gives actions and a start."""
+def problem_of(folder: Path, keys: dict[str, Any], transitions: int, threads: int) -> dropo.Problem:
+    """The pendulum, with more keys of a config; the log gives actions and a start."""
     (folder / "pendulum.xml").write_text(MODEL)
     torque = 3 * np.sin(0.31 * np.arange(transitions)) + np.sin(1.1 * np.arange(transitions))
     still = np.zeros((transitions, 2))
@@ -75,7 +75,7 @@ def problem_of(folder: Path, name: str, transitions: int, threads: int) -> dropo
         "epsilon": (NOISE**2).tolist(),
         "samples": 50,
         "threads": threads,
-        **METHODS[name],
+        **keys,
     }
     return dropo.make_problem(dropo.make_config(document, base=folder))
 
@@ -92,7 +92,7 @@ class Plan:
 def fit_cell(cell: CalibrationCell, *, transitions: int, threads: int) -> dict[str, Any]:
     """Fit one simulated log by one method."""
     with tempfile.TemporaryDirectory() as folder:
-        problem = problem_of(Path(folder), cell.method, transitions, threads)
+        problem = problem_of(Path(folder), METHODS[cell.method], transitions, threads)
         return asdict(calibrate(cell, problem, noise=NOISE))
 
 

@@ -18,6 +18,10 @@ from dropo_torch.support.random import draw_uniforms
 RUN = 20
 #: Trajectories from which on windows of one trajectory are left out together to tell how sure an estimate is.
 MANY = 10
+#: Standard deviations of a parameter at which the log's likelihood is taken, and decades below its bound.
+GRID, GRID_SPAN = 33, 5.0
+#: Quantiles of them by which means' errors are averaged.
+QUANTILES = 5
 #: Two parameters whose estimates are correlated more than this cannot be told apart on the log.
 CONFOUNDED = 0.95
 
@@ -137,12 +141,12 @@ def _standard_errors(
     """Standard errors of μ and their correlations, and standard errors of σ, in coordinates.
 
     They are the Fisher information's of N(s̄(μ), A Σ_ξ Aᵀ + C), with C of ε and noise: AᵀΣ⁻¹A for μ, and
-    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ. Those of μ are the jackknife's where that is larger. It leaves out one window after
-    the other, and one trajectory after the other of many: the windows may pull harder than Σ expects, and together. A
-    measurement that ends a window and begins the next pulls in both: what this adds or takes is counted, too. Where no
-    measurement is shared, they are at least those under variances of the parameters one standard error above the
-    fitted ones, for these are estimates, too: where σ came out too small, μ would seem too sure. What the log
-    does not tell is known by a normal of the search box's width, so that it cannot make up for others beyond its box.
+    ½ tr(Σ⁻¹ ∂Σ Σ⁻¹ ∂Σ) for log σ. σ is an estimate, too: where it came out too small, μ would seem too sure. So those
+    of μ are averaged over what the log leaves σ, and count how far μ moves with it. They are the jackknife's
+    where that is larger. It leaves out one window after the other, and one trajectory after the other of many: the
+    windows may pull harder than Σ expects, and together. A measurement that ends a window and begins the next pulls in
+    both: what this adds or takes is counted, too. What the log does not tell is known by a normal of the search box's
+    width, so that it cannot make up for others beyond its box.
 
     Args:
         objective: gives the floor of σ.
@@ -160,15 +164,9 @@ def _standard_errors(
     spread = shared * torch.outer(drawn, drawn)
     grouped, width = _groups(objective.transitions.episodes), torch.as_tensor(objective.box.width)
     variance, correlation, gram = _of_means(covariance, jacobian, spread, residual, together, grouped, width)
-    if together is None:
-        most = torch.maximum(torch.as_tensor(objective.box.max_std), drawn)
-        of_variance = 0.5 * gram.square().sum(0) + torch.diag(width**-4)
-        unsure = torch.from_numpy(estimates(of_variance.numpy())[0])
-        wider = (drawn.square() + unsure).sqrt().minimum(most)
-        above, _, _ = _of_means(
-            covariance, jacobian, shared * torch.outer(wider, wider), residual, None, grouped, width
-        )
-        variance = torch.maximum(variance, above)
+    variance = torch.maximum(
+        variance, _given_the_log(objective, covariance, jacobian, spread, residual, together, width)
+    )
     std_error = np.full(len(drawn), np.nan)
     free = distribution.std > 2 * objective.box.min_std
     if distribution.correlation is None and free.any():
@@ -177,28 +175,99 @@ def _standard_errors(
     return variance.sqrt().numpy(), correlation, std_error
 
 
+def _given_the_log(
+    objective: Objective, covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tensor,
+    residual: torch.Tensor, together: torch.Tensor | None, width: torch.Tensor,
+) -> torch.Tensor:  # fmt: skip
+    """Variances of μ, averaged over what the log leaves σ, with those of μ as σ varies, ``(d,)``.
+
+    Of each parameter in turn, the others' σ as fitted: the restricted likelihood of N(s̄, B + σ² a aᵀ), a the
+    parameter's own Jacobian, times a prior that is flat in σ up to its bound. B⁻¹ is needed once: aᵀB⁻¹a and aᵀB⁻¹r
+    give it at every σ (Sherman–Morrison).
+    """
+    least, most = torch.as_tensor(objective.box.min_std), torch.as_tensor(objective.box.max_std)
+    drawn, found = torch.diagonal(spread).sqrt(), []
+    levels = (torch.arange(QUANTILES, dtype=torch.float64) + 0.5) / QUANTILES
+    for j in range(len(drawn)):
+        others = spread.clone()
+        others[j], others[:, j] = 0.0, 0.0
+        pull, gram = _pulls(covariance, jacobian, others)
+        score = torch.nan_to_num((pull.mT @ residual[..., None])[..., 0])
+        highest = torch.maximum(most[j], drawn[j])
+        sigma = torch.logspace(-GRID_SPAN, 0, GRID, dtype=torch.float64) * highest
+        sigma = sigma[sigma >= torch.minimum(least[j], highest)]
+        log_density, means = _restricted(gram, score, j, sigma.square(), torch.diag(width**-2))
+        share = torch.softmax(log_density + sigma.log(), 0)
+        likely = sigma[torch.searchsorted(share.cumsum(0), levels).clamp(max=len(sigma) - 1)]
+        ratio = torch.ones(QUANTILES, len(drawn), dtype=torch.float64)
+        ratio[:, j] = likely / drawn[j].clamp(min=1e-300)
+        wide = spread * ratio[:, :, None] * ratio[:, None, :]
+        each = [_informed(*_pulls(covariance, jacobian, w), together, width)[0][j, j] for w in wide]
+        found.append(torch.stack(each).mean() + share @ (means - share @ means).square())
+    return torch.stack(found)
+
+
+def _restricted(
+    gram: torch.Tensor, score: torch.Tensor, j: int, variances: torch.Tensor, prior: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Log of the restricted likelihood at variances of parameter j, and how far its mean moves there, ``(V,)`` each.
+
+    From AB⁻¹Aᵀ ``(T, d, d)`` and AB⁻¹r ``(T, d)``, with B of everything else.
+    """
+    own, log_density, means = gram[:, j, j], [], []
+    for v in variances:
+        factor = v / (1 + v * own)
+        information = gram.sum(0) - torch.einsum("t,td,te->de", factor, gram[:, j], gram[:, j]) + prior
+        pulled = score.sum(0) - (factor * score[:, j]) @ gram[:, j]
+        step = torch.linalg.solve(information, pulled)
+        gained = factor @ score[:, j].square() + pulled @ step
+        log_density.append(0.5 * (gained - (v * own).log1p().sum() - torch.logdet(information)))
+        means.append(step[j])
+    return torch.stack(log_density), torch.stack(means)
+
+
+def _pulls(covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """Σ⁻¹Aᵀ ``(T, m, d)`` and AΣ⁻¹Aᵀ ``(T, d, d)`` under a covariance of the parameters."""
+    total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
+    pull = torch.linalg.solve(total, jacobian.mT)
+    return pull, jacobian @ pull
+
+
+def _informed(
+    pull: torch.Tensor, gram: torch.Tensor, together: torch.Tensor | None, width: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Covariance of the estimates of μ, the inverse of the information, and what shared measurements pull, ``(d, d)``.
+
+    A covariance that is next to nothing beside the inverse is rounding; then it is the inverse.
+    """
+    information, shared = gram.sum(0) + torch.diag(width**-2), torch.zeros_like(width[:, None] * width)
+    error, correlation = estimates(information.numpy())
+    bounded = np.minimum(error, 1e100)
+    inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))
+    if together is not None:
+        half = (pull[:-1].mT @ together @ pull[1:]).sum(0)
+        shared = half + half.T
+    return _beyond_rounding(inverse @ (information - shared) @ inverse, inverse), inverse, shared
+
+
+def _beyond_rounding(covariance: torch.Tensor, inverse: torch.Tensor) -> torch.Tensor:
+    """A covariance of estimates, or the inverse of their information where it is next to nothing beside it."""
+    return torch.where(torch.diagonal(covariance) > 1e-4 * torch.diagonal(inverse), covariance, inverse)
+
+
 def _of_means(
     covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tensor, residual: torch.Tensor,
     together: torch.Tensor | None, grouped: Sequence[torch.Tensor], width: torch.Tensor,
 ) -> tuple[torch.Tensor, np.ndarray, torch.Tensor]:  # fmt: skip
     """Variances of μ ``(d,)`` and their correlations under a covariance of the parameters, and AΣ⁻¹Aᵀ ``(T, d, d)``."""
-    total = covariance + torch.einsum("tdm,de,ten->tmn", jacobian, spread, jacobian)
-    pull = torch.linalg.solve(total, jacobian.mT)  # Σ⁻¹ Aᵀ, (T, m, d)
-    gram = jacobian @ pull
-    information = gram.sum(0) + torch.diag(width**-2)
-    error, correlation = estimates(information.numpy())
-    bounded = np.minimum(error, 1e100)
-    inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))
+    pull, gram = _pulls(covariance, jacobian, spread)
+    informed, inverse, shared = _informed(pull, gram, together, width)
     score = torch.nan_to_num((pull.mT @ residual[..., None])[..., 0])
     windows, *trajectories = (_scatter(gram, score, inverse, group) for group in grouped)
-    shared_pull = torch.zeros_like(information)
-    if together is not None:
-        half = (pull[:-1].mT @ together @ pull[1:]).sum(0)
-        shared_pull = half + half.T
-    scatters = [information - shared_pull, windows - shared_pull, *trajectories]  # which share no measurement
-    ways = [inverse @ scatter @ inverse for scatter in scatters]
-    variance, least = torch.stack([torch.diagonal(way) for way in ways]).amax(0), torch.diagonal(inverse)
-    return torch.where(variance > 1e-4 * least, variance, least), correlation, gram
+    left_out = (inverse @ scatter @ inverse for scatter in (windows - shared, *trajectories))
+    variance = torch.stack([torch.diagonal(way) for way in (informed, *left_out)]).amax(0)
+    least = torch.diagonal(inverse)
+    return variance, (inverse / torch.outer(least, least).sqrt()).clamp(-1, 1).numpy(), gram
 
 
 def _groups(episodes: np.ndarray) -> list[torch.Tensor]:

@@ -686,13 +686,14 @@ def test_intervals_hold_their_share_of_draws() -> None:
 
 def test_a_synthetic_log_is_explained_by_its_truth(folder: Path) -> None:
     ours = problem(folder, "laplace")
-    truths = draw_truths(ours, "fixed", 3)
-    assert (truths == truths[0]).all()
+    truths, center = draw_truths(ours, "fixed", 3)
+    assert (truths == center).all()
     made = synthesise(ours, truths, np.zeros(2), seed=0)
     found = fit_problem(made).distribution
     assert found.mean == pytest.approx(truths[0], rel=1e-6)
-    varying = draw_truths(ours, "varying", 3)
+    varying, center = draw_truths(ours, "varying", 3)
     assert varying.std(0) == pytest.approx(0.1 * np.array([2.5, 0.49]), rel=0.25)
+    assert (np.abs(varying.mean(0) - center) < 0.1 * np.array([2.5, 0.49])).all()
 
 
 def test_laplace_is_calibrated_for_a_fixed_truth_and_dropo_for_a_varying_one(folder: Path) -> None:
@@ -882,7 +883,7 @@ def test_what_varies_is_no_outlier_where_the_starts_are_noisy(folder: Path) -> N
     found, true = [], []
     for seed in range(3):
         exact = problem(folder, "dropo", epsilon=(noise**2).tolist())
-        truths = draw_truths(exact, "varying", seed)
+        truths, _ = draw_truths(exact, "varying", seed)
         made = synthesise(exact, truths, noise, seed=seed)
         log = made.trajectories
         starts = log.observations + noise * np.random.default_rng([seed, 1]).standard_normal(log.observations.shape)

@@ -19,7 +19,7 @@ from dropo_torch.baselines import fit_problem
 from dropo_torch.commands.cli import main
 from dropo_torch.commands.fit import HOPELESS, run_fit
 from dropo_torch.config import make_config
-from dropo_torch.diagnostics import diagnose
+from dropo_torch.diagnostics import _given_the_log, _restricted, diagnose
 from dropo_torch.distribution import DRAWN_STD, Distribution
 from dropo_torch.fit import Fit, fit
 from dropo_torch.objective import Objective
@@ -171,6 +171,41 @@ def test_standard_errors_are_the_scatter_of_the_estimates(sigma: float) -> None:
         told.append(error)
     assert 0.82 <= np.mean(inside) <= 0.96
     assert np.mean(told, axis=0) == pytest.approx(np.std(scatter, axis=0), rel=0.25)
+
+
+def test_the_likelihood_of_a_variance_is_that_of_the_whole_covariance() -> None:
+    """At every variance: the density of the residuals, the means integrated out, and where these are then."""
+    rng, prior = np.random.default_rng(0), torch.diag(torch.tensor([0.5, 2.0], dtype=torch.float64))
+    jacobian, residual = (torch.from_numpy(rng.normal(size=s)) for s in ((12, 2, 3), (12, 3)))
+    rest = torch.eye(3, dtype=torch.float64) + 0.2
+    variances, whole, means = torch.tensor([0.0, 0.1, 1.0, 30.0], dtype=torch.float64), [], []
+    for v in variances:
+        total = torch.block_diag(*(rest + v * torch.outer(a[1], a[1]) for a in jacobian))
+        slope, flat = jacobian.mT.reshape(-1, 2), residual.reshape(-1)
+        marginal = total + slope @ torch.linalg.inv(prior) @ slope.T
+        whole.append(-0.5 * (flat @ torch.linalg.solve(marginal, flat) + torch.logdet(marginal)))
+        inverse = torch.linalg.inv(total)
+        means.append(torch.linalg.solve(slope.T @ inverse @ slope + prior, slope.T @ inverse @ flat)[1])
+    pull = torch.linalg.solve(rest, jacobian.mT)
+    found, there = _restricted(jacobian @ pull, (pull.mT @ residual[..., None])[..., 0], 1, variances, prior)
+    whole = torch.stack(whole)
+    assert (found - found[0]).numpy() == pytest.approx((whole - whole[0]).numpy(), abs=1e-9)
+    assert there.numpy() == pytest.approx(torch.stack(means).numpy(), abs=1e-9)
+
+
+def test_means_are_no_surer_where_sigma_came_out_too_small() -> None:
+    """A parameter that few windows show: its error with σ at the floor is near that with the true one, not a fifth."""
+    shown = np.where(np.arange(60) % 12 == 0, 1.0, 1e-3)
+    jacobian = torch.from_numpy(shown[:, None, None])
+    true, told = 0.1, []
+    objective = linear_objective(LinearSimulator(space_of(a=[0, 1]), np.eye(1)), np.zeros((60, 1)), epsilon=1e-4)
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        pulls = shown * rng.normal(0, true, 60) + rng.normal(0, 1e-2, 60)
+        arguments = torch.from_numpy(pulls[:, None]), None, torch.ones(1, dtype=torch.float64)
+        spread, noise = torch.full((1, 1), 1e-10).double(), torch.full((60, 1, 1), 1e-4).double()
+        told.append(_given_the_log(objective, noise, jacobian, spread, *arguments).sqrt().item())
+    assert 0.7 < np.median(told) / (true / np.sqrt(5)) < 1.4
 
 
 def test_standard_errors_count_what_windows_of_a_trajectory_have_in_common() -> None:

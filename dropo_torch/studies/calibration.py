@@ -129,16 +129,17 @@ def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: in
     )
 
 
-def draw_truths(problem: Problem, kind: Kind, seed: int) -> np.ndarray:
-    """Return parameters of each transition of a log, in coordinates, ``(T, d)``."""
+def draw_truths(problem: Problem, kind: Kind, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return parameters of each transition of a log, in coordinates, ``(T, d)``, and the mean they are drawn around."""
     box, generator = SearchBox.of(problem.space), np.random.default_rng([seed, 23])
     d, count = len(problem.space), len(problem.trajectories)
     share = generator.uniform(size=d) - 0.5
     if kind == "fixed":
-        return np.tile(box.middle + share * box.width, (count, 1))
+        center = box.middle + share * box.width
+        return np.tile(center, (count, 1)), center
     center = box.middle + _INNER * share * box.width
     draws = generator.standard_normal((count, d)).clip(-2, 2)
-    return center + SPREAD * box.width * draws
+    return center + SPREAD * box.width * draws, center
 
 
 def interval(found: Fit, level: float) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +170,7 @@ def calibrate(cell: CalibrationCell, problem: Problem, *, noise: np.ndarray) -> 
         noise: standard deviation on each observed column of the ends of transitions, ``(n,)``.
     """
     space, box = problem.space, SearchBox.of(problem.space)
-    truths = draw_truths(problem, cell.kind, cell.log)
+    truths, _ = draw_truths(problem, cell.kind, cell.log)
     values = to_values(truths, space.is_log)
     config = problem.config.model_copy(update={"seed": cell.log})  # fits of several logs are independent
     fitted = fit_problem(replace(synthesise(problem, values, noise, seed=cell.log), config=config))
