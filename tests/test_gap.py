@@ -42,7 +42,7 @@ from dropo_torch.gap.remaining import Remaining
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears
-from dropo_torch.gap.scene import searched, short_windows
+from dropo_torch.gap.scene import outstanding, searched, short_windows
 from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Ended, Naming, believed, start
 from dropo_torch.gap.sound import absurd, has_skill
@@ -672,6 +672,37 @@ def test_noise_is_what_a_right_model_leaves(factor: float) -> None:
     lacking = refit(scene_of("joint_damping").evidence, scene.begin, iterations=3)
     left, told = noise_left(lacking, scene_of("joint_damping").noise, Rules()), hidden("joint_damping").noise
     assert (left > 0.9 * np.array(told)).all()
+
+
+def test_what_shows_in_the_first_rows_of_one_episode_is_found() -> None:
+    """Searches begin where delays and lags know their commands; if they find nothing, the rows before are looked at."""
+    case = hidden()
+    log = case.trajectories
+    first = np.flatnonzero(log.terminals)[0] + 1
+    pushed = log.next_observations.copy()
+    pushed[first : first + 5] += 0.05 * log.next_observations.std(0)
+    later = log.observations.copy()
+    later[first + 1 : first + 6] = pushed[first : first + 5]
+    jolt = dataclasses.replace(
+        case, trajectories=dataclasses.replace(log, observations=later, next_observations=pushed)
+    )
+    scene = prepare(load(jolt))
+    rare = outstanding(scene, scene.evidence, true(case))
+    assert rare is not None
+    assert 0 in rare.windows.steps[rare.windows.episodes == 1]
+    assert outstanding(scene_of(), scene_of().evidence, true(case)) is None
+    gap = search(jolt, FEW)
+    assert [e.effect for e in gap.effects] == ["unnamed"]
+
+
+def test_windows_that_stand_out_tell_no_noise() -> None:
+    """A rest in a fifth of the windows, beside a right model."""
+    scene, truth = scene_of(), np.array(hidden().noise)
+    fitted = refit(dataclasses.replace(scene.evidence, noise=truth), true(hidden()), iterations=3)
+    residual = fitted.residual.copy()
+    residual[::5] *= 3.0
+    worse = dataclasses.replace(fitted, residual=residual)
+    assert noise_left(worse, truth, Rules()) == pytest.approx(noise_left(fitted, truth, Rules()), rel=0.05)
 
 
 @pytest.mark.parametrize("factor", [0.4, 3.0])

@@ -173,6 +173,7 @@ class Weighed:
         known: least share of the windows that a hypothesis must know the commands of, or it cannot be judged by them.
         sharp: weight from which on a residual counts as one that noise on the initial state does not bend, and
         rows: the least of them that show a feature's noise.
+        calm: standard deviations by which a window's χ² may exceed the median one's, for it to tell the noise.
         agree: standard errors by which the noise that long windows leave may exceed what short ones with free forces
             say.
         moved: relative change of a feature's noise from which on everything is compared again.
@@ -185,6 +186,7 @@ class Weighed:
     known: float = 0.25
     sharp: float = 0.999
     rows: int = 60
+    calm: float = 4.0
     agree: float = 4.0
     moved: float = 0.03
     growth: float = 0.1

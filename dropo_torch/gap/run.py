@@ -21,11 +21,14 @@ from dropo_torch.gap.outcome import make_result, with_forces
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
-from dropo_torch.gap.scene import Scene, prepare, searched
+from dropo_torch.gap.scene import Scene, outstanding, prepare, searched
 from dropo_torch.gap.search import Ended, Naming, believed, kept, resort, search, start, with_ties
 from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
+
+#: Suffix of the checkpoint of a search over windows that stand out.
+RARE = "-rare"
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -166,6 +169,9 @@ def _name(
 ) -> Naming:  # fmt: skip
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly.
 
+    Where the windows show nothing, those that do are searched, if the log has any: but not for what remembers commands,
+    which acts throughout.
+
     Where there are contacts, long windows bend, and what is most of the gap there may be an effect of the wrong kind:
     names that leave a rest are then believed only if they leave none in shorter windows, in most of the log at least,
     or if these find no others that do. Where no search has names, the base family of all joints is the last resort;
@@ -183,7 +189,14 @@ def _name(
         found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume, end=ends))
         last = found[-1].naming
         doubtful = touches and remains(last.final.cost, ground.rules)
-        if not found[0].naming.gap or (last.named and not doubtful):
+        if not found[0].naming.gap:
+            rare = None if suffix == RARE else outstanding(scene, last.evidence, last.base.hypothesis)
+            if rare is None:
+                return with_ties(found[-1])
+            found, waiting = [], [(RARE, rare)]
+            ground = replace(ground, effects=tuple(e for e in ground.effects if not e.has("command")))
+            continue
+        if last.named and not doubtful:
             return with_ties(found[-1])
         if not last.named and decided(last):
             return last

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories
@@ -33,6 +34,8 @@ from dropo_torch.problem import Problem
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
+#: Windows among which rare events are looked for, at most; how many with them, and of all, are then searched.
+ALL, RARE, BESIDE = 600, 20, 60
 #: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
 LEAD, LEAD_SHARE = 20, 0.1
 #: Windows of an episode from which on one of them is not missed.
@@ -167,6 +170,36 @@ def searched(scene: Scene) -> Iterator[tuple[str, Evidence]]:
         yield "-shorter", _cut(scene.evidence, scene.train, scene.since, length, rough=scene.evidence.rough)
     if scene.setting.signals.contacts.any():
         yield "-contact", replace(_cut(scene.evidence, scene.train, scene.since, shortest), robust=True)
+
+
+def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence | None:
+    """Return windows of which some show more than noise where those that were searched show none; ``None`` if none do.
+
+    What is rare may lie between the windows of a long log, or among an episode's first rows, where a search does not
+    begin because of what candidates may remember. Chance lets less than one log in a hundred have such a window.
+
+    Args:
+        scene: gives the log.
+        evidence: of the search, with the noise that it found.
+        base: the declared parameters as it found them.
+    """
+    train, rules, twin = scene.train, evidence.rules, evidence.twin
+    since = twin.settled(base.variant, train.commands)
+    windows = spread(cut_windows(train, twin.setting.observation, evidence.windows.length, since=since), ALL)
+    odds = []
+    for rows in np.array_split(np.arange(len(windows)), max(1, -(-len(windows) // MOST))):
+        part = evidence.on(windows.select(rows))
+        linear = part.linearise(base.variant)
+        chi2 = (part.project(part.residuals([base.variant])[0][0], linear) ** 2).sum(-1) / rules.sound.rest
+        degrees = np.maximum((linear.weights > 0).sum(-1) - part.chart.size, 1)
+        odds.append(np.where(linear.counted, stats.chi2.logsf(chi2, degrees), 0.0))
+    order = np.argsort(np.concatenate(odds), kind="stable")
+    far = order[np.concatenate(odds)[order] < np.log(rules.chance.error / max(len(order), 1))]
+    if not far.size:
+        return None
+    others, count = np.sort(order[len(far) :]), BESIDE - min(RARE, len(far))
+    beside = others[np.unique(np.linspace(0, len(others) - 1, min(count, len(others))).astype(int))]
+    return evidence.on(windows.select(np.sort(np.concatenate([far[:RARE], beside]))))
 
 
 def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, since: np.ndarray) -> Evidence:

@@ -40,7 +40,8 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
     ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
-    others = [(nearer(focus, origin, c),) for c in promising(focus, ranked, own, ground.rules.alike)]
+    near = [nearer(focus, origin, c) for c in promising(focus, ranked, own, ground.rules.alike)]
+    others = [(p,) for p in (*near, *varieties(ground, near, own))]
     looking = replace(state, number=ROUND)
     rivals, found = ground.refits(
         looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully, iterations=ITERATIONS
@@ -93,6 +94,18 @@ def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Ali
     found = [c for c in ranked if not c.dead and c.key != own.key and share[c.key] < most]
     found = [c for c in found if not (own.effect.name in c.placed.effect.contains and c.placed.target == own.target)]
     return sorted(found, key=lambda c: share[c.key])[: rules.roughly]
+
+
+def varieties(ground: Ground, placed: Sequence[Placed], own: Placed) -> list[Placed]:
+    """Return effects of other kinds of the same thing and with as many numbers, which are not looked for alone."""
+    return [
+        Placed(effect, p.target).at(values)
+        for p in placed
+        for effect in ground.effects
+        if effect.known_as == p.effect.name and effect.name != own.effect.name
+        for values in effect.extends(ground.setting, p)
+        if len(values) == len(p.values)
+    ]
 
 
 def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
