@@ -339,6 +339,23 @@ def test_forces_decide_before_shorter_windows_are_searched(
     assert [e.effect for e in gap.effects] == ["joint_friction" if forces else "unnamed"]
 
 
+def test_names_without_skill_are_no_rivals_of_the_forces(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of what predictions name, and unseen data refute, forces cannot even judge a delay."""
+
+    def astray(ground: Ground, begin: Hypothesis, *_: Any, **__: Any) -> Ended:
+        state = start(ground, begin)
+        wrong = (next(p for p in ground.candidates if p.effect.name == "actuator_delay"),)
+        final = ground.refit(begin.with_effects(wrong), iterations=0)
+        found = Naming(ground.evidence, state.base, state.first, final, gap=True, named=True, ties=((),), shares=(1.0,))
+        return Ended(ground, state, found)
+
+    monkeypatch.setattr(run, "search", astray)
+    monkeypatch.setattr(run, "with_ties", lambda ended: ended.naming)
+    problem = problem_of(tmp_path, 5, friction=(0.5, 0.8, 0.3), seconds=20)
+    gap = find_gap(problem, effects=[find_effect(e) for e in ("joint_friction", "actuator_delay")])
+    assert [e.effect for e in gap.effects] == ["joint_friction"]
+
+
 def test_friction_that_gives_is_told_and_written(tmp_path: Path) -> None:
     """With both its numbers; and the config that is written simulates it."""
     truth = {"friction": (0.5, 0.8, 0.3), "gives": (0.02, 0.02, 0.03), "ripple": 0.02, "seconds": 20}

@@ -209,6 +209,8 @@ def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
     """What was found, without names: with them the model still predicts no better than constant velocity."""
     placed = naming.final.hypothesis.placed
     names = " and ".join(p.effect.name.replace("_", " ") + (f" of {p.target}" if p.target else "") for p in placed)
+    if naming.family:
+        names = "friction, inertia, offset and delay of all joints"
     reason = (
         f"with {names}, which would account for most of the misfit, the model still predicts unseen data no better "
         f"than constant velocity does (open loop {after.rollout_rmse:.3g} against {constant:.3g})"

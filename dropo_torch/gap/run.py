@@ -134,7 +134,8 @@ def find_gap(
     gap = make_result(scene, naming, started, report)
     if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
         return gap
-    if (decided := view(naming.final.hypothesis.placed if naming.named else ())) is None:
+    refused = gap.verdict == "unnamed"  # names under which the model has no skill are no rivals
+    if (decided := view(() if refused else naming.final.hypothesis.placed)) is None:
         return gap
     return replace(with_forces(scene, gap, decided), seconds=time.perf_counter() - started)
 
