@@ -29,7 +29,7 @@ from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, Scene, accept, add, find_gap, prepare
+from dropo_torch.gap import Gap, Scene, accept, add, find_gap, outcome, prepare
 from dropo_torch.gap.accept import extend, imitates, is_done, is_needed
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
@@ -693,6 +693,23 @@ def test_what_shows_in_the_first_rows_of_one_episode_is_found() -> None:
     assert outstanding(scene_of(), scene_of().evidence, true(case)) is None
     gap = search(jolt, FEW)
     assert [e.effect for e in gap.effects] == ["unnamed"]
+
+
+def test_names_that_make_unseen_predictions_worse_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where they leave more than noise: friction that is taken for damping, if damping predicted worse than nothing."""
+    loose = Rules(accounted=0.3)
+    named = search(hidden("joint_friction"), ("joint_damping",), rules=loose)
+    assert named.verdict == "partly explained"
+    known = outcome.score
+
+    def perfect(*arguments: Any) -> Score:
+        return dataclasses.replace(known(*arguments), rollout_rmse=0.0)
+
+    monkeypatch.setattr(outcome, "score", perfect)
+    refused = search(hidden("joint_friction"), ("joint_damping",), rules=loose)
+    assert refused.verdict == "unnamed"
+    assert "no better than without them" in refused.document()["verdict_reason"]
+    assert search(hidden("joint_damping"), ("joint_damping",), rules=loose).verdict == "explained"
 
 
 def test_windows_that_stand_out_tell_no_noise() -> None:

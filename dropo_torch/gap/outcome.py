@@ -18,7 +18,7 @@ from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.renew import moved, noise_beside
-from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Residuals, Score, Strength
+from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Residuals, Strength
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
@@ -41,6 +41,11 @@ UNSEEN = (
     "the stretches that were compared show no more than noise, but open-loop errors on unseen data are {:.0f} times "
     "what noise makes"
 )
+#: Why unseen data refute names.
+UNSKILLED = (
+    "the model still predicts unseen data no better than constant velocity does (open loop {:.3g} against {:.3g})"
+)
+WORSE = "the model predicts unseen data no better than without them (open loop {:.3g} against {:.3g})"
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -73,7 +78,11 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
     if not naming.gap and astray > rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(astray))
     if naming.named and not has_skill(after_score, floor, constant, rules.sound):
-        return make_result(scene, _without_names(naming, after_score, constant), started, report)
+        refused = UNSKILLED.format(after_score.rollout_rmse, constant)
+        return make_result(scene, _without_names(naming, refused), started, report)
+    if naming.named and remains(rest.cost, rules) and after_score.rollout_rmse > given.rollout_rmse:
+        refused = WORSE.format(after_score.rollout_rmse, given.rollout_rmse)
+        return make_result(scene, _without_names(naming, refused), started, report)
     skill = has_skill(given, floor, constant, rules.sound)
     report("verifying", 0.8)
     short, best = scene.short, final.hypothesis
@@ -205,16 +214,13 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
     return final, rest
 
 
-def _without_names(naming: Naming, after: Score, constant: float) -> Naming:
-    """What was found, without names: with them the model still predicts no better than constant velocity."""
+def _without_names(naming: Naming, refused: str) -> Naming:
+    """What was found, without names: unseen data refute them."""
     placed = naming.final.hypothesis.placed
     names = " and ".join(p.effect.name.replace("_", " ") + (f" of {p.target}" if p.target else "") for p in placed)
     if naming.family:
         names = "friction, inertia, offset and delay of all joints"
-    reason = (
-        f"with {names}, which would account for most of the misfit, the model still predicts unseen data no better "
-        f"than constant velocity does (open loop {after.rollout_rmse:.3g} against {constant:.3g})"
-    )
+    reason = f"with {names}, which would account for most of the misfit, {refused}"
     return replace(naming, final=naming.base, named=False, ties=(), shares=(), partial=False, refused=reason)
 
 
