@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import functools
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -107,35 +107,50 @@ def markdown(rows: Sequence[Coverage]) -> str:
     return "\n".join(lines) + "\n"
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def options(doc: str | None) -> argparse.ArgumentParser:
+    """What every study of many fits is told on the command line."""
+    parser = argparse.ArgumentParser(description=doc, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--logs", type=int, default=100, help="of each kind")
     parser.add_argument("--transitions", type=int, default=60)
-    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--workers", type=int, default=1, help="logs at a time")
     parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
-    given = parser.parse_args(arguments)
-    if given.workers < 1:
-        parser.error(f"--workers {given.workers}: expected 1 or more")
-    cells = [CalibrationCell(k, m, n) for n in range(given.logs) for k in KINDS for m in given.methods]
-    work = functools.partial(fit_cell, transitions=given.transitions)
+    return parser
+
+
+def fit_all(
+    parser: argparse.ArgumentParser, given: argparse.Namespace, plan: object, cells: Sequence[CalibrationCell],
+    work: Callable[..., dict[str, Any]],
+) -> list[dict[str, Any]]:  # fmt: skip
+    """Fit every cell, with its progress, and return all results; what is wrong ends the command in one line."""
+    for name in ("logs", "transitions", "workers"):
+        if (number := getattr(given, name)) < 1:
+            parser.error(f"--{name} {number}: expected 1 or more")
     try:
-        found = run_cells(
-            given.out,
-            Plan(given.transitions),
-            cells,
-            work,
-            resume=given.resume,
-            workers=given.workers,
+        return run_cells(
+            given.out, plan, cells, work, resume=given.resume, workers=given.workers,
             report=lambda stage, _: print(stage, flush=True),
-        )
+        )  # fmt: skip
     except dropo.InputError as error:
         parser.error(str(error))
-    runs = [CalibrationRun(**{k: v for k, v in run.items() if k != "cell"}) for run in found]
-    table = markdown(coverages(runs))
-    (given.out / "calibration.md").write_text(table)
+
+
+def write_table(path: Path, table: str) -> None:
+    """Write a table, and print it."""
+    path.write_text(table)
     print(table)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = options(__doc__)
+    parser.add_argument("--methods", nargs="+", choices=list(METHODS), default=list(METHODS))
+    given = parser.parse_args(arguments)
+    cells = [CalibrationCell(k, m, n) for n in range(given.logs) for k in KINDS for m in given.methods]
+    found = fit_all(
+        parser, given, Plan(given.transitions), cells, functools.partial(fit_cell, transitions=given.transitions)
+    )
+    runs = [CalibrationRun(**{k: v for k, v in run.items() if k != "cell"}) for run in found]
+    write_table(given.out / "calibration.md", markdown(coverages(runs)))
 
 
 if __name__ == "__main__":

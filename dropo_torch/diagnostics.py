@@ -202,7 +202,7 @@ def _given_the_log(
         ratio = torch.ones(QUANTILES, len(drawn), dtype=torch.float64)
         ratio[:, j] = likely / drawn[j].clamp(min=1e-300)
         wide = spread * ratio[:, :, None] * ratio[:, None, :]
-        each = [_informed(*_pulls(covariance, jacobian, w), together, width)[0][j, j] for w in wide]
+        each = [_informed(*_pulls(covariance, jacobian, w), together, width)[0][j] for w in wide]
         found.append(torch.stack(each).mean() + share @ (means - share @ means).square())
     return torch.stack(found)
 
@@ -236,23 +236,16 @@ def _pulls(covariance: torch.Tensor, jacobian: torch.Tensor, spread: torch.Tenso
 def _informed(
     pull: torch.Tensor, gram: torch.Tensor, together: torch.Tensor | None, width: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Covariance of the estimates of μ, the inverse of the information, and what shared measurements pull, ``(d, d)``.
-
-    A covariance that is next to nothing beside the inverse is rounding; then it is the inverse.
-    """
-    information, shared = gram.sum(0) + torch.diag(width**-2), torch.zeros_like(width[:, None] * width)
+    """Variances of μ ``(d,)``, the inverse of their information, and what shared measurements pull, ``(d, d)`` each."""
+    information, shared = gram.sum(0) + torch.diag(width**-2), torch.zeros_like(gram[0])
     error, correlation = estimates(information.numpy())
     bounded = np.minimum(error, 1e100)
     inverse = torch.from_numpy(correlation * np.outer(bounded, bounded))
     if together is not None:
         half = (pull[:-1].mT @ together @ pull[1:]).sum(0)
         shared = half + half.T
-    return _beyond_rounding(inverse @ (information - shared) @ inverse, inverse), inverse, shared
-
-
-def _beyond_rounding(covariance: torch.Tensor, inverse: torch.Tensor) -> torch.Tensor:
-    """A covariance of estimates, or the inverse of their information where it is next to nothing beside it."""
-    return torch.where(torch.diagonal(covariance) > 1e-4 * torch.diagonal(inverse), covariance, inverse)
+    variance, least = torch.diagonal(inverse @ (information - shared) @ inverse), torch.diagonal(inverse)
+    return torch.where(variance > 1e-4 * least, variance, least), inverse, shared  # next to nothing is rounding
 
 
 def _of_means(
@@ -264,8 +257,8 @@ def _of_means(
     informed, inverse, shared = _informed(pull, gram, together, width)
     score = torch.nan_to_num((pull.mT @ residual[..., None])[..., 0])
     windows, *trajectories = (_scatter(gram, score, inverse, group) for group in grouped)
-    left_out = (inverse @ scatter @ inverse for scatter in (windows - shared, *trajectories))
-    variance = torch.stack([torch.diagonal(way) for way in (informed, *left_out)]).amax(0)
+    left_out = [torch.diagonal(inverse @ scatter @ inverse) for scatter in (windows - shared, *trajectories)]
+    variance = torch.stack([informed, *left_out]).amax(0)
     least = torch.diagonal(inverse)
     return variance, (inverse / torch.outer(least, least).sqrt()).clamp(-1, 1).numpy(), gram
 

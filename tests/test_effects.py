@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import mujoco
@@ -33,6 +34,7 @@ from dropo_torch.effects.simulator import EffectSimulator, effect_simulator
 from dropo_torch.errors import InputError
 from dropo_torch.fit import fit
 from dropo_torch.gap.add import search_box, write_config
+from dropo_torch.gap.ties import varieties
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.optimizers import FitSettings
 from dropo_torch.parameters import ParameterSpace
@@ -329,6 +331,17 @@ def test_a_sole_touches_where_its_surface_is(foot: str, larger: str, sinks: floa
     np.testing.assert_allclose(simulate(with_effects(plain, [Placed(sole, "foot", (0.0,))])), simulate(plain))
     raised = with_effects(plain, [Placed(sole, "floor", (0.01,))])
     np.testing.assert_allclose(raised.geom_pos[0], 0.01 * normal, atol=1e-15)
+
+
+def test_what_is_never_looked_for_alone_is_tried_as_a_tie_beside_its_kind() -> None:
+    """A sole where a margin may be what ties, at its size; nothing beside friction, nor a sole beside itself."""
+    foot = 'type="sphere" size=".1" mass="1"'
+    setting = setting_of(mujoco.MjModel.from_xml_string(FEET.format(foot=foot, height=0.115, other="")))
+    ground: Any = SimpleNamespace(effects=tuple(VOCABULARY.values()), setting=setting)
+    margin, friction, sole = (find_effect(f"contact_{name}") for name in ("margin", "friction", "sole"))
+    near, own = [Placed(margin, "floor", (0.01,)), Placed(friction, "floor", (2.0,))], Placed(friction, "foot", (2.0,))
+    assert [(p.key, p.values) for p in varieties(ground, near, own)] == [(("contact_sole", "floor"), (0.01,))]
+    assert varieties(ground, near, Placed(sole, "foot", (0.01,))) == []
 
 
 def test_planes_sink_only_under_a_geom_that_alone_touches_them() -> None:

@@ -18,7 +18,7 @@ from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.renew import moved, noise_beside
-from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Residuals, Strength
+from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Residuals, Score, Strength
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
@@ -42,10 +42,8 @@ UNSEEN = (
     "what noise makes"
 )
 #: Why unseen data refute names.
-UNSKILLED = (
-    "the model still predicts unseen data no better than constant velocity does (open loop {:.3g} against {:.3g})"
-)
-WORSE = "the model predicts unseen data no better than without them (open loop {:.3g} against {:.3g})"
+UNSKILLED = "the model still predicts unseen data no better than constant velocity does"
+WORSE = "the model predicts unseen data worse than without them"
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -78,11 +76,9 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
     if not naming.gap and astray > rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(astray))
     if naming.named and not has_skill(after_score, floor, constant, rules.sound):
-        refused = UNSKILLED.format(after_score.rollout_rmse, constant)
-        return make_result(scene, _without_names(naming, refused), started, report)
+        return make_result(scene, _without_names(naming, UNSKILLED, after_score, constant), started, report)
     if naming.named and remains(rest.cost, rules) and after_score.rollout_rmse > given.rollout_rmse:
-        refused = WORSE.format(after_score.rollout_rmse, given.rollout_rmse)
-        return make_result(scene, _without_names(naming, refused), started, report)
+        return make_result(scene, _without_names(naming, WORSE, after_score, given.rollout_rmse), started, report)
     skill = has_skill(given, floor, constant, rules.sound)
     report("verifying", 0.8)
     short, best = scene.short, final.hypothesis
@@ -214,13 +210,14 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
     return final, rest
 
 
-def _without_names(naming: Naming, refused: str) -> Naming:
-    """What was found, without names: unseen data refute them."""
+def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Naming:
+    """What was found, without names: with them, open loop on unseen data is no better than a rival's."""
     placed = naming.final.hypothesis.placed
     names = " and ".join(p.effect.name.replace("_", " ") + (f" of {p.target}" if p.target else "") for p in placed)
     if naming.family:
         names = "friction, inertia, offset and delay of all joints"
-    reason = f"with {names}, which would account for most of the misfit, {refused}"
+    sizes = f"open loop {after.rollout_rmse:.3g} against {rival:.3g}"
+    reason = f"with {names}, which would account for most of the misfit, {why} ({sizes})"
     return replace(naming, final=naming.base, named=False, ties=(), shares=(), partial=False, refused=reason)
 
 

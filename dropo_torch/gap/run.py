@@ -27,9 +27,6 @@ from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
 
-#: Suffix of the checkpoint of a search over windows that stand out.
-RARE = "-rare"
-
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
     """Return where simulation and log disagree, the largest share first; nothing if what remains is noise.
@@ -134,7 +131,7 @@ def find_gap(
     gap = make_result(scene, naming, started, report)
     if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
         return gap
-    refused = gap.verdict == "unnamed"  # names under which the model has no skill are no rivals
+    refused = gap.verdict == "unnamed"  # names that unseen data refute are no rivals
     if (decided := view(() if refused else naming.final.hypothesis.placed)) is None:
         return gap
     return replace(with_forces(scene, gap, decided), seconds=time.perf_counter() - started)
@@ -181,22 +178,24 @@ def _name(
     touches = bool(scene.setting.signals.contacts.any())
     known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
     found, waiting = list[Ended](), list(searched(scene))
+
+    def sought(suffix: str, ground: Ground, end: float) -> Ended:
+        path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
+        return search(ground, scene.begin, path, resume=resume, end=end)
+
     while waiting and (not found or time.monotonic() < end):
         suffix, evidence = waiting.pop(0)
         if found:
             ground.report("searching over shorter windows", 0.0)
-        path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
-        ends = share_of(end, len(waiting))
-        found.append(search(replace(ground, evidence=evidence), scene.begin, path, resume=resume, end=ends))
+        found.append(sought(suffix, replace(ground, evidence=evidence), share_of(end, len(waiting))))
         last = found[-1].naming
         doubtful = touches and remains(last.final.cost, ground.rules)
         if not found[0].naming.gap:
-            rare = None if suffix == RARE else outstanding(scene, last.evidence, last.base.hypothesis)
-            if rare is None:
-                return with_ties(found[-1])
-            found, waiting = [], [(RARE, rare)]
-            ground = replace(ground, effects=tuple(e for e in ground.effects if not e.has("command")))
-            continue
+            rare = outstanding(scene, last.evidence, last.base.hypothesis)
+            now = tuple(e for e in ground.effects if not e.has("command"))
+            return (
+                last if rare is None else with_ties(sought("-rare", replace(ground, evidence=rare, effects=now), end))
+            )
         if last.named and not doubtful:
             return with_ties(found[-1])
         if not last.named and decided(last):

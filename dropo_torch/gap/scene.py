@@ -34,7 +34,7 @@ from dropo_torch.problem import Problem
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
-#: Windows among which rare events are looked for, at most; how many with them, and of all, are then searched.
+#: Windows among which those that stand out are looked for, at most; of these that are searched, and with others beside.
 ALL, RARE, BESIDE = 600, 20, 60
 #: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
 LEAD, LEAD_SHARE = 20, 0.1
@@ -193,8 +193,9 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
         chi2 = (part.project(part.residuals([base.variant])[0][0], linear) ** 2).sum(-1) / rules.sound.rest
         degrees = np.maximum((linear.weights > 0).sum(-1) - part.chart.size, 1)
         odds.append(np.where(linear.counted, stats.chi2.logsf(chi2, degrees), 0.0))
-    order = np.argsort(np.concatenate(odds), kind="stable")
-    far = order[np.concatenate(odds)[order] < np.log(rules.chance.error / max(len(order), 1))]
+    chance = np.concatenate(odds)
+    order = np.argsort(chance, kind="stable")
+    far = order[chance[order] < np.log(rules.chance.error / max(len(order), 1))]
     if not far.size:
         return None
     others, count = np.sort(order[len(far) :]), BESIDE - min(RARE, len(far))

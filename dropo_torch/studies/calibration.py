@@ -23,7 +23,7 @@ import scipy.special
 import torch
 
 from dropo_torch.baselines import Mixture, fit_problem
-from dropo_torch.data.trajectory import make_transitions
+from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.distribution import SearchBox, to_values
 from dropo_torch.fit import Fit
 from dropo_torch.problem import Problem
@@ -122,11 +122,13 @@ def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: in
         state = simulator.simulate(state, control, torch.from_numpy(truths[t : t + 1].copy()))[:, 0]
         after[t, columns] = state[0].numpy()[index]
     after[:, columns] += noise * np.random.default_rng(seed).standard_normal((len(log), len(columns)))
-    made = replace(log, observations=before, next_observations=after)
-    lag = problem.objective.transitions.lag
-    return replace(
-        problem, trajectories=made, objective=problem.objective.on(make_transitions(made, observation, lag=lag))
-    )
+    return with_log(problem, replace(log, observations=before, next_observations=after))
+
+
+def with_log(problem: Problem, log: Trajectories) -> Problem:
+    """Return the problem of another log with the same columns."""
+    transitions = make_transitions(log, problem.observation, lag=problem.objective.transitions.lag)
+    return replace(problem, trajectories=log, objective=problem.objective.on(transitions))
 
 
 def draw_truths(problem: Problem, kind: Kind, seed: int) -> tuple[np.ndarray, np.ndarray]:
