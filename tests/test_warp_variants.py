@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from dataclasses import replace
 
 import mujoco
@@ -13,9 +14,12 @@ from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import Placed, find_effect
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.placing import plain_setting
-from dropo_torch.parameters import ParameterSpace
+from dropo_torch.errors import UnsupportedModel
+from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.engine import Batch, Engine
-from dropo_torch.simulators.warp.variants import Variants, Worlds
+from dropo_torch.simulators.warp.layout import FIELDS
+from dropo_torch.simulators.warp.types import Tables
+from dropo_torch.simulators.warp.variants import Variants, Worlds, _structure
 from dropo_torch.testing.effects import RIG
 
 pytest.importorskip("warp")
@@ -37,6 +41,13 @@ FORCED: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
     (("joint_cogging", "elbow", (0.3, 2.0, 0.0)), ("joint_stribeck", "rail", (0.1, 0.3, 0.2))),
     (("joint_stribeck", "elbow", (0.05, 0.1, 0.5)), ("integration", None, (0.0025,))),
     (("joint_presliding", "rail", (0.3, 0.01)),),
+]
+#: Effects that are wrenches on bodies, alone, two of them, beside a force and beside another step.
+WRENCHED: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
+    (("external_force", "lower", (1.0, -0.5, 2.0)),),
+    (("external_force", "ball", (0.5, 1.5, -1.0)), ("external_force", "lower", (1.0, 0.0, 0.3))),
+    (("external_force", "lower", (0.7, 0.0, 1.0)), FORCED[0][0]),
+    (("external_force", "cart", (1.0, 0.0, 0.0)), ("integration", None, (0.0025,))),
 ]
 
 
@@ -67,7 +78,7 @@ def simulated(
 
 @pytest.mark.parametrize("fine", [False, True])
 def test_variants_are_those_of_mujoco(fine: bool) -> None:
-    variants = [variant(effects, mass) for effects in (*NATIVE, *FORCED) for mass in (0.7, 1.1)]
+    variants = [variant(effects, mass) for effects in (*NATIVE, *FORCED, *WRENCHED) for mass in (0.7, 1.1)]
     ours, theirs = (simulated(engine, variants, fine) for engine in engines())
     assert ours.shape == (len(variants), WINDOWS, STEPS if fine else STEPS // SKIP, 9 + 8 + 2)
     np.testing.assert_allclose(ours, theirs, rtol=0, atol=1e-8)
@@ -75,7 +86,7 @@ def test_variants_are_those_of_mujoco(fine: bool) -> None:
 
 
 def test_what_is_simulated_with_warp_is(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wrenches and models outside the subset go to MuJoCo; an engine serves all variants of a structure."""
+    """Models outside the subset go to MuJoCo; an engine serves all variants of a structure."""
     asked: list[bool] = []
     worlds = Variants.worlds
 
@@ -86,22 +97,51 @@ def test_what_is_simulated_with_warp_is(monkeypatch: pytest.MonkeyPatch) -> None
 
     monkeypatch.setattr(Variants, "worlds", counted)
     ours, theirs = engines()
-    pushed = variant((("external_force", "cart", (1.0, 0.0, 0.0)),), 0.7)
-    np.testing.assert_array_equal(simulated(ours, [pushed]), simulated(theirs, [pushed]))
-    assert asked == []
     dragged = variant((("fluid_drag", "cart", (0.5,)),), 0.7)
     np.testing.assert_array_equal(simulated(ours, [dragged]), simulated(theirs, [dragged]))
     assert asked == [False]
-    plain = [variant((), mass) for mass in (0.5, 0.9)]
-    simulated(ours, plain)
-    assert asked == [False, True]
+    simulated(ours, [variant(effects, mass) for effects in ((), WRENCHED[0]) for mass in (0.5, 0.9)])
+    assert asked == [False, True, True]
     assert sum(e is not None for e in ours._warp._engines.values()) == 1
+
+
+def tables_of(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, object] | None:
+    """All that an engine of a model has in its tables; ``None`` where there is none."""
+    try:
+        engine = Engine(model, space, skip=1, chunk_size=1, num_threads=1, device="cpu")
+    except UnsupportedModel:
+        return None
+    values = {name: getattr(engine.tables, name) for name in Tables.vars}
+    return {n: v.numpy().tolist() if hasattr(v, "numpy") else np.array(v).tolist() for n, v in values.items()}
+
+
+def test_models_of_one_structure_share_their_tables() -> None:
+    """Whatever number of θ is zero, or is not."""
+    model = mujoco.MjModel.from_xml_string(ROUND)
+    space = ParameterSpace(model, MASS)
+    known, shared = {_structure(model): tables_of(model, space)}, 0
+    for field in sorted(set(FIELDS)):
+        for flat in range(read_field(model, field).size):
+            for value in (0.3,) if field in ("body_mass", "body_inertia") else (0.0, 0.3, -0.3):
+                other = copy.copy(model)
+                if field.startswith("opt."):
+                    array = read_field(other, field).copy()
+                    array.reshape(-1)[flat] = value
+                    setattr(other.opt, field[4:], array if array.size > 1 else value)
+                else:
+                    getattr(other, field).reshape(-1)[flat] = value
+                key = _structure(other)
+                shared += key in known
+                tables = tables_of(other, space)
+                assert known.setdefault(key, tables) == tables, (field, flat, value)
+    assert shared > 5 * len(known)
+    assert sum(tables is not None for tables in known.values()) > 0.9 * len(known)
 
 
 def test_pushes_are_those_of_mujoco() -> None:
     """Generalised forces of every logged step, alone and beside an effect that is a force."""
     ours, theirs = engines()
-    variants = [variant((), 0.7), variant(FORCED[0], 0.7)]
+    variants = [variant(effects, 0.7) for effects in ((), FORCED[0], WRENCHED[0], WRENCHED[2])]
     pushes = np.random.default_rng(1).normal(0, 0.5, (len(variants), STEPS // SKIP, 9))
     pushed, same = (simulated(engine, variants, pushes=pushes) for engine in (ours, theirs))
     np.testing.assert_allclose(pushed, same, rtol=0, atol=1e-8)
@@ -118,22 +158,34 @@ def test_forces_keep_to_their_rows() -> None:
         np.testing.assert_allclose(together, alone, rtol=0, atol=1e-12)
 
 
-def test_applied_forces_have_gradients() -> None:
-    """Of all that stands in the controls, by central differences."""
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+@pytest.mark.parametrize(("applied", "wrenched"), [(True, False), (False, True), (True, True)])
+def test_what_acts_besides_has_gradients(applied: bool, wrenched: bool, integrator: str) -> None:
+    """Of all that stands in the controls, of the state and of θ beside it, by central differences."""
     model = mujoco.MjModel.from_xml_string(ROUND)
-    engine = Engine(model, ParameterSpace(model, MASS), skip=SKIP, chunk_size=8, num_threads=1, device="cpu")
-    theta, width, rng = engine.fields.of([model]), model.nu + model.nv, np.random.default_rng(2)
-    state = torch.from_numpy(np.concatenate([model.qpos0, rng.normal(0, 0.3, model.nv)])[None])
-    controls = torch.from_numpy(rng.normal(0, 0.3, (1, 2, width)))
-
-    batch = Batch(theta, state, controls, SKIP, applied=True)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    centre = {"centre": {"field": "body_ipos", "name": "lower", "index": 2, "bounds": [-0.3, 0.3]}}
+    engine = Engine(model, ParameterSpace(model, MASS | centre), skip=SKIP, chunk_size=8, num_threads=1, device="cpu")
+    width, rng = model.nu + 6 * model.nbody * wrenched + model.nv * applied, np.random.default_rng(2)
+    state = np.concatenate([model.qpos0, rng.normal(0, 0.3, model.nv)])
+    state[[0, 1, 4, 9]] += [0.2, -0.3, 0.5, 0.1]  # the ball is in the air
+    turned = range(5, 9)  # the ball's quaternion, which has no gradient but along turns
+    given = {
+        "theta": engine.fields.of([model]), "states": torch.from_numpy(state[None]),
+        "controls": torch.from_numpy(rng.normal(0, 0.3, (1, 2, width))),
+    }  # fmt: skip
+    batch = Batch(**given, skip=SKIP, applied=applied, wrenched=wrenched)
     _, traces = engine.simulate(batch, True)
-    _, _, bar = engine.adjoint(batch, torch.ones(2, state.shape[1], dtype=torch.float64), traces)
-    for k in range(width):
-        shift = torch.zeros_like(controls)
-        shift[0, 0, k] = 1e-5
-        there, back = (engine.simulate(replace(batch, controls=controls + s * shift), False)[0] for s in (1, -1))
-        assert float((there - back).sum() / 2e-5) == pytest.approx(float(bar[0, 0, k]), rel=1e-4, abs=1e-6)
+    bars = engine.adjoint(batch, torch.ones(2, model.nq + model.nv, dtype=torch.float64), traces)
+    for (name, x), bar in zip(given.items(), bars, strict=True):
+        for k in engine.fields.wanted[:8] if name == "theta" else range(x[0].numel()):
+            if name == "states" and k in turned:
+                continue
+            shift = torch.zeros_like(x)
+            shift.view(-1)[k] = 1e-5
+            there, back = (engine.simulate(replace(batch, **{name: x + s * shift}), False)[0] for s in (1, -1))
+            slope = float((there - back).sum() / 2e-5)
+            assert slope == pytest.approx(float(bar.view(-1)[k]), rel=1e-4, abs=1e-6), (name, k)
 
 
 def test_a_force_that_is_there_twice_acts_twice() -> None:

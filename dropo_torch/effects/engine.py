@@ -220,33 +220,38 @@ class VariantEngine:
         pushes: np.ndarray | None, finer: int, every: int,
     ) -> np.ndarray | None:  # fmt: skip
         """Do what :meth:`_by_mujoco` does with Warp, or return ``None`` where it cannot."""
-        if self._warp is None or len(self._filters) or any(v.has("wrench") for v in variants):
+        if self._warp is None or len(self._filters):
             return None
         (num_k, num_w, total), nq = signals.shape[:3], self._base.nq
         worlds = self._warp.worlds([m for m in models if m is not None], num_w)
         if worlds is None:
             return None
         states, control = starts.reshape(num_k * num_w, -1), signals.reshape(num_k * num_w, total, -1)
-        forces, applied = forces_of(variants, num_w), pushes is not None
+        forces, applied, wrenched = forces_of(variants, num_w), pushes is not None, variants[0].has("wrench")
+        if wrenched:
+            outer = self._wrenches(variants).reshape(num_k, -1).repeat(num_w, 0)[:, None]
+            control = np.concatenate([control, np.broadcast_to(outer, (*control.shape[:2], outer.shape[2]))], 2)
         if pushes is not None:
             pushed = np.repeat(np.repeat(pushes, self._setting.frame_skip, axis=1), num_w, axis=0)
             control = np.concatenate([control, pushed], 2)
         if not forces:
             held = 1 if _varies(control, every) else every
-            path = worlds.rollout(states, control[:, ::held], held * finer, applied=applied)
+            path = worlds.rollout(states, control[:, ::held], held * finer, applied=applied, wrenched=wrenched)
             return path[:, every // held - 1 :: every // held].reshape(num_k, num_w, -1, states.shape[1])
         if not applied:
             control = np.concatenate([control, np.zeros((*control.shape[:2], self._base.nv))], 2)
-        own = control[:, :, -self._base.nv :].copy()
         out, before = np.empty((len(states), total // every, states.shape[1])), states[:, nq:]
+        stepper = worlds.stepper(states, control.shape[2], 1, applied=True, wrenched=wrenched)
         for step in range(total):
             for _ in range(finer):
+                states, inputs = stepper.states, control[:, step].copy()
                 found = self._forces(forces, states[:, :nq], states[:, nq:], before, self._base.opt.timestep / finer)
-                control[:, step, -self._base.nv :], before = own[:, step] + found, states[:, nq:]
-                states = worlds.rollout(states, control[:, step : step + 1], 1, applied=True)[:, 0]
+                inputs[:, -self._base.nv :] += found
+                before = states[:, nq:]
+                stepper.step(inputs)
             if (step + 1) % every == 0:
-                out[:, (step + 1) // every - 1] = states
-        out[~np.isfinite(states).all(1)] = np.nan
+                out[:, (step + 1) // every - 1] = stepper.states
+        out[~np.isfinite(stepper.states).all(1)] = np.nan
         return out.reshape(num_k, num_w, *out.shape[1:])
 
     def _by_mujoco(
@@ -277,11 +282,8 @@ class VariantEngine:
             batch.bind("act")[:, self._filters.activations] = acting
         control = control[:, self.lead :]
         forces = forces_of(variants, num_w)
-        for k, variant in enumerate(variants):
-            for p in variant.placed:
-                if p.effect.has("wrench"):
-                    own = slice(k * num_w, (k + 1) * num_w)
-                    batch.bind("xfrc_applied")[own] += p.effect.wrench(self._setting, p.target, np.array(p.values))
+        if any(v.has("wrench") for v in variants):
+            batch.bind("xfrc_applied")[:] += self._wrenches(variants).repeat(num_w, 0)
         held = 1 if forces or _varies(control, every) else every  # steps of the base between changes
         calls, steps = (finer, 1) if forces else (1, finer * held)
         out, failed, before = np.empty((rows, total // every, starts.shape[1])), np.zeros(rows, bool), qvel.copy()
@@ -307,6 +309,15 @@ class VariantEngine:
         out[failed] = np.nan
         batch.set_models(None)
         return out.reshape(num_k, num_w, *out.shape[1:])
+
+    def _wrenches(self, variants: Sequence[Variant]) -> np.ndarray:
+        """Return the wrenches on all bodies, as ``xfrc_applied`` has them ``(K, nbody, 6)``."""
+        out = np.zeros((len(variants), self._base.nbody, 6))
+        for own, variant in zip(out, variants, strict=True):
+            for p in variant.placed:
+                if p.effect.has("wrench"):
+                    own += p.effect.wrench(self._setting, p.target, np.array(p.values))
+        return out
 
     def _batch(self, rows: int) -> mujoco.batch.Batch:
         if rows not in self._batches:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import os
 import threading
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -39,11 +40,12 @@ class Batch:
     Attributes:
         theta: parameter vectors as θ, ``(K, P)``.
         states: initial states, ``(T, nq + nv)``.
-        controls: controls of every logged step, ``(T, lag, nu)``; ``(T, lag, nu + nv)`` with ``applied``.
+        controls: controls of every logged step, ``(T, lag, nu)``, and what else acts in it, behind them.
         skip: physics steps of a logged step.
         paired: whether each transition has a parameter vector of its own (``T = K``); otherwise each is simulated
             under all of them.
-        applied: whether generalised forces, which act besides, stand after the controls.
+        applied: whether generalised forces, ``nv`` of them, stand at the end.
+        wrenched: whether wrenches on the bodies, ``6 nbody`` of them as in ``xfrc_applied``, stand after the controls.
     """
 
     theta: torch.Tensor
@@ -52,6 +54,7 @@ class Batch:
     skip: int
     paired: bool = False
     applied: bool = False
+    wrenched: bool = False
 
     @property
     def lag(self) -> int:
@@ -151,6 +154,35 @@ class Engine:
                     traces.append(trace)
         return out, traces
 
+    def repeated(self, batch: Batch, out: torch.Tensor) -> Callable[[], None]:
+        """Return what simulates a batch whenever it is called, into ``out``, from what then stands in its tensors.
+
+        Launches are prepared once: where a step at a time is simulated, they would take longer than the steps.
+
+        Args:
+            batch: what is simulated.
+            out: the states after each logged step, ``(T·K·lag, nq + nv)``.
+        """
+        calls = []
+        with self._lock, self._stream(batch):
+            chunks = self._chunks(batch)
+            slots = self._slots(max(count for _, count in chunks))
+            memory = self._trajectory(slots * _period(batch, False) * self.tables.nstage)
+            world = self._fresh_world(slots, memory, adjoint=False)
+            for first, count in chunks:
+                trace = Trace(first, count, memory, wp.empty(count, dtype=wp.int32, device=self.device))
+                rows = wp.from_torch(out[first * batch.lag : (first + count) * batch.lag])
+                arguments = [*batch.arrays, trace.alive, rows]
+                calls.append(self._launches(kernel_forward.simulate_kernel, world, batch, trace, arguments, False))
+            recorded = [[call(record_cmd=True).launch for call in slices] for slices in calls]
+
+        def run() -> None:
+            with self._lock, self._stream(batch):
+                for slices in recorded:
+                    _at_once(slices)
+
+        return run
+
     def adjoint(
         self, batch: Batch, out_bar: torch.Tensor, traces: list[Trace]
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
@@ -236,34 +268,32 @@ class Engine:
             )  # fmt: skip
 
     def _launch(self, kernel: Any, batch: Batch, trace: Trace, arguments: list[Any], keep: bool) -> None:
-        """Launch a kernel on the worlds of a chunk: on a CPU one contiguous slice for each thread.
+        """Launch a kernel on the worlds of a chunk."""
+        world = self._world(self._slots(trace.count), trace.memory, kernel is kernel_backward.adjoint_kernel)
+        _at_once(self._launches(kernel, world, batch, trace, arguments, keep))
 
-        A launch on a CPU releases Python's lock.
-        """
+    def _launches(
+        self, kernel: Any, world: Any, batch: Batch, trace: Trace, arguments: list[Any], keep: bool
+    ) -> list[Callable[..., Any]]:
+        """What launches a kernel on the worlds of a chunk: on a CPU one contiguous slice for each thread."""
         if kernel.key not in self._loaded:  # compiled or loaded before threads launch it
             wp.load_module(kernel.module.name, device=self.device)
             self._loaded.add(kernel.key)
-        slots = self._slots(trace.count)
-        world = self._world(slots, trace.memory, kernel is kernel_backward.adjoint_kernel)
 
-        def launch(local: int, number: int, slot: int) -> None:
+        def launch(local: int, number: int, slot: int) -> Callable[..., Any]:
             chunk = fill(Chunk(), {
                 "first": trace.first + local, "local": local, "nparam": len(batch.theta), "each": batch.each,
                 "lag": batch.lag, "skip": batch.skip, "period": _period(batch, keep), "slot": slot,
                 "slot_stride": int(not self.is_cpu), "keep": int(keep),
-                "applied": int(batch.applied),
+                "applied": int(batch.applied), "wrenched": int(batch.wrenched),
             })  # fmt: skip
-            wp.launch(kernel, dim=number, inputs=[self.tables, world, chunk, *arguments], device=self.device)
+            inputs = [self.tables, world, chunk, *arguments]
+            return partial(wp.launch, kernel, dim=number, inputs=inputs, device=self.device)
 
         work = trace.count * batch.lag * batch.skip * self.tables.nv
-        threads = slots if self.is_cpu and work >= ALONE else 1
-        if threads == 1:
-            launch(0, trace.count, 0)
-            return
+        threads = self._slots(trace.count) if self.is_cpu and work >= ALONE else 1
         bounds = [trace.count * i // threads for i in range(threads + 1)]
-        with ThreadPoolExecutor(threads) as pool:
-            for job in [pool.submit(launch, a, b - a, i) for i, (a, b) in enumerate(pairwise(bounds))]:
-                job.result()
+        return [launch(a, b - a, i) for i, (a, b) in enumerate(pairwise(bounds))]
 
     def _chunks(self, batch: Batch) -> list[tuple[int, int]]:
         """``(first, count)`` of the chunks of worlds."""
@@ -298,9 +328,13 @@ class Engine:
         """Working memory of a number of slots, made once, with that of the trajectories."""
         key = (slots, adjoint)
         if key not in self._worlds:
-            # a gap between slots, so that no two threads write one cache line
-            self._worlds[key] = fill(World(), self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16))
+            self._worlds[key] = self._fresh_world(slots, {}, adjoint=adjoint)
         return fill(self._worlds[key], memory)
+
+    def _fresh_world(self, slots: int, memory: dict[str, Any], *, adjoint: bool) -> World:
+        # a gap between slots, so that no two threads write one cache line
+        own = self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16)
+        return fill(World(), own | memory)
 
     def _allocate(self, fields: dict[str, tuple[Any, str]], rows: int, gap: int = 0) -> dict[str, Any]:
         """Arrays of fields of a world, with a number of rows."""
@@ -309,6 +343,16 @@ class Engine:
             width = max(self._sizes[size], 1)
             arrays[name] = wp.empty((rows, width + gap), dtype=dtype, device=self.device)[:, :width]
         return arrays
+
+
+def _at_once(launches: Sequence[Callable[..., Any]]) -> None:
+    """Make launches, each on a thread of its own; a launch on a CPU releases Python's lock."""
+    if len(launches) == 1:
+        launches[0]()
+        return
+    with ThreadPoolExecutor(len(launches)) as pool:
+        for job in [pool.submit(launch) for launch in launches]:
+            job.result()
 
 
 def _period(batch: Batch, keep: bool) -> int:

@@ -32,6 +32,7 @@ def adjoint_kernel(
     w.th = theta[world % chunk.nparam]
     w.ctrl = controls
     w.applied = chunk.applied
+    w.wrenched = chunk.wrenched
     w.ctrl_bar = control_bar
     w.t = chunk.slot + tid * chunk.slot_stride
     base = i * chunk.period * m.nstage

@@ -26,6 +26,7 @@ def simulate_kernel(
     w.th = theta[world % chunk.nparam]
     w.ctrl = controls
     w.applied = chunk.applied
+    w.wrenched = chunk.wrenched
     w.t = chunk.slot + tid * chunk.slot_stride
     base = wp.where(chunk.keep != 0, i, w.t) * chunk.period * m.nstage
     for j in range(m.nq):

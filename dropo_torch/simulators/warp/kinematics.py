@@ -24,6 +24,7 @@ from dropo_torch.simulators.warp.spatial import (
     vec4_at,
 )
 from dropo_torch.simulators.warp.types import HINGE, MINVAL, SLIDE, TRANSLATION, ZERO, Tables, World, vec3, vec6, vec10
+from dropo_torch.simulators.warp.wrenches import outer_wrench
 
 
 @wp.func
@@ -99,7 +100,7 @@ def sweep_out(m: Tables, w: World, r: int):
 
 @wp.func(inline=True)
 def inertial_forces(m: Tables, w: World):
-    """F = I A + V ×* I V of each body, less gravity compensation and drag."""
+    """F = I A + V ×* I V of each body, less gravity compensation, drag and the wrenches from outside."""
     for b in range(1, m.nb):
         i = w.inertia[w.t, b]
         w.composite[w.t, b] = i
@@ -111,6 +112,8 @@ def inertial_forces(m: Tables, w: World):
             f = inertia_mul(i, a) + cross_force(v, inertia_mul(i, v))
             if m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
                 f -= fluid_wrench(m, w, b)
+            if w.wrenched != 0:
+                f -= outer_wrench(m, w, b)
             w.force[w.t, b] = f
         else:
             w.force[w.t, b] = vec6()

@@ -34,6 +34,7 @@ from dropo_torch.simulators.warp.spatial import (
 )
 from dropo_torch.simulators.warp.touch import find_contacts
 from dropo_torch.simulators.warp.types import MINVAL, ONE, Tables, World, vec3, vec6
+from dropo_torch.simulators.warp.wrenches import outer_wrench_adjoint
 
 
 @wp.func(inline=True)
@@ -82,7 +83,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
             ncon = find_contacts(m, w)
         solve(m, fills_in(m, w, ncon), w.hess, r, w.lam, w.t)
     carry_out(m, w)
-    posed = ncon + m.has_gravcomp + m.has_fluid
+    posed = ncon + m.has_gravcomp + m.has_fluid + w.wrenched
     bodies_adjoint(m, w, 1 - softening, posed)
     for i in range(m.nv):
         w.grad[w.t, m.o_armature + i] += w.lam[w.t, i] * w.qacc[w.t, i]
@@ -118,7 +119,7 @@ def carry_out(m: Tables, w: World):
 def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
     """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
 
-    ``moving`` 0 leaves out V, gravity compensation and drag: the adjoint of λᵀ M a alone.
+    ``moving`` 0 leaves out V, gravity compensation, drag and wrenches: the adjoint of λᵀ M a alone.
     """
     _late = wp.grad(late)(ONE)
     zero = vec6()
@@ -153,6 +154,8 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
                 _inertia_adjoint(m, w, b, dual, a, lv, v)
             if moving != 0 and m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
                 _fluid_adjoint(m, w, b, dual, v)
+            if moving != 0 and w.wrenched != 0:
+                outer_wrench_adjoint(m, w, b, dual)
 
 
 @wp.func(inline=True)

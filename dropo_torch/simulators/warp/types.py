@@ -163,15 +163,30 @@ World: Any = _struct(
         "ctrl_bar": Reals2,
         **dict.fromkeys(("t", "rc", "rb"), wp.int32),
         "applied": wp.int32,  # whether the last nv controls are generalised forces
+        "wrenched": wp.int32,  # whether wrenches on the bodies stand before them
     },
 )
 
 #: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each`` and parameter
-#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``. ``applied``: see the world's.
+#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``. ``applied``,
+#: ``wrenched``: see the world's.
 Chunk: Any = _struct(
     "Chunk",
     dict.fromkeys(
-        ("first", "local", "nparam", "each", "lag", "skip", "period", "slot", "slot_stride", "keep", "applied"),
+        (
+            "first",
+            "local",
+            "nparam",
+            "each",
+            "lag",
+            "skip",
+            "period",
+            "slot",
+            "slot_stride",
+            "keep",
+            "applied",
+            "wrenched",
+        ),
         wp.int32,
     ),
 )

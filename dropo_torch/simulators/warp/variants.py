@@ -16,7 +16,7 @@ from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.layout import FIELDS
 
 #: Engines that are kept.
-KEPT = 64
+KEPT = 256
 
 
 @dataclass(frozen=True)
@@ -27,25 +27,73 @@ class Worlds:
         engines: for each structure among the models its engine, the rows of its models, and their θ ``(r, P)``.
     """
 
-    engines: tuple[tuple[Engine, np.ndarray, torch.Tensor], ...]
+    engines: tuple[tuple[Engine, np.ndarray | slice, torch.Tensor], ...]
 
-    def rollout(self, starts: np.ndarray, controls: np.ndarray, skip: int, *, applied: bool = False) -> np.ndarray:
+    def rollout(
+        self, starts: np.ndarray, controls: np.ndarray, skip: int, *, applied: bool = False, wrenched: bool = False
+    ) -> np.ndarray:
         """Return the states after every logged step ``(R, S, nq + nv)``, NaN throughout where one diverged.
 
         Args:
             starts: initial states ``(R, nq + nv)``.
-            controls: controls of every logged step ``(R, S, nu)``, or with generalised forces ``(R, S, nu + nv)``.
+            controls: controls of every logged step ``(R, S, nu)``, and what else acts in it, behind them.
             skip: physics steps of a logged step.
-            applied: whether there are such forces.
+            applied: whether generalised forces stand at the end, and
+            wrenched: whether wrenches on the bodies do after the controls, see :class:`Batch`.
         """
         out = np.empty((*controls.shape[:2], starts.shape[1]))
         for engine, rows, theta in self.engines:
             states, inputs = (torch.from_numpy(np.ascontiguousarray(x[rows])) for x in (starts, controls))
-            flat, _ = engine.simulate(Batch(theta, states, inputs, skip, paired=True, applied=applied), keep=False)
-            out[rows] = flat.numpy().reshape(len(rows), *out.shape[1:])
+            batch = Batch(theta, states, inputs, skip, paired=True, applied=applied, wrenched=wrenched)
+            flat, _ = engine.simulate(batch, keep=False)
+            out[rows] = flat.numpy().reshape(len(theta), *out.shape[1:])
         with np.errstate(invalid="ignore"):
             out[~(np.abs(out) < DIVERGED).all((1, 2))] = np.nan
         return out
+
+    def stepper(
+        self, starts: np.ndarray, width: int, skip: int, *, applied: bool = False, wrenched: bool = False
+    ) -> Stepper:
+        """Return what simulates one logged step after the other from ``starts``; see there."""
+        return Stepper(self, starts, width, skip, applied=applied, wrenched=wrenched)
+
+
+class Stepper:
+    """Simulates models one logged step at a time, under inputs that depend on the states.
+
+    Args:
+        worlds: the models.
+        states: the initial states ``(R, nq + nv)``.
+        width: inputs of a step, see :meth:`Worlds.rollout`.
+        skip: physics steps of a logged step.
+        applied, wrenched: what stands in the inputs, see :class:`Batch`.
+
+    Attributes:
+        states: the states now, ``(R, nq + nv)``.
+    """
+
+    def __init__(
+        self, worlds: Worlds, states: np.ndarray, width: int, skip: int, *, applied: bool = False,
+        wrenched: bool = False,
+    ) -> None:  # fmt: skip
+        self.states, self._parts = states, []
+        for engine, rows, theta in worlds.engines:
+            before, after = (torch.empty(len(theta), states.shape[1], dtype=torch.float64) for _ in range(2))
+            inputs = torch.empty(len(theta), 1, width, dtype=torch.float64)
+            batch = Batch(theta, before, inputs, skip, paired=True, applied=applied, wrenched=wrenched)
+            arrays = before.numpy(), inputs.numpy()[:, 0], after.numpy()
+            self._parts.append((rows, *arrays, engine.repeated(batch, after)))
+
+    def step(self, inputs: np.ndarray) -> None:
+        """Simulate one logged step under inputs ``(R, width)``; one that diverges is NaN from then on."""
+        found = np.empty_like(self.states)
+        for rows, before, given, after, run in self._parts:
+            before[:], given[:] = self.states[rows], inputs[rows]
+            run()
+            found[rows] = after
+        with np.errstate(invalid="ignore"):
+            found[~(np.abs(found) < DIVERGED).all(1)] = np.nan
+        self.states = found
 
 
 class Variants:
@@ -75,7 +123,8 @@ class Variants:
             engine = self._of(structure, models[own[0]])
             if engine is None:
                 return None
-            rows = (np.array(own)[:, None] * each + np.arange(each)).ravel()
+            alone = len(own) == len(models)
+            rows = slice(None) if alone else (np.array(own)[:, None] * each + np.arange(each)).ravel()
             theta = engine.fields.of([models[k] for k in own]).repeat_interleave(each, 0)
             found.append((engine, rows, theta))
         return Worlds(tuple(found))
@@ -96,12 +145,16 @@ class Variants:
 
 
 def _structure(model: mujoco.MjModel) -> bytes:
-    """Everything but the numbers in θ, of which only stands whether each is zero; what it is in, an engine serves."""
-    numbers = [np.asarray(read_field(model, field)) != 0 for field in sorted(set(FIELDS))]
+    """What an engine's tables, and whether there may be one, follow from; of numbers in θ only which are zero."""
+    numbers = [np.sign(read_field(model, field)) for field in _SIGNS]
+    numbers += [np.any(read_field(model, field)) for field in _ANY]
     tabled = [np.asarray(read_field(model, field)) for field in _TABLED if field not in FIELDS]
     return b"|".join(array.tobytes() for array in (*numbers, *tabled))
 
 
+#: Fields of θ of which each number's sign matters, and such of which it does whether any is not zero.
+_SIGNS = ("dof_frictionloss", "body_gravcomp", "actuator_gainprm", "actuator_biasprm")
+_ANY = ("dof_damping", "dof_dampingpoly", "jnt_stiffness", "jnt_stiffnesspoly", "opt.density", "opt.viscosity")
 #: Fields that an effect may change and that stand in an engine's tables.
 _TABLED = (
     "opt.timestep", "opt.integrator", "opt.disableflags", "opt.cone", "opt.impratio", "opt.o_margin", "body_iquat",
