@@ -364,14 +364,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if given.resume and given.out is None:
         parser.error("--resume needs --out")
     path = None if given.out is None else given.out / "results.jsonl"
-    before = read_results(path) if given.resume and path is not None else []
+    before = read_results(path) if path is not None else []
+    if before and not (given.resume or given.list):
+        parser.error(f"--out: {path} holds results; add --resume to go on with them, or name another folder")
     seed = given.seed if given.seed is not None else (before[0]["seed"] if before else int(time.time()) % 1_000_000)
     specs = select(cases(seed, "small" if given.small else "all"), given.cases, given.only)
-    kept = [r for r in before if r["seed"] == seed and "failure" not in r]
-    results = [r for r in kept if r["name"] in {s.name for s in specs}]
     if given.list:
         print("\n".join(s.name for s in specs))
         return
+    kept = [r for r in before if r["seed"] == seed and "failure" not in r]
+    results = [r for r in kept if r["name"] in {s.name for s in specs}]
     print(f"seed {seed}: {len(specs)} cases, {len(results)} of them done before", flush=True)
     if path is not None:
         path.parent.mkdir(parents=True, exist_ok=True)

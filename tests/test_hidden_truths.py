@@ -27,7 +27,7 @@ from benchmarks.hidden.systems import (
     load,
 )  # fmt: skip
 from benchmarks.hidden.truths import Before, Effect
-from benchmarks.hidden_effects import by_trait, interval, judge, noise_ratios, reductions, scores
+from benchmarks.hidden_effects import by_trait, interval, judge, main, noise_ratios, reductions, scores
 from dropo_torch.config import load_config
 from dropo_torch.problem import make_problem
 
@@ -550,3 +550,11 @@ def test_amplitudes_and_phases_are_those_of_the_same_wave() -> None:
 def test_wilson_interval() -> None:
     low, high = interval(9, 10, z=1.96)
     assert (low, high) == pytest.approx((0.5958, 0.9821), abs=1e-4)
+
+
+def test_results_of_an_earlier_run_are_not_overwritten(tmp_path, capsys) -> None:
+    (tmp_path / "results.jsonl").write_text('{"name": "null-furuta", "seed": 4}\n')
+    with pytest.raises(SystemExit):
+        main(["--seed", "5", "--cases", "none", "--out", str(tmp_path)])
+    assert "--resume" in capsys.readouterr().err
+    assert (tmp_path / "results.jsonl").read_text() == '{"name": "null-furuta", "seed": 4}\n'
