@@ -43,7 +43,7 @@ from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears
 from dropo_torch.gap.scene import outstanding, searched, short_windows
-from dropo_torch.gap.screen import Focus, all_candidates, promised, screen
+from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Ended, Naming, believed, start
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.twin import Windows, secants
@@ -917,8 +917,49 @@ def test_noise_stays_beside_a_hypothesis_under_which_nothing_can_be_simulated() 
     assert beside == pytest.approx(scene.noise)
 
 
+@pytest.mark.parametrize("wrong", [0.85, 1.15])
+def test_noise_that_is_told_is_that_of_all_windows(wrong: float) -> None:
+    """Refits use a part of them, which may be off by chance; so may what the last fit starts with."""
+    scene, truth = scene_of("joint_damping"), np.array(hidden("joint_damping").noise)
+    evidence = dataclasses.replace(scene.evidence, noise=wrong * truth)
+    last, _ = outcome._last_fit(evidence, scene.noisy, true(hidden("joint_damping")))
+    assert last.evidence.noise == pytest.approx(truth, rel=0.07)
+
+
+def test_members_of_a_family_are_not_swapped() -> None:
+    placed = [Placed(find_effect("joint_friction"), f"joint{i}", (0.1,)) for i in range(3)]
+    other = Placed(find_effect("joint_damping"), "joint0", (0.1,))
+    assert accept._single([*placed, other]) == [3]
+    assert accept._single([*placed[:2], other]) == [0, 1, 2]
+
+
 def test_what_promises_no_number_comes_last() -> None:
     assert sorted([3.0, promised(float("nan")), 1.0, promised(2.0)]) == [1.0, 2.0, 3.0, np.inf]
+
+
+#: A screening of no candidates.
+NOTHING = Screening((), np.ones(1), np.zeros((0, 1)), 1.0)
+
+
+def test_first_screening_tells_what_may_tie() -> None:
+    """It leaves out what is away from what an effect explains, and is silent where it does not predict the effect."""
+    size = 1000
+    own, beside, away = (np.eye(size)[i] for i in range(3))
+    slopes = {"own": own, "same": 3 * own, "half": own + away, "away": away, "beside": beside}
+    residual = 60 * own + 40 * beside
+
+    def candidate(target: str) -> Candidate:
+        placed = Placed(find_effect("joint_damping"), target, (0.0,))
+        return Candidate(placed, placed, 0.0, residual, slopes[target][None], dead=False)
+
+    ranked = {target: candidate(target) for target in slopes}
+    first = Screening(tuple(ranked.values()), residual, np.zeros((0, size)), 100.0)
+    named, rules = [ranked["own"].placed, ranked["beside"].placed], Rules().alike
+    found = first.rivals(named, 0, rules)
+    assert found is not None
+    assert {target for _, target in found} == {"own", "same", "half"}
+    assert first.rivals(named[:1], 0, rules) is None  # alone, it leaves what the other explains
+    assert first.rivals([*named, Placed(find_effect("payload"), "own", (0.0,) * 4)], 0, rules) is None
 
 
 def ended(scene: Scene, excess: float, *, partial: bool = False, named: bool = True) -> Any:
@@ -926,7 +967,7 @@ def ended(scene: Scene, excess: float, *, partial: bool = False, named: bool = T
     base = refit(scene.evidence, scene.begin, iterations=0)
     cost = Cost(np.array([excess * 1e3]), np.zeros(1), 1e3)
     final = dataclasses.replace(base, cost=cost)
-    found = Naming(scene.evidence, base, Screening((), 1.0, 1.0), final, gap=True, named=named, partial=partial)
+    found = Naming(scene.evidence, base, NOTHING, final, gap=True, named=named, partial=partial)
     return SimpleNamespace(naming=found)
 
 

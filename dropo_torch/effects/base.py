@@ -309,6 +309,11 @@ class Placed:
         """Return the same effect with other values."""
         return Placed(self.effect, self.target, tuple(float(v) for v in values))
 
+    def is_neutral(self, setting: Setting) -> bool:
+        """Return whether the effect is absent with these values."""
+        quantities = self.effect.quantities(setting, self.target)
+        return all(v == q.neutral for q, v in zip(quantities, self.values, strict=True))
+
     def summary(self, setting: Setting) -> dict[str, Any]:
         """Return the values by name."""
         return {q.name: v for q, v in zip(self.effect.quantities(setting, self.target), self.values, strict=True)}

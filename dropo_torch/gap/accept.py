@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -14,6 +15,8 @@ from dropo_torch.gap.rules import accounts, beyond_free, remains, significant, s
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
+#: Places from which on an effect is a family, whose members stand together.
+MANY = 3
 #: Dry friction as MuJoCo has it by default.
 SOFT = "joint_soft_friction"
 
@@ -126,16 +129,17 @@ def add(ground: Ground, state: State) -> State:
 
 
 def swap(ground: Ground, state: State) -> State:
-    """Try to put another effect in the place of each accepted one."""
+    """Try to put another effect in the place of each accepted one, but not of one that is at many places at once."""
     tried = ground.rules.tried
     for _ in range(2):
         before = state.current
-        for index in range(len(before.hypothesis.placed)):
+        for index in _single(before.hypothesis.placed):
             ground.report("swapping", 0.0)
             without = ground.refit(state.current.hypothesis.without(index))
             focus = ground.focus(without)
             here = refit(focus.evidence, state.current.hypothesis, iterations=0, slopes=False).cost.chi2
-            alive = [c for c in ground.screened(without) if not c.dead]
+            likely = state.first.rivals(state.current.hypothesis.placed, index, ground.rules.alike)
+            alive = [c for c in ground.screened(without, likely) if not c.dead]
             rivals = [
                 (c.placed,) for c in alive[: tried.rivals] if c.chi2 < tried.promises * here
             ]  # that promise to explain more
@@ -146,6 +150,12 @@ def swap(ground: Ground, state: State) -> State:
         if state.current is before:
             break
     return state
+
+
+def _single(placed: Sequence[Placed]) -> list[int]:
+    """Numbers of the effects that are not members of a family."""
+    names = Counter(p.effect.name for p in placed)
+    return [i for i, p in enumerate(placed) if names[p.effect.name] < MANY]
 
 
 def extend(ground: Ground, state: State) -> State:

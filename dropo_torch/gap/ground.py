@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -13,8 +13,8 @@ from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import parts_of, since_known, spread
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Ranked
-from dropo_torch.gap.rules import Rules, as_good, chance_of, clears
-from dropo_torch.gap.screen import Candidate, Focus, all_candidates, screen
+from dropo_torch.gap.rules import Alike, Rules, as_good, chance_of, clears
+from dropo_torch.gap.screen import Candidate, Focus, all_candidates, left_by, screen
 from dropo_torch.gap.twin import Windows
 
 #: Windows that refits use, and that the screening uses; all if there are fewer.
@@ -30,18 +30,45 @@ class Screening:
 
     Attributes:
         ranked: the candidates, the most promising first.
-        chi2: χ² of the screened windows without them.
-        degrees: its degrees of freedom.
+        residual: weighted residuals of the screened windows without them, ``(W·N,)``.
+        slope: their derivatives by the declared parameters, ``(d, W·N)``.
+        degrees: degrees of freedom of these windows.
     """
 
     ranked: tuple[Candidate, ...]
-    chi2: float
+    residual: np.ndarray
+    slope: np.ndarray
     degrees: float
+
+    @property
+    def chi2(self) -> float:
+        """χ² of the screened windows without them."""
+        return float(self.residual @ self.residual)
 
     @property
     def silent(self) -> tuple[Placed, ...]:
         """Candidates that change nothing on this log, which it therefore cannot judge."""
         return tuple(c.placed for c in self.ranked if c.dead)
+
+    def rivals(self, placed: Sequence[Placed], index: int, rules: Alike) -> set[tuple[str, str | None]] | None:
+        """Return which candidates may explain what one effect does beside others, by first order; ``None`` for any.
+
+        This screening says so only where it predicts, for the effects themselves, what they turned out to explain.
+
+        Args:
+            placed: effects that were found since.
+            index: of the one.
+            rules: thresholds.
+        """
+        alive = {c.key: c for c in self.ranked if not c.dead}
+        if any(p.key not in alive for p in placed):
+            return None
+        others = [alive[p.key] for i, p in enumerate(placed) if i != index]
+        before = max(left_by(self, others) - self.degrees, 1e-12)
+        share = {key: (left_by(self, [*others, c]) - self.degrees) / before for key, c in alive.items()}
+        if share[placed[index].key] > rules.straight:
+            return None
+        return {key for key, left in share.items() if left < rules.likely}
 
 
 @dataclass(frozen=True)
@@ -153,11 +180,12 @@ class Ground:
         )  # fmt: skip
         return Focus(self.part.select(rows), here)
 
-    def screened(self, fitted: Refit) -> list[Candidate]:
-        """Return what all candidates promise beside a fitted hypothesis."""
-        stage = f"screening {len(self.candidates)} candidates"
+    def screened(self, fitted: Refit, keys: Container[tuple[str, str | None]] | None = None) -> list[Candidate]:
+        """Return what candidates promise beside a fitted hypothesis: those of some effects and targets, or all."""
+        candidates = [c for c in self.candidates if keys is None or c.key in keys]
+        stage = f"screening {len(candidates)} candidates"
         self.report(stage, 0.0)
-        return screen(self.focus(fitted), self.candidates, self.rules.tried, lambda share: self.report(stage, share))
+        return screen(self.focus(fitted), candidates, self.rules.tried, lambda share: self.report(stage, share))
 
     @property
     def comparisons(self) -> int:

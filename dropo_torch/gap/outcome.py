@@ -185,17 +185,16 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
     """Fit the named effects on all windows, as they are weighted and stepped in the end; and beside it as noise weighs.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
-    error of a real model grows with the lead, and differs between columns. Where a finer step is better, the noise is
-    told beside it once more, for what the model's own step leaves passes for noise.
+    error of a real model grows with the lead, and differs between columns. The noise is told once more, by all windows
+    and beside a finer step where that is better, for what the model's own step leaves passes for noise.
     """
     own = refit(evidence, hypothesis, iterations=6)
     final = resolved(evidence, own, anew=True)
-    if final.error.any():
-        noise = noise_beside(final.evidence, short, final.fit)
-        if moved(noise, evidence.noise, evidence.rules):
-            evidence = replace(evidence, noise=noise)
-            own = refit(evidence, own.hypothesis, iterations=2)
-            final = resolved(evidence, own, anew=True)
+    noise = noise_beside(final.evidence, short, final.fit)
+    if moved(noise, evidence.noise, evidence.rules):
+        evidence = replace(evidence, noise=noise)
+        own = refit(evidence, own.hypothesis, iterations=2)
+        final = resolved(evidence, own, anew=True)
     rest = final.fit
     for _ in range(ROUNDS):
         if final.fit.cost.reduced < evidence.rules.sound.model_error:

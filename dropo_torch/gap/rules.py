@@ -46,6 +46,9 @@ class Alike:
         sigmas: standard deviations of χ², by one of which a rival may be worse at all, however unsure that is; the
             search prefers fewer numbers among hypotheses within it.
         promising: share of what a named effect explains that a candidate may leave, to first order, to be tried.
+        straight: share of what a named effect explains that the first screening may have left, to first order, for it
+            to say which candidates are screened again as ties, and
+        likely: the share below which they are.
         roughly, fully: candidates that are tried as ties of one effect, at most, by a rough refit and by a full one.
     """
 
@@ -55,6 +58,8 @@ class Alike:
     excess: float = 0.3
     sigmas: float = 4.0
     promising: float = 0.3
+    straight: float = 0.1
+    likely: float = 0.7
     roughly: int = 16
     fully: int = 8
 

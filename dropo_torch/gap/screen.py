@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
+from typing import Protocol
 
 import numpy as np
 
@@ -26,6 +27,18 @@ STEP = 2e-3
 DAMPING, RIDGE, FAINT = 1e-6, 1e-10, 1e-9
 #: Candidates that one batch of simulations holds.
 BATCH = 24
+
+
+class Beside(Protocol):
+    """What candidates are compared beside: residuals ``(W·N,)`` of a hypothesis, and their derivatives."""
+
+    @property
+    def residual(self) -> np.ndarray:
+        """Weighted residuals, ``(W·N,)``."""
+
+    @property
+    def slope(self) -> np.ndarray:
+        """Their derivatives by the hypothesis' numbers, ``(q, W·N)``."""
 
 
 @dataclass(frozen=True)
@@ -54,6 +67,11 @@ class Focus:
     def slope(self) -> np.ndarray:
         """Their derivatives by its numbers, ``(q, W·N)``."""
         return self.fitted.slope.reshape(len(self.fitted.slope), self.factor.size) * self.factor
+
+    @cached_property
+    def simulated(self) -> np.ndarray:
+        """Residuals of the fitted hypothesis as they are, ``(W, N)``."""
+        return self.evidence.residuals([self.fitted.hypothesis.variant])[0][0]
 
     @property
     def cost(self) -> Cost:
@@ -121,7 +139,10 @@ def screen(
 
 
 def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Candidate]:
-    """Simulate candidates at their starts and beside them, in one batch, and predict."""
+    """Simulate candidates at their starts and beside them, in one batch, and predict.
+
+    A neutral start is the fitted hypothesis itself.
+    """
     evidence, linear, factor = focus.evidence, focus.fitted.linear, focus.factor
     variants: list[Variant] = []
     plans = []
@@ -133,16 +154,19 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         moving = moving[limits.free[len(hypothesis.vector) - size + moving]]
         columns = len(hypothesis.vector) - size + moving
         moved, steps = beside(hypothesis, limits, columns, STEP)
-        plans.append((moving, limits.of(columns), steps, slice(len(variants), len(variants) + 1 + len(moved))))
-        variants += [h.variant for h in (hypothesis, *moved)]
+        begins = [] if placed.is_neutral(evidence.twin.setting) else [hypothesis]
+        own = [h.variant for h in (*begins, *moved)]
+        rows = slice(len(variants), len(variants) + len(own))
+        variants += own
+        plans.append((hypothesis.variant, moving, limits.of(columns), steps, rows))
     found, _ = evidence.residuals(variants)
     before, shared = focus.residual, focus.slope
-    for placed, (moving, limits, steps, rows) in zip(part, plans, strict=True):
-        begin = found[rows][0]
+    for placed, (variant, moving, limits, steps, rows) in zip(part, plans, strict=True):
+        begin, *there = found[rows] if len(steps) < len(found[rows]) else (focus.simulated, *found[rows])
         residual = evidence.project(begin, linear).ravel() * factor
-        change = (found[rows][1:] - begin) / steps[:, None, None]
+        change = (np.reshape(there, (len(steps), *begin.shape)) - begin) / steps[:, None, None]
         slope = evidence.project_slope(change, linear).reshape(len(moving), factor.size) * factor
-        known = evidence.twin.knows(variants[rows.start], evidence.windows)
+        known = evidence.twin.knows(variant, evidence.windows)
         here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
         residual, slope = np.where(here, residual, before), slope * here
         lengths = np.sqrt((slope**2).sum(1))
@@ -198,10 +222,11 @@ def _best(focus: Focus, groups: Iterable[Sequence[Candidate]]) -> list[tuple[flo
     return sorted(((left_by(focus, members), members) for members in groups), key=lambda item: item[0])
 
 
-def left_by(focus: Focus, members: Sequence[Candidate]) -> float:
+def left_by(beside: Beside, members: Sequence[Candidate]) -> float:
     """Return the χ² that is left beside the shared numbers, the members' numbers, and the steps to their starts."""
-    before = focus.residual
-    columns = np.stack([*focus.slope, *(s for c in members for s in c.slope), *(c.residual - before for c in members)])
+    before = beside.residual
+    steps = [(c.residual - before)[None] for c in members]
+    columns = np.concatenate([beside.slope, *(c.slope for c in members), *steps])
     norm = np.sqrt((columns**2).sum(1))
     columns = columns[norm > 0] / norm[norm > 0, None]
     gradient = columns @ before

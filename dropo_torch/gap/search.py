@@ -180,7 +180,7 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
     if first is None:
         ranked, focus = ground.screened(base), ground.focus(base)
         degrees = focus.evidence.degrees(focus.fitted.linear)
-        first = Screening(tuple(ranked), float((focus.residual**2).sum()), degrees)
+        first = Screening(tuple(ranked), focus.residual, focus.slope, degrees)
     return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few)
 
 
@@ -219,10 +219,17 @@ def conclude(ground: Ground, state: State) -> Ended:
         return Ended(ground, state, unnamed)
     if state.family:
         return Ended(ground, state, conclude_family(ground, state, unnamed))
-    if count := len(state.current.hypothesis.placed):
+    pruned = state
+    if (count := len(state.current.hypothesis.placed)) and may_account(ground, state):
         ground.report(f"checking {count} effect{'s' if count > 1 else ''}", 0.0)
-    pruned = prune(ground, state)
+        pruned = prune(ground, state)
     return Ended(ground, pruned, judged(ground, pruned, state.current, unnamed))
+
+
+def may_account(ground: Ground, state: State) -> bool:
+    """Return whether effects, or some of them, may account for the gap: together they leave little enough of it."""
+    left = state.current.cost.left_of(state.base.cost)
+    return ground.clears(state.base, state.current) or left <= 1 - ground.rules.accounted
 
 
 def judged(ground: Ground, state: State, found: Refit, unnamed: Naming) -> Naming:

@@ -39,7 +39,8 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     ground.report("looking for ties", 0.0)
     own, origin = current.hypothesis.placed[index], current.hypothesis.without(index)
     without = ground.refit(origin) if origin.placed else state.base
-    ranked, focus = ground.screened(without), ground.focus(without)  # with the noise and on the windows of now
+    likely = state.first.rivals(current.hypothesis.placed, index, ground.rules.alike)
+    ranked, focus = ground.screened(without, likely), ground.focus(without)  # with the noise and on the windows of now
     near = [nearer(focus, origin, c) for c in promising(focus, ranked, own, ground.rules.alike)]
     others = [(p,) for p in (*near, *varieties(ground, near, own))]
     looking = replace(state, number=ROUND)
