@@ -17,6 +17,7 @@ from typing import Any
 import mujoco
 import numpy as np
 import pytest
+import torch
 import yaml
 from arm import Folder
 
@@ -27,7 +28,9 @@ from benchmarks.hidden.systems import CART_POLE, FURUTA, SERVO_ARM, TORQUE_ARM, 
 from benchmarks.hidden.truths import Before, Case, Effect, make_case, make_recording, simulate_truth
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
-from dropo_torch.effects import VOCABULARY, Placed, find_effect
+from dropo_torch.effects import VOCABULARY, Placed, Quantity, Setting, find_effect
+from dropo_torch.effects.path import SensedPath
+from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, accept, add, find_gap, outcome, prepare
 from dropo_torch.gap.accept import extend, imitates, is_done, is_needed
@@ -922,15 +925,16 @@ def test_noise_that_is_told_is_that_of_all_windows(wrong: float) -> None:
     """Refits use a part of them, which may be off by chance; so may what the last fit starts with."""
     scene, truth = scene_of("joint_damping"), np.array(hidden("joint_damping").noise)
     evidence = dataclasses.replace(scene.evidence, noise=wrong * truth)
-    last, _ = outcome._last_fit(evidence, scene.noisy, true(hidden("joint_damping")))
+    last, rest, own = outcome._last_fit(evidence, scene.noisy, true(hidden("joint_damping")))
     assert last.evidence.noise == pytest.approx(truth, rel=0.07)
+    assert outcome._own_step(own, rest.cost, scene.rules) is None  # it was the noise, and no step
 
 
 def test_members_of_a_family_are_not_swapped() -> None:
     placed = [Placed(find_effect("joint_friction"), f"joint{i}", (0.1,)) for i in range(3)]
     other = Placed(find_effect("joint_damping"), "joint0", (0.1,))
-    assert accept._single([*placed, other]) == [3]
-    assert accept._single([*placed[:2], other]) == [0, 1, 2]
+    assert accept._single([*placed, other]) == [other.key]
+    assert accept._single([*placed[:2], other]) == [p.key for p in (*placed[:2], other)]
 
 
 def test_what_promises_no_number_comes_last() -> None:
@@ -1089,6 +1093,58 @@ def test_ripple_between_those_that_are_tried_is_ranked_first(poles: int) -> None
     names = ("joint_cogging", "joint_stiffness", "center_of_mass", "external_force", "actuator_bias")
     ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in names))
     assert ground.screened(ground.refit(scene.begin))[0].key == ("joint_cogging", "elbow")
+
+
+class Echo(SensorEffect):
+    """A sensor that shows a share of what it showed before, and knows nothing of what was before a window."""
+
+    name, sentence = "test_echo", "the sensor of {target} shows an echo"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("share", "", 0.0, -1.0, 1.0, 0.1),)
+
+    def memory(self, values: np.ndarray) -> float:
+        return 0.1
+
+    def sense(self, path: SensedPath, column: int, values: torch.Tensor) -> torch.Tensor:
+        return path.shown[..., column] + values[:, :1] * path.ago(column, torch.full_like(values[:, :1], 0.1))
+
+
+def test_slopes_of_the_screening_are_those_of_the_candidate() -> None:
+    """Also at a neutral start, where a filter moves what it stands beside to a step of its own, and if it remembers."""
+    scene = scene_of("joint_friction")
+    beside = [
+        Placed(find_effect("joint_friction"), "rail", (0.3,)),
+        Placed(find_effect("integration"), None, (0.000625,)),
+    ]
+    fitted = refit(scene.evidence, scene.begin.with_effects(beside), iterations=0)
+    focus, size = Focus(scene.evidence, fitted), 1e-4
+    bias, damping = (
+        Placed(find_effect("sensor_bias"), "hinge.position", (0.0,)),
+        Placed(find_effect("joint_damping"), "hinge", (0.0,)),
+    )
+    echo = Placed(Echo(), "hinge.position", (0.0,))
+    for candidate in screen(focus, [bias, damping, echo], Rules().tried):
+        scale = candidate.placed.effect.quantities(scene.setting, candidate.placed.target)[0].scale
+        there = [fitted.hypothesis.with_effects([candidate.start.at([v])]).variant for v in (0.0, size * scale)]
+        begin, end = scene.evidence.project(scene.evidence.residuals(there)[0], fitted.linear)
+        expected = (end - begin) / size
+        error = candidate.slope.reshape(expected.shape) - expected
+        assert np.linalg.norm(error) < 0.03 * np.linalg.norm(expected), candidate.key
+
+
+def test_differences_are_taken_with_a_step_that_costs_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Derivatives, and what initial states explain, are nearly the same; residuals are those of the step itself."""
+    scene, effect = scene_of("joint_friction"), find_effect("integration")
+    step = scene.setting.model.opt.timestep
+    hypothesis = true(hidden("joint_friction")).with_effects([Placed(effect, None, (step / 8,))])
+    assert [hypothesis.variant.eased(scene.setting).placed[-1].values for _ in range(2)] == [(step / 2,)] * 2
+    easy = refit(scene.evidence, hypothesis, iterations=0)
+    monkeypatch.setattr(type(effect), "eased", lambda self, setting, values: values)
+    full = refit(scene.evidence, hypothesis, iterations=0)
+    assert np.linalg.norm(easy.slope - full.slope) < 0.05 * np.linalg.norm(full.slope)
+    assert np.linalg.norm(easy.residual - full.residual) < 0.05 * np.linalg.norm(full.residual)
+    assert not np.array_equal(easy.slope, full.slope)
 
 
 # --- outliers -------------------------------------------------------------------------------------------------

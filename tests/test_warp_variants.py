@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from dropo_torch.data.observation import parse_observation
-from dropo_torch.effects import Placed, find_effect
+from dropo_torch.effects import Effect, Placed, Quantity, Setting, find_effect
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.placing import plain_setting
 from dropo_torch.errors import UnsupportedModel
@@ -19,7 +19,7 @@ from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.types import Tables
-from dropo_torch.simulators.warp.variants import Variants, Worlds, _structure
+from dropo_torch.simulators.warp.variants import Variants, Worlds, _structure, tabled_fields
 from dropo_torch.testing.effects import RIG
 
 pytest.importorskip("warp")
@@ -119,7 +119,8 @@ def test_models_of_one_structure_share_their_tables() -> None:
     """Whatever number of θ is zero, or is not."""
     model = mujoco.MjModel.from_xml_string(ROUND)
     space = ParameterSpace(model, MASS)
-    known, shared = {_structure(model): tables_of(model, space)}, 0
+    tabled = tabled_fields(model)
+    known, shared = {_structure(model, tabled): tables_of(model, space)}, 0
     for field in sorted(set(FIELDS)):
         for flat in range(read_field(model, field).size):
             for value in (0.3,) if field in ("body_mass", "body_inertia") else (0.0, 0.3, -0.3):
@@ -130,12 +131,58 @@ def test_models_of_one_structure_share_their_tables() -> None:
                     setattr(other.opt, field[4:], array if array.size > 1 else value)
                 else:
                     getattr(other, field).reshape(-1)[flat] = value
-                key = _structure(other)
+                key = _structure(other, tabled)
                 shared += key in known
                 tables = tables_of(other, space)
                 assert known.setdefault(key, tables) == tables, (field, flat, value)
     assert shared > 5 * len(known)
     assert sum(tables is not None for tables in known.values()) > 0.9 * len(known)
+
+
+def test_effects_are_written_in_any_order() -> None:
+    """Friction's softness is that of the step, whichever is named first."""
+    effects, engine = (("joint_friction", "elbow", (0.2,)), ("integration", None, (0.0025,))), engines()[1]
+    one, other = (engine.model(variant(order, 0.7)) for order in (effects, effects[::-1]))
+    assert one.opt.timestep == other.opt.timestep
+    np.testing.assert_array_equal(one.dof_solref, other.dof_solref)
+
+
+class Rotor(Effect):
+    """An effect of a user's own that writes what no effect of the package does."""
+
+    name, kind, sentence = "test_rotor", "actuator", "the motor of {target} has inertia"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return ["lift"]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("inertia", "kg m^2", 0.0, 0.0, 1.0, 0.1),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.actuator_armature[:] = values[0]
+
+
+def test_no_engine_serves_a_model_that_differs_in_anything_else() -> None:
+    model = mujoco.MjModel.from_xml_string(ROUND)
+    tabled = tabled_fields(model)
+    own = _structure(model, tabled)
+    for field in tabled:
+        if field.startswith("opt."):
+            continue
+        other = copy.copy(model)
+        numbers = getattr(other, field).reshape(-1)
+        numbers[-1] = not numbers[-1] if numbers.dtype == bool else numbers[-1] + 1
+        assert _structure(other, tabled) != own, field
+    for field in ("actuator_armature", "eq_active0", "geom_rbound", "jnt_actgravcomp", "opt.solver", "opt.enableflags"):
+        assert field in tabled or not read_field(model, field).size, field
+
+
+def test_an_own_effect_is_simulated_as_by_mujoco_whatever_came_before() -> None:
+    ours, theirs = engines()
+    variants = [variant((), 0.7), Variant((0.7,), (Placed(Rotor(), "lift", (0.3,)),))]
+    plain, rotor = (np.concatenate([simulated(engine, [v]) for v in variants]) for engine in (ours, theirs))
+    np.testing.assert_allclose(plain, rotor, rtol=0, atol=1e-8)
+    assert np.abs(plain[1] - plain[0]).max() > 1e-3
 
 
 def test_pushes_are_those_of_mujoco() -> None:

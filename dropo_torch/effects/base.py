@@ -160,6 +160,7 @@ class Effect(abc.ABC):
         contains: names of effects that are special cases of it, at the same target.
         alone: whether it is looked for by itself; otherwise only in the place of a simpler one, or in the base family.
         known_as: name of the effect of which it is a kind, by which answers call it; none for its own.
+        steps: whether it sets the physics step. It is then written first, for others may depend on that.
     """
 
     name: ClassVar[str]
@@ -169,6 +170,7 @@ class Effect(abc.ABC):
     contains: ClassVar[tuple[str, ...]] = ()
     alone: ClassVar[bool] = True
     known_as: ClassVar[str] = ""
+    steps: ClassVar[bool] = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""
@@ -199,6 +201,10 @@ class Effect(abc.ABC):
 
     def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
         """Return the values that a linear prediction ``values`` from ``start`` stands for."""
+        return values
+
+    def eased(self, setting: Setting, values: tuple[float, ...]) -> tuple[float, ...]:
+        """Return values under which a simulation costs less and changes alike with initial states and other numbers."""
         return values
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
@@ -309,6 +315,10 @@ class Placed:
         """Return the same effect with other values."""
         return Placed(self.effect, self.target, tuple(float(v) for v in values))
 
+    def eased(self, setting: Setting) -> Placed:
+        """Return the effect with the values under which differences by other numbers are taken."""
+        return self.at(self.effect.eased(setting, self.values))
+
     def is_neutral(self, setting: Setting) -> bool:
         """Return whether the effect is absent with these values."""
         quantities = self.effect.quantities(setting, self.target)
@@ -319,9 +329,14 @@ class Placed:
         return {q.name: v for q, v in zip(self.effect.quantities(setting, self.target), self.values, strict=True)}
 
 
+def apply_all(model: mujoco.MjModel, placed: Iterable[Placed]) -> None:
+    """Write effects into a model, in whatever order they are given, but not yet what is derived from them."""
+    for p in sorted(placed, key=lambda p: not p.effect.steps):
+        p.effect.apply(model, p.target, np.asarray(p.values))
+
+
 def applied(model: mujoco.MjModel, placed: Iterable[Placed]) -> mujoco.MjModel:
     """Return a copy of a model with effects written into it, but not yet what is derived from them."""
     out = copy.copy(model)
-    for p in placed:
-        p.effect.apply(out, p.target, np.asarray(p.values))
+    apply_all(out, placed)
     return out

@@ -11,7 +11,7 @@ import mujoco
 import mujoco.batch
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Method, Placed, Setting
+from dropo_torch.effects.base import Effect, Method, Placed, Setting, apply_all
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace
@@ -34,6 +34,10 @@ class Variant:
     def has(self, *methods: Method) -> bool:
         """Whether any of its effects acts by one of some methods."""
         return any(p.effect.has(m) for p in self.placed for m in methods)
+
+    def eased(self, setting: Setting) -> Variant:
+        """The same as differences are taken of it; see :meth:`Effect.eased`."""
+        return Variant(self.declared, tuple(p.eased(setting) for p in self.placed))
 
 
 @dataclass
@@ -155,8 +159,7 @@ class VariantEngine:
         model = copy.copy(self._base)
         self._space.write_into(model, variant.declared)
         step = model.opt.timestep
-        for placed in variant.placed:
-            placed.effect.apply(model, placed.target, np.asarray(placed.values))
+        apply_all(model, variant.placed)
         if model.opt.timestep != step and whole_ratio(self._base.opt.timestep, model.opt.timestep) is None:
             raise ModelRefused(f"no whole number of its steps of {model.opt.timestep:g} s is the model's")
         if (model.body_mass < 0).any() or (model.body_inertia < 0).any() or (model.dof_armature < 0).any():
@@ -228,27 +231,27 @@ class VariantEngine:
             return None
         states, control = starts.reshape(num_k * num_w, -1), signals.reshape(num_k * num_w, total, -1)
         forces, applied, wrenched = forces_of(variants, num_w), pushes is not None, variants[0].has("wrench")
-        if wrenched:
-            outer = self._wrenches(variants).reshape(num_k, -1).repeat(num_w, 0)[:, None]
-            control = np.concatenate([control, np.broadcast_to(outer, (*control.shape[:2], outer.shape[2]))], 2)
-        if pushes is not None:
-            pushed = np.repeat(np.repeat(pushes, self._setting.frame_skip, axis=1), num_w, axis=0)
-            control = np.concatenate([control, pushed], 2)
+        outer = self._wrenches(variants).reshape(num_k, -1).repeat(num_w, 0) if wrenched else np.zeros((len(states), 0))
+        nothing, skip = np.zeros((len(states), total // self._setting.frame_skip, 0)), self._setting.frame_skip
+        pushed = nothing if pushes is None else np.repeat(pushes, num_w, axis=0)
         if not forces:
             held = 1 if _varies(control, every) else every
-            path = worlds.rollout(states, control[:, ::held], held * finer, applied=applied, wrenched=wrenched)
+            at = np.arange(0, total, held)
+            constant = np.broadcast_to(outer[:, None], (len(states), len(at), outer.shape[1]))
+            inputs = np.concatenate([control[:, at], constant, pushed[:, at // skip]], 2)
+            path = worlds.rollout(states, inputs, held * finer, applied=applied, wrenched=wrenched)
             return path[:, every // held - 1 :: every // held].reshape(num_k, num_w, -1, states.shape[1])
-        if not applied:
-            control = np.concatenate([control, np.zeros((*control.shape[:2], self._base.nv))], 2)
         out, before = np.empty((len(states), total // every, states.shape[1])), states[:, nq:]
-        stepper = worlds.stepper(states, control.shape[2], 1, applied=True, wrenched=wrenched)
+        width = control.shape[2] + outer.shape[1] + self._base.nv
+        stepper = worlds.stepper(states, width, 1, applied=True, wrenched=wrenched)
         for step in range(total):
             for _ in range(finer):
-                states, inputs = stepper.states, control[:, step].copy()
+                states = stepper.states
                 found = self._forces(forces, states[:, :nq], states[:, nq:], before, self._base.opt.timestep / finer)
-                inputs[:, -self._base.nv :] += found
+                if applied:
+                    found = found + pushed[:, step // skip]
                 before = states[:, nq:]
-                stepper.step(inputs)
+                stepper.step(np.concatenate([control[:, step], outer, found], 1))
             if (step + 1) % every == 0:
                 out[:, (step + 1) // every - 1] = stepper.states
         out[~np.isfinite(stepper.states).all(1)] = np.nan

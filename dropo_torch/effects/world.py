@@ -75,11 +75,18 @@ class Integration(WorldEffect):
 
     #: How many times finer the step becomes, and its integrator.
     FINER = 8
+    #: By how much coarser a step serves for differences: still finer than the model's, with the better integrator.
+    EASED = 4
     shares = (1 / FINER,)
+    steps = True
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         step = float(setting.model.opt.timestep)
         return (Quantity("timestep", "s", step, step / self.FINER, step, step, discrete=True),)
+
+    def eased(self, setting: Setting, values: tuple[float, ...]) -> tuple[float, ...]:
+        finer = round(setting.model.opt.timestep / values[0])
+        return values if finer % (2 * self.EASED) else (self.EASED * values[0],)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] == model.opt.timestep:

@@ -133,7 +133,11 @@ def swap(ground: Ground, state: State) -> State:
     tried = ground.rules.tried
     for _ in range(2):
         before = state.current
-        for index in _single(before.hypothesis.placed):
+        for own in _single(before.hypothesis.placed):
+            keys = [p.key for p in state.current.hypothesis.placed]
+            if own not in keys:
+                continue
+            index = keys.index(own)
             ground.report("swapping", 0.0)
             without = ground.refit(state.current.hypothesis.without(index))
             focus = ground.focus(without)
@@ -152,10 +156,10 @@ def swap(ground: Ground, state: State) -> State:
     return state
 
 
-def _single(placed: Sequence[Placed]) -> list[int]:
-    """Numbers of the effects that are not members of a family."""
+def _single(placed: Sequence[Placed]) -> list[tuple[str, str | None]]:
+    """Effects and targets that are not members of a family."""
     names = Counter(p.effect.name for p in placed)
-    return [i for i, p in enumerate(placed) if names[p.effect.name] < MANY]
+    return [p.key for p in placed if names[p.effect.name] < MANY]
 
 
 def extend(ground: Ground, state: State) -> State:

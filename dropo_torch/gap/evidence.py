@@ -142,6 +142,27 @@ class Evidence:
         known = self.chart.known(valid).reshape(*shape, self.num_rows)
         return np.where(known, residual.reshape(known.shape) / self.model_error, 0.0), known
 
+    def changes(
+        self, own: Variant, at: np.ndarray, others: Sequence[Variant], moved: np.ndarray | None = None,
+        pushes: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Return by how much residuals of hypotheses differ from those of one that is near, ``(K, W, N)``.
+
+        They are taken where simulations cost less, if there is such a place: see :meth:`Effect.eased`.
+
+        Args:
+            own: the one that is near.
+            at: its residuals, ``(W, N)``.
+            others: the hypotheses, K of them, with
+            moved, pushes: see :meth:`residuals`.
+        """
+        setting = self.twin.setting
+        easy = own.eased(setting)
+        if easy != own:
+            at = self.residuals([easy])[0][0]
+        found, _ = self.residuals([v.eased(setting) for v in others], moved, pushes)
+        return found - at
+
     def linearise(self, variant: Variant) -> Linearisation:
         """Return how a hypothesis' residuals depend on the initial states."""
         found = self._statistical(variant) if self.rough else self._where_needed(variant)
@@ -173,10 +194,11 @@ class Evidence:
     def _differences(self, variant: Variant) -> tuple[Linearisation, np.ndarray]:
         """The linearisation, and the residuals ``(W, N)`` at the measured initial states."""
         m = self.chart.size
-        found, known = self.residuals([variant] * (m + 1), np.eye(m + 1, m, -1)[:, None])
-        basis, _ = np.linalg.qr(np.moveaxis(np.nan_to_num(found[1:] - found[:1]), 0, -1))
-        weights = known[0].astype(float)
-        return Linearisation(basis, weights, np.zeros(weights.shape), 0.0), found[0]
+        (residual,), (known,) = self.residuals([variant])
+        changes = self.changes(variant, residual, [variant] * m, np.eye(m)[:, None])
+        basis, _ = np.linalg.qr(np.moveaxis(np.nan_to_num(changes), 0, -1))
+        weights = known.astype(float)
+        return Linearisation(basis, weights, np.zeros(weights.shape), 0.0), residual
 
     def _statistical(self, variant: Variant, pairs: int = PAIRS) -> Linearisation:
         """Regress the residuals on draws of noise on the initial states; what is left over adds to the noise."""

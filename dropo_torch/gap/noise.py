@@ -88,18 +88,18 @@ def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeF
     scale = TRIAL * twin.setting.signals.force
     time = (np.arange(length) + 0.5) / length - 0.5
     basis = np.stack([np.ones(length), time * 2, (time * 2) ** 2 - 1 / 3])[:ORDER]
-    pushes = np.zeros((1 + m + ORDER * nv, length, nv))
+    pushes = np.zeros((m + ORDER * nv, length, nv))
     for dof in range(nv):
-        pushes[1 + m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
-    moved = np.eye(len(pushes), m, -1)[:, None]
-    found, seen = evidence.residuals([variant] * len(pushes), moved, pushes)
-    usable = np.isfinite(found).all((0, 2))
+        pushes[m + dof * ORDER :, :, dof][:ORDER] = basis * scale[dof]
+    (own,), (seen,) = evidence.residuals([variant])
+    moved = np.eye(len(pushes), m)[:, None]
+    changes = evidence.changes(variant, own, [variant] * len(pushes), moved, pushes)
+    usable = np.isfinite(own).all(1) & np.isfinite(changes).all((0, 2))
     if not usable.any():
         raise Diverges(_lost(twin, windows))
     if (told := usable & twin.knows(variant, windows)).any():
         usable = told
-    residual, slope = found[0, usable], np.moveaxis(found[1:, usable] - found[:1, usable], 0, -1)
-    counted = np.asarray(seen[:, usable].all(0))
+    residual, slope, counted = own[usable], np.moveaxis(changes[:, usable], 0, -1), seen[usable]
     relative, unsure = _relative_noise(residual, slope, counted, m) if not known else (np.ones(m), np.zeros(m))
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)

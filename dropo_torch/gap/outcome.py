@@ -10,7 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Quantity, Setting
-from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
 from dropo_torch.gap.ground import Report
@@ -59,11 +59,14 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
     """
     problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
     rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
-    last, rest = None, naming.final
+    last, rest, alone, own_step = None, naming.final, naming.base, None
     if naming.named:
         report("fitting on all windows", 0.0)
-        last, rest = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
-        evidence, noise = replace(evidence, noise=last.evidence.noise), last.evidence.noise
+        last, rest, own = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
+        own_step = _own_step(own, rest.cost, rules)
+        if not np.array_equal(last.evidence.noise, noise):
+            evidence, noise = replace(evidence, noise=last.evidence.noise), last.evidence.noise
+            alone = refit(evidence, base, iterations=0, slopes=False)
     final = naming.final if last is None else last.fit
     report("verifying", 0.0)
     held = cut_held(evidence, scene.held, final.hypothesis)
@@ -87,9 +90,8 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
         shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
-    own_step = _own_step(naming, rest, rules)
     untold = naming.named and (own_step is None or naming.partial)
-    remaining = _remaining(setting, naming, rest, after, astray, rules) if untold else None
+    remaining = _remaining(setting, naming, alone.cost, rest, after, astray, rules) if untold else None
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)
     return Gap(
         where=places(setting, before, naming.first, rules.shown) if naming.gap else (),
@@ -103,7 +105,7 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         noise=tuple(noise.tolist()),
         labels=evidence.chart.labels,
         units=evidence.chart.units,
-        reduced=(naming.base.cost.reduced, rest.cost.reduced),
+        reduced=(alone.cost.reduced, rest.cost.reduced),
         ranking=_ranking(naming.attempts),
         residuals=residual_pictures(setting, before, after, 2 if naming.gap else 0),
         cannot_judge=tuple(p.key for p in naming.first.silent),
@@ -181,8 +183,10 @@ def _force_pictures(setting: Setting, view: ForceView) -> tuple[Residuals, ...]:
     )  # fmt: skip
 
 
-def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> tuple[Resolved, Refit]:
-    """Fit the named effects on all windows, as they are weighted and stepped in the end; and beside it as noise weighs.
+def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> tuple[Resolved, Refit, Cost]:
+    """Fit the named effects on all windows, as they are weighted and stepped in the end.
+
+    And as noise alone weighs them, and the misfit that they have so with the model's own step.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
     error of a real model grows with the lead, and differs between columns. The noise is told once more, by all windows
@@ -195,7 +199,7 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
         evidence = replace(evidence, noise=noise)
         own = refit(evidence, own.hypothesis, iterations=2)
         final = resolved(evidence, own, anew=True)
-    rest = final.fit
+    rest, with_own_step = final.fit, own.cost
     for _ in range(ROUNDS):
         if final.fit.cost.reduced < evidence.rules.sound.model_error:
             break
@@ -206,7 +210,7 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
         evidence = replace(evidence, model_error=smooth.ravel())
         own = refit(evidence, own.hypothesis, iterations=6)
         final = resolved(evidence, own, anew=True)
-    return final, rest
+    return final, rest, with_own_step
 
 
 def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Naming:
@@ -221,13 +225,12 @@ def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Nami
 
 
 def _remaining(
-    setting: Setting, naming: Naming, rest: Refit, after: FreeForces, astray: float, rules: Rules
+    setting: Setting, naming: Naming, base: Cost, rest: Refit, after: FreeForces, astray: float, rules: Rules
 ) -> Remaining | None:
     """What the named effects leave, if it is more than noise; what only the step of the model leaves is no part."""
     cost, typical = rest.cost, rest.typical
     if not naming.partial and not remains(cost, rules) and not astray > rules.sound.astray:
         return None
-    base = naming.base.cost
     dof = guilty(after)
     share = float(np.clip(cost.left_of(base) * base.degrees / cost.degrees, 0, 1))
     off = float(np.mean(typical > rules.sound.rest))
@@ -235,11 +238,9 @@ def _remaining(
     return Remaining(cost.reduced, share, off, dof_names(setting.model)[dof], when, astray)
 
 
-def _own_step(naming: Naming, rest: Refit, rules: Rules) -> tuple[float, float] | None:
-    """χ² per degree of freedom with the model's own step and with a finer one, where that step is all that remains."""
-    own = naming.final.cost
-    only = naming.named and remains(own, rules) and not remains(rest.cost, rules)
-    return (own.reduced, rest.cost.reduced) if only else None
+def _own_step(own: Cost, best: Cost, rules: Rules) -> tuple[float, float] | None:
+    """χ² per degree of freedom with the model's own step and with the best one, where that step is all that remains."""
+    return (own.reduced, best.reduced) if remains(own, rules) and not remains(best, rules) else None
 
 
 def _notes(setting: Setting, naming: Naming, skill: bool, transitions: int) -> Iterator[str]:

@@ -226,8 +226,8 @@ def _sloped(evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarr
     moved, steps = beside(here.hypothesis, limits, np.flatnonzero(limits.free), STEP)
     slope = np.zeros_like(here.slope)
     if moved:
-        found, _ = evidence.residuals([h.variant for h in moved])
-        slope[limits.free] = evidence.project_slope((found - residuals) / steps[:, None, None], here.linear)
+        changes = evidence.changes(here.hypothesis.variant, residuals, [h.variant for h in moved])
+        slope[limits.free] = evidence.project_slope(changes / steps[:, None, None], here.linear)
     return replace(here, slope=slope)
 
 

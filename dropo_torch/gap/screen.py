@@ -141,7 +141,8 @@ def screen(
 def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Candidate]:
     """Simulate candidates at their starts and beside them, in one batch, and predict.
 
-    A neutral start is the fitted hypothesis itself.
+    A neutral start is the fitted hypothesis itself, but for filters: these may act under a step of their own, and what
+    they show first is from before the window.
     """
     evidence, linear, factor = focus.evidence, focus.fitted.linear, focus.factor
     variants: list[Variant] = []
@@ -154,7 +155,7 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         moving = moving[limits.free[len(hypothesis.vector) - size + moving]]
         columns = len(hypothesis.vector) - size + moving
         moved, steps = beside(hypothesis, limits, columns, STEP)
-        begins = [] if placed.is_neutral(evidence.twin.setting) else [hypothesis]
+        begins = [] if placed.is_neutral(evidence.twin.setting) and not placed.effect.is_filter else [hypothesis]
         own = [h.variant for h in (*begins, *moved)]
         rows = slice(len(variants), len(variants) + len(own))
         variants += own

@@ -219,8 +219,11 @@ def conclude(ground: Ground, state: State) -> Ended:
         return Ended(ground, state, unnamed)
     if state.family:
         return Ended(ground, state, conclude_family(ground, state, unnamed))
+    count = len(state.current.hypothesis.placed)
+    if count and not may_account(ground, state):
+        return Ended(ground, state, replace(unnamed, attempts=state.attempts, refused=state.refused))
     pruned = state
-    if (count := len(state.current.hypothesis.placed)) and may_account(ground, state):
+    if count:
         ground.report(f"checking {count} effect{'s' if count > 1 else ''}", 0.0)
         pruned = prune(ground, state)
     return Ended(ground, pruned, judged(ground, pruned, state.current, unnamed))

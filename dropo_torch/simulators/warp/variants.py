@@ -16,7 +16,7 @@ from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.layout import FIELDS
 
 #: Engines that are kept.
-KEPT = 256
+KEPT = 64
 
 
 @dataclass(frozen=True)
@@ -108,6 +108,7 @@ class Variants:
     def __init__(self, space: ParameterSpace, *, num_threads: int = 0, device: str = "cpu") -> None:
         self._space, self._device, self._threads = space, device, num_threads
         self._engines: dict[bytes, Engine | None] = {}
+        self._tabled: tuple[str, ...] = ()
 
     def worlds(self, models: Sequence[mujoco.MjModel], each: int) -> Worlds | None:
         """Return worlds of variants, with their derived constants, each in ``each`` rows.
@@ -116,8 +117,9 @@ class Variants:
             ``None`` where one of them is outside the subset that Warp simulates.
         """
         members: dict[bytes, list[int]] = {}
+        self._tabled = self._tabled or tabled_fields(models[0])
         for k, model in enumerate(models):
-            members.setdefault(_structure(model), []).append(k)
+            members.setdefault(_structure(model, self._tabled), []).append(k)
         found = []
         for structure, own in members.items():
             engine = self._of(structure, models[own[0]])
@@ -131,11 +133,11 @@ class Variants:
 
     def _of(self, structure: bytes, model: mujoco.MjModel) -> Engine | None:
         """The engine of a structure, as a model has it; ``None`` outside the subset."""
-        if structure not in self._engines:
-            if len(self._engines) >= KEPT:
-                self._engines.pop(next(iter(self._engines)))
-            self._engines[structure] = self._engine(model)
-        return self._engines[structure]
+        engine = self._engines.pop(structure) if structure in self._engines else self._engine(model)
+        if len(self._engines) >= KEPT:  # the one not used for longest
+            self._engines.pop(next(iter(self._engines)))
+        self._engines[structure] = engine
+        return engine
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
         try:
@@ -144,22 +146,36 @@ class Variants:
             return None
 
 
-def _structure(model: mujoco.MjModel) -> bytes:
+def tabled_fields(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return the fields of a model of which an engine's tables, or whether there may be one, may follow.
+
+    All that hold anything, but for those in θ, those that follow from the others, and those that move nothing.
+    """
+    arrays = [name for name in dir(model) if not name.startswith(("_", *_IDLE)) and name not in _DERIVED]
+    arrays = [name for name in arrays if isinstance(found := getattr(model, name), np.ndarray) and found.size]
+    options = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
+    return tuple(field for field in (*options, *arrays) if field not in FIELDS)
+
+
+def _structure(model: mujoco.MjModel, tabled: Sequence[str]) -> bytes:
     """What an engine's tables, and whether there may be one, follow from; of numbers in θ only which are zero."""
     numbers = [np.sign(read_field(model, field)) for field in _SIGNS]
     numbers += [np.any(read_field(model, field)) for field in _ANY]
-    tabled = [np.asarray(read_field(model, field)) for field in _TABLED if field not in FIELDS]
-    return b"|".join(array.tobytes() for array in (*numbers, *tabled))
+    return b"|".join(array.tobytes() for array in (*numbers, *(np.asarray(read_field(model, f)) for f in tabled)))
 
 
 #: Fields of θ of which each number's sign matters, and such of which it does whether any is not zero.
 _SIGNS = ("dof_frictionloss", "body_gravcomp", "actuator_gainprm", "actuator_biasprm")
 _ANY = ("dof_damping", "dof_dampingpoly", "jnt_stiffness", "jnt_stiffnesspoly", "opt.density", "opt.viscosity")
-#: Fields that an effect may change and that stand in an engine's tables.
-_TABLED = (
-    "opt.timestep", "opt.integrator", "opt.disableflags", "opt.cone", "opt.impratio", "opt.o_margin", "body_iquat",
-    "body_pos", "body_quat", "body_sameframe", "geom_pos", "geom_quat", "geom_size", "geom_sameframe", "geom_priority",
-    "geom_condim", "geom_fluid", "geom_gap", "geom_solmix", "geom_contype", "geom_conaffinity", "jnt_axis", "jnt_pos",
-    "jnt_limited", "jnt_actfrclimited", "actuator_biastype", "actuator_gaintype", "actuator_forcelimited",
-    "actuator_ctrllimited", "actuator_gear", "actuator_dyntype", "qpos0", "actuator_damping",
+#: What fields begin with that show things, name them, or measure.
+_IDLE = (
+    "bvh_", "cam_", "key_", "light_", "mat_", "mesh_pathadr", "mesh_tex", "name", "numeric_", "oct_", "sensor_",
+    "skin_", "tex_", "text_", "tuple_",
 )  # fmt: skip
+#: Fields that follow from others, as constants derived from θ, and looks of what also moves.
+_DERIVED = frozenset((
+    "actuator_acc0", "actuator_length0", "body_invweight0", "body_margin", "body_subtreemass", "dof_M0",
+    "dof_invweight0", "dof_length", "efm0_L", "flexedge_invweight0", "flexedge_length0", "geom_aabb",
+    "geom_castshadow", "geom_group", "geom_matid", "geom_rgba", "jnt_group", "site_group", "site_matid", "site_rgba",
+    "tendon_group", "tendon_invweight0", "tendon_length0", "tendon_matid", "tendon_rgba",
+))  # fmt: skip
