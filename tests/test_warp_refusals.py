@@ -8,6 +8,7 @@ import pytest
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import WarpSimulator
+from dropo_torch.simulators.warp.support import Missing, summary
 
 SOUND = """<mujoco><option {option}><flag {flag}/></option><worldbody>
 <body name="a"><joint name="j" {joint}/><geom name="a" size=".1" mass="1"/>
@@ -40,20 +41,20 @@ def test_the_sound_model_is_simulated() -> None:
         ({"option": 'iterations="3"'}, "option iterations=3"),
         ({"option": 'solver="PGS"'}, "option solver=PGS"),
         ({"option": 'integrator="implicitfast" density="1"'}, "implicitfast with density or viscosity"),
-        ({"option": 'integrator="implicitfast"'}, "free body of joint 'root' under implicitfast"),
+        ({"option": 'integrator="implicitfast"'}, "implicitfast with a lone free body (its"),
         ({"option": 'actuatorgroupdisable="0"'}, "option actuatorgroupdisable"),
         ({"flag": 'override="enable"'}, "flag override enabled"),
-        ({"geom": 'fluidshape="ellipsoid"'}, "ellipsoid fluid model of geom 'b'"),
-        ({"body": 'gravcomp="-1"'}, "negative gravcomp of body 'b'"),
-        ({"body": 'gravcomp="1"', "second": 'actuatorgravcomp="true"'}, "actuatorgravcomp on body 'b'"),
+        ({"geom": 'fluidshape="ellipsoid"'}, "ellipsoid fluid model of geom (1: 'b')"),
+        ({"body": 'gravcomp="-1"'}, "negative gravcomp of body (1: 'b', which"),
+        ({"body": 'gravcomp="1"', "second": 'actuatorgravcomp="true"'}, "actuatorgravcomp on body (1: 'b')"),
         ({"world": '<body name="m" mocap="true"/>'}, "mocap body (1)"),
-        ({"actuator": '<general name="g" joint="k" gaintype="user"/>'}, "actuator 'g': gain user"),
+        ({"actuator": '<general name="g" joint="k" gaintype="user"/>'}, "actuator gain user (1: 'g')"),
         (
             {"actuator": '<motor name="g" jointinparent="root"/>'},
-            "actuator 'g': transmission in the parent's frame of a free or ball joint",
+            "actuator of a free or ball joint with its transmission in the parent's frame (1: 'g')",
         ),
         ({"extra": '<equality><connect name="e" body1="a" body2="b" anchor="0 0 0"/></equality>'},
-         "equality 'e': connect"),
+         "connect equality (1: 'e')"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
@@ -64,14 +65,30 @@ def test_a_part_that_warp_lacks_is_named(parts: dict[str, str], words: str) -> N
 @pytest.mark.parametrize(
     ("parameter", "parts", "words"),
     [
-        ({"field": "actuator_gainprm", "name": "m", "index": 4}, {}, "actuator_gainprm[4] does not act, only"),
+        ({"field": "actuator_gainprm", "name": "m", "index": 4}, {}, "effects of actuator_gainprm[4], only of"),
         ({"field": "eq_data", "name": "e", "index": 6},
-         {"extra": '<equality><joint name="e" joint1="j" joint2="k"/></equality>'}, "eq_data[6] does not act, only"),
-        ({"field": "qpos_spring", "name": "root", "index": 4}, {}, "qpos_spring of a quaternion has no gradient here"),
-        ({"field": "geom_size", "name": "a", "index": 0}, {}, "geom_size has no gradient here"),
+         {"extra": '<equality><joint name="e" joint1="j" joint2="k"/></equality>'}, "effects of eq_data[6], only of"),
+        ({"field": "qpos_spring", "name": "root", "index": 4}, {}, "gradients of qpos_spring of a quaternion"),
+        ({"field": "geom_size", "name": "a", "index": 0}, {}, "gradients of geom_size"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
 def test_a_parameter_without_effect_there_is_named(parameter: dict, parts: dict[str, str], words: str) -> None:
     found = refused({**parameter, "bounds": [0.1, 1.0]}, **parts)
-    assert f"parameter 'p': {words}" in found
+    assert words in found
+    assert "(1: parameter 'p')" in found
+
+
+def test_what_is_missing_often_is_counted_and_said_once() -> None:
+    names = [f"g{i}" for i in range(5)]
+    some = "".join(f'<general name="{n}" joint="k" gaintype="user" dyntype="user"/>' for n in names)
+    message = refused(actuator=some)
+    assert "actuator gain user (5: 'g0', 'g1', 'g2', ...)" in message
+    assert message.count("gain user") == 1
+    assert "'g3'" not in message
+
+
+def test_three_are_named_without_dots() -> None:
+    assert summary([Missing("x", "'a'"), Missing("y"), Missing("x", "'b'"), Missing("x", "'c'")]) == (
+        "x (3: 'a', 'b', 'c'); y"
+    )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
@@ -22,6 +23,17 @@ _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 
 
+#: Names that a refusal gives of those that lack the same.
+SHOWN = 3
+
+
+class Missing(NamedTuple):
+    """Something that the backend does not simulate, and an element that needs it; an empty name for a whole model."""
+
+    what: str
+    where: str = ""
+
+
 def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> None:
     """Raise one error that names everything in ``model`` and ``space`` that the backend does not simulate.
 
@@ -31,27 +43,47 @@ def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tupl
         pairs: geoms that may touch, ``(geom1, geom2, pair or -1)``, the smaller geom type first.
 
     Raises:
-        UnsupportedModel: the list of all offending elements.
+        UnsupportedModel: what is missing, how many elements need it, and the first of them.
     """
-    reasons = [
+    found = missing(model, space, pairs)
+    if found:
+        raise UnsupportedModel(f"backend warp does not simulate: {summary(found)}. Use backend mujoco")
+
+
+def missing(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> list[Missing]:
+    """Return everything that the backend lacks for ``model`` and ``space``; see :func:`check_support`."""
+    return [
         *_options(model), *_structure(model), *_joints(model), *_actuators(model, space), *_equalities(model),
         *_contacts(model, pairs), *_parameters(model, space),
     ]  # fmt: skip
-    if reasons:
-        raise UnsupportedModel("backend warp does not simulate: " + "; ".join(reasons) + ". Use backend mujoco")
 
 
-def _options(model: mujoco.MjModel) -> Iterator[str]:
+def summary(found: Iterable[Missing]) -> str:
+    """Return what is missing in one line: each thing once, with the number of elements and the first few names."""
+    groups: dict[str, list[str]] = {}
+    for what, where in found:
+        groups.setdefault(what, []).append(where)
+    return "; ".join(what + _named(names) for what, names in groups.items())
+
+
+def _named(names: list[str]) -> str:
+    """`` (5: 'a', 'b', 'c', ...)``, or nothing for a whole model."""
+    if not any(names):
+        return ""
+    return f" ({len(names)}: {', '.join(names[:SHOWN])}{', ...' if len(names) > SHOWN else ''})"
+
+
+def _options(model: mujoco.MjModel) -> Iterator[Missing]:
     opt = model.opt
     disable, enable = mujoco.mjtDisableBit, mujoco.mjtEnableBit
     if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
-        yield "option integrator=implicit (use implicitfast, Euler or RK4)"
+        yield Missing("option integrator=implicit (use implicitfast, Euler or RK4)")
     if opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
-        yield f"option solver={mujoco.mjtSolver(opt.solver).name[6:]} (Newton is solved to convergence)"
+        yield Missing(f"option solver={mujoco.mjtSolver(opt.solver).name[6:]} (Newton is solved to convergence)")
     elif opt.iterations < 10 and model.nv:
-        yield f"option iterations={opt.iterations} (Newton is solved to convergence; allow 10 or more)"
+        yield Missing(f"option iterations={opt.iterations} (Newton is solved to convergence; allow 10 or more)")
     if opt.noslip_iterations > 0:
-        yield f"option noslip_iterations={opt.noslip_iterations}"
+        yield Missing(f"option noslip_iterations={opt.noslip_iterations}")
     harmless = (
         disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EQUALITY | disable.mjDSBL_FRICTIONLOSS | disable.mjDSBL_LIMIT
         | disable.mjDSBL_CONTACT | disable.mjDSBL_SPRING | disable.mjDSBL_DAMPER | disable.mjDSBL_GRAVITY
@@ -63,41 +95,43 @@ def _options(model: mujoco.MjModel) -> Iterator[str]:
     for kind, flags in ((disable, opt.disableflags & ~int(harmless)), (enable, opt.enableflags & ~int(inert))):
         for bit in kind.__members__.values():
             if flags & int(bit) and not bit.name.startswith("mjN"):
-                yield f"flag {bit.name[7:].lower()} {'disabled' if kind is disable else 'enabled'}"
+                yield Missing(f"flag {bit.name[7:].lower()} {'disabled' if kind is disable else 'enabled'}")
     if opt.disableactuator:
-        yield "option actuatorgroupdisable"
+        yield Missing("option actuatorgroupdisable")
     if (opt.density or opt.viscosity) and opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        yield "implicitfast with density or viscosity"
+        yield Missing("implicitfast with density or viscosity")
 
 
-def _structure(model: mujoco.MjModel) -> Iterator[str]:
+def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
     counts = {"nflex": "flex", "nplugin": "plugin", "nmocap": "mocap body", "nhistory": "delay or history buffer",
               "nplastic": "plastic spring", "na": "actuator activation (dynamics) state"}  # fmt: skip
     for field, what in counts.items():
         number = int(getattr(model, field, 0))
         if number:
-            yield f"{what} ({number})"
+            yield Missing(f"{what} ({number})")
     if not (model.nu == model.nactuator == model.nout):
-        yield "actuators with several controls or outputs"
+        yield Missing("actuators with several controls or outputs")
     flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
-    yield from (f"geom {what}" for flag, what in flags.items() if getattr(model, flag, False))
+    yield from (Missing(f"geom {what}") for flag, what in flags.items() if getattr(model, flag, False))
     for i in range(model.ntendon):
         fields = ("limited", "stiffness", "damping", "frictionloss", "armature", "stiffnesspoly", "dampingpoly")
         if any(np.any(getattr(model, f"tendon_{field}")[i]) for field in fields):
-            yield f"tendon {model.tendon(i).name or i!r}"
+            yield Missing("tendon with a force or a limit", repr(model.tendon(i).name or i))
     for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
-        yield f"ellipsoid fluid model of geom {object_names(model, 'geom')[g]!r}"
+        yield Missing("ellipsoid fluid model of geom", repr(object_names(model, "geom")[g]))
     acting = set(model.jnt_bodyid[model.jnt_actgravcomp.astype(bool)])  # bodies compensated through actuators
     for i in range(1, model.nbody):
         if model.body_parentid[i] in acting:
             acting.add(i)
         if model.body_gravcomp[i] < 0:
-            yield f"negative gravcomp of body {model.body(i).name!r} (MuJoCo ignores it unless another is positive)"
+            yield Missing(
+                "negative gravcomp of body", f"{model.body(i).name!r}, which MuJoCo ignores unless another is positive"
+            )
         if model.body_gravcomp[i] and i in acting:
-            yield f"actuatorgravcomp on body {model.body(i).name!r}"
+            yield Missing("actuatorgravcomp on body", repr(model.body(i).name))
 
 
-def _joints(model: mujoco.MjModel) -> Iterator[str]:
+def _joints(model: mujoco.MjModel) -> Iterator[Missing]:
     names = object_names(model, "jnt")
     for j in range(model.njnt):
         kind = model.jnt_type[j]
@@ -105,41 +139,44 @@ def _joints(model: mujoco.MjModel) -> Iterator[str]:
             root = model.jnt_bodyid[j]
             alone = not any(model.body_dofnum[b] for b in range(root + 1, model.nbody) if model.body_rootid[b] == root)
             if alone and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-                yield f"free body of joint {names[j]!r} under implicitfast (its gyroscopic derivative)"
+                yield Missing("implicitfast with a lone free body (its gyroscopic derivative)", repr(names[j]))
             if model.jnt_limited[j]:
-                yield f"limit of free joint {names[j]!r}"
+                yield Missing("limit of free joint", repr(names[j]))
         if kind in (_FREE, _BALL) and model.jnt_actfrclimited[j]:
-            yield f"actuatorfrcrange of joint {names[j]!r}"
+            yield Missing("actuatorfrcrange of free or ball joint", repr(names[j]))
     for i in range(model.nv):
         if model.dof_frictionloss[i] < 0:
-            yield f"negative frictionloss of dof {i}"
+            yield Missing("negative frictionloss of dof", str(i))
 
 
-def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[str]:
+def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing]:
     if model.nu != model.nactuator:
         return
     varied = {(t.field, t.index) for p in space.parameters for t in p.targets}
     names = object_names(model, "actuator")
     for i in range(model.nu):
-        where = f"actuator {names[i]!r}"
+        where = repr(names[i])
         if model.actuator_trntype[i] not in _TRANSMISSIONS:
-            yield f"{where}: transmission {mujoco.mjtTrn(model.actuator_trntype[i]).name[6:].lower()}"
+            yield Missing(f"actuator transmission {mujoco.mjtTrn(model.actuator_trntype[i]).name[6:].lower()}", where)
         elif model.jnt_type[model.actuator_trnid[i, 0]] in (_FREE, _BALL):
-            yield from (f"{where}: {what} of a free or ball joint" for what in _beyond_moments(model, i, varied))
+            yield from (
+                Missing(f"actuator of a free or ball joint with {what}", where)
+                for what in _beyond_moments(model, i, varied)
+            )
         if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
-            yield f"{where}: dynamics {mujoco.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()}"
+            yield Missing(f"actuator dynamics {mujoco.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()}", where)
         if model.actuator_gaintype[i] not in _GAINS:
-            yield f"{where}: gain {mujoco.mjtGain(model.actuator_gaintype[i]).name[7:].lower()}"
+            yield Missing(f"actuator gain {mujoco.mjtGain(model.actuator_gaintype[i]).name[7:].lower()}", where)
         if model.actuator_biastype[i] not in _BIASES:
-            yield f"{where}: bias {mujoco.mjtBias(model.actuator_biastype[i]).name[7:].lower()}"
+            yield Missing(f"actuator bias {mujoco.mjtBias(model.actuator_biastype[i]).name[7:].lower()}", where)
         if model.actuator_damping[i] or model.actuator_dampingpoly[i].any() or model.actuator_armature[i]:
-            yield f"{where}: damping or armature"
+            yield Missing("actuator damping or armature", where)
 
 
 def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str, int]]) -> Iterator[str]:
     """What of an actuator on a free or ball joint is more than a force by constant moments, its gears."""
     if model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINTINPARENT:
-        yield "transmission in the parent's frame"
+        yield "its transmission in the parent's frame"
     affine = {"actuator_gainprm": model.actuator_gaintype, "actuator_biasprm": model.actuator_biastype}
     kinds = {"actuator_gainprm": mujoco.mjtGain.mjGAIN_AFFINE, "actuator_biasprm": mujoco.mjtBias.mjBIAS_AFFINE}
     ball = model.jnt_type[model.actuator_trnid[actuator, 0]] == _BALL
@@ -155,37 +192,37 @@ def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str,
             yield "a force by the velocity under implicitfast"
 
 
-def _equalities(model: mujoco.MjModel) -> Iterator[str]:
+def _equalities(model: mujoco.MjModel) -> Iterator[Missing]:
     for i in range(model.neq):
         if not model.eq_active0[i]:
             continue
         name = model.equality(i).name or i
         if model.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT:
-            yield f"equality {name!r}: {mujoco.mjtEq(model.eq_type[i]).name[5:].lower()}"
+            yield Missing(f"{mujoco.mjtEq(model.eq_type[i]).name[5:].lower()} equality", repr(name))
             continue
         for j in (model.eq_obj1id[i], model.eq_obj2id[i]):
             if j >= 0 and model.jnt_type[j] in (_FREE, _BALL):
-                yield f"equality {name!r} of a free or ball joint"
+                yield Missing("equality of a free or ball joint", repr(name))
 
 
-def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Iterator[str]:
+def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Iterator[Missing]:
     names = object_names(model, "geom")
     for g1, g2, _pair in pairs:
         kinds = tuple(mujoco.mjtGeom(model.geom_type[g]) for g in (g1, g2))
         if kinds not in KINDS:
             a, b = (kind.name[7:].lower() for kind in kinds)
-            yield f"contact of {a} {names[g1]!r} with {b} {names[g2]!r}"
+            yield Missing(f"contacts of {a} with {b}", f"{names[g1]!r} with {names[g2]!r}")
 
 
-def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[str]:
+def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing]:
     for parameter in space.parameters:
         for field in {t.field for t in parameter.targets}:
             if field not in FIELDS:
-                yield f"parameter {parameter.name!r}: {field} has no gradient here"
+                yield Missing(f"gradients of {field}", f"parameter {parameter.name!r}")
         for target in parameter.targets:
             reason = _dead(model, target.field, target.index)
             if reason:
-                yield f"parameter {parameter.name!r}: {reason}"
+                yield Missing(reason, f"parameter {parameter.name!r}")
                 break
 
 
@@ -196,13 +233,13 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
     width = max(1, int(np.prod(read_field(model, field).shape[1:], dtype=int)))
     column = index % width
     if column >= _KEPT.get(field, width):
-        return f"{field}[{column}] does not act, only " + ", ".join(f"{field}[{i}]" for i in range(_KEPT[field]))
+        return f"effects of {field}[{column}], only of " + ", ".join(f"{field}[{i}]" for i in range(_KEPT[field]))
     if field == "actuator_gear" and model.actuator_trntype[index // width] in _TRANSMISSIONS:
         dofs = int(joint_dofs(model)[model.actuator_trnid[index // width, 0]])
         if column >= dofs:
-            return f"{field}[{column}] does not act, only " + ", ".join(f"{field}[{i}]" for i in range(dofs))
+            return f"effects of {field}[{column}], only of " + ", ".join(f"{field}[{i}]" for i in range(dofs))
     if field == "qpos_spring":
         kinds, _joints, _dofs, starts = link_table(model)
         if ((kinds == BALL) & (starts <= index) & (index < starts + 4)).any():
-            return "qpos_spring of a quaternion has no gradient here"
+            return "gradients of qpos_spring of a quaternion"
     return ""
