@@ -47,7 +47,7 @@ def test_the_sound_model_is_simulated() -> None:
         ({"geom": 'fluidshape="ellipsoid"'}, "ellipsoid fluid model of geom (1: 'b')"),
         ({"body": 'gravcomp="-1"'}, "negative gravcomp of body (1: 'b', which"),
         ({"body": 'gravcomp="1"', "second": 'actuatorgravcomp="true"'}, "actuatorgravcomp on body (1: 'b')"),
-        ({"world": '<body name="m" mocap="true"/>'}, "mocap body (1)"),
+        ({"world": '<body name="m" mocap="true"/>'}, "mocap body (1: 'm')"),
         ({"actuator": '<general name="g" joint="k" gaintype="user"/>'}, "actuator gain user (1: 'g')"),
         (
             {"actuator": '<motor name="g" jointinparent="root"/>'},

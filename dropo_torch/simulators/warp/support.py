@@ -103,12 +103,15 @@ def _options(model: mujoco.MjModel) -> Iterator[Missing]:
 
 
 def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
-    counts = {"nflex": "flex", "nplugin": "plugin", "nmocap": "mocap body", "nhistory": "delay or history buffer",
-              "nplastic": "plastic spring", "na": "actuator activation (dynamics) state"}  # fmt: skip
-    for field, what in counts.items():
-        number = int(getattr(model, field, 0))
-        if number:
-            yield Missing(f"{what} ({number})")
+    counts = {"nplugin": "plugins", "nhistory": "delays or history buffers", "nplastic": "plastic springs",
+              "na": "activation states of actuators"}  # fmt: skip
+    yield from (Missing(what) for number, what in counts.items() if getattr(model, number, 0))
+    yield from (
+        Missing("flex", repr(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i) or i)) for i in range(model.nflex)
+    )
+    yield from (
+        Missing("mocap body", repr(object_names(model, "body")[b])) for b in np.flatnonzero(model.body_mocapid >= 0)
+    )
     if not (model.nu == model.nactuator == model.nout):
         yield Missing("actuators with several controls or outputs")
     flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
