@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import copy
 import fnmatch
 import importlib.util
 import json
@@ -48,15 +49,16 @@ PACKAGES = {
 LARGEST = 120
 STATES, STEPS = 20, 2
 #: Seconds of motion before a state is taken.
-SETTLING = (0.0, 0.02, 0.2, 0.6)
-#: Median errors that pass, of states and of derivatives; and of states where contacts come and go by a hair's breadth.
+SETTLING = (0.0, 0.1, 0.3, 1.0)
+#: Median errors that pass, of states and of derivatives; and of states at a tie, where contacts come and go by a hair's
+#: breadth: these count as right where they are so with margins by that much smaller or larger.
 STATE_ERROR, GRADIENT_ERROR, TIE_ERROR = 1e-8, 1e-5, 1e-6
 #: Fields that vary, and whose gradients are compared.
 VARIED = {"mass": "body_mass", "friction": "geom_friction", "pair friction": "pair_friction", "damping": "dof_damping"}
 _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 #: What stands in a model's place while it is simulated, and stays there if that ends the whole run.
 DIED = "the run died"
-#: Displacement of a state that must not change which geoms touch.
+#: A hair's breadth: displacement of a state, or of the margins, that must not change which geoms touch.
 NUDGE = 1e-9
 
 
@@ -153,10 +155,10 @@ def random_states(model: mujoco.MjModel, count: int, seed: int) -> np.ndarray:
         if model.nkey and attempt % 2:
             mujoco.mj_resetDataKeyframe(model, data, 0)
         _disturb(model, data, rng, 1.0 if attempt % 3 == 0 else 0.1)
-        for _ in range(int(rng.choice(SETTLING) / model.opt.timestep)):
-            data.ctrl[:] = random_controls(model, rng)
+        for _ in range(min(500, int(rng.choice(SETTLING) / model.opt.timestep))):
+            data.ctrl[:] = 0.3 * random_controls(model, rng)
             mujoco.mj_step(model, data)
-        sound = not any(w.number for w in data.warning) and np.abs(data.qvel).max() < 50
+        sound = not any(w.number for w in data.warning) and np.abs(data.qvel).max() < 100
         if sound or attempt >= 10 * count:  # one that never comes to rest is taken as it is
             states.append(np.r_[data.qpos, data.qvel])
     return np.array(states)
@@ -227,16 +229,31 @@ def conformance(model: mujoco.MjModel, seed: int = 0) -> dict[str, Any]:
         found = simulator.simulate(states, inputs, values)[:, 0]
         weights = torch.from_numpy(rng.normal(size=tuple(states.shape)))
         slopes = _slopes(simulator, states, inputs, values, weights)
-    reference = MujocoSimulator(
-        converged(space).model, parameters=converged(space), frame_skip=STEPS, num_threads=1, chunk_size=1000
-    )
-    true = reference.simulate(states, inputs, values)[:, 0]
-    errors = _errors(found, true).numpy()
+    reference = _reference(space)
+    errors = _errors(found, reference.simulate(states, inputs, values)[:, 0])
     ties = np.array([_is_tied(model, s, rng) for s in states.numpy()])
-    names = ("states", *space.names)
-    moved = {**_differences(reference, states, inputs, values, weights), "names": names}
-    gradient = _gradient_errors(slopes, moved, space)
-    return _judged(errors, ties, gradient) | {"contacts": _contacts(model, states.numpy())}
+    for margin in (NUDGE, -NUDGE) if ties.any() else ():
+        other = _reference(space.on(_with_margins(model, margin))).simulate(states[ties], inputs[ties], values)[:, 0]
+        errors[ties] = torch.minimum(errors[ties], _errors(found[ties], other))
+    sound = torch.from_numpy(~ties)
+    true = _differences(reference, states[sound], inputs[sound], values, weights[sound])
+    gradient = _gradient_errors({name: slope[~ties] for name, slope in slopes.items()}, true, space)
+    return judged(errors.numpy(), ties, gradient) | {"contacts": _contacts(model, states.numpy())}
+
+
+def _reference(space: ParameterSpace) -> MujocoSimulator:
+    """C MuJoCo, with its solver run to convergence."""
+    own = converged(space)
+    assert own.model is not None
+    return MujocoSimulator(own.model, parameters=own, frame_skip=STEPS, num_threads=1, chunk_size=1000)
+
+
+def _with_margins(model: mujoco.MjModel, change: float) -> mujoco.MjModel:
+    """A copy whose contacts are made a little earlier or later."""
+    model = copy.copy(model)
+    model.geom_margin += change
+    model.pair_margin += change
+    return model
 
 
 def _inputs(model: mujoco.MjModel, width: int, rng: np.random.Generator) -> np.ndarray:
@@ -288,7 +305,9 @@ def _differences(
             moved = (flat[:, None] + sign * step * torch.eye(width, dtype=torch.float64)).reshape(-1, *given.shape[1:])
             others = [x.repeat_interleave(width, 0) for x in (states, controls)]
             others[name == "controls"] = moved
-            both.append(reference.simulate(*others, values)[:, 0].reshape(count, width, -1) if width else None)
+            both.append(
+                reference.simulate(*others, values)[:, 0].reshape(count, width, states.shape[1]) if width else None
+            )
         slope = ((both[0] - both[1]) * weights[:, None]).sum(-1) / (2 * step) if width else flat
         out[name] = slope.numpy()
     return out
@@ -316,21 +335,24 @@ def relative_errors(found: np.ndarray, true: np.ndarray, floor: float = 1e-6) ->
 
 
 def _is_tied(model: mujoco.MjModel, state: np.ndarray, rng: np.random.Generator) -> bool:
-    """Whether a displacement by a hair's breadth changes which geoms touch."""
+    """Whether a hair's breadth, of the pose or of the margins, changes which geoms touch."""
     data = mujoco.MjData(model)
 
-    def touching(qpos: np.ndarray) -> list[tuple[int, int]]:
+    def touching(model: mujoco.MjModel, qpos: np.ndarray) -> list[tuple[int, int]]:
         data.qpos[:] = qpos
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_collision(model, data)
-        return sorted((int(c.geom[0]), int(c.geom[1])) for c in data.contact)
+        return sorted((int(c.geom[0]), int(c.geom[1])) for c in data.contact if not c.exclude)
 
-    expected = touching(state[: model.nq])
+    own = state[: model.nq]
+    expected = touching(model, own)
+    if any(touching(_with_margins(model, change), own) != expected for change in (NUDGE, -NUDGE)):
+        return True
     for _ in range(4):
-        qpos = state[: model.nq].copy()
+        qpos = own.copy()
         mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), NUDGE)
-        if touching(qpos) != expected:
+        if touching(model, qpos) != expected:
             return True
     return False
 
@@ -345,17 +367,18 @@ def _contacts(model: mujoco.MjModel, states: np.ndarray) -> int:
     return number
 
 
-def _judged(errors: np.ndarray, ties: np.ndarray, gradient: dict[str, np.ndarray]) -> dict[str, Any]:
-    """The verdict on a model's errors."""
+def judged(errors: np.ndarray, ties: np.ndarray, gradient: dict[str, np.ndarray]) -> dict[str, Any]:
+    """The verdict on errors of states ``(T,)``, which of them are at a tie, and errors of derivatives by kind."""
     sound = errors[~ties]
     median = float(np.median(sound)) if len(sound) else 0.0
     slopes = {kind: float(np.median(e)) if len(e) else None for kind, e in gradient.items()}
     wrong = [kind for kind, e in slopes.items() if e is not None and e > GRADIENT_ERROR]
     tied = float(np.median(errors[ties])) if ties.any() else 0.0
     passed = median <= STATE_ERROR and tied <= TIE_ERROR and not wrong
+    off = int((errors > np.where(ties, TIE_ERROR, STATE_ERROR)).sum())
     return {
         "passed": bool(passed), "state_median": median, "state_worst": float(errors.max()),
-        "off": int((errors > STATE_ERROR).sum()), "ties": int(ties.sum()), "gradients": slopes, "wrong": wrong,
+        "off": off, "ties": int(ties.sum()), "gradients": slopes, "wrong": wrong,
     }  # fmt: skip
 
 

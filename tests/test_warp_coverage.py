@@ -12,6 +12,7 @@ from benchmarks.warp_coverage import (
     Model,
     compiled_models,
     examine,
+    judged,
     kept,
     package_folder,
     random_states,
@@ -94,3 +95,16 @@ def test_results_are_kept(tmp_path: Path) -> None:
     kept(out, results)
     assert resumed(out) == results
     assert "1 fail, 100.0% of those taken" in report(results)
+
+
+def test_states_at_a_tie_are_judged_apart() -> None:
+    ties, gradient = (
+        np.array([True, True, False, False, False]),
+        {"mass": np.array([1e-7, 1e-6]), "friction": np.zeros(0)},
+    )
+    good = judged(np.array([1e-7, 1e-7, 1e-12, 1e-12, 1e-3]), ties, gradient)
+    assert (good["passed"], good["off"], good["ties"]) == (True, 1, 2)
+    assert good["gradients"]["friction"] is None
+    assert not judged(np.array([1e-5, 1e-5, 0, 0, 0]), ties, gradient)["passed"]
+    assert not judged(np.array([0, 0, 1e-7, 1e-7, 0]), ties, gradient)["passed"]
+    assert judged(np.zeros(5), ties, {"mass": np.full(3, 1e-4)})["wrong"] == ["mass"]
