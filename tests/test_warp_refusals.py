@@ -38,8 +38,9 @@ def test_the_sound_model_is_simulated() -> None:
 @pytest.mark.parametrize(
     ("parts", "words"),
     [
-        ({"option": 'iterations="3"'}, "option iterations=3"),
-        ({"option": 'solver="PGS"'}, "option solver=PGS"),
+        ({"option": 'integrator="discrete"'}, "option integrator=discrete"),
+        ({"option": 'noslip_iterations="3"'}, "option noslip_iterations, more than 0"),
+        ({"flag": 'diagexact="enable"'}, "flag diagexact enabled"),
         ({"option": 'integrator="implicitfast" density="1"'}, "implicitfast with density or viscosity"),
         ({"option": 'integrator="implicitfast"'}, "implicitfast with a lone free body (its"),
         ({"option": 'actuatorgroupdisable="0"'}, "option actuatorgroupdisable"),

@@ -93,7 +93,7 @@ def _write(problem: Problem, result: Fit, diagnostics: Diagnostics, out: Path) -
     portable = yaml.safe_dump(config.portable(), sort_keys=False, allow_unicode=True)
     write_atomically(out / "fitted_config.yaml", portable.encode())
     title, notes = f"Fit of {config.sim or config.model or config.environment}", _write_model(problem, result, out)
-    notes += [_left_out(problem)] if problem.left_out else []
+    notes += [*([_left_out(problem)] if problem.left_out else []), *problem.simulator.notes]
     about = {"title": title, "notes": notes, **provenance(config)}
     write_fit_report(out / "report.html", fit=result, diagnostics=diagnostics, space=problem.space, **about)
 

@@ -29,6 +29,7 @@ class Simulator(abc.ABC):
         history: logged steps before each transition whose controls come with it, for what remembers them.
         num_states: width of a state, ``nq + nv`` for a MuJoCo model.
         num_controls: width of a control, ``nu``.
+        notes: how it simulates otherwise than the model's options say, in sentences for a person.
         timestep: seconds of one logged transition, or ``None`` if the simulator does not say.
     """
 
@@ -41,6 +42,7 @@ class Simulator(abc.ABC):
     num_states: int
     num_controls: int
     timestep: float | None
+    notes: tuple[str, ...] = ()
 
     def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         """Return the states after ``lag`` transitions, the last of :meth:`rollout`.

@@ -106,6 +106,7 @@ def converged(space: ParameterSpace) -> ParameterSpace:
     """Return a space over a copy of its model whose constraint solver runs to convergence."""
     model = copy.copy(space.model)
     assert model is not None
+    model.opt.solver, model.opt.jacobian = mujoco.mjtSolver.mjSOL_NEWTON, mujoco.mjtJacobian.mjJAC_DENSE
     model.opt.tolerance, model.opt.ls_tolerance = 0.0, 1e-12
     model.opt.iterations, model.opt.ls_iterations = 200, 200
     return space.on(model)

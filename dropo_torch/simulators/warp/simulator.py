@@ -14,6 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
 from dropo_torch.simulators.warp.engine import Batch, Engine, Simulate
+from dropo_torch.simulators.warp.support import remarks
 
 
 class WarpSimulator(Simulator):
@@ -61,6 +62,7 @@ class WarpSimulator(Simulator):
         self._engine = Engine(
             model, parameters, skip=frame_skip, chunk_size=chunk_size, num_threads=threads, device=device
         )
+        self.notes = remarks(model)
         self._device = wp.device_to_torch(device)
 
     def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:

@@ -18,6 +18,10 @@ from dropo_torch.simulators.warp.types import BALL
 _KEPT = {field: keep for _, field, keep in DIRECT if keep}
 # compared with numpy integers, which do not equal MuJoCo's enumerations from the right
 _TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+_INTEGRATORS = (
+    int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4),
+    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+)  # fmt: skip
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
@@ -25,6 +29,8 @@ _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 
 #: Names that a refusal gives of those that lack the same.
 SHOWN = 3
+#: Iterations in which Newton's method converges but for rare states.
+ENOUGH = 10
 
 
 class Missing(NamedTuple):
@@ -66,6 +72,19 @@ def summary(found: Iterable[Missing]) -> str:
     return "; ".join(what + _named(names) for what, names in groups.items())
 
 
+def remarks(model: mujoco.MjModel) -> tuple[str, ...]:
+    """Return how a model that is taken is simulated otherwise than its options say, in sentences."""
+    opt, said = model.opt, []
+    if opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
+        name = mujoco.mjtSolver(opt.solver).name[6:]
+        said.append(f"Constraints are solved to convergence by Newton's method; solver {name} has the same optimum.")
+    if opt.iterations < ENOUGH:
+        said.append(f"Constraints are solved to convergence, not for {opt.iterations} iterations.")
+    if opt.enableflags & int(mujoco.mjtEnableBit.mjENBL_SLEEP):
+        said.append("Bodies do not fall asleep.")
+    return tuple(said)
+
+
 def _named(names: list[str]) -> str:
     """`` (5: 'a', 'b', 'c', ...)``, or nothing for a whole model."""
     if not any(names):
@@ -76,14 +95,11 @@ def _named(names: list[str]) -> str:
 def _options(model: mujoco.MjModel) -> Iterator[Missing]:
     opt = model.opt
     disable, enable = mujoco.mjtDisableBit, mujoco.mjtEnableBit
-    if opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
-        yield Missing("option integrator=implicit (use implicitfast, Euler or RK4)")
-    if opt.solver != mujoco.mjtSolver.mjSOL_NEWTON:
-        yield Missing(f"option solver={mujoco.mjtSolver(opt.solver).name[6:]} (Newton is solved to convergence)")
-    elif opt.iterations < 10 and model.nv:
-        yield Missing(f"option iterations={opt.iterations} (Newton is solved to convergence; allow 10 or more)")
+    if opt.integrator not in _INTEGRATORS:
+        name = mujoco.mjtIntegrator(opt.integrator).name[6:].lower()
+        yield Missing(f"option integrator={name} (use implicitfast, Euler or RK4)")
     if opt.noslip_iterations > 0:
-        yield Missing(f"option noslip_iterations={opt.noslip_iterations}")
+        yield Missing("option noslip_iterations, more than 0")
     harmless = (
         disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EQUALITY | disable.mjDSBL_FRICTIONLOSS | disable.mjDSBL_LIMIT
         | disable.mjDSBL_CONTACT | disable.mjDSBL_SPRING | disable.mjDSBL_DAMPER | disable.mjDSBL_GRAVITY
@@ -91,7 +107,7 @@ def _options(model: mujoco.MjModel) -> Iterator[Missing]:
         | disable.mjDSBL_REFSAFE | disable.mjDSBL_SENSOR | disable.mjDSBL_MIDPHASE | disable.mjDSBL_EULERDAMP
         | disable.mjDSBL_AUTORESET | disable.mjDSBL_NATIVECCD | disable.mjDSBL_ISLAND | disable.mjDSBL_MULTICCD
     )  # fmt: skip
-    inert = enable.mjENBL_ENERGY | enable.mjENBL_FWDINV
+    inert = enable.mjENBL_ENERGY | enable.mjENBL_FWDINV | enable.mjENBL_INVDISCRETE | enable.mjENBL_SLEEP
     for kind, flags in ((disable, opt.disableflags & ~int(harmless)), (enable, opt.enableflags & ~int(inert))):
         for bit in kind.__members__.values():
             if flags & int(bit) and not bit.name.startswith("mjN"):
@@ -143,8 +159,6 @@ def _joints(model: mujoco.MjModel) -> Iterator[Missing]:
             alone = not any(model.body_dofnum[b] for b in range(root + 1, model.nbody) if model.body_rootid[b] == root)
             if alone and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
                 yield Missing("implicitfast with a lone free body (its gyroscopic derivative)", repr(names[j]))
-            if model.jnt_limited[j]:
-                yield Missing("limit of free joint", repr(names[j]))
         if kind in (_FREE, _BALL) and model.jnt_actfrclimited[j]:
             yield Missing("actuatorfrcrange of free or ball joint", repr(names[j]))
     for i in range(model.nv):

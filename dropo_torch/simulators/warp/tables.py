@@ -172,7 +172,8 @@ def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]
 
     loses = (model.dof_frictionloss > 0) | np.isin(np.arange(model.nv), list(_targets(space, "dof_frictionloss")))
     friction = np.flatnonzero(loses & on(_DISABLE.mjDSBL_FRICTIONLOSS))
-    limited = np.flatnonzero(model.jnt_limited.astype(bool) & on(_DISABLE.mjDSBL_LIMIT))
+    limited = model.jnt_limited.astype(bool) & (model.jnt_type != _JNT.mjJNT_FREE)  # of a free joint there is no limit
+    limited = np.flatnonzero(limited & on(_DISABLE.mjDSBL_LIMIT))
     ids = np.flatnonzero(model.eq_active0.astype(bool) & on(_DISABLE.mjDSBL_EQUALITY))
     joints = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
     first, second = model.jnt_bodyid[joints].T

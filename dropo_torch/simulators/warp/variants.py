@@ -14,6 +14,7 @@ from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.layout import FIELDS
+from dropo_torch.simulators.warp.support import remarks
 
 #: Engines that are kept.
 KEPT = 64
@@ -140,6 +141,8 @@ class Variants:
         return engine
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
+        if remarks(model):  # it stands in for MuJoCo with these very options
+            return None
         try:
             return Engine(model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device)
         except InputError:
