@@ -11,6 +11,7 @@ import warp as wp
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp import collide
 from dropo_torch.simulators.warp.layout import FIELDS
+from dropo_torch.simulators.warp.meshes import mesh_tables
 from dropo_torch.simulators.warp.pairs import condim, joins_branches
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
 
@@ -50,6 +51,7 @@ def build_tables(
 ) -> Tables:
     """Return the tables of a supported model on a device."""
     columns = _bodies(model) | _links(model) | _actuators(model) | _constraints(model, space) | _pairs(model, pairs)
+    columns |= mesh_tables(model, pairs)
     columns |= _switches(model, space) | {f"o_{name}": offset for name, (offset, _size) in sections.items()}
     return fill(Tables(), {k: _to_warp(x, device) if isinstance(x, np.ndarray) else x for k, x in columns.items()})
 

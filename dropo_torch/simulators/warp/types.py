@@ -84,9 +84,9 @@ _INDICES = (
     "act_dof", "act_ndof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
-    "geom_body",
+    "geom_body", "geom_hull", "geom_nhull", "hull_id", "hull_edgeadr", "hull_edge",
 )  # fmt: skip
-_VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size")
+_VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert")
 _ROTATIONS = ("body_mat", "body_imat", "geom_mat")
 
 #: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
