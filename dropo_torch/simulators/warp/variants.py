@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -164,7 +165,8 @@ def _structure(model: mujoco.MjModel, tabled: Sequence[str]) -> bytes:
     """What an engine's tables, and whether there may be one, follow from; of numbers in θ only which are zero."""
     numbers = [np.sign(read_field(model, field)) for field in _SIGNS]
     numbers += [np.any(read_field(model, field)) for field in _ANY]
-    return b"|".join(array.tobytes() for array in (*numbers, *(np.asarray(read_field(model, f)) for f in tabled)))
+    arrays = (*numbers, *(np.asarray(read_field(model, field)) for field in tabled))
+    return hashlib.blake2b(b"|".join(array.tobytes() for array in arrays)).digest()
 
 
 #: Fields of θ of which each number's sign matters, and such of which it does whether any is not zero.
