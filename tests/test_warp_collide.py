@@ -10,12 +10,15 @@ import numpy as np
 import pytest
 import warp as wp
 
+from dropo_torch.simulators.warp.boxes import box_contact, box_spots, is_second
 from dropo_torch.simulators.warp.collide import (
     are_parallel,
     capsule_box_codes,
     capsule_box_contact,
+    cylinder_place,
     overlap_end,
     round_contact,
+    sphere_cylinder,
     vec7,
 )
 from dropo_torch.simulators.warp.start import start_warp
@@ -24,12 +27,16 @@ from dropo_torch.simulators.warp.types import Mats, Vec3s, f64, vec3
 MARGIN = 0.02
 RADIUS, HALF = 0.05, 0.2
 SIZE = (0.15, 0.1, 0.2)
-TWO_CAPSULES = f"""<mujoco><worldbody>
-<body><freejoint/><geom type="capsule" size="{RADIUS} {HALF}" margin="{MARGIN}"/></body>
-<body><freejoint/><geom type="capsule" size="{SIZE[0]} {SIZE[1]}"/></body></worldbody></mujoco>"""
-CAPSULE_AND_BOX = f"""<mujoco><worldbody>
-<body><freejoint/><geom type="capsule" size="{RADIUS} {HALF}" margin="{MARGIN}"/></body>
-<body><freejoint/><geom type="box" size="{SIZE[0]} {SIZE[1]} {SIZE[2]}"/></body></worldbody></mujoco>"""
+#: Half-lengths of the first of two boxes.
+FIRST = (0.05, 0.2, 0.1)
+PAIR = """<mujoco><worldbody><body><freejoint/><geom type="{}" size="{}" margin="{}"/></body>
+<body><freejoint/><geom type="{}" size="{}"/></body></worldbody></mujoco>"""
+
+
+def pair(one: str, size: tuple[float, ...], two: str, margin: float = MARGIN) -> str:
+    """Model of two free geoms; the second has ``SIZE``."""
+    width = {"capsule": 2, "cylinder": 2, "box": 3}[two]
+    return PAIR.format(one, " ".join(map(str, size)), margin, two, " ".join(map(str, SIZE[:width])))
 
 
 @wp.kernel(enable_backward=False)
@@ -66,6 +73,36 @@ def capsules_kernel(c1: Vec3s, r1: Mats, c2: Vec3s, r2: Mats, size: vec3, found:
         found[i, k] = x
 
 
+@wp.kernel(enable_backward=False)
+def sphere_cylinder_kernel(c1: Vec3s, r1: Mats, c2: Vec3s, r2: Mats, size: vec3, found: wp.array2d(dtype=vec7)):
+    """Contact of a sphere and a cylinder."""
+    i = wp.tid()
+    axis = vec3(r2[i][0, 2], r2[i][1, 2], r2[i][2, 2])
+    place = cylinder_place(c1[i] - c2[i], axis, size)
+    found[i, 0] = sphere_cylinder(c1[i], f64(RADIUS), c2[i], axis, size, place)
+
+
+@wp.kernel(enable_backward=False)
+def boxes_kernel(c1: Vec3s, r1: Mats, c2: Vec3s, r2: Mats, size: vec3, found: wp.array2d(dtype=vec7)):
+    """Contacts of two boxes in MuJoCo's order, each from its code alone; infinitely far where there is none."""
+    i = wp.tid()
+    first = vec3(f64(0.05), f64(0.2), f64(0.1))  # FIRST
+    spots, codes, normal, count = box_spots(c1[i], r1[i], first, c2[i], r2[i], size, f64(MARGIN))
+    for k in range(8):
+        x = vec7()
+        x[0] = f64(1.0)
+        if k < count:
+            code = codes[k]
+            if is_second(code) != 0:
+                x = box_contact(c2[i], r2[i], size, c1[i], r1[i], first, code)
+            else:
+                x = box_contact(c1[i], r1[i], first, c2[i], r2[i], size, code)
+            x = vec7(x[0], x[1], x[2], x[3], normal[0], normal[1], normal[2])
+            if wp.abs(x[0] - spots[k, 0]) > f64(1e-9):
+                x[0] = f64(wp.nan)
+        found[i, k] = x
+
+
 def poses(rng: np.random.Generator, count: int, jitter: float | None) -> np.ndarray:
     """Positions of two free bodies that are near each other, turned at random or by quarter turns and a little more."""
     qpos = np.zeros((count, 14))
@@ -79,34 +116,50 @@ def poses(rng: np.random.Generator, count: int, jitter: float | None) -> np.ndar
     return qpos
 
 
-@pytest.mark.parametrize("jitter", [None, 1e-3, 1e-4, 1e-5, 1e-8])
-@pytest.mark.parametrize(("kernel", "xml"), [(capsule_box_kernel, CAPSULE_AND_BOX), (capsules_kernel, TWO_CAPSULES)])
-def test_geoms_touch_where_mujoco_says(kernel: wp.Kernel, xml: str, jitter: float | None) -> None:
+def touching(xml: str, qpos: np.ndarray) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Positions and rotations of the two geoms, and MuJoCo's contacts (distance, point, normal), of each state."""
     model = mujoco.MjModel.from_xml_string(xml)
     data = mujoco.MjData(model)
-    qpos = poses(np.random.default_rng(0), 4000, jitter)
-    where = []
-    expected = []
+    where, expected = [], []
     for q in qpos:
         data.qpos[:] = q
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)
         where.append((data.geom_xpos.copy(), data.geom_xmat.copy().reshape(2, 3, 3)))
-        expected.append([np.r_[c.dist, c.pos, c.frame[:3]] for c in data.contact])
+        expected.append(np.array([np.r_[c.dist, c.pos, c.frame[:3]] for c in data.contact]).reshape(-1, 7))
+    return [np.array([w[k][g] for w in where]) for g in (0, 1) for k in (0, 1)], expected
+
+
+CASES = {
+    "capsule, box": (capsule_box_kernel, pair("capsule", (RADIUS, HALF), "box")),
+    "capsules": (capsules_kernel, pair("capsule", (RADIUS, HALF), "capsule")),
+    "sphere, cylinder": (sphere_cylinder_kernel, pair("sphere", (RADIUS,), "cylinder")),
+    "boxes": (boxes_kernel, pair("box", FIRST, "box")),
+}
+
+
+@pytest.mark.parametrize("jitter", [None, 1e-2, 1e-3, 1e-4, 1e-5, 1e-8, 0.0])
+@pytest.mark.parametrize("name", CASES)
+def test_geoms_touch_where_mujoco_says(name: str, jitter: float | None) -> None:
+    kernel, xml = CASES[name]
+    qpos = poses(np.random.default_rng(0), 4000, jitter)
+    arrays, expected = touching(xml, qpos)
     start_warp()
-    arrays = [np.array([w[k][g] for w in where]) for g in (0, 1) for k in (0, 1)]
-    c1, r1, c2, r2 = (
-        wp.array(a, dtype=wp.vec3d if a.ndim == 2 else wp.mat33d, device="cpu") for a in arrays
-    )  # fmt: skip
-    found = wp.zeros((len(qpos), 2), dtype=vec7, device="cpu")
-    wp.launch(kernel, len(qpos), inputs=[c1, r1, c2, r2, vec3(*SIZE), found], device="cpu")
-    numbers = [0, 0, 0]
+    inputs = [wp.array(a, dtype=wp.vec3d if a.ndim == 2 else wp.mat33d, device="cpu") for a in arrays]
+    found = wp.full((len(qpos), 8), vec7(1.0, *[0.0] * 6), dtype=vec7, device="cpu")
+    wp.launch(kernel, len(qpos), inputs=[*inputs, vec3(*SIZE), found], device="cpu")
+    numbers = np.zeros(9, dtype=int)
     for i, (mine, theirs) in enumerate(zip(found.numpy(), expected, strict=True)):
-        mine = mine[mine[:, 0] < MARGIN]
-        assert len(mine) == len(theirs), i
-        numbers[len(mine)] += 1
-        if theirs:
-            np.testing.assert_allclose(mine, theirs, atol=1e-11 if jitter is None else 1e-9, rtol=0, err_msg=str(i))
-    assert min(numbers[:2]) > 200
-    assert kernel is capsules_kernel or numbers[2] > 200
-    assert kernel is capsule_box_kernel or (numbers[2] > 200) == (jitter is not None and jitter < 1e-4)
+        near = mine[~(mine[:, 0] >= MARGIN)]
+        assert len(near) == len(theirs), i
+        numbers[len(near)] += 1
+        np.testing.assert_allclose(near, theirs, atol=1e-11 if jitter is None else 1e-9, rtol=0, err_msg=str(i))
+    assert numbers[0] > 200
+    assert numbers[1:].sum() > 200
+    if name == "capsule, box":
+        assert numbers[2] > 200
+    elif name == "capsules":
+        assert (numbers[2] > 200) == (jitter is not None and jitter < 1e-4)
+    elif name == "boxes":
+        assert numbers[4] > 200
+        assert jitter is not None or all(numbers[:8] > 10)

@@ -411,6 +411,20 @@ polycoef=".3 0 0 0 0"/><joint joint1="a" joint2="c" polycoef="0 1.5 .2 0 0"/></e
 OVER_EDGE = """<mujoco><worldbody><geom name="floor" type="box" size=".5 .4 .5"/><body name="rod" pos=".45 .05 .56"
 euler="3 85 10"><freejoint/><geom name="grod" type="capsule" size=".05 .2" friction=".7 .01 .01"/></body></worldbody>
 </mujoco>"""
+STACK = BOX + free("upper", ".03 .02 .29", 'type="box" size=".1 .12 .08"', "0.95 0 0 0.1")
+ON_EDGE = BOX + free("upper", ".1 .12 .33", 'type="box" size=".05 .04 .2"', "0.8 0.3 0.4 0.1")
+DRUM = '<geom type="cylinder" size=".15 .1" pos="0 0 .1" euler="4 3 0"/>'
+ROLLS = DRUM + free("ball", ".2 .05 .1", 'type="sphere" size=".08"')
+BALANCED = DRUM + free("ball", ".08 .05 .27", 'type="sphere" size=".08"')
+#: A hull with a flat bottom of five corners, started a little tilted.
+HULL = '<asset><mesh name="hull" vertex="-.2 -.1 0 .2 -.1 0 .25 .1 0 -.2 .12 0 0 .2 0 .1 0 .3 -.15 -.05 .2"/></asset>'
+MESH = free("hull", "0 0 .12", 'type="mesh" mesh="hull"', "0.99 0.05 0.02 0.1")
+#: A finger of a box on two slides pushes a box on a table of a box.
+FINGER = """<geom name="table" type="box" size=".6 .5 .05" pos="0 0 -.049"/><body name="finger" pos="-.18 .02 .06">
+<joint name="x" type="slide" axis="1 0 0" damping="2"/><joint name="turn" axis="0 0 1" damping=".1"/>
+<geom name="gfinger" type="box" size=".04 .06 .05"/></body>"""
+PUSHED_BOX = FINGER + free("box", "0 0 .1", 'type="box" size=".13 .1 .1"')
+FINGER_MOTORS = '<actuator><motor joint="x" gear="12"/><motor joint="turn" gear=".3"/></actuator>'
 ON_BOX = BOX + free("rod", ".02 .03 .27", 'type="capsule" size=".06 .15"', "0.7 0.1 0.7 0.1")
 CONTACTS += [
     Case(
@@ -433,6 +447,38 @@ CONTACTS += [
         spread=0.1,
         states=1e-8,
     ),
+    Case("boxes, stacked", scene(STACK, slope=".05"), contact_parameters("upper"), length=24),
+    Case(
+        "boxes, stacked, elliptic RK4",
+        scene(STACK, slope=".05", cone="elliptic", condim="4", integrator="RK4", geom='margin=".01" gap=".004"'),
+        contact_parameters("upper"),
+        length=24,
+        states=1e-8,
+    ),
+    Case("boxes, edge on edge", scene(ON_EDGE, slope="0"), contact_parameters("upper"), length=32, spread=0.1),
+    Case(
+        "a box pushed by a box on a box",
+        scene(PUSHED_BOX, slope="0", cone="elliptic", extra=FINGER_MOTORS),
+        {
+            "mass": p("body_mass", "box"),
+            "friction": p("geom_friction", "gbox"),
+            "solref": p("geom_solref", "table", 0),
+            "finger": p("body_mass", "finger"),
+        },
+        length=24,
+        spread=0.05,
+        states=1e-8,
+    ),
+    Case("mesh", scene(MESH, extra=HULL), contact_parameters("hull"), length=40),
+    Case(
+        "mesh, elliptic RK4",
+        scene(MESH, extra=HULL, cone="elliptic", condim="6", integrator="RK4", geom='margin=".02" gap=".01"'),
+        contact_parameters("hull"),
+        length=40,
+        states=1e-8,
+    ),
+    Case("ball beside a cylinder", scene(ROLLS, slope="0"), contact_parameters("ball"), length=16, spread=0.1),
+    Case("ball on a cylinder", scene(BALANCED, slope="0"), contact_parameters("ball"), length=16, spread=0.1),
     Case("welded bodies", WELDED, {"b": p("body_mass", "b"), "c": p("body_mass", "c")}, most=1e-2),
     Case("sphere in a box", IN_BOX, {"mass": p("body_mass", "ball"), "solref": p("geom_solref", "floor", 0)}, length=8),
     Case("equalities across trees", LOOP, {"b": p("body_mass", "b"), "c": p("body_mass", "c")}),

@@ -1,9 +1,10 @@
 """Where two geoms touch: distance, point and normal as smooth functions of their poses.
 
-A contact is found by ``find_contacts`` (contact.py) and named by its pair and a number ``which`` within the pair;
-its geometry is then one of three shapes. Against a plane it is decided by a point x fixed in the other geom, or by
+A contact is found by ``find_contacts`` (touch.py) and named by its pair and a number ``which`` within the pair;
+its geometry is then one of a few shapes. Against a plane it is decided by a point x fixed in the other geom, or by
 the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments; against a
-box by a ball, at a capsule's centre line wherever ``which`` says (:func:`capsule_place`).
+box by a ball, at a capsule's centre line wherever ``which`` says (:func:`capsule_place`); between a sphere and a
+cylinder by a side, a cap or a rim. Two boxes have a module of their own.
 """
 
 # mypy: ignore-errors
@@ -24,11 +25,21 @@ vec7: Any = wp.types.vector(7, wp.float64)
 PLANE_SPHERE = wp.constant(0)
 PLANE_CAPSULE = wp.constant(1)
 PLANE_BOX = wp.constant(2)
-PLANE_CYLINDER = wp.constant(3)
-PLANE_ELLIPSOID = wp.constant(4)
-ROUND = wp.constant(5)  # spheres and capsules among themselves
-CAPSULE_BOX = wp.constant(6)  # a sphere too
+PLANE_MESH = wp.constant(3)
+PLANE_CYLINDER = wp.constant(4)
+PLANE_ELLIPSOID = wp.constant(5)
+ROUND = wp.constant(6)  # spheres and capsules among themselves
+CAPSULE_BOX = wp.constant(7)  # a sphere too
+SPHERE_CYLINDER = wp.constant(8)
+BOX_BOX = wp.constant(9)  # see boxes.py
+#: Where a sphere touches a cylinder: its side, a cap, the rim of a cap; odd the upper, then the lower.
+SIDE = wp.constant(0)
+CAP = wp.constant(1)
+RIM = wp.constant(3)
 
+#: Contacts of a plane with a mesh, and their distance from the first, relative to the mesh's radius.
+MESH_CONTACTS = wp.constant(3)
+MESH_APART = wp.constant(wp.float64(0.3))
 #: Squared sine of the angle below which MuJoCo 4 takes two capsules for parallel.
 PARALLEL = wp.constant(wp.float64(1.0e-8))
 #: Where on its axis a capsule touches a box: one of its ends, where it passes a corner, where it passes an edge.
@@ -192,6 +203,48 @@ def round_dual(
 def support_dual(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int, xbar: vec3) -> f64:
     """Leaf: the adjoint of :func:`support_point` is its gradient."""
     return wp.dot(support_point(kind, n, c, rot, size, which), xbar)
+
+
+@wp.func
+def cylinder_place(v: vec3, axis: vec3, size: vec3) -> int:
+    """Where a cylinder is touched by a sphere whose centre is ``v`` from its own."""
+    x = wp.dot(axis, v)
+    r = wp.length(v - axis * x)
+    beside = wp.abs(x) < size[1]
+    above = r < size[0]
+    if beside and above:
+        beside = size[1] - wp.abs(x) >= size[0] - r
+        above = not beside
+    lower = wp.where(x > ZERO, 0, 1)
+    place = int(RIM + lower)
+    if beside:
+        place = SIDE
+    elif above:
+        place = CAP + lower
+    return place
+
+
+@wp.func
+def sphere_cylinder(c1: vec3, radius: f64, c2: vec3, axis: vec3, size: vec3, place: int) -> vec7:
+    """Contact of a sphere (first geom) and a cylinder (second) at a place of the cylinder."""
+    v = c1 - c2
+    x = wp.dot(axis, v)
+    if place == SIDE:
+        return balls(c1, c2 + axis * x, radius, size[0])
+    up = axis * wp.where(place % 2 == 1, ONE, -ONE)
+    if place < RIM:
+        y = plane_point(up, c2 + up * size[1], c1, radius)
+        return vec7(y[0], y[1], y[2], y[3], -up[0], -up[1], -up[2])
+    out = v - axis * x
+    return balls(c1, c2 + up * size[1] + out * (size[0] / wp.length(out)), radius, ZERO)
+
+
+@wp.func
+def sphere_cylinder_dual(
+    c1: vec3, radius: f64, c2: vec3, axis: vec3, size: vec3, place: int, dbar: f64, pbar: vec3, nbar: vec3
+) -> f64:
+    """Leaf: the adjoint of :func:`sphere_cylinder` is its gradient."""
+    return pair7(sphere_cylinder(c1, radius, c2, axis, size, place), dbar, pbar, nbar)
 
 
 @wp.func

@@ -131,6 +131,7 @@ class Engine:
             "qpos": m.nq, "dof": m.nv, "triangle": m.nh, "body": m.nb, "row": m.maxrow, "contact": m.maxcon,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
         }  # fmt: skip
+        self._may_overflow = int(m.pair_most.numpy().sum()) > m.maxcon
         self._worlds: dict[tuple[int, bool], World] = {}
         self._free: list[dict[str, Any]] = []
         self._last: dict[str, Any] | None = None
@@ -163,7 +164,7 @@ class Engine:
             batch: what is simulated.
             out: the states after each logged step, ``(T·K·lag, nq + nv)``.
         """
-        calls = []
+        calls, traces = [], []
         with self._lock, self._stream(batch):
             chunks = self._chunks(batch)
             slots = self._slots(max(count for _, count in chunks))
@@ -174,12 +175,14 @@ class Engine:
                 rows = wp.from_torch(out[first * batch.lag : (first + count) * batch.lag])
                 arguments = [*batch.arrays, trace.alive, rows]
                 calls.append(self._launches(kernel_forward.simulate_kernel, world, batch, trace, arguments, False))
+                traces.append(trace)
             recorded = [[call(record_cmd=True).launch for call in slices] for slices in calls]
 
         def run(_kept: object = calls) -> None:  # what was recorded points into the arrays of the calls
             with self._lock, self._stream(batch):
-                for slices in recorded:
+                for slices, trace in zip(recorded, traces, strict=True):
                     _at_once(slices)
+                    self._check_contacts(trace)
 
         return run
 
@@ -241,7 +244,16 @@ class Engine:
         self._launch(
             kernel_forward.simulate_kernel, batch, trace, [*batch.arrays, trace.alive, wp.from_torch(out)], keep
         )
+        self._check_contacts(trace)
         return trace
+
+    def _check_contacts(self, trace: Trace) -> None:
+        """Raise where a world had more contacts than there is memory for, if that can be."""
+        if self._may_overflow and bool((trace.alive.numpy() < 0).any()):
+            raise InputError(
+                f"backend warp: more than {self.tables.maxcon} contacts in one simulation; let fewer geoms touch "
+                "(contype, conaffinity, <exclude>), or use backend mujoco"
+            )
 
     def _backward(self, batch: Batch, trace: Trace, out_bar: torch.Tensor) -> list[Any]:
         """Adjoints of θ, states and controls, a row for every world (and logged step) of a chunk."""
@@ -334,6 +346,7 @@ class Engine:
     def _fresh_world(self, slots: int, memory: dict[str, Any], *, adjoint: bool) -> World:
         # a gap between slots, so that no two threads write one cache line
         own = self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16)
+        own["full"] = wp.zeros(slots, dtype=wp.int32, device=self.device)
         return fill(World(), own | memory)
 
     def _allocate(self, fields: dict[str, tuple[Any, str]], rows: int, gap: int = 0) -> dict[str, Any]:

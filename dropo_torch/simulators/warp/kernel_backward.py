@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, support_dual
+from dropo_torch.simulators.warp.boxes import box_dual
+from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, sphere_cylinder_dual, support_dual
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.fluid import box_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
@@ -41,7 +42,7 @@ def adjoint_kernel(
         for k in range(m.nq + m.nv):
             seen += wp.abs(out_bar[row, k])
     # a gradient that arrives at a simulation that diverged
-    blank = wp.where(alive[i] == 0 and seen != ZERO, wp.float64(wp.nan), ZERO)
+    blank = wp.where(alive[i] <= 0 and seen != ZERO, wp.float64(wp.nan), ZERO)
     for j in range(columns.shape[0]):  # whatever else is added up is never read
         w.grad[w.t, columns[j]] = blank
     for j in range(m.nv):
@@ -50,7 +51,7 @@ def adjoint_kernel(
     for row in range(i * chunk.lag, (i + 1) * chunk.lag):
         for k in range(control_bar.shape[1]):
             control_bar[row, k] = blank
-    if alive[i] != 0 and seen != ZERO:
+    if alive[i] > 0 and seen != ZERO:
         for back in range(chunk.lag):
             logged = chunk.lag - 1 - back
             w.rc = tr * chunk.lag + logged
@@ -87,6 +88,8 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     y[3] = round_dual(v, v, s, v, v, s, 0, s, v, v)
     y[4] = support_dual(3, v, v, r[0], v, 0, v)
     y[0] = capsule_box_dual(v, v, s, v, r[0], v, 0, s, v, v)
+    y[5] = sphere_cylinder_dual(v, s, v, v, v, 0, s, v, v)
+    y[6] = box_dual(v, r[0], v, v, r[0], v, 0, s, v, v)
     y[7] = chart_rate_dual(v, v, v)
 
 

@@ -18,7 +18,10 @@ wp.set_module_options({"enable_backward": False})
 def simulate_kernel(
     m: Tables, w: World, chunk: Chunk, theta: Reals2, states: Reals2, controls: Reals2, alive: Ints, out: Reals2
 ):
-    """Simulate the worlds of a chunk; ``out`` has a row per logged step."""
+    """Simulate the worlds of a chunk; ``out`` has a row per logged step.
+
+    ``alive`` says whether a world stayed finite; −1 is a world that had more contacts than there is memory for.
+    """
     tid = wp.tid()
     world = chunk.first + tid
     i = chunk.local + tid
@@ -28,6 +31,7 @@ def simulate_kernel(
     w.applied = chunk.applied
     w.wrenched = chunk.wrenched
     w.t = chunk.slot + tid * chunk.slot_stride
+    w.full[w.t] = 0
     base = wp.where(chunk.keep != 0, i, w.t) * chunk.period * m.nstage
     for j in range(m.nq):
         w.qpos[base, j] = states[tr, j]
@@ -41,6 +45,7 @@ def simulate_kernel(
         for _k in range(chunk.skip):
             if ok != 0:
                 ok = step(m, w, base + (n % chunk.period) * m.nstage, base + ((n + 1) % chunk.period) * m.nstage)
+                ok *= 1 - w.full[w.t]
             n += 1
         r = base + (n % chunk.period) * m.nstage
         if ok != 0:
@@ -50,4 +55,4 @@ def simulate_kernel(
             if ok != 0:
                 y = w.qpos[r, j] if j < m.nq else w.qvel[r, j - m.nq]
             out[i * chunk.lag + logged, j] = y
-    alive[i] = ok
+    alive[i] = ok - w.full[w.t]

@@ -27,11 +27,15 @@ _LINKS = {
     _JNT.mjJNT_BALL: ((BALL, 0),),
     _JNT.mjJNT_FREE: ((TRANSLATION, 0), (BALL, 3)),
 }
-#: Kinds of pairs by the geoms' types, the smaller first: constant of the kernels, points that may touch, most contacts.
+#: Contacts of a world that memory is kept for, at most.
+MOST_CONTACTS = 512
+#: Kinds of pairs by the geoms' types, the smaller first: constant of the kernels, points that may touch, most
+#: contacts; 0 points where contacts are found together.
 KINDS = {
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE): (collide.PLANE_SPHERE, 1, 1),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CAPSULE): (collide.PLANE_CAPSULE, 2, 2),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_BOX): (collide.PLANE_BOX, 8, 4),
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH): (collide.PLANE_MESH, 0, 3),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CYLINDER): (collide.PLANE_CYLINDER, 4, 4),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_ELLIPSOID): (collide.PLANE_ELLIPSOID, 1, 1),
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_SPHERE): (collide.ROUND, 1, 1),
@@ -39,6 +43,8 @@ KINDS = {
     (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_CAPSULE): (collide.ROUND, 2, 2),
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 1, 1),
     (_GEOM.mjGEOM_CAPSULE, _GEOM.mjGEOM_BOX): (collide.CAPSULE_BOX, 2, 2),
+    (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER): (collide.SPHERE_CYLINDER, 1, 1),
+    (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_BOX): (collide.BOX_BOX, 0, 8),
 }  # fmt: skip
 
 
@@ -199,9 +205,14 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str
     bodies = model.geom_bodyid[table[:, :2]]
     size = model.geom_size.copy()
     size[model.geom_type == _GEOM.mjGEOM_SPHERE, 1:] = 0.0
+    gap = model.geom_gap[table[:, 0]] + model.geom_gap[table[:, 1]]
+    explicit = table[:, 2] >= 0
+    gap[explicit] = model.pair_gap[table[explicit, 2]]
     return {
-        "npair": len(pairs), "maxcon": int(most.sum()), "pair_kind": kind, "pair_points": points,
+        "npair": len(pairs), "maxcon": min(int(most.sum()), MOST_CONTACTS), "pair_kind": kind, "pair_points": points,
+        "pair_most": most,
         "pair_bound": (model.geom_rbound[table[:, 1]] + model.geom_rbound[table[:, 0]]) * (1 + 1e-9),
+        "pair_gap": gap,
         "pair_body1": bodies[:, 0], "pair_body2": bodies[:, 1], "pair_geom1": table[:, 0], "pair_geom2": table[:, 1],
         "pair_dim": np.array([condim(model, *p) for p in pairs], dtype=int),
         "pair_dense": np.array([joins_branches(model, int(a), int(b)) for a, b in bodies], dtype=int),

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp import collide
+from dropo_torch.simulators.warp import boxes, collide
 from dropo_torch.simulators.warp.spatial import pull, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
 
@@ -70,9 +70,86 @@ def _towards_plane(kind: int, n: vec3, c: vec3, axis: vec3, rot: mat33, size: ve
         x = c + axis * (size[1] * (ONE - TWO * f64(which)))
     elif kind == collide.PLANE_BOX:
         x = c + rot * collide.corner(which, size)
-    elif kind > collide.PLANE_BOX:
+    elif kind >= collide.PLANE_CYLINDER:
         x = collide.support_point(kind, n, c, rot, size, which)
     return x
+
+
+@wp.func(inline=True)
+def _add_boxes(m: Tables, w: World, n: int, k: int, c1: vec3, r1: mat33, c2: vec3, r2: mat33, margin: f64) -> int:
+    """Write the contacts of a pair of boxes from number ``n`` on and return the number of the next one."""
+    size1 = m.geom_size[m.pair_geom1[k]]
+    size2 = m.geom_size[m.pair_geom2[k]]
+    spots, codes, normal, found = boxes.box_spots(c1, r1, size1, c2, r2, size2, margin + m.pair_gap[k])
+    number = n
+    for i in range(found):
+        if spots[i, 0] < margin:
+            x = collide.vec7(spots[i, 0], spots[i, 1], spots[i, 2], spots[i, 3], normal[0], normal[1], normal[2])
+            _add(w, number, k, codes[i], x, vec3())
+            number += 1
+    return number
+
+
+@wp.func(inline=True)
+def _deepest(m: Tables, g: int, way: vec3) -> int:
+    """The vertex of a mesh that is farthest along ``way``, as MuJoCo climbs to it: which of the ties depends on it."""
+    start = m.geom_hull[g]
+    best = int(start)
+    if m.hull_edge[m.hull_edgeadr[start]] < 0:  # a mesh without edges
+        for v in range(start + 1, start + m.geom_nhull[g]):
+            if wp.dot(way, m.hull_vert[v]) > wp.dot(way, m.hull_vert[best]):
+                best = v
+    climbs = int(1)
+    while climbs != 0:
+        climbs = int(0)
+        e = int(m.hull_edgeadr[best])
+        while m.hull_edge[e] >= 0:
+            v = start + m.hull_edge[e]
+            if wp.dot(way, m.hull_vert[v]) > wp.dot(way, m.hull_vert[best]):
+                best = v
+                climbs = int(1)
+            e += 1
+    return best
+
+
+@wp.func(inline=True)
+def _add_corners(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2: vec3, rot: mat33, margin: f64) -> int:
+    """Write the contacts of a plane and a mesh from number ``n`` on and return the number of the next one.
+
+    They are the deepest vertex of its hull, and of its neighbours the first two that are apart from it.
+    """
+    g = m.pair_geom2[k]
+    start = m.geom_hull[g]
+    deepest = _deepest(m, g, -(wp.transpose(rot) * normal))
+    first = collide.plane_point(normal, c1, c2 + rot * m.hull_vert[deepest], ZERO)
+    number = n
+    if first[0] < margin:
+        _add(w, number, k, deepest, first, vec3())
+        number += 1
+    e = m.hull_edgeadr[deepest]
+    edges = m.hull_edge[e] >= 0
+    count = int(1)
+    others = int(wp.where(edges, e, start))
+    while count < collide.MESH_CONTACTS and _is_other(m, g, others, edges):
+        v = wp.where(edges, start + m.hull_edge[others], others)
+        x = c2 + rot * m.hull_vert[v]
+        y = collide.plane_point(normal, c1, x, ZERO)
+        apart = wp.length(x - first[1:4]) >= collide.MESH_APART * m.pair_bound[k]
+        if y[0] < margin + m.pair_gap[k] and apart and v != deepest:
+            count += 1
+            if y[0] < margin:
+                _add(w, number, k, v, y, vec3())
+                number += 1
+        others += 1
+    return number
+
+
+@wp.func(inline=True)
+def _is_other(m: Tables, g: int, i: int, edges: bool) -> bool:
+    """Whether there is an ``i``-th neighbour, or vertex of a mesh without edges."""
+    if edges:
+        return m.hull_edge[i] >= 0
+    return i < m.geom_hull[g] + m.geom_nhull[g]
 
 
 @wp.func(inline=True)
@@ -92,7 +169,13 @@ def find_contacts(m: Tables, w: World) -> int:
         if kind <= collide.PLANE_ELLIPSOID:
             normal = geom_axis(m, w, g1)
             near = wp.dot(normal, c2 - c1) < reach
-        if near:
+        if near and n + m.pair_most[k] > m.maxcon:
+            w.full[w.t] = 1
+        elif near and kind == collide.BOX_BOX:
+            n = _add_boxes(m, w, n, k, c1, geom_rotation(m, w, g1), c2, geom_rotation(m, w, g2), margin)
+        elif near and kind == collide.PLANE_MESH:
+            n = _add_corners(m, w, n, k, normal, c1, c2, geom_rotation(m, w, g2), margin)
+        elif near:
             size1 = m.geom_size[g1]
             size2 = m.geom_size[g2]
             axis = geom_axis(m, w, g2)
@@ -105,7 +188,7 @@ def find_contacts(m: Tables, w: World) -> int:
             if kind == collide.ROUND:
                 a1 = half_axis(m, w, g1)
                 parallel = collide.are_parallel(a1, a2)
-            elif kind > collide.PLANE_CAPSULE:
+            elif kind > collide.PLANE_CAPSULE and kind != collide.SPHERE_CYLINDER:
                 rot = geom_rotation(m, w, g2)
             if kind == collide.CAPSULE_BOX and size1[1] > ZERO:  # a sphere has only the place 0
                 a1 = half_axis(m, w, g1)
@@ -133,6 +216,9 @@ def find_contacts(m: Tables, w: World) -> int:
                     if parallel:
                         which = collide.overlap_end(c1, a1, c2, a2, i)
                     x = collide.round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
+                elif kind == collide.SPHERE_CYLINDER:
+                    which = collide.cylinder_place(c1 - c2, axis, size2)
+                    x = collide.sphere_cylinder(c1, size1[0], c2, axis, size2, which)
                 else:
                     which = wp.where(i == 0, first, second)
                     possible = which >= 0
@@ -148,6 +234,28 @@ def find_contacts(m: Tables, w: World) -> int:
 def _turned(r: mat33, rbar: mat33) -> vec3:
     """Torque that a rotation's adjoint is: Σ columns r × r̄."""
     return wp.cross(r[:, 0], rbar[:, 0]) + wp.cross(r[:, 1], rbar[:, 1]) + wp.cross(r[:, 2], rbar[:, 2])
+
+
+@wp.func(inline=True)
+def _boxes_adjoint(
+    c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, code: int, dbar: f64, pbar: vec3, nbar: vec3
+):
+    """Spatial forces on the bodies of two boxes; :func:`box_contact` takes the reference box first."""
+    swap = boxes.is_second(code) != 0
+    sign = wp.where(swap, -ONE, ONE)
+    ca = wp.where(swap, c2, c1)
+    cb = wp.where(swap, c1, c2)
+    ra = r1
+    rb = r2
+    if swap:
+        ra = r2
+        rb = r1
+    cab, rab, _sa, cbb, rbb, _sb, _w, _d, _p, _n = wp.grad(boxes.box_dual)(
+        ca, ra, wp.where(swap, size2, size1), cb, rb, wp.where(swap, size1, size2), code, dbar, pbar, nbar * sign
+    )
+    ya = pull(cab, ca, _turned(ra, rab))
+    yb = pull(cbb, cb, _turned(rb, rbb))
+    return wp.where(swap, yb, ya), wp.where(swap, ya, yb)
 
 
 @wp.func(inline=True)
@@ -174,14 +282,18 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
     c2 = geom_centre(m, w, g2)
     size = m.geom_size[g2]
     rot = mat33()
-    if kind != collide.ROUND and kind != collide.PLANE_SPHERE:
+    if kind != collide.ROUND and kind != collide.PLANE_SPHERE and kind != collide.SPHERE_CYLINDER:
         rot = geom_rotation(m, w, g2)
     y1 = vec6()
     y2 = vec6()
     if kind <= collide.PLANE_ELLIPSOID:
         # dist = n·(x − c1) − r, p = x − n (r + dist/2), x a point of the second geom
         radius = wp.where(kind <= collide.PLANE_CAPSULE, size[0], ZERO)
-        x = _towards_plane(kind, n, c2, hint, rot, size, which)
+        x = c2
+        if kind == collide.PLANE_MESH:
+            x = c2 + rot * m.hull_vert[which]
+        else:
+            x = _towards_plane(kind, n, c2, hint, rot, size, which)
         slope = distbar - HALF * wp.dot(pbar, n)
         xbar = pbar + n * slope
         nbar = nbar + (x - c1) * slope - pbar * (radius + HALF * w.con_dist[w.t, c])
@@ -202,6 +314,15 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
         )
         y1 = pull(c1b, c1, wp.cross(a1, a1b))
         y2 = pull(c2b, c2, wp.cross(a2, a2b))
+    elif kind == collide.SPHERE_CYLINDER:
+        axis = geom_axis(m, w, g2)
+        c1b, _r1, c2b, axisb, _sb, _w, _d, _p, _n = wp.grad(collide.sphere_cylinder_dual)(
+            c1, m.geom_size[g1][0], c2, axis, size, which, distbar, pbar, nbar
+        )
+        y1 = wrench(c1b, c1)
+        y2 = pull(c2b, c2, wp.cross(axis, axisb))
+    elif kind == collide.BOX_BOX:
+        y1, y2 = _boxes_adjoint(c1, geom_rotation(m, w, g1), m.geom_size[g1], c2, rot, size, which, distbar, pbar, nbar)
     else:
         a1 = half_axis(m, w, g1)
         c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(collide.capsule_box_dual)(

@@ -84,6 +84,7 @@ _INDICES = (
     "act_dof", "act_ndof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
+    "pair_most",
     "geom_body", "geom_hull", "geom_nhull", "hull_id", "hull_edgeadr", "hull_edge",
 )  # fmt: skip
 _VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert")
@@ -99,7 +100,7 @@ Tables: Any = _struct(
         **dict.fromkeys(_ROTATIONS, Mats),
         "dof_parent": Ints2,  # row 0 the parent in the tree, row 1 the previous dof (dense elimination)
         "origin_base": vec3,  # of the sweep; the origin travels along origin_axis with the root's translations
-        **dict.fromkeys(("link_ref", "eq_ref", "pair_bound"), Reals),
+        **dict.fromkeys(("link_ref", "eq_ref", "pair_bound", "pair_gap"), Reals),
         **dict.fromkeys(("h", "impratio"), wp.float64),
     },
 )
@@ -158,6 +159,7 @@ World: Any = _struct(
     {
         **{name: wp.array2d(dtype=dtype) for name, (dtype, _) in (TRAJECTORY | IMPLICIT | SCRATCH | ADJOINT).items()},
         "held": Ints,  # of a stage: 1 if it has scalar rows, plus 2 if it has contacts
+        "full": Ints,  # of a slot: 1 once a world had more contacts than there is memory for
         "th": Reals,
         "ctrl": Reals2,
         "ctrl_bar": Reals2,
