@@ -133,5 +133,5 @@ def halves(
         prior=np.append(regression.prior, extra),
     )  # fmt: skip
     picked, owner = np.append(chosen, extra > 0), np.append(found.owner, np.array(bent, dtype=int))
-    widths = half_widths(wider, picked, np.append(coefficients, np.zeros(len(bent))))
+    widths = half_widths(wider, picked)
     return [widths[owner == n] for n in members]

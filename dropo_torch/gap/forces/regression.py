@@ -168,18 +168,13 @@ def chance_of(gains: np.ndarray) -> float:
     return min(1.0, 2 * min(by_size, p_of_ranks(gains)))
 
 
-def half_widths(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-    """Return half-widths of the 90 % intervals of coefficients ``(P,)``, by how much blocks disagree (sandwich)."""
-    found, picked, left = np.zeros(len(chosen)), np.flatnonzero(chosen), regression.left(coefficients)
-    if not picked.size:
-        return found
-    scale = np.maximum(np.sqrt((left**2).mean(0)), 1e-300)
-    columns = regression.columns[picked] / scale
-    normal = np.einsum("pnj,qnj->pq", columns, columns) + np.diag(regression.correlated / regression.prior[picked] ** 2)
-    scores = np.einsum("pnj,nj->np", columns, left / scale)
-    sums = np.stack([scores[regression.blocks == name].sum(0) for name in regression.names])
-    count = len(sums)
-    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
-    covariance = inverse @ (sums.T @ sums) @ inverse * count / max(count - 1, 1)
-    found[picked] = stats.t.ppf(0.95, max(count - 1, 1)) * np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    return found
+def half_widths(regression: Regression, chosen: np.ndarray) -> np.ndarray:
+    """Return half-widths of the 90 % intervals of coefficients ``(P,)``, by how they move without each block (jackknife).
+
+    A fit bends towards each of its blocks, the more the fewer these are for its columns. What is left of a block by a
+    fit that has seen it would make the intervals too narrow.
+    """
+    count = len(regression.names)
+    moved = np.stack([fit(regression, chosen, without=b) for b in range(count)])
+    variance = (count - 1) * moved.var(0)
+    return np.asarray(stats.t.ppf(0.95, max(count - 1, 1)) * np.sqrt(variance))

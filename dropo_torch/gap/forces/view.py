@@ -185,7 +185,7 @@ def _sure(found: Terms, regression: Regression, chosen: np.ndarray, rules: Force
         likely = chances(regression, chosen, [chosen & (families == k) for k in present])
         worst = int(np.argmax(likely))
         sizes = np.maximum(np.abs(values), 1e-300)
-        unsure = np.where(chosen & single, half_widths(regression, chosen, values) / sizes, 0.0)
+        unsure = np.where(chosen & single, half_widths(regression, chosen) / sizes, 0.0)
         if bound.any():
             chosen = chosen & ~np.isin(found.owner, found.owner[bound])
         elif likely[worst] > rules.error / len(kinds):
