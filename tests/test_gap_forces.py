@@ -153,6 +153,43 @@ def test_friction_that_depends_on_the_velocity_does_not_give(tmp_path: Path, at_
     assert "joint_presliding" not in {p.effect.name for p in view.placed}
 
 
+@pytest.mark.parametrize("gives", [(0, 0, 0), (0.02, 0, 0.03), (0.006, 0.006, 0.006)])
+def test_halves_of_a_log_say_the_same_of_friction(tmp_path: Path, gives: tuple[float, ...]) -> None:
+    """Whether it gives or not: what either half names is the truth or has it as a tie, and the other half tells it."""
+    told = []
+    for half in halves(problem_of(tmp_path, 1, friction=(0.5, 0.8, 0.3), gives=gives, ripple=0.05), blocks=8):
+        view = view_of(half)
+        assert view is not None
+        told.append({p.target: (p.effect.name, *(t.effect.name for t in tied if t.target == p.target))
+                     for p, tied in zip(view.placed, view.ties, strict=True) if p.effect.kind == "joint"})  # fmt: skip
+    for joint, displacement in zip(JOINTS, gives, strict=True):
+        kinds = [half[joint] for half in told]
+        assert all(("joint_presliding" if displacement else "joint_friction") in kind for kind in kinds)
+        assert kinds[0][0] in kinds[1]
+        assert kinds[1][0] in kinds[0]
+
+
+def halves(problem: Problem, blocks: int) -> list[Problem]:
+    """Return a problem with every other of a log's blocks, and with the rest."""
+    log = problem.trajectories
+    ends = np.linspace(-1, len(log) - 1, blocks + 1).astype(int)[1:]
+    log = replace(log, terminals=np.isin(np.arange(len(log)), ends))
+    return [replace(problem, trajectories=log.select_episodes(range(half, blocks, 2))) for half in (0, 1)]
+
+
+def test_what_did_the_same_as_what_has_gone_comes_back(linear: Callable) -> None:
+    """Of two groups that explain the same, one is chosen; without it, the other."""
+    problem = linear(3)
+    columns = np.concatenate([problem.columns, problem.columns[:1] + 0.05 * problem.columns[5:]])
+    every, groups = np.full(7, np.inf), np.arange(7)
+    twice = replace(problem, columns=columns, low=-every, high=every, prior=every)
+    chosen = regression.select(twice, groups, groups)
+    assert chosen[[0, 6]].sum() == 1
+    other = chosen & ~np.isin(groups, [0, 6])
+    assert regression.refined(twice, other, groups, ~chosen)[[0, 6]].sum() == 1
+    assert not regression.refined(twice, other, groups, groups == 3)[[0, 6]].any()
+
+
 def test_intervals_hold_the_truth(tmp_path: Path) -> None:
     truth, inside = (0.5, 0.8, 0.3), []
     for seed in range(10, 18):

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from dropo_torch.effects.base import Placed, Setting, find_effect
 from dropo_torch.effects.presliding import PAST, bristle_after
+from dropo_torch.gap.chance import least_surplus
 from dropo_torch.gap.forces.motion import Stretch
 from dropo_torch.gap.forces.regression import Regression, chance_of, half_widths, unseen
 from dropo_torch.gap.forces.terms import AT_REST, FRICTION, PRESLIDING, Terms, sharp
@@ -22,6 +23,19 @@ FINER = ((2.0**-0.5, 2.0**0.5), (2.0**-0.25, 2.0**0.25), (2.0**-0.125, 2.0**0.12
 SPEEDS = (AT_REST, 0.05, 0.1, 0.2)
 #: Relative step of the derivative by a displacement.
 STEP = 0.1
+
+
+@dataclass(frozen=True)
+class Giving:
+    """Where friction gives before it slides, by the number of the friction's effect.
+
+    Attributes:
+        displacements: of those that do.
+        rivals: the other of the two kinds of friction, where unseen blocks leave open which one it is.
+    """
+
+    displacements: Mapping[int, float] = field(default_factory=dict)
+    rivals: Mapping[int, Placed] = field(default_factory=dict)
 
 
 def bristles(position: np.ndarray, displacement: float, speed: float) -> np.ndarray:
@@ -52,11 +66,12 @@ def built_up(setting: Setting, parts: Sequence[Stretch], joint: str | None, disp
 
 def displacements(
     setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces
-) -> dict[int, float]:
-    """Return the displacement of each friction, by the number of its effect, that gives before it slides.
+) -> Giving:
+    """Return where friction gives before it slides, over which displacements, and where that is left open.
 
-    It must leave clearly less of unseen blocks than friction that depends on the velocity alone: at all joints with
-    friction together by more than chance explains, and then at each. Displacements are the best on the same blocks.
+    At all joints with friction together it must leave less of unseen blocks than friction that depends on the velocity
+    alone, by more than chance explains. Then it gives where it leaves clearly less; what one joint does not show by
+    itself is left open, and so is what is not surely less than that. Displacements are the best on the same blocks.
 
     Args:
         setting: the model.
@@ -66,15 +81,21 @@ def displacements(
         chosen: the columns that explain unseen blocks, ``(P,)`` bool.
         rules: thresholds.
     """
-    given, gains = {}, np.zeros(len(regression.names))
-    for number in np.unique(found.owner[chosen]).tolist():
-        if found.placed[number].effect.name == FRICTION:
-            displacement, less = _displacement(setting, parts, found, regression, chosen, number)
-            gains += less
-            if less.mean() > 1 - rules.gives:
-                given[number] = displacement, chance_of(less)
-    together = chance_of(gains) if given else 1.0
-    return {n: displacement for n, (displacement, chance) in given.items() if max(together, chance) <= rules.error}
+    tried = {
+        number: _displacement(setting, parts, found, regression, chosen, number)
+        for number in np.unique(found.owner[chosen]).tolist()
+        if found.placed[number].effect.name == FRICTION
+    }
+    clear = {n for n, (_, less) in tried.items() if less.mean() > 1 - rules.gives}
+    if clear and chance_of(np.sum([less for _, less in tried.values()], axis=0)) > rules.error:
+        clear = set()
+    rivals = {}
+    for n, (displacement, less) in tried.items():
+        if n in clear and chance_of(less) > rules.error:
+            rivals[n] = found.placed[n]
+        elif n not in clear and -least_surplus(-less, rules.error) > (1 - rules.gives) * len(less):
+            rivals[n] = Placed(find_effect(PRESLIDING), found.placed[n].target, (0.0, displacement))
+    return Giving({n: tried[n][0] for n in clear}, rivals)
 
 
 def _displacement(

@@ -100,7 +100,7 @@ def _solved(normal: np.ndarray, right: np.ndarray, low: np.ndarray, high: np.nda
     free = linalg.solve_triangular(factor, target) / size
     if (free >= low).all() and (free <= high).all():
         return np.asarray(free)
-    return np.asarray(optimize.lsq_linear(factor, target, (low * size, high * size)).x / size)
+    return np.asarray(optimize.lsq_linear(factor, target, (low * size, high * size), method="bvls").x / size)
 
 
 def unseen(regression: Regression, chosen: np.ndarray) -> np.ndarray:
@@ -133,14 +133,35 @@ def select(regression: Regression, groups: np.ndarray, families: np.ndarray) -> 
             break
         chosen, best = chosen | (families == family), tried[family]
         waiting.discard(family)
-    while chosen.any():
-        tried = {g: score(unseen(regression, chosen & (groups != g))) for g in np.unique(groups[chosen]).tolist()}
-        idle = [g for g in tried if tried[g] <= best + GAIN]
-        if not idle:
-            break
-        group = min(idle, key=lambda g: (-np.count_nonzero(groups == g), tried[g]))
-        chosen, best = chosen & (groups != group), min(best, tried[group])
-    return chosen
+    return refined(regression, chosen, groups, np.isin(families, families[chosen]))
+
+
+def refined(regression: Regression, chosen: np.ndarray, groups: np.ndarray, allowed: np.ndarray) -> np.ndarray:
+    """Return the chosen columns ``(P,)`` bool without groups that do not help in unseen blocks, with others that do.
+
+    Groups may do the same: what did not help beside one that has gone since comes back, if it helps by as much as each
+    of its columns must.
+
+    Args:
+        regression: the signal and all columns.
+        chosen: the columns to begin with, ``(P,)`` bool.
+        groups: group of each column, ``(P,)``.
+        allowed: columns that may come back, ``(P,)`` bool.
+    """
+    best, sizes = score(unseen(regression, chosen)), np.bincount(groups)
+    while True:
+        without = {g: score(unseen(regression, chosen & (groups != g))) for g in np.unique(groups[chosen]).tolist()}
+        if idle := [g for g in without if without[g] <= best + GAIN]:
+            group = min(idle, key=lambda g: (-sizes[g], without[g]))
+            chosen, best = chosen & (groups != group), min(best, without[group])
+            continue
+        absent = np.unique(groups[allowed & ~chosen]).tolist()
+        beside = {g: score(unseen(regression, chosen | (groups == g))) for g in absent}
+        helpful = [g for g in absent if beside[g] < best - GAIN * sizes[g]]
+        if not helpful:
+            return chosen
+        group = min(helpful, key=lambda g: beside[g])
+        chosen, best = chosen | (groups == group), beside[group]
 
 
 def chances(regression: Regression, chosen: np.ndarray, parts: Iterable[np.ndarray]) -> list[float]:
@@ -169,7 +190,7 @@ def chance_of(gains: np.ndarray) -> float:
 
 
 def half_widths(regression: Regression, chosen: np.ndarray) -> np.ndarray:
-    """Return half-widths of the 90 % intervals of coefficients ``(P,)``, by how they move without each block (jackknife).
+    """Return half-widths of the 90 % intervals of coefficients ``(P,)``, by how they move without a block (jackknife).
 
     A fit bends towards each of its blocks, the more the fewer these are for its columns. What is left of a block by a
     fit that has seen it would make the intervals too narrow.

@@ -6,7 +6,7 @@ and a heavier arm predicts better only because it moves as it did. In the space 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +14,18 @@ import numpy as np
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Effect, Placed, Setting, find_effect
 from dropo_torch.gap.forces.motion import FORCES, KEPT, has_forces, highest_frequency, stretches
-from dropo_torch.gap.forces.presliding import displacements, giving, halves
-from dropo_torch.gap.forces.regression import GAIN, Regression, chances, fit, half_widths, score, select, unseen
+from dropo_torch.gap.forces.presliding import Giving, displacements, giving, halves
+from dropo_torch.gap.forces.regression import (
+    GAIN,
+    Regression,
+    chances,
+    fit,
+    half_widths,
+    refined,
+    score,
+    select,
+    unseen,
+)
 from dropo_torch.gap.forces.terms import CENTER, FRICTION, PRESLIDING, Terms, linear_effects, needed, terms
 from dropo_torch.gap.rules import Forces
 
@@ -94,12 +104,14 @@ def force_view(
     regression, theirs = _regression(seen, blocks), _coefficients(placed, last.owner, rival)
     left_by_rival = None if theirs is None else _regression(last, last.episodes).left(theirs)
     chosen = select(regression, seen.owner, _families(seen))
-    given = displacements(setting, parts, seen, regression, chosen, rules) if find_effect(PRESLIDING) in known else {}
-    if given:
-        seen, last = giving(setting, parts, seen, given), giving(setting, others, last, given)
+    bent = Giving()
+    if find_effect(PRESLIDING) in known:
+        bent = displacements(setting, parts, seen, regression, chosen, rules)
+    if bent.displacements:
+        seen, last = (giving(setting, p, t, bent.displacements) for p, t in ((parts, seen), (others, last)))
         regression = _regression(seen, blocks)
         chosen = select(regression, seen.owner, _families(seen))
-    chosen = _sure(seen, regression, chosen, rules)
+    chosen = _settled(seen, regression, chosen, rules)
     found = fit(regression, chosen)
     named = ForceView(
         np.concatenate([part.compared(part.velocity) for part in others]), last.missing,
@@ -112,7 +124,7 @@ def force_view(
         placed=tuple(_moved(seen.placed[i], found[seen.owner == i]) for i in np.unique(seen.owner[chosen])),
         halves=tuple(halves(setting, parts, seen, regression, chosen, found)),
         shares=_shares(regression, chosen, seen.owner),
-        ties=_ties(seen, regression, chosen),
+        ties=_ties(seen, regression, chosen, bent.rivals),
     )
 
 
@@ -170,6 +182,18 @@ def _families(found: Terms) -> np.ndarray:
     return np.array([kinds[n] for n in names])[found.owner]
 
 
+def _settled(found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces) -> np.ndarray:
+    """Of the columns those that may have a name ``(P,)`` bool, each needed beside just these."""
+    families, refused = _families(found), np.zeros_like(chosen)
+    while True:
+        sure = _sure(found, regression, chosen, rules)
+        refused |= chosen & ~sure
+        allowed = np.isin(families, families[sure]) & ~refused
+        chosen = refined(regression, sure, found.owner, allowed)
+        if not (chosen & ~sure).any():
+            return chosen
+
+
 def _sure(found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces) -> np.ndarray:
     """Of the chosen columns those that may have a name ``(P,)`` bool: of kinds of effects that chance does not explain.
 
@@ -209,8 +233,10 @@ def _shares(regression: Regression, chosen: np.ndarray, owner: np.ndarray) -> tu
     return tuple(float(np.clip(g / max(1 - whole, 1e-12), 0, 1)) for g in gone)
 
 
-def _ties(found: Terms, regression: Regression, chosen: np.ndarray) -> tuple[tuple[Placed, ...], ...]:
-    """For each chosen effect those that may stand in its place."""
+def _ties(
+    found: Terms, regression: Regression, chosen: np.ndarray, told: Mapping[int, Placed]
+) -> tuple[tuple[Placed, ...], ...]:
+    """For each chosen effect those that may stand in its place, with those that are told already, by its number."""
     members = np.unique(found.owner[chosen]).tolist()
     most, names, ties = score(unseen(regression, chosen)) + GAIN, [p.effect.name for p in found.placed], []
     for member in members:
@@ -218,7 +244,7 @@ def _ties(found: Terms, regression: Regression, chosen: np.ndarray) -> tuple[tup
         grouped = [m for m in members if m != member and names[m] == names[member] == CENTER]
         others = [n for n in range(len(names)) if n not in members]
         rivals = [n for n in others if score(unseen(regression, without | (found.owner == n))) <= most]
-        ties.append(tuple(found.placed[n] for n in (*grouped, *rivals)))
+        ties.append((*(found.placed[n] for n in (*grouped, *rivals)), *(told[n] for n in {member} & {*told})))
     return tuple(ties)
 
 
