@@ -235,8 +235,8 @@ class Forces:
     Attributes:
         left: share of the forces' mean squares on unseen data, averaged over the joints, that may be left.
         clearer: what may be left, relative to what effects leave that predictions named, to take their place.
-        apart: half-widths of its 90 % interval by which an effect of one number must differ from its neutral value.
-        error: how often chance may give an effect a name there, over all effects that forces can tell.
+        error: how often chance may give an effect a name there, over all effects that forces can tell, and an effect of
+            one number, over all of its kind.
         blocks: stretches of the log that count as independent, at least and at most.
         sampled: change of the logarithm of a joint's missing force, where every second row of the log is left out, from
             which on sampling makes too much of it.
@@ -246,7 +246,6 @@ class Forces:
 
     left: float = 0.25
     clearer: float = 0.7
-    apart: float = 1.6
     error: float = 0.05
     blocks: tuple[int, int] = (8, 20)
     sampled: float = 0.2

@@ -195,7 +195,28 @@ def half_widths(regression: Regression, chosen: np.ndarray) -> np.ndarray:
     A fit bends towards each of its blocks, the more the fewer these are for its columns. What is left of a block by a
     fit that has seen it would make the intervals too narrow.
     """
+    return np.asarray(stats.t.ppf(0.95, max(len(regression.names) - 1, 1)) * _standard_errors(regression, chosen))
+
+
+def _standard_errors(regression: Regression, chosen: np.ndarray) -> np.ndarray:
+    """Standard errors of coefficients ``(P,)``, by how they move without a block."""
     count = len(regression.names)
     moved = np.stack([fit(regression, chosen, without=b) for b in range(count)])
-    variance = (count - 1) * moved.var(0)
-    return np.asarray(stats.t.ppf(0.95, max(count - 1, 1)) * np.sqrt(variance))
+    return np.asarray(np.sqrt((count - 1) * moved.var(0)))
+
+
+def neutral_chances(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return how likely coefficients ``(P,)`` are as large by chance, were they 0; 1 for those not chosen."""
+    errors = np.maximum(_standard_errors(regression, chosen), 1e-300)
+    found = 2 * stats.t.sf(np.abs(coefficients) / errors, max(len(regression.names) - 1, 1))
+    return np.where(chosen, found, 1.0)
+
+
+def refusal(likely: np.ndarray, tried: int) -> float:
+    """Return the level from which on Holm's procedure takes all of some effects for real, of so many that were tried.
+
+    Args:
+        likely: chances of these ``(n,)``, were they none.
+        tried: effects among which they were found, n or more.
+    """
+    return float((np.sort(likely) * (tried - np.arange(len(likely)))).max())

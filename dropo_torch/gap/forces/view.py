@@ -20,8 +20,9 @@ from dropo_torch.gap.forces.regression import (
     Regression,
     chances,
     fit,
-    half_widths,
+    neutral_chances,
     refined,
+    refusal,
     score,
     select,
     unseen,
@@ -197,25 +198,31 @@ def _settled(found: Terms, regression: Regression, chosen: np.ndarray, rules: Fo
 def _sure(found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces) -> np.ndarray:
     """Of the chosen columns those that may have a name ``(P,)`` bool: of kinds of effects that chance does not explain.
 
-    What ends at a bound of physics has none. Of the rest, an effect of one number must differ from its neutral value by
-    clearly more than its interval.
+    What ends at a bound of physics has none. Of the rest, an effect of one number must differ from its neutral value,
+    by more than chance explains in any of its kind that were tried (Holm's procedure).
     """
     families, single = _families(found), np.bincount(found.owner)[found.owner] == 1
     kinds = np.unique(families)
+    tried = [int((single & (families == k)).sum()) for k in kinds]
     while chosen.any():
         values = fit(regression, chosen)
         bound = chosen & ((values <= found.low) | (values >= found.high))
         present = [k for k in kinds if (chosen & (families == k)).any()]
         likely = chances(regression, chosen, [chosen & (families == k) for k in present])
         worst = int(np.argmax(likely))
-        sizes = np.maximum(np.abs(values), 1e-300)
-        unsure = np.where(chosen & single, half_widths(regression, chosen) / sizes, 0.0)
+        neutral = neutral_chances(regression, chosen, values)
+        unsure = [
+            (float(refusal(neutral[own], count) / rules.error), own)
+            for k, count in zip(kinds, tried, strict=True)
+            if (own := np.flatnonzero(chosen & single & (families == k))).size
+        ]
         if bound.any():
             chosen = chosen & ~np.isin(found.owner, found.owner[bound])
         elif likely[worst] > rules.error / len(kinds):
             chosen = chosen & (families != present[worst])
-        elif unsure.max() * rules.apart >= 1:
-            chosen = chosen & (np.arange(len(chosen)) != int(np.argmax(unsure)))
+        elif unsure and max(unsure, key=lambda item: item[0])[0] > 1:
+            own = max(unsure, key=lambda item: item[0])[1]
+            chosen = chosen & (np.arange(len(chosen)) != own[np.argmax(neutral[own])])
         else:
             break
     return chosen
