@@ -1,14 +1,16 @@
 """Speed of the Warp backend beside mujoco.batch on one core, in one run.
 
-Hopper, worlds × 4 RK4 substeps, in flight and in contact: forward; forward and backward to states, controls and all
-inertial, damping and gear parameters; and what the same gradient costs by differences of mujoco.batch.
+Worlds × 4 substeps, forward; forward and backward to states, controls and parameters; and what the same gradient costs
+by differences of mujoco.batch: of the Hopper in flight and in contact, with its inertial, damping and gear parameters,
+and of the systems in ``warp_models.py``, with their masses, gears and frictions.
 
-    python benchmarks/warp_speed.py [--worlds 10000] [--repeats 5]
+    python benchmarks/warp_speed.py [--worlds 10000] [--repeats 5] [--models hopper ant humanoid arm hand]
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -18,8 +20,9 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
+from warp_models import MODELS
 
-from dropo_torch.parameters import ParameterSpace
+from dropo_torch.parameters import ParameterSpace, object_names
 from dropo_torch.simulators.warp import WarpSimulator
 
 SKIP = 4
@@ -41,22 +44,35 @@ def parameters(model: mujoco.MjModel, size: int) -> ParameterSpace:
     return ParameterSpace(model, dict(list(fields.items())[:size]))
 
 
-def worlds(model: mujoco.MjModel, count: int, contact: bool) -> tuple[np.ndarray, np.ndarray]:
-    """States of random controls, near the ground or a metre above it, and controls."""
+def common(model: mujoco.MjModel, size: int) -> ParameterSpace:
+    """The first ``size`` of a system's masses, gears and frictions, taken in turn."""
+    kinds = {"body_mass": ("body", range(1, model.nbody)), "actuator_gear": ("actuator", range(model.nu)),
+             "geom_friction": ("geom", range(model.ngeom))}  # fmt: skip
+    found = [
+        [(field, object_names(model, kind)[i]) for i in numbers if field != "body_mass" or model.body_mass[i] > 0]
+        for field, (kind, numbers) in kinds.items()
+    ]
+    turns = [entry for turn in itertools.zip_longest(*found) for entry in turn if entry]
+    fields = {f"{field} {name}": {"field": field, "name": name, "bounds": [1e-3, 1e3]} for field, name in turns[:size]}
+    return ParameterSpace(model, fields)
+
+
+def worlds(model: mujoco.MjModel, count: int, lift: float = 0.0) -> tuple[np.ndarray, np.ndarray]:
+    """States of random controls, the second coordinate lifted at the start, and controls."""
     rng = np.random.default_rng(0)
     data = mujoco.MjData(model)
     states = np.zeros((count, model.nq + model.nv))
     i = 0
     while i < count:
         mujoco.mj_resetData(model, data)
-        data.qpos[:] += rng.uniform(-0.05, 0.05, model.nq)
-        data.qpos[1] += 0.0 if contact else 1.5
+        mujoco.mj_integratePos(model, data.qpos, rng.uniform(-0.05, 0.05, model.nv), 1.0)
+        data.qpos[1] += lift
         data.qvel[:] = rng.uniform(-0.5, 0.5, model.nv)
-        for _ in range(10 if contact else 2):
+        for _ in range(2 if lift else 10):
             data.ctrl[:] = rng.uniform(-1, 1, model.nu)
             for _ in range(SKIP):
                 mujoco.mj_step(model, data)
-        for _ in range(20 if contact else 5):
+        for _ in range(5 if lift else 20):
             data.ctrl[:] = rng.uniform(-1, 1, model.nu)
             for _ in range(SKIP):
                 mujoco.mj_step(model, data)
@@ -77,11 +93,14 @@ def best(work: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
-def run(count: int, repeats: int, contact: bool) -> None:
-    """Measure one kind of state and print the ratios."""
-    assets = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
-    model = mujoco.MjModel.from_xml_path(str(assets / "hopper.xml"))
-    states, controls = worlds(model, count, contact)
+def run(name: str, count: int, repeats: int, lift: float = 0.0) -> None:
+    """Measure a system and print the ratios."""
+    if name == "hopper":
+        assets = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+        model, choose = mujoco.MjModel.from_xml_path(str(assets / "hopper.xml")), parameters
+    else:
+        model, choose = mujoco.MjModel.from_xml_string(MODELS[name]()), common
+    states, controls = worlds(model, count, lift)
 
     batch = mujoco.batch.Batch(model, nsim=count, nthread=1)
     views = {name: batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qacc_warmstart")}
@@ -94,9 +113,9 @@ def run(count: int, repeats: int, contact: bool) -> None:
 
     start, inputs = torch.tensor(states), torch.tensor(controls)
     base = best(reference, repeats)
-    print(f"{'contact' if contact else 'flight'}: mujoco.batch forward {base:.3f} s")
+    print(f"{name}{' in flight' if lift else ''}: mujoco.batch forward {base:.3f} s", flush=True)
     for size in (4, 18):
-        space = parameters(model, size)
+        space = choose(model, size)
         simulator = WarpSimulator(model, parameters=space, frame_skip=SKIP, num_threads=1)
         values = torch.tensor(space.nominal[None])
         error = np.abs(simulator.simulate(start, inputs, values)[:, 0].numpy() - reference()).max()
@@ -110,7 +129,8 @@ def run(count: int, repeats: int, contact: bool) -> None:
         print(
             f"  d = {size}: max difference {error:.1e}; Warp forward {forward:.3f} s ({base / forward:.2f} × faster);"
             f" forward + backward {both:.3f} s ({both / forward:.2f} × its forward);"
-            f" one-sided differences would take {(size + 1) * base:.2f} s ({(size + 1) * base / both:.1f} ×)"
+            f" one-sided differences would take {(size + 1) * base:.2f} s ({(size + 1) * base / both:.1f} ×)",
+            flush=True,
         )
 
 
@@ -118,10 +138,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--worlds", type=int, default=10_000)
     parser.add_argument("--repeats", type=int, default=3)
+    names = ["hopper", *MODELS]
+    parser.add_argument("--models", nargs="+", default=names, choices=names)
     arguments = parser.parse_args()
     torch.set_num_threads(1)
-    for contact in (False, True):
-        run(arguments.worlds, arguments.repeats, contact)
+    for name in arguments.models:
+        if name == "hopper":
+            run(name, arguments.worlds, arguments.repeats, lift=1.5)
+        run(name, arguments.worlds, arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import mujoco
+import numpy as np
 import pytest
+import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators.warp import WarpSimulator
+from dropo_torch.simulators.warp import WarpSimulator, tables
 from dropo_torch.simulators.warp.support import Missing, summary
 
 SOUND = """<mujoco><option {option}><flag {flag}/></option><worldbody>
@@ -93,3 +95,22 @@ def test_three_are_named_without_dots() -> None:
     assert summary([Missing("x", "'a'"), Missing("y"), Missing("x", "'b'"), Missing("x", "'c'")]) == (
         "x (3: 'a', 'b', 'c'); y"
     )
+
+
+def test_more_contacts_than_there_is_memory_for_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "MOST_CONTACTS", 5)
+    boxes = "".join(
+        f'<body name="{name}" pos="{x} 0 .099"><freejoint/><geom type="box" size=".1 .1 .1"/></body>'
+        for name, x in (("a", 0), ("b", 3))
+    )
+    model = mujoco.MjModel.from_xml_string(
+        f'<mujoco><worldbody><geom type="plane" size="5 5 1"/>{boxes}</worldbody></mujoco>'
+    )
+    simulator = WarpSimulator(model, parameters=ParameterSpace(model, {"p": MASS}), frame_skip=1)
+    both = torch.from_numpy(np.r_[model.qpos0, np.zeros(model.nv)])[None]
+    one = both.clone()
+    one[0, 9] += 1.0  # the other box is in the air
+    control, values = torch.zeros(1, 1, 0, dtype=torch.float64), torch.ones(1, 1, dtype=torch.float64)
+    assert simulator.simulate(one, control, values).isfinite().all()
+    with pytest.raises(InputError, match="more than 5 contacts in one simulation"):
+        simulator.simulate(both, control, values)

@@ -37,9 +37,6 @@ SIDE = wp.constant(0)
 CAP = wp.constant(1)
 RIM = wp.constant(3)
 
-#: Contacts of a plane with a mesh, and their distance from the first, relative to the mesh's radius.
-MESH_CONTACTS = wp.constant(3)
-MESH_APART = wp.constant(wp.float64(0.3))
 #: Squared sine of the angle below which MuJoCo 4 takes two capsules for parallel.
 PARALLEL = wp.constant(wp.float64(1.0e-8))
 #: Where on its axis a capsule touches a box: one of its ends, where it passes a corner, where it passes an edge.

@@ -51,17 +51,12 @@ def make_contacts(m: Tables, w: World, ncon: int):
         k = w.con_pair[w.t, c]
         b1 = m.pair_body1[k]
         b2 = m.pair_body2[k]
-        for i in range(m.nv):
-            w.con_jac[w.t, c * m.nv + i] = vec6()
         p = w.con_point[w.t, c]
         frame = w.con_frame[w.t, c]
-        for side in range(2):
-            sign = f64(2 * side - 1)
-            i = m.body_lastdof[wp.where(side == 0, b1, b2)]
-            while i >= 0:
-                column_i = in_frame(frame, w.motion[w.t, i], p) * sign
-                w.con_jac[w.t, c * m.nv + i] = w.con_jac[w.t, c * m.nv + i] + column_i
-                i = m.dof_parent[0, i]
+        first = m.pair_dofadr[k]
+        for a in range(m.pair_dofadr[k + 1] - first):
+            motion = w.motion[w.t, m.pair_dof[first + a]]
+            w.con_jac[w.t, c * m.nv + a] = in_frame(frame, motion, p) * f64(m.pair_sign[first + a])
         v = in_frame(frame, w.velocity[w.t, b2] - w.velocity[w.t, b1], p)
         soft = contact_softness(m, w, c)
         friction_ref = theta_vec2(w.th, m.o_pair_solreffriction + 2 * k)

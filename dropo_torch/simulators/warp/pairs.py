@@ -53,17 +53,24 @@ def _dynamic(model: mujoco.MjModel, g1: int, g2: int, excluded: set[int]) -> boo
 
 def joins_branches(model: mujoco.MjModel, body1: int, body2: int) -> bool:
     """Whether a constraint between two bodies couples dofs that are not on one chain to the root."""
-
-    def chain(body: int) -> set[int]:
-        dofs = set()
-        while body:
-            first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
-            dofs |= set(range(first, first + count))
-            body = int(model.body_parentid[body])
-        return dofs
-
-    one, two = chain(body1), chain(body2)
+    one, two = chain(model, body1), chain(model, body2)
     return bool(one - two) and bool(two - one)
+
+
+def chain(model: mujoco.MjModel, body: int) -> set[int]:
+    """Return the dofs that move a body."""
+    dofs = set()
+    while body:
+        first, count = int(model.body_dofadr[body]), int(model.body_dofnum[body])
+        dofs |= set(range(first, first + count))
+        body = int(model.body_parentid[body])
+    return dofs
+
+
+def relative_dofs(model: mujoco.MjModel, body1: int, body2: int) -> list[tuple[int, int]]:
+    """Return the dofs that move one body relative to the other, in order, and −1 for the first's or 1."""
+    one, two = chain(model, body1), chain(model, body2)
+    return [(dof, 1 if dof in two else -1) for dof in sorted(one ^ two)]
 
 
 def condim(model: mujoco.MjModel, g1: int, g2: int, pair: int) -> int:

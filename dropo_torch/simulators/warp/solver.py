@@ -83,39 +83,33 @@ def mass_mul(m: Tables, w: World, x: Reals2, rx: int, y: Reals2, ry: int):
 def contact_dot(m: Tables, w: World, c: int, x: Reals2, r: int) -> vec6:
     """J x of contact ``c``."""
     y = vec6()
-    base = c * m.nv
-    for i in range(m.nv):
-        y += w.con_jac[w.t, base + i] * x[r, i]
+    k = w.con_pair[w.t, c]
+    first = m.pair_dofadr[k]
+    for a in range(m.pair_dofadr[k + 1] - first):
+        y += w.con_jac[w.t, c * m.nv + a] * x[r, m.pair_dof[first + a]]
     return y
 
 
 @wp.func(inline=True)
-def _add_contact_hessian(m: Tables, w: World, dense: int, c: int, ll: mat33, la: mat33, aa: mat33, r: int):
+def _add_contact_hessian(m: Tables, w: World, c: int, ll: mat33, la: mat33, aa: mat33, r: int):
     """H += Jᵀ C J of one contact."""
     base = c * m.nv
     k = w.con_pair[w.t, c]
-    which = int(1)
-    i = m.nv - 1
-    if m.pair_dense[k] == 0 and dense == 0:
-        which = 0
-        i = wp.max(m.body_lastdof[m.pair_body1[k]], m.body_lastdof[m.pair_body2[k]])
-    while i >= 0:
-        ri = packed(i, 0)
-        ji = w.con_jac[w.t, base + i]
-        cl = ll * wp.spatial_top(ji)
+    first = m.pair_dofadr[k]
+    for a in range(m.pair_dofadr[k + 1] - first):
+        ri = packed(m.pair_dof[first + a], 0)
+        ja = w.con_jac[w.t, base + a]
+        cl = ll * wp.spatial_top(ja)
         ca = vec3()
         if m.pair_dim[k] > 3:
-            cl += la * wp.spatial_bottom(ji)
-            ca = wp.transpose(la) * wp.spatial_top(ji) + aa * wp.spatial_bottom(ji)
-        j = i
-        while j >= 0:
-            x = w.con_jac[w.t, base + j]
+            cl += la * wp.spatial_bottom(ja)
+            ca = wp.transpose(la) * wp.spatial_top(ja) + aa * wp.spatial_bottom(ja)
+        for b in range(a + 1):
+            x = w.con_jac[w.t, base + b]
             y = wp.dot(cl, wp.spatial_top(x))
             if m.pair_dim[k] > 3:
                 y += wp.dot(ca, wp.spatial_bottom(x))
-            w.hess[r, ri + j] += y
-            j = m.dof_parent[which, j]
-        i = m.dof_parent[which, i]
+            w.hess[r, ri + m.pair_dof[first + b]] += y
 
 
 @wp.func(inline=True)
@@ -133,7 +127,7 @@ def _add_row_hessian(m: Tables, w: World, n: int, r: int):
 
 
 @wp.func(inline=True)
-def assemble(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
+def assemble(m: Tables, w: World, nrow: int, ncon: int, r: int):
     """H = M + Jᵀ C J and the gradient M a + c − τ − Jᵀ f at the current J a − aref, into ``w.step``."""
     for i in range(m.nh):
         w.hess[r, i] = w.mass[w.t, i]
@@ -150,11 +144,11 @@ def assemble(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
         jar6 = w.con_jar[w.t, c]
         if cone_piece(cone, jar6) != 0:
             f = cone_force(cone, jar6)
-            base = c * m.nv
-            for i in range(m.nv):
-                w.step[w.t, i] += wp.dot(w.con_jac[w.t, base + i], f)
+            first = m.pair_dofadr[k]
+            for a in range(m.pair_dofadr[k + 1] - first):
+                w.step[w.t, m.pair_dof[first + a]] += wp.dot(w.con_jac[w.t, c * m.nv + a], f)
             ll, la, aa = cone_hessian(cone, jar6)
-            _add_contact_hessian(m, w, dense, c, ll, la, aa, r)
+            _add_contact_hessian(m, w, c, ll, la, aa, r)
 
 
 @wp.func(inline=True)
@@ -232,7 +226,7 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
     _unconstrained_gradient(m, w, r)
     done = int(0)
     for _k in range(ITERATIONS):
-        assemble(m, w, nrow, ncon, dense, r)
+        assemble(m, w, nrow, ncon, r)
         factor(m, dense, w.hess, r)
         if done != 0:
             break

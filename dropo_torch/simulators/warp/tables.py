@@ -12,7 +12,7 @@ from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp import collide
 from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.meshes import mesh_tables
-from dropo_torch.simulators.warp.pairs import condim, joins_branches
+from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_dofs
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
 
 _JNT, _GEOM, _DISABLE = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit
@@ -35,7 +35,7 @@ KINDS = {
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_SPHERE): (collide.PLANE_SPHERE, 1, 1),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CAPSULE): (collide.PLANE_CAPSULE, 2, 2),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_BOX): (collide.PLANE_BOX, 8, 4),
-    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH): (collide.PLANE_MESH, 0, 3),
+    (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_MESH): (collide.PLANE_MESH, 0, 4),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_CYLINDER): (collide.PLANE_CYLINDER, 4, 4),
     (_GEOM.mjGEOM_PLANE, _GEOM.mjGEOM_ELLIPSOID): (collide.PLANE_ELLIPSOID, 1, 1),
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_SPHERE): (collide.ROUND, 1, 1),
@@ -205,12 +205,15 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str
     bodies = model.geom_bodyid[table[:, :2]]
     size = model.geom_size.copy()
     size[model.geom_type == _GEOM.mjGEOM_SPHERE, 1:] = 0.0
+    moving = [relative_dofs(model, int(a), int(b)) for a, b in bodies]
+    dofs = np.array([dof for pair in moving for dof in pair], dtype=int).reshape(-1, 2)
     gap = model.geom_gap[table[:, 0]] + model.geom_gap[table[:, 1]]
     explicit = table[:, 2] >= 0
     gap[explicit] = model.pair_gap[table[explicit, 2]]
     return {
         "npair": len(pairs), "maxcon": min(int(most.sum()), MOST_CONTACTS), "pair_kind": kind, "pair_points": points,
-        "pair_most": most,
+        "pair_most": most, "pair_dofadr": np.cumsum([0, *map(len, moving)]), "pair_dof": dofs[:, 0],
+        "pair_sign": dofs[:, 1],
         "pair_bound": (model.geom_rbound[table[:, 1]] + model.geom_rbound[table[:, 0]]) * (1 + 1e-9),
         "pair_gap": gap,
         "pair_body1": bodies[:, 0], "pair_body2": bodies[:, 1], "pair_geom1": table[:, 0], "pair_geom2": table[:, 1],

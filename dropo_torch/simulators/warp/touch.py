@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp import boxes, collide
+from dropo_torch.simulators.warp import boxes, collide, hull
 from dropo_torch.simulators.warp.spatial import pull, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
 
@@ -91,65 +91,31 @@ def _add_boxes(m: Tables, w: World, n: int, k: int, c1: vec3, r1: mat33, c2: vec
 
 
 @wp.func(inline=True)
-def _deepest(m: Tables, g: int, way: vec3) -> int:
-    """The vertex of a mesh that is farthest along ``way``, as MuJoCo climbs to it: which of the ties depends on it."""
-    start = m.geom_hull[g]
-    best = int(start)
-    if m.hull_edge[m.hull_edgeadr[start]] < 0:  # a mesh without edges
-        for v in range(start + 1, start + m.geom_nhull[g]):
-            if wp.dot(way, m.hull_vert[v]) > wp.dot(way, m.hull_vert[best]):
-                best = v
-    climbs = int(1)
-    while climbs != 0:
-        climbs = int(0)
-        e = int(m.hull_edgeadr[best])
-        while m.hull_edge[e] >= 0:
-            v = start + m.hull_edge[e]
-            if wp.dot(way, m.hull_vert[v]) > wp.dot(way, m.hull_vert[best]):
-                best = v
-                climbs = int(1)
-            e += 1
-    return best
-
-
-@wp.func(inline=True)
 def _add_corners(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2: vec3, rot: mat33, margin: f64) -> int:
     """Write the contacts of a plane and a mesh from number ``n`` on and return the number of the next one.
 
-    They are the deepest vertex of its hull, and of its neighbours the first two that are apart from it.
+    They are the deepest vertex of the hull and up to three more of the face there that is turned most to the plane.
     """
     g = m.pair_geom2[k]
     start = m.geom_hull[g]
-    deepest = _deepest(m, g, -(wp.transpose(rot) * normal))
-    first = collide.plane_point(normal, c1, c2 + rot * m.hull_vert[deepest], ZERO)
+    local = wp.transpose(rot) * normal
+    deepest = hull.deepest(m, g, -local)
+    x = collide.plane_point(normal, c1, c2 + rot * m.hull_vert[start + deepest], ZERO)
     number = n
-    if first[0] < margin:
-        _add(w, number, k, deepest, first, vec3())
+    if x[0] < margin:
+        _add(w, number, k, start + deepest, x, vec3())
         number += 1
-    e = m.hull_edgeadr[deepest]
-    edges = m.hull_edge[e] >= 0
-    count = int(1)
-    others = int(wp.where(edges, e, start))
-    while count < collide.MESH_CONTACTS and _is_other(m, g, others, edges):
-        v = wp.where(edges, start + m.hull_edge[others], others)
-        x = c2 + rot * m.hull_vert[v]
-        y = collide.plane_point(normal, c1, x, ZERO)
-        apart = wp.length(x - first[1:4]) >= collide.MESH_APART * m.pair_bound[k]
-        if y[0] < margin + m.pair_gap[k] and apart and v != deepest:
-            count += 1
-            if y[0] < margin:
-                _add(w, number, k, v, y, vec3())
+    face = hull.lowest_face(m, start + deepest, local)
+    if x[0] <= margin + m.pair_gap[k] and face >= 0:
+        own, others = hull.face_corners(m, start, face, deepest)
+        for i in range(wp.min(m.poly_num[face], 4) - 1):
+            v = start + m.poly_vert[m.poly_adr[face] + (own + others[i]) % m.poly_num[face]]
+            way = rot * m.hull_vert[v]
+            x = collide.plane_point(normal, c1, c2 + way, ZERO)
+            if x[0] < margin and wp.dot(normal, way) <= ZERO:
+                _add(w, number, k, v, x, vec3())
                 number += 1
-        others += 1
     return number
-
-
-@wp.func(inline=True)
-def _is_other(m: Tables, g: int, i: int, edges: bool) -> bool:
-    """Whether there is an ``i``-th neighbour, or vertex of a mesh without edges."""
-    if edges:
-        return m.hull_edge[i] >= 0
-    return i < m.geom_hull[g] + m.geom_nhull[g]
 
 
 @wp.func(inline=True)

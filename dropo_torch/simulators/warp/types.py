@@ -84,10 +84,12 @@ _INDICES = (
     "act_dof", "act_ndof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
-    "pair_most",
-    "geom_body", "geom_hull", "geom_nhull", "hull_id", "hull_edgeadr", "hull_edge",
+    "pair_most", "pair_dofadr", "pair_dof", "pair_sign",
+    "geom_body",
+    "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
+    "poly_adr", "poly_num", "poly_vert",
 )  # fmt: skip
-_VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert")
+_VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert", "poly_normal")
 _ROTATIONS = ("body_mat", "body_imat", "geom_mat")
 
 #: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
@@ -137,7 +139,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "con_point": (vec3, "contact"), "con_frame": (mat33, "contact"), "con_hint": (vec3, "contact"),
     "con_d": (f64, "contact"),  # D of the normal (elliptic) or of every edge (pyramidal)
     "con_aref": (vec6, "contact"), "con_jar": (vec6, "contact"), "con_dir": (vec6, "contact"),
-    "con_jac": (vec6, "jacobian"),  # columns of J, (contact, dof)
+    "con_jac": (vec6, "jacobian"),  # columns of J, (contact, dof of the pair)
 }  # fmt: skip
 #: Working memory of the adjoint.
 ADJOINT: dict[str, tuple[Any, str]] = {
