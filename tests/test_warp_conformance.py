@@ -413,8 +413,11 @@ euler="3 85 10"><freejoint/><geom name="grod" type="capsule" size=".05 .2" frict
 </mujoco>"""
 STACK = BOX + free("upper", ".03 .02 .29", 'type="box" size=".1 .12 .08"', "0.95 0 0 0.1")
 ON_EDGE = BOX + free("upper", ".1 .12 .33", 'type="box" size=".05 .04 .2"', "0.8 0.3 0.4 0.1")
-DRUM = '<geom type="cylinder" size=".15 .1" pos="0 0 .1" euler="4 3 0"/>'
+DRUM = '<geom type="cylinder" size=".15 .1" pos="0 0 .1" euler="4 3 0" friction=".3 .01 .001"/>'
 ROLLS = DRUM + free("ball", ".2 .05 .1", 'type="sphere" size=".08"')
+BALL = {
+    "mass": p("body_mass", "ball"), "friction": p("geom_friction", "gball"), "solref": p("geom_solref", "gball", 0),
+}  # fmt: skip
 BALANCED = DRUM + free("ball", ".08 .05 .27", 'type="sphere" size=".08"')
 #: A hull with a flat bottom of five corners, started a little tilted.
 HULL = '<asset><mesh name="hull" vertex="-.2 -.1 0 .2 -.1 0 .25 .1 0 -.2 .12 0 0 .2 0 .1 0 .3 -.15 -.05 .2"/></asset>'
@@ -477,8 +480,8 @@ CONTACTS += [
         length=40,
         states=1e-8,
     ),
-    Case("ball beside a cylinder", scene(ROLLS, slope="0"), contact_parameters("ball"), length=16, spread=0.1),
-    Case("ball on a cylinder", scene(BALANCED, slope="0"), contact_parameters("ball"), length=16, spread=0.1),
+    Case("ball beside a cylinder", scene(ROLLS, slope="0"), BALL, length=16, spread=0.1),
+    Case("ball on a cylinder", scene(BALANCED, slope="0"), BALL, length=16, spread=0.1),
     Case("welded bodies", WELDED, {"b": p("body_mass", "b"), "c": p("body_mass", "c")}, most=1e-2),
     Case("sphere in a box", IN_BOX, {"mass": p("body_mass", "ball"), "solref": p("geom_solref", "floor", 0)}, length=8),
     Case("equalities across trees", LOOP, {"b": p("body_mass", "b"), "c": p("body_mass", "c")}),
