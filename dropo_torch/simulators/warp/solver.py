@@ -255,8 +255,11 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
             break
         alpha = ONE
         small = int(1)
+        enough = f64(1.0e-11)
+        if same != 0:
+            enough = f64(1.0e-8)  # on one smooth piece convergence is quadratic
         for i in range(m.nv):
-            if wp.abs(w.step[w.t, i]) > f64(1.0e-11) * (ONE + wp.abs(w.acc[r, i])):
+            if wp.abs(w.step[w.t, i]) > enough * (ONE + wp.abs(w.acc[r, i])):
                 small = 0
         if small == 0:
             alpha = _line_search(m, w, nrow, ncon, r)
