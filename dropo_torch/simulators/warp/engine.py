@@ -129,6 +129,7 @@ class Engine:
         self.wanted = torch.from_numpy(self.fields.wanted.astype(np.int64))
         self._sizes = {
             "qpos": m.nq, "dof": m.nv, "triangle": m.nh, "body": m.nb, "row": m.maxrow, "contact": m.maxcon,
+            "tendon": m.nten, "arm": len(m.ten_dof) if m.nten else 0,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
         }  # fmt: skip
         self._may_overflow = int(m.pair_most.numpy().sum()) > m.maxcon
@@ -347,6 +348,8 @@ class Engine:
         # a gap between slots, so that no two threads write one cache line
         own = self._allocate(SCRATCH | ADJOINT if adjoint else SCRATCH, slots, gap=16)
         own["full"] = wp.zeros(slots, dtype=wp.int32, device=self.device)
+        if not self.tables.nweld:  # then nothing is added to M
+            own["quad"] = own["mass"]
         return fill(World(), own | memory)
 
     def _allocate(self, fields: dict[str, tuple[Any, str]], rows: int, gap: int = 0) -> dict[str, Any]:

@@ -15,11 +15,12 @@ import numpy as np
 import torch
 
 from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.simulators.warp.couplings import equality_bodies, has_dofs, welds
 from dropo_torch.simulators.warp.layout import DIRECT, MIXED, PAIR
 from dropo_torch.simulators.warp.pairs import mixing
 from dropo_torch.support.threads import single_thread
 
-_INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature"})
+_INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature", "tendon_armature"})
 #: The fields that are read: name of the section, field, columns kept of each row (0: all).
 _READ = (*DIRECT, *((field, field, 0) for field in MIXED))
 _MINVAL = 1e-15
@@ -57,10 +58,12 @@ class Fields:
         self._raw = torch.from_numpy(_raw(model))
         self.sections = {name: self._raw_sections[name][:2] for name, _f, _k in DIRECT}
         self._direct = self.size = sum(size for _, size in self.sections.values())
-        widths = {f"pair_{name}": width * len(pairs) for name, width in PAIR.items()} | {"dof_invweight": model.nv}
+        widths = {f"pair_{name}": width * len(pairs) for name, width in PAIR.items()}
+        widths |= {"dof_invweight": model.nv, "weld_invweight": 2 * len(welds(model)), "ten_invweight": model.ntendon}
         for name, width in widths.items():
             self.sections[name] = (self.size, width)
             self.size += width
+        self._anchors = _Anchors(model, space, columns["eq_data"])
         self._targets(space, columns)
         self._derive: tuple[Callable[[Section], torch.Tensor], ...] = (_Mixing(model, pairs), _Weights(model, pairs))
         self._constant = self._derived(self._raw[None])
@@ -73,9 +76,10 @@ class Fields:
         self._factors = torch.tensor([t.factor for _, t in targets], dtype=torch.float64)
         self._sources = torch.tensor([source for source, _ in targets], dtype=torch.long)
         self._varies = bool(fields & set(MIXED)), bool(fields & _INERTIAL)
-        derived = [name for name in self.sections if name.startswith("pair_") or name == "dof_invweight"]
+        derived = [name for name in self.sections if name.startswith("pair_") or name.endswith("invweight")]
         own = [self.columns(name) for name in derived if self._varies[name.endswith("invweight")]]
-        direct = self._written[self._written < self._direct].numpy()
+        direct = np.concatenate([self._written.numpy(), self._anchors.derived])
+        direct = direct[direct < self._direct]
         self.wanted = np.unique(np.concatenate([direct, *own])).astype(np.int32)
 
     def columns(self, name: str) -> np.ndarray:
@@ -112,6 +116,7 @@ class Fields:
         """Return θ ``(K, P)`` of parameter vectors ``(K, d)``, differentiable."""
         raw = self._raw.expand(len(values), -1)
         raw = raw.index_copy(1, self._written, values[:, self._sources] * self._factors)
+        raw = self._anchors(raw)
         derived = [
             derive(partial(self._section, raw)) if varies else constant.expand(len(values), -1)
             for derive, varies, constant in zip(self._derive, self._varies, self._constant, strict=True)
@@ -161,8 +166,37 @@ class _Mixing:
         return torch.cat([p.flatten(1) for p in parts], dim=1)
 
 
+class _Anchors:
+    """What ``mj_setConst`` makes of a connect's data: the anchor in the second body, from that in the first.
+
+    Attributes:
+        derived: columns of θ that then depend on others.
+    """
+
+    def __init__(self, model: mujoco.MjModel, space: ParameterSpace, columns: np.ndarray) -> None:
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        written = {t.index // mujoco.mjNEQDATA for p in space.parameters for t in p.targets if t.field == "eq_data"}
+        bodies = model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY)
+        self._maps = []
+        for i in sorted(written):
+            if bodies[i] and model.eq_type[i] == int(mujoco.mjtEq.mjEQ_CONNECT):
+                own = torch.from_numpy(columns.reshape(model.neq, -1)[i]).long()
+                b1, b2 = model.eq_obj1id[i], model.eq_obj2id[i]
+                r1, r2 = (data.xmat[b].reshape(3, 3) for b in (b1, b2))
+                offset = r2.T @ (data.xpos[b1] - data.xpos[b2])
+                self._maps.append((own, torch.from_numpy(r2.T @ r1), torch.from_numpy(offset)))
+        self.derived = np.array([c for own, _r, _o in self._maps for c in own[3:6].tolist()], dtype=int)
+
+    def __call__(self, raw: torch.Tensor) -> torch.Tensor:
+        """Return the model's numbers with what follows from others in its place."""
+        for own, turn, offset in self._maps:
+            raw = raw.index_copy(1, own[3:6], raw[:, own[:3]] @ turn.T + offset)
+        return raw
+
+
 class _Weights:
-    """``body_invweight0`` (translation) of pairs and ``dof_invweight0`` as functions of the inertial parameters."""
+    """``body_invweight0`` and ``dof_invweight0`` as functions of the inertial parameters."""
 
     def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
         model, data = copy.copy(model), mujoco.MjData(model)
@@ -173,27 +207,54 @@ class _Weights:
         for b in range(1, model.nbody):
             mujoco.mj_jac(model, data, jac[0, b], jac[1, b], data.xpos[b], b)
         self.linear, self.angular = torch.from_numpy(jac)
+        mujoco.mj_tendon(model, data)
+        self.arms = torch.zeros(model.ntendon, model.nv, dtype=torch.float64)
+        for k in range(model.ntendon):
+            own = slice(model.ten_J_rowadr[k], model.ten_J_rowadr[k] + model.ten_J_rownnz[k])
+            self.arms[k].index_add_(0, torch.tensor(model.ten_J_colind[own]).long(), torch.tensor(data.ten_J[own]))
+        self.related = torch.from_numpy(_related(model))
         self.rotation, self.principal = (torch.tensor(x).reshape(-1, 3, 3) for x in (data.xmat, data.ximat))
-        self.moving, self.simple = torch.tensor(model.body_weldid != 0), torch.tensor(model.body_simple == 2)
+        self.moving = torch.tensor([has_dofs(model, b) for b in range(model.nbody)])
+        self.simple = torch.tensor(model.body_simple == 2)
         self.dof_body = torch.tensor(model.dof_bodyid, dtype=torch.long)
         self.bodies = torch.tensor([[model.geom_bodyid[g] for g in pair[:2]] for pair in pairs]).long().reshape(-1, 2)
+        self.welded = torch.from_numpy(equality_bodies(model, welds(model))).long()
         self.average = torch.eye(model.nv, dtype=torch.float64)
         for start, kind in zip(model.jnt_dofadr, model.jnt_type, strict=True):
             for g in range(start, start + {0: 6, 1: 3}.get(int(kind), 0), 3):  # of a free or a ball joint
                 self.average[g : g + 3, g : g + 3] = 1 / 3
 
     def __call__(self, section: Section) -> torch.Tensor:
-        """Return the sum of the two bodies' weights of each pair and the weights of dofs, ``(K, n + nv)``."""
+        """Return the weights of pairs, dofs, welds and tendons, ``(K, n + nv + 2 w + t)``.
+
+        A pair's is the sum of its two bodies' for translations, a weld has that and the one for rotations.
+        """
         mass, armature, inertia = section("mass")[..., 0], section("armature")[..., 0], section("inertia")
         arm = torch.einsum("bij,kbj->kbi", self.rotation, section("ipos"))
         linear = self.linear + torch.linalg.cross(self.angular.expand(len(arm), -1, -1, -1), arm[..., None], dim=2)
         local = self.principal.transpose(1, 2) @ self.angular
         matrix = torch.einsum("kb,kbij,kbil->kjl", mass, linear, linear)
         matrix = matrix + torch.einsum("kbi,bij,bil->kjl", inertia, local, local) + torch.diag_embed(armature)
+        if len(self.arms):
+            tendons = torch.einsum("kt,ti,tj->kij", section("ten_armature")[..., 0], self.arms, self.arms)
+            matrix = matrix + tendons * self.related
         inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L)
         body = torch.einsum("kbij,kjl,kbil->kb", linear, inverse, linear) / 3
         light = 1 / mass.clamp(min=_MINVAL)
         body = torch.where(self.moving, torch.where(self.simple, light, body), torch.zeros_like(body))
+        turning = torch.einsum("bij,kjl,bil->kb", self.angular, inverse, self.angular) / 3
+        turning = torch.where(self.moving & ~self.simple, turning, torch.zeros_like(turning))
         dof = torch.diagonal(inverse, dim1=1, dim2=2) @ self.average
         dof = torch.where(self.simple[self.dof_body], light[:, self.dof_body], dof)
-        return torch.cat([body[:, self.bodies[:, 0]] + body[:, self.bodies[:, 1]], dof], dim=1)
+        weld = torch.stack([weights[:, self.welded].sum(-1) for weights in (body, turning)], dim=-1)
+        tendon = torch.einsum("ti,kij,tj->kt", self.arms, inverse, self.arms)
+        return torch.cat([body[:, self.bodies].sum(-1), dof, weld.flatten(1), tendon], dim=1)
+
+
+def _related(model: mujoco.MjModel) -> np.ndarray:
+    """Return 1 for pairs of dofs for which MuJoCo's M has room, ``(nv, nv)``."""
+    room = np.zeros((model.nv, model.nv))
+    for i, (start, count) in enumerate(zip(model.M_rowadr, model.M_rownnz, strict=True)):
+        own = model.M_colind[start : start + count]
+        room[i, own] = room[own, i] = 1.0
+    return room

@@ -13,7 +13,15 @@ import warp as wp
 
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log, quat_mul
 from dropo_torch.simulators.warp.spatial import add_at, vec3_at, vec4_at
-from dropo_torch.simulators.warp.types import BALL, MINVAL, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
+from dropo_torch.simulators.warp.tendons import (
+    add_tendon_forces,
+    rate_bar,
+    tendon_add,
+    tendon_bar,
+    tendon_dot,
+    tendon_forces_adjoint,
+)
+from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
 
 
 @wp.func(inline=True)
@@ -136,6 +144,8 @@ def actuator_length(m: Tables, w: World, r: int, i: int) -> f64:
     y = ZERO
     if m.act_ndof[i] == 1:
         y = w.th[m.o_gear + 6 * i] * w.qpos[r, m.act_qpos[i]]
+    elif m.act_tendon[i] >= 0:
+        y = w.th[m.o_gear + 6 * i] * w.ten_length[w.t, m.act_tendon[i]]
     return y
 
 
@@ -145,6 +155,8 @@ def actuator_rate(m: Tables, w: World, r: int, i: int) -> f64:
     y = ZERO
     for k in range(m.act_ndof[i]):
         y += w.th[m.o_gear + 6 * i + k] * w.qvel[r, m.act_dof[i] + k]
+    if m.act_tendon[i] >= 0:
+        y = w.th[m.o_gear + 6 * i] * w.ten_rate[w.t, m.act_tendon[i]]
     return y
 
 
@@ -180,12 +192,45 @@ def sum_forces(m: Tables, w: World, r: int):
         f = ranged_force(m, w, r, i)
         for k in range(m.act_ndof[i]):
             w.work[w.t, m.act_dof[i] + k] += w.th[m.o_gear + 6 * i + k] * f
+        if m.act_tendon[i] >= 0:
+            w.ten_force[w.t, m.act_tendon[i]] += w.th[m.o_gear + 6 * i] * f
+            w.ten_sum[w.t, m.act_tendon[i]] += f
+    for k in range(m.nten):
+        f = tendon_actuation(m, w, k)
+        if f != ZERO:
+            tendon_add(m, w, k, f, w.work, w.t)
+
+
+@wp.func(inline=True)
+def tendon_actuation(m: Tables, w: World, k: int) -> f64:
+    """Force of all actuators of tendon ``k``, scaled so that the sum without gears is within the tendon's range."""
+    f = w.ten_force[w.t, k]
+    total = w.ten_sum[w.t, k]
+    if m.ten_frclimited[k] != 0 and total != ZERO:
+        f *= clamp(w, m.o_ten_actfrcrange + 2 * k, total) / total
+    return f
+
+
+@wp.func
+def tendon_actuation_adjoint(m: Tables, w: World, k: int, bar: f64):
+    """Adjoint of :func:`tendon_actuation`: of the sums with and without gears, in their place."""
+    scale = ONE
+    sum_bar = ZERO
+    total = w.ten_sum[w.t, k]
+    if m.ten_frclimited[k] != 0 and total != ZERO:
+        o = m.o_ten_actfrcrange + 2 * k
+        ranged = clamp(w, o, total)
+        scale = ranged / total
+        scale_bar = bar * w.ten_force[w.t, k]
+        sum_bar = clamp_adjoint(w, o, total, scale_bar / total) - scale_bar * scale / total
+    w.ten_force[w.t, k] = bar * scale
+    w.ten_sum[w.t, k] = sum_bar
 
 
 @wp.func(inline=True)
 def add_actuators(m: Tables, w: World, r: int):
     """Load from actuators, clamped per joint where the joint says so."""
-    if m.has_frclimit == 0:
+    if m.has_frclimit + m.nten == 0:
         for i in range(m.nu):
             f = ranged_force(m, w, r, i)
             for k in range(m.act_ndof[i]):
@@ -213,8 +258,14 @@ def actuators_adjoint(m: Tables, w: World, r: int):
                 for k in range(m.link_ndof[j]):
                     w.work[w.t, d + k] = -w.lam[w.t, d + k]
     else:
+        if m.nten != 0:
+            sum_forces(m, w, r)
         for i in range(m.nv):
             w.work[w.t, i] = -w.lam[w.t, i]
+    for k in range(m.nten):
+        if w.ten_force[w.t, k] != ZERO:
+            tendon_bar(m, w, k, tendon_actuation(m, w, k), w.work, w.t)
+        tendon_actuation_adjoint(m, w, k, tendon_dot(m, w, k, w.work, w.t))
     for i in range(m.nu):
         d = m.act_dof[i]
         og = m.o_gain + 3 * i
@@ -227,6 +278,8 @@ def actuators_adjoint(m: Tables, w: World, r: int):
         fbar = ZERO  # ∂/∂force
         for k in range(m.act_ndof[i]):
             fbar += w.th[oe + k] * w.work[w.t, d + k]
+        if m.act_tendon[i] >= 0:
+            fbar = w.th[oe] * w.ten_force[w.t, m.act_tendon[i]] + w.ten_sum[w.t, m.act_tendon[i]]
         if m.act_frclimited[i] != 0:
             fbar = clamp_adjoint(w, m.o_forcerange + 2 * i, f, fbar)
             f = clamp(w, m.o_forcerange + 2 * i, f)
@@ -252,6 +305,12 @@ def actuators_adjoint(m: Tables, w: World, r: int):
         for k in range(m.act_ndof[i]):
             w.vel_bar[w.t, d + k] += fbar * slope_v * w.th[oe + k]
             w.grad[w.t, oe + k] += f * w.work[w.t, d + k] + fbar * slope_v * w.qvel[r, d + k]
+        if m.act_tendon[i] >= 0:
+            k = m.act_tendon[i]
+            w.ten_length_bar[w.t, k] += fbar * slope_l * w.th[oe]
+            rate_bar(m, w, k, fbar * slope_v * w.th[oe], w.vel_bar, r)
+            lever = slope_l * w.ten_length[w.t, k] + slope_v * w.ten_rate[w.t, k]
+            w.grad[w.t, oe] += f * w.ten_force[w.t, k] + fbar * lever
         control_adjoint(m, w, i, fbar * gain)
 
 
@@ -299,6 +358,8 @@ def add_forces(m: Tables, w: World, r: int):
         w.load[w.t, i] += v * (w.th[m.o_damping + i] + n * (w.th[ip] + n * w.th[ip + 1]))
     if m.has_spring != 0:
         add_springs(m, w, r)
+    if m.nten != 0:
+        add_tendon_forces(m, w)
     add_actuators(m, w, r)
 
 
@@ -318,4 +379,6 @@ def forces_adjoint(m: Tables, w: World, r: int):
         w.grad[w.t, ip + 1] += jl * v * n * n
     if m.has_spring != 0:
         springs_adjoint(m, w, r)
+    if m.nten != 0:
+        tendon_forces_adjoint(m, w, r)
     actuators_adjoint(m, w, r)

@@ -18,9 +18,17 @@ from dropo_torch.simulators.warp.rotations import (
     right_jacobian_t,
     turn,
 )
-from dropo_torch.simulators.warp.solver import factor, mass_mul, solve
+from dropo_torch.simulators.warp.solver import factor, matrix_mul, solve
 from dropo_torch.simulators.warp.spatial import add_at, late, vec3_at, vec4_at
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
+from dropo_torch.simulators.warp.tendons import (
+    add_outer,
+    outer_dot,
+    outer_mul,
+    rate_bar,
+    tendon_damping_slope,
+    tendons_adjoint,
+)
 from dropo_torch.simulators.warp.types import BALL, HALF, ONE, RK4, THREE, TWO, ZERO, Reals2, Tables, World, f64, vec4
 
 LARGE = wp.constant(wp.float64(1.0e10))  # mjMAXVAL
@@ -112,19 +120,35 @@ def implicit_slope(m: Tables, w: World, r: int, i: int) -> f64:
         b = damping_slope(m, w, w.qvel[r, i], i)
     if m.implicit_actuators != 0:
         for a in range(m.nu):
-            if m.act_dof[a] == i:
+            if m.act_dof[a] == i and m.act_tendon[a] < 0:
                 b -= actuator_slope(m, w, r, a)
     return b
 
 
 @wp.func(inline=True)
+def tendon_slope(m: Tables, w: World, r: int, k: int) -> f64:
+    """−∂F/∂v of the force F and the velocity v of tendon ``k``."""
+    y = ZERO
+    if m.ten_damped[k] != 0:
+        y = tendon_damping_slope(m, w, k)
+    for a in range(m.nu):
+        if m.act_tendon[a] == k:
+            y -= actuator_slope(m, w, r, a)
+    return y
+
+
+@wp.func(inline=True)
 def soften(m: Tables, w: World, r: int):
     """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``w.soft_hess[r]``."""
-    mass_mul(m, w, w.acc, r, w.soft, r)
+    matrix_mul(m, 0, w.mass, w.t, w.acc, r, w.soft, r)
     for i in range(m.nh):
         w.soft_hess[r, i] = w.mass[w.t, i]
     for i in range(m.nv):
         w.soft_hess[r, packed(i, i)] += m.h * implicit_slope(m, w, r, i)
+    for k in range(m.nten * m.implicit_actuators):
+        y = m.h * tendon_slope(m, w, r, k)
+        if y != ZERO:
+            add_outer(m, w, k, y, w.soft_hess, r)
     factor(m, 0, w.soft_hess, r)
     solve(m, 0, w.soft_hess, r, w.soft, r)
 
@@ -144,8 +168,31 @@ def slope_adjoint(m: Tables, w: World, r: int):
             w.stage_vel_bar[w.t, i] += y * (TWO * w.th[ip] * wp.sign(v) + f64(6.0) * w.th[ip + 1] * v)
     if m.implicit_actuators != 0:
         for a in range(m.nu):
-            i = m.act_dof[a]
-            actuator_slope_adjoint(m, w, r, a, m.h * w.lam[w.t, i] * w.soft[r, i])
+            if m.act_tendon[a] < 0:
+                i = m.act_dof[a]
+                actuator_slope_adjoint(m, w, r, a, m.h * w.lam[w.t, i] * w.soft[r, i])
+        for k in range(m.nten):
+            _tendon_slope_adjoint(m, w, r, k)
+        tendons_adjoint(m, w)
+
+
+@wp.func
+def _tendon_slope_adjoint(m: Tables, w: World, r: int, k: int):
+    """The part of tendon ``k`` in :func:`slope_adjoint`."""
+    power = outer_dot(m, w, k, w.lam, w.t, w.soft, r, -m.h * tendon_slope(m, w, r, k))
+    if m.ten_damped[k] != 0:
+        y = -m.h * power  # ∂/∂B
+        v = w.ten_rate[w.t, k]
+        n = wp.abs(v)
+        ip = m.o_ten_dampingpoly + 2 * k
+        w.grad[w.t, m.o_ten_damping + k] += y
+        w.grad[w.t, ip] += TWO * n * y
+        w.grad[w.t, ip + 1] += THREE * n * n * y
+        curve = TWO * w.th[ip] * wp.sign(v) + f64(6.0) * w.th[ip + 1] * v
+        rate_bar(m, w, k, y * curve, w.stage_vel_bar, r)
+    for a in range(m.nu):
+        if m.act_tendon[a] == k:
+            actuator_slope_adjoint(m, w, r, a, m.h * power)
 
 
 @wp.func(inline=True)
@@ -239,6 +286,8 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
                 # ā = M λ, with M λ = Σ_subtree s · I Λ + armature
                 inertial = wp.dot(w.motion[w.t, i], w.f_accel[w.t, m.dof_body[i]])
                 w.acc_bar[w.t, i] = inertial + w.th[m.o_armature + i] * w.lam[w.t, i]
+            for n in range(m.nten):
+                outer_mul(m, w, n, w.th[m.o_ten_armature + n], w.lam, w.t, w.acc_bar, w.t)
         elif k > 0:
             c = stage_time(h, k)
             chart_rates_adjoint(m, w, r + k, c, k * nv)

@@ -12,8 +12,15 @@ DIRECT = (
     ("damping", "dof_damping", 0), ("dampingpoly", "dof_dampingpoly", 0), ("armature", "dof_armature", 0),
     ("frictionloss", "dof_frictionloss", 0), ("dof_solref", "dof_solref", 0), ("dof_solimp", "dof_solimp", 0),
     ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 0),
-    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 5),
+    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 0),
     ("eq_solref", "eq_solref", 0), ("eq_solimp", "eq_solimp", 0),
+    ("ten_stiffness", "tendon_stiffness", 0), ("ten_stiffnesspoly", "tendon_stiffnesspoly", 0),
+    ("ten_damping", "tendon_damping", 0), ("ten_dampingpoly", "tendon_dampingpoly", 0),
+    ("ten_armature", "tendon_armature", 0), ("ten_frictionloss", "tendon_frictionloss", 0),
+    ("ten_range", "tendon_range", 0), ("ten_margin", "tendon_margin", 0),
+    ("ten_lengthspring", "tendon_lengthspring", 0), ("ten_actfrcrange", "tendon_actfrcrange", 0),
+    ("ten_solref_lim", "tendon_solref_lim", 0), ("ten_solimp_lim", "tendon_solimp_lim", 0),
+    ("ten_solref_fri", "tendon_solref_fri", 0), ("ten_solimp_fri", "tendon_solimp_fri", 0),
 )  # fmt: skip
 #: Fields from which the contact parameters of a pair are mixed.
 MIXED = (
@@ -25,4 +32,5 @@ PAIR = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 
 #: Fields that θ is made of: those that a parameter may write and the adjoint differentiates.
 FIELDS = (*(field for _, field, _ in DIRECT), *MIXED)
 #: All sections of θ, in order.
-SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight")
+SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight", "weld_invweight",
+            "ten_invweight")  # fmt: skip

@@ -5,6 +5,8 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
+from dropo_torch.simulators.warp.couplings import has_dofs
+
 _PLANE = int(mujoco.mjtGeom.mjGEOM_PLANE)
 
 
@@ -26,7 +28,7 @@ def candidate_pairs(model: mujoco.MjModel) -> list[tuple[int, int, int]]:
             if key not in found and _dynamic(model, g1, g2, excluded):
                 found[key] = -1
     plane = [all(model.geom_type[g] == _PLANE for g in key) for key in found]
-    moving = [any(model.body_weldid[model.geom_bodyid[g]] for g in key) for key in found]
+    moving = [any(has_dofs(model, int(model.geom_bodyid[g])) for g in key) for key in found]
     return [(*key, i) for (key, i), p, m in zip(found.items(), plane, moving, strict=True) if m and not p]
 
 

@@ -62,20 +62,20 @@ def solve(m: Tables, dense: int, hess: Reals2, r: int, x: Reals2, rx: int):
 
 
 @wp.func(inline=True)
-def mass_mul(m: Tables, w: World, x: Reals2, rx: int, y: Reals2, ry: int):
-    """y ← M x."""
+def matrix_mul(m: Tables, dense: int, matrix: Reals2, r: int, x: Reals2, rx: int, y: Reals2, ry: int):
+    """y ← A x, A packed in row ``r`` and as sparse as the tree (dense = 0)."""
     for i in range(m.nv):
         y[ry, i] = ZERO
     for i in range(m.nv):
         ri = packed(i, 0)
         xi = x[rx, i]
-        yi = w.mass[w.t, ri + i] * xi
-        j = m.dof_parent[0, i]
+        yi = matrix[r, ri + i] * xi
+        j = m.dof_parent[dense, i]
         while j >= 0:
-            mij = w.mass[w.t, ri + j]
-            yi += mij * x[rx, j]
-            y[ry, j] += mij * xi
-            j = m.dof_parent[0, j]
+            aij = matrix[r, ri + j]
+            yi += aij * x[rx, j]
+            y[ry, j] += aij * xi
+            j = m.dof_parent[dense, j]
         y[ry, i] += yi
 
 
@@ -115,6 +115,32 @@ def _add_contact_hessian(m: Tables, w: World, c: int, ll: mat33, la: mat33, aa: 
 @wp.func(inline=True)
 def _add_row_hessian(m: Tables, w: World, n: int, r: int):
     """H += Jᵀ D J of one scalar row."""
+    if m.nten != 0 and w.row_tendon[w.t, n] != 0:
+        _add_tendon_hessian(m, w, n, r)
+    else:
+        _add_dofs_hessian(m, w, n, r)
+
+
+@wp.func
+def _add_tendon_hessian(m: Tables, w: World, n: int, r: int):
+    d = w.row_d[w.t, n]
+    for a in range(2):
+        for b in range(2):
+            ka = w.row_dof[w.t, n][a]
+            kb = w.row_dof[w.t, n][b]
+            if ka >= 0 and kb >= 0:
+                y = d * w.row_coef[w.t, n][a] * w.row_coef[w.t, n][b]
+                for ci in range(m.ten_start[ka], m.ten_start[ka + 1]):
+                    i = m.ten_dof[ci]
+                    yi = y * w.ten_jac[w.t, ci]
+                    for cj in range(m.ten_start[kb], m.ten_start[kb + 1]):
+                        j = m.ten_dof[cj]
+                        if j <= i:
+                            w.hess[r, packed(i, 0) + j] += yi * w.ten_jac[w.t, cj]
+
+
+@wp.func(inline=True)
+def _add_dofs_hessian(m: Tables, w: World, n: int, r: int):
     d = w.row_d[w.t, n]
     c = w.row_coef[w.t, n]
     for a in range(3):
@@ -130,12 +156,12 @@ def _add_row_hessian(m: Tables, w: World, n: int, r: int):
 def assemble(m: Tables, w: World, nrow: int, ncon: int, r: int):
     """H = M + Jᵀ C J and the gradient M a + c − τ − Jᵀ f at the current J a − aref, into ``w.step``."""
     for i in range(m.nh):
-        w.hess[r, i] = w.mass[w.t, i]
+        w.hess[r, i] = w.quad[w.t, i]
     for i in range(m.nv):
         w.step[w.t, i] = -w.product[w.t, i]
     for n in range(nrow):
         jar = w.row_jar[w.t, n]
-        row_add(w, n, row_force(w, n, jar), w.step, w.t)
+        row_add(m, w, n, row_force(w, n, jar), w.step, w.t)
         if row_state(w, n, jar) == 1:
             _add_row_hessian(m, w, n, r)
     for c in range(ncon):
@@ -174,7 +200,7 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
 @wp.func(inline=True)
 def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
     """The root of φ' along the step: Newton's iteration kept in a bracket, roughly where cones are curved."""
-    mass_mul(m, w, w.step, w.t, w.work, w.t)
+    matrix_mul(m, m.quad_dense, w.quad, w.t, w.step, w.t, w.work, w.t)
     linear = ZERO
     quad = ZERO
     for i in range(m.nv):
@@ -210,8 +236,8 @@ def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
 
 @wp.func(inline=True)
 def _unconstrained_gradient(m: Tables, w: World, r: int):
-    """M a + c − τ, into ``w.product``."""
-    mass_mul(m, w, w.acc, r, w.product, w.t)
+    """quad · a + load, into ``w.product``."""
+    matrix_mul(m, m.quad_dense, w.quad, w.t, w.acc, r, w.product, w.t)
     for i in range(m.nv):
         w.product[w.t, i] += w.load[w.t, i]
 
@@ -220,7 +246,7 @@ def _unconstrained_gradient(m: Tables, w: World, r: int):
 def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
     """Solve for ``w.acc[r]`` from the guess it holds; leave the factor of H at the solution in ``w.hess[r]``."""
     for n in range(nrow):
-        w.row_jar[w.t, n] = row_dot(w, n, w.acc, r) - w.row_aref[w.t, n]
+        w.row_jar[w.t, n] = row_dot(m, w, n, w.acc, r) - w.row_aref[w.t, n]
     for c in range(ncon):
         w.con_jar[w.t, c] = contact_dot(m, w, c, w.acc, r) - w.con_aref[w.t, c]
     _unconstrained_gradient(m, w, r)
@@ -234,7 +260,7 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
         same = int(1)
         curved = int(0)
         for n in range(nrow):
-            y = row_dot(w, n, w.step, w.t)
+            y = row_dot(m, w, n, w.step, w.t)
             w.row_dir[w.t, n] = y
             jar = w.row_jar[w.t, n]
             if row_state(w, n, jar) != row_state(w, n, jar + y):

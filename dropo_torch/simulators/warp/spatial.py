@@ -29,6 +29,12 @@ def theta_vec3(th: Reals, i: int) -> vec3:
 
 
 @wp.func
+def theta_vec4(th: Reals, i: int) -> vec4:
+    """Four consecutive numbers of θ."""
+    return vec4(th[i], th[i + 1], th[i + 2], th[i + 3])
+
+
+@wp.func
 def theta_vec5(th: Reals, i: int) -> vec5:
     """Five consecutive numbers of θ."""
     return vec5(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4])

@@ -32,8 +32,16 @@ from dropo_torch.simulators.warp.spatial import (
     theta_vec3,
     wrench,
 )
+from dropo_torch.simulators.warp.tendons import (
+    add_tendon_armature,
+    clear_tendon_bars,
+    make_tendons,
+    tendon_armature_adjoint,
+    tendons_adjoint,
+)
 from dropo_torch.simulators.warp.touch import find_contacts
 from dropo_torch.simulators.warp.types import MINVAL, ONE, Tables, World, vec3, vec6
+from dropo_torch.simulators.warp.welds import make_welds, welds_adjoint
 from dropo_torch.simulators.warp.wrenches import outer_wrench_adjoint
 
 
@@ -43,17 +51,21 @@ def accelerate(m: Tables, w: World, r: int):
     sweep_out(m, w, r)
     inertial_forces(m, w)
     sweep_in(m, w)
+    if m.nten != 0:
+        make_tendons(m, w, r)
+        add_tendon_armature(m, w)
     add_forces(m, w, r)
+    make_welds(m, w, r)
     nrow = make_rows(m, w, r, 1)
     ncon = find_contacts(m, w)
     w.held[r] = wp.min(nrow, 1) + 2 * wp.min(ncon, 1)
     if nrow + ncon == 0:
         for i in range(m.nh):
-            w.hess[r, i] = w.mass[w.t, i]
-        factor(m, 0, w.hess, r)
+            w.hess[r, i] = w.quad[w.t, i]
+        factor(m, m.quad_dense, w.hess, r)
         for i in range(m.nv):
             w.acc[r, i] = -w.load[w.t, i]
-        solve(m, 0, w.hess, r, w.acc, r)
+        solve(m, m.quad_dense, w.hess, r, w.acc, r)
     else:
         make_contacts(m, w, ncon)
         newton(m, w, nrow, ncon, fills_in(m, w, ncon), r)
@@ -70,6 +82,9 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     _late = wp.grad(late)(ONE)
     nrow = int(0)
     ncon = int(0)
+    if m.nten != 0:
+        make_tendons(m, w, r)
+        clear_tendon_bars(m, w)
     if softening != 0:
         for b in range(m.nb):
             w.velocity[w.t, b] = vec6()
@@ -82,8 +97,10 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         if kept > 1:
             ncon = find_contacts(m, w)
         solve(m, fills_in(m, w, ncon), w.hess, r, w.lam, w.t)
+    if m.nten != 0:
+        tendon_armature_adjoint(m, w)
     carry_out(m, w)
-    posed = ncon + m.has_gravcomp + m.has_fluid + w.wrenched
+    posed = ncon + m.nweld + m.has_gravcomp + m.has_fluid + w.wrenched
     bodies_adjoint(m, w, 1 - softening, posed)
     for i in range(m.nv):
         w.grad[w.t, m.o_armature + i] += w.lam[w.t, i] * w.qacc[w.t, i]
@@ -91,6 +108,9 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         forces_adjoint(m, w, r)
         rows_adjoint(m, w, r, nrow)
         contacts_adjoint(m, w, ncon)
+        welds_adjoint(m, w)
+        if m.nten != 0:
+            tendons_adjoint(m, w)
     carry_in(m, w, posed)
     if softening == 0:
         add_at(w.grad, w.t, m.o_gravity, -lin(w.f_accel[w.t, 0]))

@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
+from dropo_torch.simulators.warp.couplings import acting_tendons, is_spatial
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
 from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table
 from dropo_torch.simulators.warp.types import BALL
@@ -22,9 +23,13 @@ _INTEGRATORS = (
     int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4),
     int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
 )  # fmt: skip
+_TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
+_COUPLED = (int(mujoco.mjtEq.mjEQ_TENDON),)
+_WRAPS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER))
+_HELD = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
 #: Names that a refusal gives of those that lack the same.
@@ -59,7 +64,8 @@ def check_support(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tupl
 def missing(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> list[Missing]:
     """Return everything that the backend lacks for ``model`` and ``space``; see :func:`check_support`."""
     return [
-        *_options(model), *_structure(model), *_joints(model), *_actuators(model, space), *_equalities(model),
+        *_options(model), *_structure(model), *_joints(model), *_tendons(model, space), *_actuators(model, space),
+        *_equalities(model),
         *_contacts(model, pairs), *_parameters(model, space),
     ]  # fmt: skip
 
@@ -125,17 +131,10 @@ def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
     yield from (
         Missing("flex", repr(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i) or i)) for i in range(model.nflex)
     )
-    yield from (
-        Missing("mocap body", repr(object_names(model, "body")[b])) for b in np.flatnonzero(model.body_mocapid >= 0)
-    )
     if not (model.nu == model.nactuator == model.nout):
         yield Missing("actuators with several controls or outputs")
     flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
     yield from (Missing(f"geom {what}") for flag, what in flags.items() if getattr(model, flag, False))
-    for i in range(model.ntendon):
-        fields = ("limited", "stiffness", "damping", "frictionloss", "armature", "stiffnesspoly", "dampingpoly")
-        if any(np.any(getattr(model, f"tendon_{field}")[i]) for field in fields):
-            yield Missing("tendon with a force or a limit", repr(model.tendon(i).name or i))
     for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
         yield Missing("ellipsoid fluid model of geom", repr(object_names(model, "geom")[g]))
     acting = set(model.jnt_bodyid[model.jnt_actgravcomp.astype(bool)])  # bodies compensated through actuators
@@ -173,7 +172,9 @@ def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing
     names = object_names(model, "actuator")
     for i in range(model.nu):
         where = repr(names[i])
-        if model.actuator_trntype[i] not in _TRANSMISSIONS:
+        if model.actuator_trntype[i] == _TENDON:
+            pass
+        elif model.actuator_trntype[i] not in _TRANSMISSIONS:
             yield Missing(f"actuator transmission {mujoco.mjtTrn(model.actuator_trntype[i]).name[6:].lower()}", where)
         elif model.jnt_type[model.actuator_trnid[i, 0]] in (_FREE, _BALL):
             yield from (
@@ -209,11 +210,27 @@ def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str,
             yield "a force by the velocity under implicitfast"
 
 
+def _tendons(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing]:
+    varied = {t.field for p in space.parameters for t in p.targets}
+    acts, spatial = acting_tendons(model, varied), is_spatial(model)
+    for k in np.flatnonzero(acts):
+        where = repr(model.tendon(k).name or int(k))
+        path = slice(model.tendon_adr[k], model.tendon_adr[k] + model.tendon_num[k])
+        if np.isin(model.wrap_type[path], _WRAPS).any():
+            yield Missing("tendon that wraps around a geom", where)
+        if spatial[k] and (model.tendon_armature[k] or "tendon_armature" in varied):
+            yield Missing("armature of a spatial tendon", where)
+        if model.tendon_actfrclimited[k] and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
+            yield Missing("actuatorfrcrange of a tendon under implicitfast", where)
+
+
 def _equalities(model: mujoco.MjModel) -> Iterator[Missing]:
     for i in range(model.neq):
         if not model.eq_active0[i]:
             continue
         name = model.equality(i).name or i
+        if model.eq_type[i] in _HELD + _COUPLED:
+            continue
         if model.eq_type[i] != mujoco.mjtEq.mjEQ_JOINT:
             yield Missing(f"{mujoco.mjtEq(model.eq_type[i]).name[5:].lower()} equality", repr(name))
             continue
@@ -251,6 +268,10 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
     column = index % width
     if column >= _KEPT.get(field, width):
         return f"effects of {field}[{column}], only of " + ", ".join(f"{field}[{i}]" for i in range(_KEPT[field]))
+    if field == "eq_data":
+        return _dead_data(model, index // width, column)
+    if field == "actuator_gear" and model.actuator_trntype[index // width] == _TENDON and column:
+        return f"effects of {field}[{column}], only of {field}[0]"
     if field == "actuator_gear" and model.actuator_trntype[index // width] in _TRANSMISSIONS:
         dofs = int(joint_dofs(model)[model.actuator_trnid[index // width, 0]])
         if column >= dofs:
@@ -260,3 +281,17 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
         if ((kinds == BALL) & (starts <= index) & (index < starts + 4)).any():
             return "gradients of qpos_spring of a quaternion"
     return ""
+
+
+def _dead_data(model: mujoco.MjModel, equality: int, column: int) -> str:
+    """Why a number of an equality's data does not act, or an empty string."""
+    kind = mujoco.mjtEq(model.eq_type[equality])
+    of_sites = model.eq_objtype[equality] == int(mujoco.mjtObj.mjOBJ_SITE)
+    acting = {
+        mujoco.mjtEq.mjEQ_JOINT: range(5), mujoco.mjtEq.mjEQ_TENDON: range(5),
+        mujoco.mjtEq.mjEQ_CONNECT: range(0 if of_sites else 3),
+        mujoco.mjtEq.mjEQ_WELD: range(10 if of_sites else 0, 11),
+    }.get(kind, range(0))  # fmt: skip
+    if column in acting:
+        return ""
+    return f"effects of eq_data[{column}], only of " + (", ".join(f"eq_data[{i}]" for i in acting) or "none")

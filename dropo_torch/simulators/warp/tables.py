@@ -10,12 +10,24 @@ import warp as wp
 
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp import collide
+from dropo_torch.simulators.warp.couplings import (
+    acting_tendons,
+    active_equalities,
+    equality_bodies,
+    equality_sites,
+    has_any,
+    has_dofs,
+    is_spatial,
+    segments,
+    tendon_columns,
+    welds,
+)
 from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.meshes import mesh_tables
 from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_dofs
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
 
-_JNT, _GEOM, _DISABLE = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit
+_JNT, _GEOM, _DISABLE, _EQ = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit, mujoco.mjtEq
 _INTEGRATOR = {
     mujoco.mjtIntegrator.mjINT_EULER: EULER, mujoco.mjtIntegrator.mjINT_RK4: RK4,
     mujoco.mjtIntegrator.mjINT_IMPLICITFAST: IMPLICITFAST,
@@ -58,6 +70,9 @@ def build_tables(
     """Return the tables of a supported model on a device."""
     columns = _bodies(model) | _links(model) | _actuators(model) | _constraints(model, space) | _pairs(model, pairs)
     columns |= mesh_tables(model, pairs)
+    columns |= _welds(model) | _tendons(model, space)
+    columns["always_dense"] |= columns["quad_dense"] | columns.pop("tendons_dense")
+    columns["maxrow"] += columns["nteneq"] + 3 * columns["nten"]
     columns |= _switches(model, space) | {f"o_{name}": offset for name, (offset, _size) in sections.items()}
     return fill(Tables(), {k: _to_warp(x, device) if isinstance(x, np.ndarray) else x for k, x in columns.items()})
 
@@ -91,13 +106,14 @@ def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
             last[b] = model.body_dofadr[b] + model.body_dofnum[b] - 1
         if model.body_jntnum[b] and model.jnt_type[model.body_jntadr[b]] == _JNT.mjJNT_FREE:
             pos[b], quat[b] = 0.0, (1.0, 0.0, 0.0, 0.0)
-    moving = model.body_weldid != 0
+    moving = np.array([has_dofs(model, b) for b in range(model.nbody)])
     return {
         "nb": model.nbody, "nv": model.nv, "nq": model.nq, "nh": model.nv * (model.nv + 1) // 2,
         "body_parent": model.body_parentid, "body_ndof": model.body_dofnum,
         "body_dof": np.maximum(model.body_dofadr, 0),
         "body_lastdof": last, "body_massive": moving.astype(np.int32), "body_pos": pos, "body_mat": _matrices(quat),
-        "body_imat": _matrices(model.body_iquat), "dof_body": model.dof_bodyid,
+        "body_imat": _matrices(model.body_iquat), "dof_body": model.dof_bodyid, "dof_ndof": _link_dofs(model),
+        "dof_alone": model.M_rownnz == 1,
         "dof_parent": np.stack([model.dof_parentid, np.arange(model.nv) - 1]),
     }  # fmt: skip
 
@@ -110,6 +126,15 @@ def link_table(model: mujoco.MjModel) -> np.ndarray:
         for kind, offset in _LINKS[_JNT(model.jnt_type[j])]
     ]
     return np.array(rows, dtype=int).reshape(-1, 4).T
+
+
+def _link_dofs(model: mujoco.MjModel) -> np.ndarray:
+    """How many dofs the link of each dof has, ``(nv,)``."""
+    kinds, _joints, dofs, _qs = link_table(model)
+    counts = np.ones(model.nv, dtype=int)
+    for start in dofs[kinds > SLIDE]:
+        counts[start : start + 3] = 3
+    return counts
 
 
 def _links(model: mujoco.MjModel) -> dict[str, Any]:
@@ -131,7 +156,7 @@ def _links(model: mujoco.MjModel) -> dict[str, Any]:
 def _origin(model: mujoco.MjModel, links: dict[str, Any]) -> dict[str, Any]:
     """Where the origin of the sweep is: it travels with the translations of the first body that moves."""
     origin: list[tuple[int, np.ndarray]] = []
-    body = int(np.argmax(model.body_weldid != 0))  # 0 where none moves
+    body = int(np.argmax(model.body_dofnum != 0))  # 0 where none moves
     rooted = body and model.body_parentid[body] == 0
     base = model.body_pos[body].copy() if rooted else np.zeros(3)
     turned = _matrices(model.body_quat[body : body + 1])[0]
@@ -157,10 +182,15 @@ def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
 
 def _actuators(model: mujoco.MjModel) -> dict[str, Any]:
     acting = not _disabled(model, _DISABLE.mjDSBL_ACTUATION)
-    joints = model.actuator_trnid[:, 0]
+    by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
+    joints = np.where(by_tendon, 0, model.actuator_trnid[:, 0])
+    dofs, starts, qs = joint_dofs(model), model.jnt_dofadr, model.jnt_qposadr
+    if not model.njnt:
+        dofs, starts, qs = (np.zeros(1, dtype=int) for _ in range(3))
     return {
-        "nu": model.nu if acting else 0, "act_dof": model.jnt_dofadr[joints], "act_qpos": model.jnt_qposadr[joints],
-        "act_ndof": joint_dofs(model)[joints],
+        "nu": model.nu if acting else 0, "act_dof": starts[joints], "act_qpos": qs[joints],
+        "act_tendon": np.where(by_tendon, model.actuator_trnid[:, 0], -1),
+        "act_ndof": np.where(by_tendon, 0, dofs[joints]),
         "act_affine_gain": model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE,
         "act_affine_bias": model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
         "act_ctrllimited": model.actuator_ctrllimited * (not _disabled(model, _DISABLE.mjDSBL_CLAMPCTRL)),
@@ -183,6 +213,8 @@ def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]
     limited = model.jnt_limited.astype(bool) & (model.jnt_type != _JNT.mjJNT_FREE)  # of a free joint there is no limit
     limited = np.flatnonzero(limited & on(_DISABLE.mjDSBL_LIMIT))
     ids = np.flatnonzero(model.eq_active0.astype(bool) & on(_DISABLE.mjDSBL_EQUALITY))
+    limited = np.flatnonzero(model.jnt_limited.astype(bool) & on(_DISABLE.mjDSBL_LIMIT))
+    ids = active_equalities(model, _EQ.mjEQ_JOINT)
     joints = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
     first, second = model.jnt_bodyid[joints].T
     coupled = [
@@ -196,6 +228,80 @@ def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]
         "eq_dof": np.where(pairs >= 0, model.jnt_dofadr[pairs], -1), "eq_qpos": qs, "eq_ref": model.qpos0[qs],
         "always_dense": int(any(coupled)), "maxrow": len(ids) + len(friction) + 2 * len(limited),
     }  # fmt: skip
+
+
+def _welds(model: mujoco.MjModel) -> dict[str, Any]:
+    ids = welds(model)
+    bodies, (sites, pos, quat) = equality_bodies(model, ids), equality_sites(model, ids)
+    dense = np.array([joins_branches(model, int(a), int(b)) for a, b in bodies], dtype=int)
+    return {
+        "nweld": len(ids), "weld_id": ids, "weld_body": bodies.ravel(),
+        "weld_turns": model.eq_type[ids] == int(_EQ.mjEQ_WELD), "weld_sites": sites,
+        "weld_pos": pos.reshape(-1, 3), "weld_mat": _matrices(quat.reshape(-1, 4)),
+        "weld_dense": dense, "quad_dense": int(dense.any()),
+    }  # fmt: skip
+
+
+def _tendons(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
+    n, varied = model.ntendon, {t.field for p in space.parameters for t in p.targets}
+    acts = acting_tendons(model, varied)
+    spatial = is_spatial(model) & acts
+    columns = [tendon_columns(model, k) if acts[k] else np.zeros(0, dtype=int) for k in range(n)]
+    lines = [segments(model, k) if spatial[k] else [] for k in range(n)]
+    flat = [line for own in lines for line in own]
+    ends = np.array([site for a, b, _scale in flat for site in (a, b)], dtype=int)
+    return _tendon_arms(model, acts & ~spatial, columns) | _tendon_constraints(model, varied, columns) | {
+        "nten": n if acts.any() else 0, "ten_spatial": spatial, "ten_segment": np.cumsum([0, *map(len, lines)]),
+        "seg_body": model.site_bodyid[ends], "seg_pos": model.site_pos[ends].reshape(-1, 3),
+        "seg_scale": np.array([scale for _a, _b, scale in flat], dtype=float), "ten_ref": model.tendon_length0,
+        "ten_sprung": has_any(model, varied, "tendon_stiffness", "tendon_stiffnesspoly")
+        & (not _disabled(model, _DISABLE.mjDSBL_SPRING)),
+        "ten_damped": has_any(model, varied, "tendon_damping", "tendon_dampingpoly")
+        & (not _disabled(model, _DISABLE.mjDSBL_DAMPER)),
+        "ten_frclimited": model.tendon_actfrclimited,
+    }  # fmt: skip
+
+
+def _tendon_arms(model: mujoco.MjModel, fixed: np.ndarray, columns: list[np.ndarray]) -> dict[str, Any]:
+    """Where the moment arms of tendons stand, and those of fixed tendons."""
+    place = np.full((model.ntendon, model.nv), -1)
+    start = np.cumsum([0, *map(len, columns)])
+    for row, own in enumerate(columns):
+        place[row, own] = start[row] + np.arange(len(own))
+    dofs = np.concatenate([np.zeros(0, dtype=int), *columns])
+    coef, q = np.zeros(len(dofs)), np.zeros(len(dofs), dtype=int)
+    for k in np.flatnonzero(fixed).tolist():
+        for j in range(model.tendon_adr[k], model.tendon_adr[k] + model.tendon_num[k]):
+            joint = model.wrap_objid[j]
+            c = place[k, model.jnt_dofadr[joint]]
+            coef[c] += model.wrap_prm[j]
+            q[c] = model.jnt_qposadr[joint]
+    return {"ten_start": start, "ten_dof": dofs, "ten_qpos": q, "ten_coef": coef, "ten_column": place.ravel()}
+
+
+def _tendon_constraints(model: mujoco.MjModel, varied: set[str], columns: list[np.ndarray]) -> dict[str, Any]:
+    def on(bit: Any) -> bool:
+        return not _disabled(model, _DISABLE.mjDSBL_CONSTRAINT, bit)
+
+    limited = model.tendon_limited.astype(bool) & on(_DISABLE.mjDSBL_LIMIT)
+    frictional = has_any(model, varied, "tendon_frictionloss") & on(_DISABLE.mjDSBL_FRICTIONLOSS)
+    ids = active_equalities(model, _EQ.mjEQ_TENDON)
+    equal = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
+    sets = [columns[k] for k in np.flatnonzero(limited | frictional)]
+    sets += [np.concatenate([columns[k] for k in pair if k >= 0]) for pair in equal]
+    return {
+        "ten_frictional": frictional, "ten_limited": limited, "nteneq": len(ids), "teneq_id": ids,
+        "teneq_tendon": equal.ravel(), "tendons_dense": int(any(_branches(model, own) for own in sets)),
+    }  # fmt: skip
+
+
+def _branches(model: mujoco.MjModel, dofs: np.ndarray) -> bool:
+    """Whether some of these dofs are not on one chain to the root."""
+    chain, i = set(), int(max(dofs, default=-1))
+    while i >= 0:
+        chain.add(i)
+        i = int(model.dof_parentid[i])
+    return not set(dofs.tolist()) <= chain
 
 
 def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from typing import Any
 
+import mujoco
 import warp as wp
 
 from dropo_torch.simulators.warp.layout import SECTIONS
@@ -37,6 +38,7 @@ ONE = wp.constant(wp.float64(1.0))
 TWO = wp.constant(wp.float64(2.0))
 THREE = wp.constant(wp.float64(3.0))
 MINVAL = wp.constant(wp.float64(1.0e-15))  # mjMINVAL
+EQ_WIDTH = wp.constant(mujoco.mjNEQDATA)  # numbers of an equality in eq_data
 
 #: Kinds of link: a joint, or one of the two halves of a free joint.
 HINGE = wp.constant(0)
@@ -71,26 +73,33 @@ def fill(struct: Any, fields: dict[str, Any]) -> Any:
 
 #: Numbers of things, switches of what a model has, and what gradients are wanted of.
 _COUNTS = (
-    "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "norigin", "nh", "maxcon", "maxrow",
-    "integrator", "nstage", "elliptic", "refsafe", "implicit", "implicit_actuators",
-    "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense",
+    "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq", "norigin",
+    "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe", "implicit", "implicit_actuators",
+    "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
     "want_inertial", "want_inertia", "want_ipos", "want_soft",
 )  # fmt: skip
 #: Of bodies, links (the joints, a free joint as two), dofs, actuators, scalar constraints and pairs of geoms.
 _INDICES = (
     "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive",
     "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
-    "dof_body",
-    "act_dof", "act_ndof", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited", "act_frclimited",
+    "dof_body", "dof_ndof", "dof_alone",
+    "act_dof", "act_ndof", "act_tendon", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited",
+    "act_frclimited",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
+    "weld_id", "weld_body", "weld_turns", "weld_sites", "weld_dense",
+    "ten_spatial", "ten_start", "ten_dof", "ten_qpos", "ten_column", "ten_segment", "seg_body",
+    "ten_sprung", "ten_damped", "ten_frictional", "ten_limited", "ten_frclimited", "teneq_id", "teneq_tendon",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
     "pair_most", "pair_dofadr", "pair_dof", "pair_sign",
     "geom_body",
     "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
     "poly_adr", "poly_num", "poly_vert",
 )  # fmt: skip
-_VECTORS = ("body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert", "poly_normal")
-_ROTATIONS = ("body_mat", "body_imat", "geom_mat")
+_VECTORS = (
+    "body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert", "poly_normal", "weld_pos",
+    "seg_pos",
+)  # fmt: skip
+_ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat")
 
 #: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
 Tables: Any = _struct(
@@ -102,7 +111,7 @@ Tables: Any = _struct(
         **dict.fromkeys(_ROTATIONS, Mats),
         "dof_parent": Ints2,  # row 0 the parent in the tree, row 1 the previous dof (dense elimination)
         "origin_base": vec3,  # of the sweep; the origin travels along origin_axis with the root's translations
-        **dict.fromkeys(("link_ref", "eq_ref", "pair_bound", "pair_gap"), Reals),
+        **dict.fromkeys(("link_ref", "eq_ref", "pair_bound", "pair_gap", "ten_coef", "seg_scale", "ten_ref"), Reals),
         **dict.fromkeys(("h", "impratio"), wp.float64),
     },
 )
@@ -124,13 +133,20 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "inertia": (vec10, "body"), "composite": (vec10, "body"),  # I of each body, and of each subtree
     "force": (vec6, "body"),  # F: inertial force, then summed over the subtree
     "mass": (f64, "triangle"),  # M, packed lower triangle
-    "load": (f64, "dof"),  # c − τ
+    "quad": (f64, "triangle"),  # M and what always acts with a quadratic cost
+    "weld_jac": (vec6, "dof"),
+    "load": (f64, "dof"),  # c − τ, less Jᵀ D aref of what always acts
     "step": (f64, "dof"),  # Newton direction
-    "product": (f64, "dof"),  # M·a + c − τ
+    "product": (f64, "dof"),  # quad · a + load
     "work": (f64, "dof"),
+    "ten_length": (f64, "tendon"), "ten_rate": (f64, "tendon"),
+    # of all actuators Σ gear f, and Σ f, which has a range; in the adjoint their adjoints
+    "ten_force": (f64, "tendon"), "ten_sum": (f64, "tendon"),
+    "ten_jac": (f64, "arm"),  # moment arms
     # scalar constraint rows
     "row_kind": (wp.int32, "row"), "row_index": (wp.int32, "row"),
-    "row_dof": (vec3i, "row"), "row_coef": (vec3, "row"),  # dofs, −1 where unused, and J at them
+    "row_dof": (vec3i, "row"), "row_coef": (vec3, "row"),  # dofs, −1 where unused, and J at them; or tendons
+    "row_tendon": (wp.int32, "row"),  # whether J is a combination of tendons'
     "row_x": (f64, "row"),  # position less margin
     "row_aref": (f64, "row"), "row_d": (f64, "row"), "row_loss": (f64, "row"),  # D = 1/R
     "row_jar": (f64, "row"), "row_dir": (f64, "row"),  # J a − aref, J step
@@ -147,6 +163,7 @@ ADJOINT: dict[str, tuple[Any, str]] = {
     "f_velocity": (vec6, "body"), "f_accel": (vec6, "body"), "f_total": (vec6, "body"), "f_dual": (vec6, "body"),
     "f_pose": (vec6, "body"),
     "lam": (f64, "dof"), "qacc": (f64, "dof"), "qd": (f64, "dof"),
+    "ten_length_bar": (f64, "tendon"), "ten_jac_bar": (f64, "arm"),
     "tangent": (f64, "dof"),  # adjoint of a stage's position, in the tangent space; of its velocity and acceleration
     "vel_bar": (f64, "dof"), "acc_bar": (f64, "dof"),
     "stage_vel_bar": (f64, "dof"), "stage_acc_bar": (f64, "stage"), "stage_rate_bar": (f64, "stage"),  # of all stages

@@ -170,7 +170,10 @@ def _structure(model: mujoco.MjModel, tabled: Sequence[str]) -> bytes:
 
 
 #: Fields of θ of which each number's sign matters, and such of which it does whether any is not zero.
-_SIGNS = ("dof_frictionloss", "body_gravcomp", "actuator_gainprm", "actuator_biasprm")
+_SIGNS = (
+    "dof_frictionloss", "body_gravcomp", "actuator_gainprm", "actuator_biasprm", "tendon_stiffness",
+    "tendon_stiffnesspoly", "tendon_damping", "tendon_dampingpoly", "tendon_armature", "tendon_frictionloss",
+)  # fmt: skip
 _ANY = ("dof_damping", "dof_dampingpoly", "jnt_stiffness", "jnt_stiffnesspoly", "opt.density", "opt.viscosity")
 #: What fields begin with that show things, name them, or measure.
 _IDLE = (
