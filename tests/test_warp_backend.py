@@ -206,7 +206,7 @@ def test_derived_weights_are_those_of_set_const(xml):
 
 
 REFUSED = """<mujoco><option solver="CG" integrator="implicit" noslip_iterations="3">
-<flag multiccd="enable"/></option><default><geom mass="1"/></default><worldbody>
+<flag nativeccd="disable"/></option><default><geom mass="1"/></default><worldbody>
 <body><joint name="j"/><geom name="cyl" type="cylinder" size=".1 .2"/>
 <body><joint name="k" type="ball"/><geom name="ell" type="ellipsoid" size=".1 .1 .1" pos="1 0 0"/></body></body>
 <body name="w" pos="3 0 0"><freejoint name="free"/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody>

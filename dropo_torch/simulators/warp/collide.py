@@ -32,6 +32,7 @@ ROUND = wp.constant(6)  # spheres and capsules among themselves
 CAPSULE_BOX = wp.constant(7)  # a sphere too
 SPHERE_CYLINDER = wp.constant(8)
 BOX_BOX = wp.constant(9)  # see boxes.py
+CONVEX = wp.constant(10)  # all that MuJoCo leaves to its general convex collision, see convex_touch.py
 #: Where a sphere touches a cylinder: its side, a cap, the rim of a cap; odd the upper, then the lower.
 SIDE = wp.constant(0)
 CAP = wp.constant(1)

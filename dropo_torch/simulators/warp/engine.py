@@ -24,7 +24,7 @@ from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
 from dropo_torch.simulators.warp.start import LOADING, start_warp
 from dropo_torch.simulators.warp.support import check_support
-from dropo_torch.simulators.warp.tables import build_tables
+from dropo_torch.simulators.warp.tables import build_tables, convex_sizes
 from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJECTORY, Chunk, World, fill
 
 #: Stages kept from the forward for the backward, at most; beyond it the backward simulates again, chunk by chunk.
@@ -132,6 +132,7 @@ class Engine:
             "tendon": m.nten, "arm": len(m.ten_dof) if m.nten else 0,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
         }  # fmt: skip
+        self._sizes |= convex_sizes(model, pairs, m.maxcon)
         self._may_overflow = int(m.pair_most.numpy().sum()) > m.maxcon
         self._worlds: dict[tuple[int, bool], World] = {}
         self._free: list[dict[str, Any]] = []

@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
+from dropo_torch.simulators.warp.collide import CONVEX
 from dropo_torch.simulators.warp.couplings import acting_tendons, is_spatial
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
 from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table
@@ -241,11 +242,13 @@ def _equalities(model: mujoco.MjModel) -> Iterator[Missing]:
 
 def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Iterator[Missing]:
     names = object_names(model, "geom")
+    native = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
     for g1, g2, _pair in pairs:
         kinds = tuple(mujoco.mjtGeom(model.geom_type[g]) for g in (g1, g2))
-        if kinds not in KINDS:
+        if kinds not in KINDS or (KINDS[kinds][0] == CONVEX and not native):
             a, b = (kind.name[7:].lower() for kind in kinds)
-            yield Missing(f"contacts of {a} with {b}", f"{names[g1]!r} with {names[g2]!r}")
+            why = "" if kinds not in KINDS else " without the flag nativeccd"
+            yield Missing(f"contacts of {a} with {b}{why}", f"{names[g1]!r} with {names[g2]!r}")
 
 
 def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing]:

@@ -58,6 +58,24 @@ KINDS = {
     (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_CYLINDER): (collide.SPHERE_CYLINDER, 1, 1),
     (_GEOM.mjGEOM_BOX, _GEOM.mjGEOM_BOX): (collide.BOX_BOX, 0, 8),
 }  # fmt: skip
+#: Pairs of MuJoCo's general convex collision: a shape, and the shapes of larger types that it meets there.
+_CONVEX = {
+    _GEOM.mjGEOM_SPHERE: (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_MESH),
+    _GEOM.mjGEOM_CAPSULE: (_GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_MESH),
+    _GEOM.mjGEOM_ELLIPSOID: (
+        _GEOM.mjGEOM_ELLIPSOID, _GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH,
+    ),
+    _GEOM.mjGEOM_CYLINDER: (_GEOM.mjGEOM_CYLINDER, _GEOM.mjGEOM_BOX, _GEOM.mjGEOM_MESH),
+    _GEOM.mjGEOM_BOX: (_GEOM.mjGEOM_MESH,),
+    _GEOM.mjGEOM_MESH: (_GEOM.mjGEOM_MESH,),
+}  # fmt: skip
+#: Shapes that touch at one point only.
+_SMOOTH = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID)
+KINDS |= {
+    (one, two): (collide.CONVEX, 0, 1 if one in _SMOOTH or two in _SMOOTH else 4)
+    for one, others in _CONVEX.items()
+    for two in others
+}
 
 
 def build_tables(
@@ -308,6 +326,8 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str
     table = np.array(pairs, dtype=int).reshape(-1, 3)
     kinds = [KINDS[_GEOM(model.geom_type[g1]), _GEOM(model.geom_type[g2])] for g1, g2, _pair in pairs]
     kind, points, most = (np.array([int(k[i]) for k in kinds], dtype=int) for i in range(3))
+    if _disabled(model, _DISABLE.mjDSBL_MULTICCD):
+        most[kind == collide.CONVEX] = 1
     bodies = model.geom_bodyid[table[:, :2]]
     size = model.geom_size.copy()
     size[model.geom_type == _GEOM.mjGEOM_SPHERE, 1:] = 0.0
@@ -326,8 +346,29 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str
         "pair_dim": np.array([condim(model, *p) for p in pairs], dtype=int),
         "pair_dense": np.array([joins_branches(model, int(a), int(b)) for a, b in bodies], dtype=int),
         "geom_body": model.geom_bodyid, "geom_pos": model.geom_pos, "geom_mat": _matrices(model.geom_quat),
-        "geom_size": size,
+        "geom_size": size, "geom_kind": model.geom_type,
+        "ccd_iterations": model.opt.ccd_iterations, "ccd_tolerance": model.opt.ccd_tolerance,
+        "nclip_normal": max(3, model.nmeshdegmax),
     }  # fmt: skip
+
+
+def convex_sizes(model: mujoco.MjModel, pairs: list[tuple[int, int, int]], maxcon: int) -> dict[str, int]:
+    """Return the sizes of the memory that contacts of convex geoms take: none if there are no such pairs."""
+    kinds = [tuple(_GEOM(model.geom_type[g]) for g in pair[:2]) for pair in pairs]
+    convex = [pair for pair, kind in zip(pairs, kinds, strict=True) if KINDS[kind][0] == collide.CONVEX]
+    names = ("convex", "convex2", "convex3", "convex_few", "epa_vertex", "epa_face", "clip_normals", "clip_corners",
+             "clip_polygon")  # fmt: skip
+    if not convex:
+        return dict.fromkeys(names, 0)
+    meshes = {int(model.geom_dataid[g]) for pair in convex for g in pair[:2] if model.geom_type[g] == _GEOM.mjGEOM_MESH}
+    corners = [16]  # of the polygon that stands for a disk
+    for mesh in meshes:
+        first = model.mesh_polyadr[mesh]
+        corners.extend(model.mesh_polyvertnum[first : first + model.mesh_polynum[mesh]])
+    steps, most = max(int(model.opt.ccd_iterations), 1), int(max(corners))
+    sizes = (maxcon, 2 * maxcon, 3 * maxcon, 8, 5 + steps, max(6 * steps, 8) + 8, max(3, model.nmeshdegmax), most,
+             8 * most)  # fmt: skip
+    return dict(zip(names, sizes, strict=True))
 
 
 def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:

@@ -13,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp import boxes, collide, hull
+from dropo_torch.simulators.warp.convex_touch import convex_adjoint, convex_contacts, keep_contact
 from dropo_torch.simulators.warp.spatial import pull, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
 
@@ -119,6 +120,23 @@ def _add_corners(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2
 
 
 @wp.func(inline=True)
+def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
+    """Write the contacts of a pair of convex geoms from number ``n`` on and return the number of the next one."""
+    reach = margin + m.pair_gap[k]
+    number = n
+    for i in range(convex_contacts(m, w, k, reach)):
+        dist = w.clip_dist[w.t, i] + reach
+        if dist < margin:
+            p = w.clip_mid[w.t, i]
+            normal = w.clip_normal[w.t, 0]
+            x = collide.vec7(dist, p[0], p[1], p[2], normal[0], normal[1], normal[2])
+            _add(w, number, k, 0, x, vec3())
+            keep_contact(w, number, i)
+            number += 1
+    return number
+
+
+@wp.func(inline=True)
 def find_contacts(m: Tables, w: World) -> int:
     """List the contacts of a configuration and return their number."""
     n = int(0)
@@ -141,6 +159,8 @@ def find_contacts(m: Tables, w: World) -> int:
             n = _add_boxes(m, w, n, k, c1, geom_rotation(m, w, g1), c2, geom_rotation(m, w, g2), margin)
         elif near and kind == collide.PLANE_MESH:
             n = _add_corners(m, w, n, k, normal, c1, c2, geom_rotation(m, w, g2), margin)
+        elif near and kind == collide.CONVEX:
+            n = _add_convex(m, w, n, k, margin)
         elif near:
             size1 = m.geom_size[g1]
             size2 = m.geom_size[g2]
@@ -252,7 +272,9 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
         rot = geom_rotation(m, w, g2)
     y1 = vec6()
     y2 = vec6()
-    if kind <= collide.PLANE_ELLIPSOID:
+    if kind == collide.CONVEX:
+        y1, y2 = convex_adjoint(m, w, c, distbar, pbar, nbar)
+    elif kind <= collide.PLANE_ELLIPSOID:
         # dist = n·(x − c1) − r, p = x − n (r + dist/2), x a point of the second geom
         radius = wp.where(kind <= collide.PLANE_CAPSULE, size[0], ZERO)
         x = c2

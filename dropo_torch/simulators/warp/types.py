@@ -77,6 +77,7 @@ _COUNTS = (
     "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe", "implicit", "implicit_actuators",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
     "want_inertial", "want_inertia", "want_ipos", "want_soft",
+    "ccd_iterations", "nclip_normal",
 )  # fmt: skip
 #: Of bodies, links (the joints, a free joint as two), dofs, actuators, scalar constraints and pairs of geoms.
 _INDICES = (
@@ -91,7 +92,7 @@ _INDICES = (
     "ten_sprung", "ten_damped", "ten_frictional", "ten_limited", "ten_frclimited", "teneq_id", "teneq_tendon",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
     "pair_most", "pair_dofadr", "pair_dof", "pair_sign",
-    "geom_body",
+    "geom_body", "geom_kind",
     "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
     "poly_adr", "poly_num", "poly_vert",
 )  # fmt: skip
@@ -112,7 +113,7 @@ Tables: Any = _struct(
         "dof_parent": Ints2,  # row 0 the parent in the tree, row 1 the previous dof (dense elimination)
         "origin_base": vec3,  # of the sweep; the origin travels along origin_axis with the root's translations
         **dict.fromkeys(("link_ref", "eq_ref", "pair_bound", "pair_gap", "ten_coef", "seg_scale", "ten_ref"), Reals),
-        **dict.fromkeys(("h", "impratio"), wp.float64),
+        **dict.fromkeys(("h", "impratio", "ccd_tolerance"), wp.float64),
     },
 )
 
@@ -156,6 +157,27 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "con_d": (f64, "contact"),  # D of the normal (elliptic) or of every edge (pyramidal)
     "con_aref": (vec6, "contact"), "con_jar": (vec6, "contact"), "con_dir": (vec6, "contact"),
     "con_jac": (vec6, "jacobian"),  # columns of J, (contact, dof of the pair)
+    # of contacts of convex geoms: what their adjoints hang on, see clip.py and convex_touch.py
+    "con_how": (wp.int32, "convex"), "con_height": (f64, "convex"), "con_planes": (mat33, "convex"),
+    "con_corner": (vec3, "convex"), "con_facing": (vec3, "convex"),
+    "con_single": (vec3, "convex3"), "con_curve": (vec6, "convex2"),
+    # the polytope of EPA
+    "epa_state": (wp.int32, "convex_few"), "epa_centre": (vec3, "convex_few"),
+    "epa_point": (vec3, "epa_vertex"), "epa_one": (vec3, "epa_vertex"), "epa_two": (vec3, "epa_vertex"),
+    "epa_vertex1": (wp.int32, "epa_vertex"), "epa_vertex2": (wp.int32, "epa_vertex"),
+    "epa_corners": (vec3i, "epa_face"), "epa_beside": (vec3i, "epa_face"), "epa_near": (vec3, "epa_face"),
+    "epa_dist": (f64, "epa_face"), "epa_place": (wp.int32, "epa_face"), "epa_list": (wp.int32, "epa_face"),
+    "epa_walk": (vec3i, "epa_face"), "epa_edge": (vec3i, "epa_face"),
+    # a pair's contacts, and the polygons whose corners they are
+    "clip_dist": (f64, "convex_few"), "clip_height": (f64, "convex_few"), "clip_mid": (vec3, "convex_few"),
+    "clip_corner": (vec3, "convex_few"), "clip_planes": (mat33, "convex_few"), "clip_how": (wp.int32, "convex_few"),
+    "clip_normal": (vec3, "convex_few"), "clip_single": (vec3, "convex_few"), "clip_curve": (vec6, "convex_few"),
+    "clip_normal1": (vec3, "clip_normals"), "clip_normal2": (vec3, "clip_normals"),
+    "clip_end": (vec3, "clip_normals"),
+    "clip_index1": (wp.int32, "clip_normals"), "clip_index2": (wp.int32, "clip_normals"),
+    "clip_face1": (vec3, "clip_corners"), "clip_face2": (vec3, "clip_corners"),
+    "clip_point": (vec3, "clip_polygon"), "clip_line": (wp.int32, "clip_polygon"),
+    "clip_before": (wp.int32, "clip_polygon"),
 }  # fmt: skip
 #: Working memory of the adjoint.
 ADJOINT: dict[str, tuple[Any, str]] = {
