@@ -9,7 +9,11 @@ import torch
 from test_warp_conformance import Case, check, p
 
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.simulators.hidden import prescribed_bodies
+from dropo_torch.simulators.mujoco import MujocoSimulator
+from dropo_torch.simulators.warp import WarpSimulator
 from dropo_torch.simulators.warp.fields import Fields
+from dropo_torch.testing import Tolerance, check_simulator, converged, mujoco_reference
 
 #: An arm with two branches beside a body on a rail, a mocap body that moves nothing by itself, and sites on them all.
 RIG = """<mujoco><option integrator="{integrator}" timestep="0.004"/>
@@ -82,7 +86,6 @@ SITES = f'<equality><weld name="e" site1="sb" site2="sd" torquescale=".5" {SOFT}
 CONNECT = f'<equality><connect name="e" body1="c" body2="d" anchor=".1 .02 .03" {SOFT}/></equality>'
 
 CASES = [
-    Case("weld to a mocap body", rig(TO_HAND), INERTIAL | WELD),
     Case("weld across branches", rig(OF_BRANCHES, "implicitfast", "ball"), INERTIAL | WELD),
     Case("weld of sites", rig(SITES, "RK4"), INERTIAL | {"scale": p("eq_data", "e", 10)}),
     Case("connect", rig(CONNECT, second="ball"), INERTIAL | {"anchor": p("eq_data", "e", 2)}),
@@ -148,3 +151,29 @@ def test_derived_weights_of_tendons_and_welds_are_mujocos() -> None:
     welded = model.body_invweight0[[model.body("c").id, model.body("d").id]].sum(0)
     np.testing.assert_allclose(theta[fields.columns("ten_invweight")], model.tendon_invweight0, rtol=1e-9)
     np.testing.assert_allclose(theta[fields.columns("weld_invweight")], welded, rtol=1e-9)
+
+
+@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
+def test_poses_of_mocap_bodies_are_inputs_of_a_step(integrator: str) -> None:
+    """As with C MuJoCo, with gradients in them: an arm that is welded to one, and a ball that another one touches."""
+    ball = '<body name="ball" pos="1 0 .1"><freejoint/><geom size=".1" contype="1"/></body>'
+    paddle = (
+        '<body name="paddle" mocap="true" pos="1 0 -.09"><geom type="capsule" size=".1 .2" conaffinity="1"/></body>'
+    )
+    xml = rig(TO_HAND, integrator, "ball").replace("</worldbody>", f"{paddle}{ball}</worldbody>")
+    model = mujoco.MjModel.from_xml_string(xml)
+    space, rng, count = ParameterSpace(model, INERTIAL | WELD), np.random.default_rng(0), 6
+    states = np.tile(np.concatenate([model.qpos0, np.zeros(model.nv)]), (count, 1))
+    states[:, model.nq :] = rng.normal(0, 0.3, (count, model.nv))
+    poses = [np.concatenate([model.body_pos[b], model.body_quat[b]]) for b in prescribed_bodies(model)]
+    controls = np.concatenate([np.zeros(model.nu), *poses]) + rng.normal(0, 0.02, (count, 2, model.nu + 14))
+    simulator, other = (
+        kind(model, parameters=space, frame_skip=2, num_threads=1) for kind in (WarpSimulator, MujocoSimulator)
+    )
+    report = check_simulator(
+        simulator, torch.from_numpy(states), torch.from_numpy(controls), torch.from_numpy(space.nominal[None]),
+        reference=mujoco_reference(converged(space), 2),
+        tolerance=Tolerance(states=1e-9, worst=1e-6, gradient=1e-5, most=1e-3),
+    )  # fmt: skip
+    assert "gradients are those of central differences" in report.checked
+    assert simulator.num_controls == other.num_controls == model.nu + 14

@@ -14,7 +14,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
-from dropo_torch.simulators.hidden import control_range, filters_of
+from dropo_torch.simulators.hidden import POSE, control_range, filters_of, prescribed_bodies
 from dropo_torch.testing.laws import Broken, NotApplicable, Report, require, require_same, try_laws
 
 #: ``reference(states (T, n), controls (T, lag, nu), values (K, d)) -> (T, K, lag, n)``
@@ -113,15 +113,21 @@ def converged(space: ParameterSpace) -> ParameterSpace:
 
 
 def stepped(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, frame_skip: int) -> np.ndarray:
-    """Return C MuJoCo's states ``(lag, nq + nv)`` after each control ``(lag, nu)``; filters start settled."""
+    """Return C MuJoCo's states ``(lag, nq + nv)`` after each control; filters start settled.
+
+    Controls are ``(lag, nu)``, with poses of mocap bodies behind them, see :class:`MujocoSimulator`.
+    """
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
-    first = np.clip(controls[0], *control_range(model))
+    first = np.clip(controls[0, : model.nu], *control_range(model))
     filters = filters_of(model)
     data.act[filters.activations] = first[filters.controls]
     states = []
     for control in controls:
-        data.ctrl[:] = control
+        data.ctrl[:] = control[: model.nu]
+        poses = control[model.nu :].reshape(-1, POSE)
+        mocap = model.body_mocapid[prescribed_bodies(model)[: len(poses)]]
+        data.mocap_pos[mocap], data.mocap_quat[mocap] = poses[:, :3], poses[:, 3:]
         for _ in range(frame_skip):
             mujoco.mj_step(model, data)
         states.append(np.concatenate([data.qpos, data.qvel]))

@@ -48,6 +48,10 @@ def sweep_out(m: Tables, w: World, r: int):
         rp = w.xmat[w.t, p]
         pos = w.xpos[w.t, p] + rp * m.body_pos[b]
         rot = rp * m.body_mat[b]
+        i = m.body_pose[b]
+        if i >= 0:
+            pos = vec3_at(w.ctrl, w.rc, i) - o
+            rot = quat_matrix(vec4_at(w.ctrl, w.rc, i + 3))
         v = w.velocity[w.t, p]
         a = w.bias[w.t, p]
         first = m.body_link[b]

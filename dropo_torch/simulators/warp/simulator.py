@@ -13,6 +13,7 @@ import warp as wp
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.simulators.hidden import POSE, prescribed_bodies
 from dropo_torch.simulators.warp.engine import Batch, Engine, Simulate
 from dropo_torch.simulators.warp.support import remarks
 
@@ -57,7 +58,8 @@ class WarpSimulator(Simulator):
         model = copy.copy(model)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         self.parameters, self.frame_skip = parameters, frame_skip
-        self.num_states, self.num_controls = model.nq + model.nv, model.nu
+        self.num_states = model.nq + model.nv
+        self.num_controls = model.nu + POSE * len(prescribed_bodies(model))
         self.timestep = model.opt.timestep * frame_skip
         self._engine = Engine(
             model, parameters, skip=frame_skip, chunk_size=chunk_size, num_threads=threads, device=device

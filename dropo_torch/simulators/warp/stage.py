@@ -17,6 +17,7 @@ from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
 from dropo_torch.simulators.warp.forces import add_forces, forces_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
+from dropo_torch.simulators.warp.rotations import quat_mul
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.solver import factor, newton, solve
 from dropo_torch.simulators.warp.spatial import (
@@ -30,6 +31,7 @@ from dropo_torch.simulators.warp.spatial import (
     late,
     lin,
     theta_vec3,
+    vec4_at,
     wrench,
 )
 from dropo_torch.simulators.warp.tendons import (
@@ -40,7 +42,7 @@ from dropo_torch.simulators.warp.tendons import (
     tendons_adjoint,
 )
 from dropo_torch.simulators.warp.touch import find_contacts
-from dropo_torch.simulators.warp.types import MINVAL, ONE, Tables, World, vec3, vec6
+from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, vec3, vec4, vec6
 from dropo_torch.simulators.warp.welds import make_welds, welds_adjoint
 from dropo_torch.simulators.warp.wrenches import outer_wrench_adjoint
 
@@ -224,6 +226,19 @@ def _fluid_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
 
 
 @wp.func(inline=True)
+def pose_adjoint(m: Tables, w: World, b: int, y: vec6):
+    """Adjoint of a prescribed pose among the inputs: ``y`` is that of displacing the body, which stands still."""
+    i = m.body_pose[b]
+    q = vec4_at(w.ctrl, w.rc, i + 3)
+    n = wp.length(q)
+    add_at(w.ctrl_bar, w.rb, i, lin(y))
+    if n > MINVAL:
+        torque = ang(y) - wp.cross(w.xpos[w.t, b], lin(y))
+        turned = quat_mul(vec4(ZERO, torque[0], torque[1], torque[2]), q)
+        add_at(w.ctrl_bar, w.rb, i + 3, turned * (TWO / (n * n)))
+
+
+@wp.func(inline=True)
 def carry_in(m: Tables, w: World, posed: int):
     """Adjoints of positions and velocities, from the leaves to the root.
 
@@ -273,6 +288,8 @@ def carry_in(m: Tables, w: World, posed: int):
             for i in range(d, d + m.link_ndof[k]):
                 w.vel_bar[w.t, i] += wp.dot(w.motion[w.t, i], g)
                 w.tangent[w.t, i] += wp.dot(w.motion[w.t, i], y)
+        if m.body_pose[b] >= 0:
+            pose_adjoint(m, w, b, fy - cross_force(a, fa))
         w.f_velocity[w.t, p] = w.f_velocity[w.t, p] + fv
         w.f_accel[w.t, p] = w.f_accel[w.t, p] + fa
         if posed != 0:

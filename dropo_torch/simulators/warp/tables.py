@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from dropo_torch.parameters import ParameterSpace, read_field
+from dropo_torch.simulators.hidden import POSE, prescribed_bodies
 from dropo_torch.simulators.warp import collide
 from dropo_torch.simulators.warp.couplings import (
     acting_tendons,
@@ -116,6 +117,9 @@ def _matrices(quats: np.ndarray) -> np.ndarray:
 
 
 def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
+    poses = np.full(model.nbody, -1)  # where in the inputs of a step the pose of a mocap body begins
+    prescribed = prescribed_bodies(model)
+    poses[prescribed] = model.nu + POSE * np.arange(len(prescribed))
     pos, quat = model.body_pos.copy(), model.body_quat.copy()
     last = np.full(model.nbody, -1)
     for b in range(1, model.nbody):
@@ -129,7 +133,8 @@ def _bodies(model: mujoco.MjModel) -> dict[str, Any]:
         "nb": model.nbody, "nv": model.nv, "nq": model.nq, "nh": model.nv * (model.nv + 1) // 2,
         "body_parent": model.body_parentid, "body_ndof": model.body_dofnum,
         "body_dof": np.maximum(model.body_dofadr, 0),
-        "body_lastdof": last, "body_massive": moving.astype(np.int32), "body_pos": pos, "body_mat": _matrices(quat),
+        "body_lastdof": last, "body_massive": moving.astype(np.int32), "body_pose": poses,
+        "body_pos": pos, "body_mat": _matrices(quat),
         "body_imat": _matrices(model.body_iquat), "dof_body": model.dof_bodyid, "dof_ndof": _link_dofs(model),
         "dof_alone": model.M_rownnz == 1,
         "dof_parent": np.stack([model.dof_parentid, np.arange(model.nv) - 1]),

@@ -81,7 +81,7 @@ _COUNTS = (
 )  # fmt: skip
 #: Of bodies, links (the joints, a free joint as two), dofs, actuators, scalar constraints and pairs of geoms.
 _INDICES = (
-    "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive",
+    "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive", "body_pose",
     "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
     "dof_body", "dof_ndof", "dof_alone",
     "act_dof", "act_ndof", "act_tendon", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited",
