@@ -205,7 +205,7 @@ def test_derived_weights_are_those_of_set_const(xml):
         np.testing.assert_allclose(row[fields.columns("pair_invweight")], weights, rtol=1e-11)
 
 
-REFUSED = """<mujoco><option solver="CG" integrator="implicit" noslip_iterations="3">
+REFUSED = """<mujoco><option solver="CG" integrator="discrete" noslip_iterations="3">
 <flag nativeccd="disable"/></option><default><geom mass="1"/></default><worldbody>
 <body><joint name="j"/><geom name="cyl" type="cylinder" size=".1 .2"/>
 <body><joint name="k" type="ball"/><geom name="ell" type="ellipsoid" size=".1 .1 .1" pos="1 0 0"/></body></body>
@@ -230,7 +230,7 @@ def test_one_error_names_everything_that_is_refused():
     message = str(caught.value)
     assert "\n" not in message
     for part in (
-        "integrator=implicit", "noslip", "'string'", "'glue'", "weld", "'ball_motor'", "'filtered'",
+        "integrator=discrete", "noslip", "'string'", "'glue'", "weld", "'ball_motor'", "'filtered'",
         "'on_string'", "tendon", "'cyl'", "'ell'", "ellipsoid", "cylinder", "'size'", "geom_size", "'gear1'", "gear[0]",
     ):  # fmt: skip
         assert part in message, f"{part} in {message}"

@@ -4,9 +4,9 @@
 
 Where things stand: ``support`` decides what is simulated, ``layout`` says what θ consists of, ``tables`` and
 ``fields`` turn a model and parameter vectors into arrays, ``types`` lists what the tables of a model and the memory
-of a world hold, ``kinematics``, ``forces``, ``fluid``, ``tendons``, ``rows``, ``welds``, ``collide``, ``boxes``,
-``hull``, ``touch``, ``contact``, ``cone``, ``soft`` and ``solver`` are the physics with their adjoints, ``stage`` and
-``integrate`` put them together, ``engine`` runs the kernels.
+of a world hold, ``kinematics``, ``forces``, ``fluid``, ``ellipsoid``, ``slopes``, ``tendons``, ``rows``, ``welds``,
+``collide``, ``boxes``, ``hull``, ``convex``, ``touch``, ``contact``, ``cone``, ``soft`` and ``solver`` are the physics
+with their adjoints, ``stage`` and ``integrate`` put them together, ``engine`` runs the kernels.
 """
 
 from __future__ import annotations

@@ -131,6 +131,7 @@ class Engine:
             "qpos": m.nq, "dof": m.nv, "triangle": m.nh, "body": m.nb, "row": m.maxrow, "contact": m.maxcon,
             "tendon": m.nten, "arm": len(m.ten_dof) if m.nten else 0,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
+            "soft": m.nv * m.nv if m.full else m.nh, "full_body": m.nb * m.full, "full_dof": m.nv * m.full,
         }  # fmt: skip
         self._sizes |= convex_sizes(model, pairs, m.maxcon)
         self._may_overflow = int(m.pair_most.numpy().sum()) > m.maxcon

@@ -90,3 +90,36 @@ def fluid_wrench(m: Tables, w: World, b: int) -> vec6:
     f = rot * box_force(back * (at(vel, c) - wind), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
     n = rot * box_torque(back * ang(vel), x, mass, w.th[m.o_density], w.th[m.o_viscosity])
     return pull(f, c, n)
+
+
+@wp.func
+def box_slopes(w: vec3, v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64):
+    """Minus the slopes of :func:`box_torque` and :func:`box_force`, each component in its own velocity."""
+    b0, b1, b2 = _edges(x, mass)
+    d = (b0 + b1 + b2) / THREE
+    kw = PI * d * d * d * viscosity
+    kv = THREE * PI * d * viscosity
+    p0 = b0 * b0 * b0 * b0
+    p1 = b1 * b1 * b1 * b1
+    p2 = b2 * b2 * b2 * b2
+    q = density / f64(32.0)
+    turn = vec3(
+        kw + q * b0 * (p1 + p2) * wp.abs(w[0]),
+        kw + q * b1 * (p0 + p2) * wp.abs(w[1]),
+        kw + q * b2 * (p0 + p1) * wp.abs(w[2]),
+    )
+    move = vec3(
+        kv + density * b1 * b2 * wp.abs(v[0]),
+        kv + density * b0 * b2 * wp.abs(v[1]),
+        kv + density * b0 * b1 * wp.abs(v[2]),
+    )
+    return turn, move
+
+
+@wp.func
+def box_slope_power(
+    w: vec3, v: vec3, lw: vec3, lv: vec3, uw: vec3, uv: vec3, x: vec3, mass: f64, density: f64, viscosity: f64
+) -> f64:
+    """−λᵀ (slope of drag along u), all in the inertial frame."""
+    turn, move = box_slopes(w, v, x, mass, density, viscosity)
+    return wp.dot(wp.cw_mul(turn, uw), lw) + wp.dot(wp.cw_mul(move, uv), lv)

@@ -18,6 +18,7 @@ from dropo_torch.simulators.warp.rotations import (
     right_jacobian_t,
     turn,
 )
+from dropo_torch.simulators.warp.slopes import factor_full, fill_slopes, solve_full
 from dropo_torch.simulators.warp.solver import factor, matrix_mul, solve
 from dropo_torch.simulators.warp.spatial import add_at, late, vec3_at, vec4_at
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
@@ -141,16 +142,23 @@ def tendon_slope(m: Tables, w: World, r: int, k: int) -> f64:
 def soften(m: Tables, w: World, r: int):
     """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``w.soft_hess[r]``."""
     matrix_mul(m, 0, w.mass, w.t, w.acc, r, w.soft, r)
-    for i in range(m.nh):
-        w.soft_hess[r, i] = w.mass[w.t, i]
-    for i in range(m.nv):
-        w.soft_hess[r, packed(i, i)] += m.h * implicit_slope(m, w, r, i)
-    for k in range(m.nten * m.implicit_actuators):
-        y = m.h * tendon_slope(m, w, r, k)
-        if y != ZERO:
-            add_outer(m, w, k, y, w.soft_hess, r)
-    factor(m, 0, w.soft_hess, r)
-    solve(m, 0, w.soft_hess, r, w.soft, r)
+    if m.full != 0:
+        fill_slopes(m, w, r)
+        for i in range(m.nv):
+            w.soft_hess[r, i * m.nv + i] += m.h * implicit_slope(m, w, r, i)
+        factor_full(m, w.soft_hess, r)
+        solve_full(m, w.soft_hess, r, w.soft, r)
+    else:
+        for i in range(m.nh):
+            w.soft_hess[r, i] = w.mass[w.t, i]
+        for i in range(m.nv):
+            w.soft_hess[r, packed(i, i)] += m.h * implicit_slope(m, w, r, i)
+        for k in range(m.nten * m.implicit_actuators):
+            y = m.h * tendon_slope(m, w, r, k)
+            if y != ZERO:
+                add_outer(m, w, k, y, w.soft_hess, r)
+        factor(m, 0, w.soft_hess, r)
+        solve(m, 0, w.soft_hess, r, w.soft, r)
 
 
 @wp.func(inline=True)
@@ -254,32 +262,57 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
     h = m.h
     nv = m.nv
     _end_adjoint(m, w, r, nxt)
-    for back in range(m.nstage + m.implicit):
+    passes = m.nstage + m.implicit * (1 + m.implicit_fluid + 2 * m.has_turning)
+    for back in range(passes):
+        left = passes - 1 - back
         softening = int(0)
         k = int(0)
         if m.nstage > 1:
             k = m.nstage - 1 - back
             for i in range(nv):
                 w.acc_bar[w.t, i] = w.stage_acc_bar[w.t, k * nv + i]
-        elif m.implicit != 0 and back == 0:
-            softening = 1
+        elif left != 0:
+            softening = 3
+            if back == 0:
+                softening = 1
+            elif back == 1 and m.implicit_fluid != 0:
+                softening = 2
         for i in range(nv):
             w.tangent[w.t, i] = ZERO
             w.vel_bar[w.t, i] = ZERO
+        if softening == 3:
+            # ∂c/∂v a' = (c(v + h a') − c(v − h a')) / 2 h, for c is quadratic in v
+            for i in range(nv):
+                y = wp.where(left == 2, h, -h) * w.soft[r, i]
+                w.kept[w.t, i] = w.qvel[r, i]
+                w.qvel[r, i] = w.qvel[r, i] + y
+                w.lam[w.t, i] = w.lam[w.t, i] * wp.where(left == 2, -HALF, -ONE)
+                w.qacc[w.t, i] = ZERO
+                w.qd[w.t, i] = w.qvel[r, i]
         sweep_out(m, w, r + k)
-        if softening != 0:
-            # λ = (M + h B)⁻¹ ā', then the gradient of λᵀ (M (a − a') − h B a')
+        if softening == 1:
+            # λ = (M + h B)⁻ᵀ ā', then the gradient of λᵀ (M (a − a') − h B a')
             for i in range(nv):
                 w.lam[w.t, i] = w.acc_bar[w.t, i]
                 w.qacc[w.t, i] = w.acc[r, i] - w.soft[r, i]
                 w.qd[w.t, i] = ZERO
-        else:
+        elif softening == 2:
+            for i in range(nv):
+                w.qacc[w.t, i] = -h * w.soft[r, i]
+                w.qd[w.t, i] = w.qvel[r, i]
+        elif softening == 0:
             for i in range(nv):
                 w.lam[w.t, i] = -w.acc_bar[w.t, i]
                 w.qacc[w.t, i] = w.acc[r + k, i]
                 w.qd[w.t, i] = w.qvel[r + k, i]
         accelerate_adjoint(m, w, r + k, softening)
-        if softening != 0:
+        if softening > 1:
+            for i in range(nv):
+                w.pos_bar0[w.t, i] += w.tangent[w.t, i]
+                w.stage_vel_bar[w.t, i] += w.vel_bar[w.t, i]
+                if softening == 3:
+                    w.qvel[r, i] = w.kept[w.t, i]
+        elif softening == 1:
             slope_adjoint(m, w, r)
             for i in range(nv):
                 w.pos_bar0[w.t, i] += w.tangent[w.t, i]

@@ -10,7 +10,8 @@ import warp as wp
 from dropo_torch.simulators.warp.boxes import box_dual
 from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, sphere_cylinder_dual, support_dual
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
-from dropo_torch.simulators.warp.fluid import box_power
+from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, ellipsoid_slope_power
+from dropo_torch.simulators.warp.fluid import box_power, box_slope_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
 from dropo_torch.simulators.warp.rotations import chart_rate_dual
 from dropo_torch.simulators.warp.spatial import theta_vec2, theta_vec3, theta_vec5
@@ -85,6 +86,9 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     y[1] = elliptic_power(3, a, a, a, s, s, v5, v2, v2, v5, s, s, s, 1)
     y[8] = contact_scalars(3, s, s, s, v2, v5, s, s, s, 1, s, s, s)
     y[2] = box_power(v, v, v, v, v, s, s, s)
+    y[9] = ellipsoid_power(v, v, v, v, v, v, v, v, v, s, s)
+    y[10] = box_slope_power(v, v, v, v, v, v, v, s, s, s)
+    y[11] = ellipsoid_slope_power(v, v, v, v, v, v, v, v, v, v, v, s, s, 1)
     y[3] = round_dual(v, v, s, v, v, s, 0, s, v, v)
     y[4] = support_dual(3, v, v, r[0], v, 0, v)
     y[0] = capsule_box_dual(v, v, s, v, r[0], v, 0, s, v, v)

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from dropo_torch.simulators.warp.ellipsoid import ellipsoids_wrench
 from dropo_torch.simulators.warp.fluid import fluid_wrench
 from dropo_torch.simulators.warp.rotations import quat_matrix, rotation
 from dropo_torch.simulators.warp.spatial import (
@@ -115,7 +116,10 @@ def inertial_forces(m: Tables, w: World):
                 a += join(vec3(), theta_vec3(w.th, m.o_gravity) * w.th[m.o_gravcomp + b])
             f = inertia_mul(i, a) + cross_force(v, inertia_mul(i, v))
             if m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
-                f -= fluid_wrench(m, w, b)
+                if m.body_nfluid[b] != 0:
+                    f -= ellipsoids_wrench(m, w, b)
+                else:
+                    f -= fluid_wrench(m, w, b)
             if w.wrenched != 0:
                 f -= outer_wrench(m, w, b)
             w.force[w.t, b] = f

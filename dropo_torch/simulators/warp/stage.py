@@ -14,11 +14,13 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make_contacts
+from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, fluid_centre, fluid_frame
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
 from dropo_torch.simulators.warp.forces import add_forces, forces_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
 from dropo_torch.simulators.warp.rotations import quat_mul
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
+from dropo_torch.simulators.warp.slopes import fluid_slopes_adjoint, solve_full_transposed
 from dropo_torch.simulators.warp.solver import factor, newton, solve
 from dropo_torch.simulators.warp.spatial import (
     add_at,
@@ -78,8 +80,9 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     """Adjoint of :func:`accelerate`: adds to ``w.tangent``, ``w.vel_bar``, controls and θ.
 
     Poses of row ``r`` are in the scratch memory, minus the adjoint of the acceleration in ``w.lam``, its acceleration
-    and velocity in ``w.qacc`` and ``w.qd``. With ``softening`` it is instead the part of M in the adjoint of an
-    implicit integrator: λᵀ M a alone, of bodies at rest without gravity, with λ solved with ``soft_hess``.
+    and velocity in ``w.qacc`` and ``w.qd``. With ``softening`` it is instead a part of the adjoint of an implicit
+    integrator: 1, that of M, λᵀ M a of bodies at rest without gravity, with λ solved with ``soft_hess``; 2, with that
+    same λ, of the medium's slope, λᵀ B a; 3, of velocity products, λᵀ c.
     """
     _late = wp.grad(late)(ONE)
     nrow = int(0)
@@ -87,12 +90,19 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     if m.nten != 0:
         make_tendons(m, w, r)
         clear_tendon_bars(m, w)
-    if softening != 0:
+    if softening == 1:
         for b in range(m.nb):
             w.velocity[w.t, b] = vec6()
             w.bias[w.t, b] = vec6()
-        solve(m, 0, w.soft_hess, r, w.lam, w.t)
-    else:
+        if m.full != 0:
+            solve_full_transposed(m, w.soft_hess, r, w.lam, w.t)
+        else:
+            solve(m, 0, w.soft_hess, r, w.lam, w.t)
+    elif softening == 3:
+        gravity = w.bias[w.t, 0]
+        for b in range(m.nb):
+            w.bias[w.t, b] = w.bias[w.t, b] - gravity
+    elif softening == 0:
         kept = w.held[r]
         if kept % 2 != 0:
             nrow = make_rows(m, w, r, 0)
@@ -103,9 +113,12 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         tendon_armature_adjoint(m, w)
     carry_out(m, w)
     posed = ncon + m.nweld + m.has_gravcomp + m.has_fluid + w.wrenched
-    bodies_adjoint(m, w, 1 - softening, posed)
-    for i in range(m.nv):
-        w.grad[w.t, m.o_armature + i] += w.lam[w.t, i] * w.qacc[w.t, i]
+    if softening == 2:
+        fluid_slopes_adjoint(m, w)
+    else:
+        bodies_adjoint(m, w, softening, posed)
+        for i in range(m.nv):
+            w.grad[w.t, m.o_armature + i] += w.lam[w.t, i] * w.qacc[w.t, i]
     if softening == 0:
         forces_adjoint(m, w, r)
         rows_adjoint(m, w, r, nrow)
@@ -138,10 +151,11 @@ def carry_out(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
+def bodies_adjoint(m: Tables, w: World, softening: int, posed: int):
     """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
 
-    ``moving`` 0 leaves out V, gravity compensation, drag and wrenches: the adjoint of λᵀ M a alone.
+    ``softening`` 1 leaves out V, and 3 all bodies whose velocity products are not taken implicitly; both leave out
+    gravity compensation, drag and wrenches.
     """
     _late = wp.grad(late)(ONE)
     zero = vec6()
@@ -152,15 +166,15 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
         if posed != 0:
             w.f_total[w.t, b] = zero
             w.f_pose[w.t, b] = zero
-        if m.body_massive[b] != 0:
+        if m.body_massive[b] != 0 and (softening != 3 or m.body_turning[b] != 0):
             i = w.inertia[w.t, b]
             dual = w.dual[w.t, b]
             v = w.velocity[w.t, b]
             a = w.bias[w.t, b]
             fa = inertia_mul(i, dual)
             lv = cross_motion(dual, v)
-            if moving != 0:
-                if m.has_gravcomp != 0:
+            if softening != 1:
+                if softening == 0 and m.has_gravcomp != 0:
                     gc = w.th[m.o_gravcomp + b]
                     g = join(vec3(), theta_vec3(w.th, m.o_gravity))
                     a += g * gc
@@ -174,9 +188,12 @@ def bodies_adjoint(m: Tables, w: World, moving: int, posed: int):
             w.f_accel[w.t, b] = fa
             if m.want_inertial != 0:
                 _inertia_adjoint(m, w, b, dual, a, lv, v)
-            if moving != 0 and m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
-                _fluid_adjoint(m, w, b, dual, v)
-            if moving != 0 and w.wrenched != 0:
+            if softening == 0 and m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
+                if m.body_nfluid[b] != 0:
+                    _ellipsoids_adjoint(m, w, b, dual, v)
+                else:
+                    _fluid_adjoint(m, w, b, dual, v)
+            if softening == 0 and w.wrenched != 0:
                 outer_wrench_adjoint(m, w, b, dual)
 
 
@@ -223,6 +240,30 @@ def _fluid_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
     add_at(w.grad, w.t, m.o_wind, -fv)
     add_at(w.grad, w.t, m.o_inertia + 3 * b, xbar)
     add_at(w.grad, w.t, m.o_ipos + 3 * b, cbar)
+
+
+@wp.func(inline=True)
+def _ellipsoids_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
+    """Gradient of −λ · (forces of the medium on the body's ellipsoids)."""
+    wind = theta_vec3(w.th, m.o_wind)
+    first = m.body_fluid[b]
+    for i in range(first, first + m.body_nfluid[b]):
+        g = m.fluid_geom[i]
+        rot = fluid_frame(m, w, b, g)
+        back = wp.transpose(rot)
+        c = fluid_centre(m, w, b, g)
+        wbar, vbar, lwbar, lvbar, _s, _d, _l, _m, _i, denbar, visbar = wp.grad(ellipsoid_power)(
+            back * ang(v), back * (at(v, c) - wind), back * ang(dual), back * at(dual, c), m.fluid_size[i],
+            m.fluid_drag[i], m.fluid_lift[i], m.fluid_mass[i], m.fluid_inertia[i], w.th[m.o_density],
+            w.th[m.o_viscosity],
+        )  # fmt: skip
+        fv = rot * vbar
+        w.f_velocity[w.t, b] = w.f_velocity[w.t, b] + wrench(fv, c) + join(rot * wbar, vec3())
+        w.f_dual[w.t, b] = w.f_dual[w.t, b] + wrench(rot * lvbar, c) + join(rot * lwbar, vec3())
+        w.f_pose[w.t, b] = w.f_pose[w.t, b] - join(wp.cross(fv, wind), vec3())
+        w.grad[w.t, m.o_density] += denbar
+        w.grad[w.t, m.o_viscosity] += visbar
+        add_at(w.grad, w.t, m.o_wind, -fv)
 
 
 @wp.func(inline=True)

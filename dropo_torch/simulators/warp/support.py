@@ -13,7 +13,7 @@ from dropo_torch.parameters import ParameterSpace, object_names, read_field
 from dropo_torch.simulators.warp.collide import CONVEX
 from dropo_torch.simulators.warp.couplings import acting_tendons, is_spatial
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
-from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table
+from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table, turning_bodies
 from dropo_torch.simulators.warp.types import BALL
 
 #: Fields of which only the first columns act, and how many.
@@ -22,9 +22,10 @@ _KEPT = {field: keep for _, field, keep in DIRECT if keep}
 _TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 _INTEGRATORS = (
     int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4),
-    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST),
+    int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
 )  # fmt: skip
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
+_IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
@@ -104,9 +105,9 @@ def _options(model: mujoco.MjModel) -> Iterator[Missing]:
     disable, enable = mujoco.mjtDisableBit, mujoco.mjtEnableBit
     if opt.integrator not in _INTEGRATORS:
         name = mujoco.mjtIntegrator(opt.integrator).name[6:].lower()
-        yield Missing(f"option integrator={name} (use implicitfast, Euler or RK4)")
+        yield Missing(f"option integrator={name} (use implicitfast, implicit, Euler or RK4)")
     if opt.noslip_iterations > 0:
-        yield Missing("option noslip_iterations, more than 0")
+        yield Missing("option noslip_iterations")
     harmless = (
         disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EQUALITY | disable.mjDSBL_FRICTIONLOSS | disable.mjDSBL_LIMIT
         | disable.mjDSBL_CONTACT | disable.mjDSBL_SPRING | disable.mjDSBL_DAMPER | disable.mjDSBL_GRAVITY
@@ -121,8 +122,6 @@ def _options(model: mujoco.MjModel) -> Iterator[Missing]:
                 yield Missing(f"flag {bit.name[7:].lower()} {'disabled' if kind is disable else 'enabled'}")
     if opt.disableactuator:
         yield Missing("option actuatorgroupdisable")
-    if (opt.density or opt.viscosity) and opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-        yield Missing("implicitfast with density or viscosity")
 
 
 def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
@@ -136,8 +135,6 @@ def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
         yield Missing("actuators with several controls or outputs")
     flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
     yield from (Missing(f"geom {what}") for flag, what in flags.items() if getattr(model, flag, False))
-    for g in np.flatnonzero(model.geom_fluid[:, 0] > 0):
-        yield Missing("ellipsoid fluid model of geom", repr(object_names(model, "geom")[g]))
     acting = set(model.jnt_bodyid[model.jnt_actgravcomp.astype(bool)])  # bodies compensated through actuators
     for i in range(1, model.nbody):
         if model.body_parentid[i] in acting:
@@ -154,11 +151,6 @@ def _joints(model: mujoco.MjModel) -> Iterator[Missing]:
     names = object_names(model, "jnt")
     for j in range(model.njnt):
         kind = model.jnt_type[j]
-        if kind == _FREE:
-            root = model.jnt_bodyid[j]
-            alone = not any(model.body_dofnum[b] for b in range(root + 1, model.nbody) if model.body_rootid[b] == root)
-            if alone and model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST:
-                yield Missing("implicitfast with a lone free body (its gyroscopic derivative)", repr(names[j]))
         if kind in (_FREE, _BALL) and model.jnt_actfrclimited[j]:
             yield Missing("actuatorfrcrange of free or ball joint", repr(names[j]))
     for i in range(model.nv):
@@ -199,7 +191,7 @@ def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str,
     affine = {"actuator_gainprm": model.actuator_gaintype, "actuator_biasprm": model.actuator_biastype}
     kinds = {"actuator_gainprm": mujoco.mjtGain.mjGAIN_AFFINE, "actuator_biasprm": mujoco.mjtBias.mjBIAS_AFFINE}
     ball = model.jnt_type[model.actuator_trnid[actuator, 0]] == _BALL
-    implicit = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    implicit = model.opt.integrator in _INTEGRATORS[2:]
     for field, types in affine.items():
         if types[actuator] != kinds[field]:
             continue
@@ -208,21 +200,26 @@ def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str,
         if ball and by_length:
             yield "a force by the length"
         if implicit and by_velocity:
-            yield "a force by the velocity under implicitfast"
+            yield "a force by the velocity under implicit or implicitfast"
 
 
 def _tendons(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing]:
     varied = {t.field for p in space.parameters for t in p.targets}
     acts, spatial = acting_tendons(model, varied), is_spatial(model)
+    implicit = model.opt.integrator in _IMPLICIT
+    medium = model.opt.density or model.opt.viscosity or {"opt.density", "opt.viscosity"} & varied
+    full = bool(turning_bodies(model).any() or (implicit and medium))
     for k in np.flatnonzero(acts):
         where = repr(model.tendon(k).name or int(k))
+        if full:
+            yield Missing("tendon under implicit, or under implicitfast with a lone free body or a medium", where)
         path = slice(model.tendon_adr[k], model.tendon_adr[k] + model.tendon_num[k])
         if np.isin(model.wrap_type[path], _WRAPS).any():
             yield Missing("tendon that wraps around a geom", where)
         if spatial[k] and (model.tendon_armature[k] or "tendon_armature" in varied):
             yield Missing("armature of a spatial tendon", where)
-        if model.tendon_actfrclimited[k] and model.opt.integrator == int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST):
-            yield Missing("actuatorfrcrange of a tendon under implicitfast", where)
+        if model.tendon_actfrclimited[k] and implicit:
+            yield Missing("actuatorfrcrange of a tendon under implicit or implicitfast", where)
 
 
 def _equalities(model: mujoco.MjModel) -> Iterator[Missing]:

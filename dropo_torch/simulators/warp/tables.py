@@ -31,7 +31,7 @@ from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, 
 _JNT, _GEOM, _DISABLE, _EQ = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit, mujoco.mjtEq
 _INTEGRATOR = {
     mujoco.mjtIntegrator.mjINT_EULER: EULER, mujoco.mjtIntegrator.mjINT_RK4: RK4,
-    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: IMPLICITFAST,
+    mujoco.mjtIntegrator.mjINT_IMPLICITFAST: IMPLICITFAST, mujoco.mjtIntegrator.mjINT_IMPLICIT: IMPLICITFAST,
 }  # fmt: skip
 #: Links of a joint: kind, and how far after the joint's first dof and position the link's are.
 _LINKS = {
@@ -92,6 +92,7 @@ def build_tables(
     columns |= _welds(model) | _tendons(model, space)
     columns["always_dense"] |= columns["quad_dense"] | columns.pop("tendons_dense")
     columns["maxrow"] += columns["nteneq"] + 3 * columns["nten"]
+    columns |= _ellipsoids(model)
     columns |= _switches(model, space) | {f"o_{name}": offset for name, (offset, _size) in sections.items()}
     return fill(Tables(), {k: _to_warp(x, device) if isinstance(x, np.ndarray) else x for k, x in columns.items()})
 
@@ -376,6 +377,38 @@ def convex_sizes(model: mujoco.MjModel, pairs: list[tuple[int, int, int]], maxco
     return dict(zip(names, sizes, strict=True))
 
 
+def _ellipsoids(model: mujoco.MjModel) -> dict[str, Any]:
+    """Geoms on which the medium acts as on ellipsoids, by bodies: their semi-axes and coefficients."""
+    geoms = np.flatnonzero(model.geom_fluid[:, 0] > 0)  # geoms stand in the order of their bodies
+    bodies = model.geom_bodyid[geoms]
+    size, kind = model.geom_size[geoms], model.geom_type[geoms]
+    axes = size.copy()
+    round_ = np.isin(kind, [int(_GEOM.mjGEOM_SPHERE), int(_GEOM.mjGEOM_CAPSULE), int(_GEOM.mjGEOM_CYLINDER)])
+    axes[round_, 1] = size[round_, 0]
+    axes[round_, 2] = np.where(kind[round_] == _GEOM.mjGEOM_SPHERE, size[round_, 0], size[round_, 1])
+    axes[kind == _GEOM.mjGEOM_CAPSULE, 2] += size[kind == _GEOM.mjGEOM_CAPSULE, 0]
+    _on, drag, lift, mass, inertia = np.split(model.geom_fluid[geoms], (1, 4, 6, 9), axis=1)
+    return {
+        "body_fluid": np.searchsorted(bodies, np.arange(model.nbody)),
+        "body_nfluid": np.bincount(bodies, minlength=model.nbody), "fluid_geom": geoms, "fluid_size": axes,
+        "fluid_drag": drag, "fluid_lift": np.pad(lift, ((0, 0), (0, 1))), "fluid_mass": mass, "fluid_inertia": inertia,
+    }  # fmt: skip
+
+
+def turning_bodies(model: mujoco.MjModel) -> np.ndarray:
+    """Bodies whose velocity products the integrator takes implicitly, ``(nbody,)`` bool.
+
+    All under implicit; under implicitfast those of trees that move as one free rigid body.
+    """
+    if model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICIT:
+        return np.arange(model.nbody) > 0
+    dofs = np.bincount(model.body_rootid, model.body_dofnum, model.nbody)
+    free = np.zeros(model.nbody, dtype=bool)
+    free[model.jnt_bodyid[model.jnt_type == _JNT.mjJNT_FREE]] = True
+    fast = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    return fast & free[model.body_rootid] & (dofs[model.body_rootid] == 6)
+
+
 def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
     integrator = _INTEGRATOR[mujoco.mjtIntegrator(model.opt.integrator)]
     damped, sprung = (not _disabled(model, bit) for bit in (_DISABLE.mjDSBL_DAMPER, _DISABLE.mjDSBL_SPRING))
@@ -388,6 +421,7 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
 
     damper = damped and acts("dof_damping", "dof_dampingpoly")
     implicit_damper = integrator == EULER and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP)
+    turning = turning_bodies(model)
     passive = damped or sprung  # without springs and dampers MuJoCo leaves out all passive forces
     switches = {
         "want_inertial": wanted("body_mass", "body_inertia", "body_ipos"), "want_inertia": wanted("body_inertia"),
@@ -397,9 +431,12 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
         "implicit": integrator == IMPLICITFAST or implicit_damper, "has_damper": damper,
         "has_spring": sprung and acts("jnt_stiffness", "jnt_stiffnesspoly"),
         "has_gravcomp": passive and acts("body_gravcomp"),
-        "has_fluid": passive and acts("opt.density", "opt.viscosity"),
+        "has_fluid": passive and acts("opt.density", "opt.viscosity"), "has_turning": bool(turning.any()),
     }  # fmt: skip
+    switches["implicit_fluid"] = integrator == IMPLICITFAST and switches["has_fluid"]
+    switches["full"] = switches["implicit_fluid"] or switches["has_turning"]
+    switches["symmetric_fluid"] = model.opt.integrator == mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     return {name: int(on) for name, on in switches.items()} | {
-        "integrator": integrator, "nstage": 4 if integrator == RK4 else 1, "h": model.opt.timestep,
-        "impratio": max(model.opt.impratio, 1e-15),
+        "body_turning": turning, "integrator": integrator, "nstage": 4 if integrator == RK4 else 1,
+        "h": model.opt.timestep, "impratio": max(model.opt.impratio, 1e-15),
     }  # fmt: skip

@@ -74,7 +74,8 @@ def fill(struct: Any, fields: dict[str, Any]) -> Any:
 #: Numbers of things, switches of what a model has, and what gradients are wanted of.
 _COUNTS = (
     "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq", "norigin",
-    "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe", "implicit", "implicit_actuators",
+    "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
+    "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
     "want_inertial", "want_inertia", "want_ipos", "want_soft",
     "ccd_iterations", "nclip_normal",
@@ -95,10 +96,11 @@ _INDICES = (
     "geom_body", "geom_kind",
     "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
     "poly_adr", "poly_num", "poly_vert",
+    "body_fluid", "body_nfluid", "fluid_geom", "body_turning",
 )  # fmt: skip
 _VECTORS = (
     "body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert", "poly_normal", "weld_pos",
-    "seg_pos",
+    "seg_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass", "fluid_inertia",
 )  # fmt: skip
 _ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat")
 
@@ -124,7 +126,7 @@ TRAJECTORY: dict[str, tuple[Any, str]] = {
     "hess": (f64, "triangle"),  # factor of H
 }  # fmt: skip
 #: What the implicit integrators add: a', and the factor of M + h B.
-IMPLICIT: dict[str, tuple[Any, str]] = {"soft": (f64, "dof"), "soft_hess": (f64, "triangle")}
+IMPLICIT: dict[str, tuple[Any, str]] = {"soft": (f64, "dof"), "soft_hess": (f64, "soft")}
 #: Working memory, one row per slot; a slot serves one world at a time.
 SCRATCH: dict[str, tuple[Any, str]] = {
     "xpos": (vec3, "body"), "xmat": (mat33, "body"),
@@ -144,6 +146,8 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     # of all actuators Σ gear f, and Σ f, which has a range; in the adjoint their adjoints
     "ten_force": (f64, "tendon"), "ten_sum": (f64, "tendon"),
     "ten_jac": (f64, "arm"),  # moment arms
+    # of a full B: operators of subtrees, and slopes of accelerations in each velocity
+    "slope": (mat66, "full_body"), "swing": (vec6, "full_dof"),
     # scalar constraint rows
     "row_kind": (wp.int32, "row"), "row_index": (wp.int32, "row"),
     "row_dof": (vec3i, "row"), "row_coef": (vec3, "row"),  # dofs, −1 where unused, and J at them; or tendons
@@ -190,6 +194,7 @@ ADJOINT: dict[str, tuple[Any, str]] = {
     "vel_bar": (f64, "dof"), "acc_bar": (f64, "dof"),
     "stage_vel_bar": (f64, "dof"), "stage_acc_bar": (f64, "stage"), "stage_rate_bar": (f64, "stage"),  # of all stages
     "pos_bar": (f64, "dof"), "rate_bar": (f64, "dof"),  # adjoint of the state at the end of a step
+    "kept": (f64, "dof"),  # a velocity while another stands in its place
     "pos_bar0": (f64, "dof"),  # and of the position at its start
     "grad": (f64, "theta"),
 }  # fmt: skip
