@@ -11,6 +11,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import WarpSimulator, tables
 from dropo_torch.simulators.warp.support import Missing, summary
+from dropo_torch.simulators.warp.supported import DOCS, written
 
 SOUND = """<mujoco><option {option}><flag {flag}/></option><worldbody>
 <body name="a"><joint name="j" {joint}/><geom name="a" size=".1" mass="1"/>
@@ -121,3 +122,8 @@ def test_more_contacts_than_there_is_memory_for_are_refused(monkeypatch: pytest.
     assert simulator.simulate(one, control, values).isfinite().all()
     with pytest.raises(InputError, match="more than 5 contacts in one simulation"):
         simulator.simulate(both, control, values)
+
+
+def test_the_documentation_lists_what_the_code_takes() -> None:
+    text = DOCS.read_text()
+    assert written(text) == text, "run python -m dropo_torch.simulators.warp.supported"

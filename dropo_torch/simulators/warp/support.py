@@ -20,7 +20,7 @@ from dropo_torch.simulators.warp.types import BALL
 _KEPT = {field: keep for _, field, keep in DIRECT if keep}
 # compared with numpy integers, which do not equal MuJoCo's enumerations from the right
 _TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-_INTEGRATORS = (
+INTEGRATORS = (
     int(mujoco.mjtIntegrator.mjINT_EULER), int(mujoco.mjtIntegrator.mjINT_RK4),
     int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST), int(mujoco.mjtIntegrator.mjINT_IMPLICIT),
 )  # fmt: skip
@@ -34,6 +34,17 @@ _WRAPS = (int(mujoco.mjtWrap.mjWRAP_SPHERE), int(mujoco.mjtWrap.mjWRAP_CYLINDER)
 _HELD = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
 
 
+_DISABLE, _ENABLE = mujoco.mjtDisableBit, mujoco.mjtEnableBit
+#: Flags that may be disabled, and those that may be enabled.
+HARMLESS = int(
+    _DISABLE.mjDSBL_CONSTRAINT | _DISABLE.mjDSBL_EQUALITY | _DISABLE.mjDSBL_FRICTIONLOSS | _DISABLE.mjDSBL_LIMIT
+    | _DISABLE.mjDSBL_CONTACT | _DISABLE.mjDSBL_SPRING | _DISABLE.mjDSBL_DAMPER | _DISABLE.mjDSBL_GRAVITY
+    | _DISABLE.mjDSBL_CLAMPCTRL | _DISABLE.mjDSBL_WARMSTART | _DISABLE.mjDSBL_FILTERPARENT
+    | _DISABLE.mjDSBL_ACTUATION | _DISABLE.mjDSBL_REFSAFE | _DISABLE.mjDSBL_SENSOR | _DISABLE.mjDSBL_MIDPHASE
+    | _DISABLE.mjDSBL_EULERDAMP | _DISABLE.mjDSBL_AUTORESET | _DISABLE.mjDSBL_NATIVECCD | _DISABLE.mjDSBL_ISLAND
+    | _DISABLE.mjDSBL_MULTICCD
+)  # fmt: skip
+INERT = int(_ENABLE.mjENBL_ENERGY | _ENABLE.mjENBL_FWDINV | _ENABLE.mjENBL_INVDISCRETE | _ENABLE.mjENBL_SLEEP)
 #: Names that a refusal gives of those that lack the same.
 SHOWN = 3
 #: Iterations in which Newton's method converges but for rare states.
@@ -102,21 +113,13 @@ def _named(names: list[str]) -> str:
 
 def _options(model: mujoco.MjModel) -> Iterator[Missing]:
     opt = model.opt
-    disable, enable = mujoco.mjtDisableBit, mujoco.mjtEnableBit
-    if opt.integrator not in _INTEGRATORS:
+    disable, enable = _DISABLE, _ENABLE
+    if opt.integrator not in INTEGRATORS:
         name = mujoco.mjtIntegrator(opt.integrator).name[6:].lower()
         yield Missing(f"option integrator={name} (use implicitfast, implicit, Euler or RK4)")
     if opt.noslip_iterations > 0:
         yield Missing("option noslip_iterations")
-    harmless = (
-        disable.mjDSBL_CONSTRAINT | disable.mjDSBL_EQUALITY | disable.mjDSBL_FRICTIONLOSS | disable.mjDSBL_LIMIT
-        | disable.mjDSBL_CONTACT | disable.mjDSBL_SPRING | disable.mjDSBL_DAMPER | disable.mjDSBL_GRAVITY
-        | disable.mjDSBL_CLAMPCTRL | disable.mjDSBL_WARMSTART | disable.mjDSBL_FILTERPARENT | disable.mjDSBL_ACTUATION
-        | disable.mjDSBL_REFSAFE | disable.mjDSBL_SENSOR | disable.mjDSBL_MIDPHASE | disable.mjDSBL_EULERDAMP
-        | disable.mjDSBL_AUTORESET | disable.mjDSBL_NATIVECCD | disable.mjDSBL_ISLAND | disable.mjDSBL_MULTICCD
-    )  # fmt: skip
-    inert = enable.mjENBL_ENERGY | enable.mjENBL_FWDINV | enable.mjENBL_INVDISCRETE | enable.mjENBL_SLEEP
-    for kind, flags in ((disable, opt.disableflags & ~int(harmless)), (enable, opt.enableflags & ~int(inert))):
+    for kind, flags in ((disable, opt.disableflags & ~HARMLESS), (enable, opt.enableflags & ~INERT)):
         for bit in kind.__members__.values():
             if flags & int(bit) and not bit.name.startswith("mjN"):
                 yield Missing(f"flag {bit.name[7:].lower()} {'disabled' if kind is disable else 'enabled'}")
@@ -191,7 +194,7 @@ def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str,
     affine = {"actuator_gainprm": model.actuator_gaintype, "actuator_biasprm": model.actuator_biastype}
     kinds = {"actuator_gainprm": mujoco.mjtGain.mjGAIN_AFFINE, "actuator_biasprm": mujoco.mjtBias.mjBIAS_AFFINE}
     ball = model.jnt_type[model.actuator_trnid[actuator, 0]] == _BALL
-    implicit = model.opt.integrator in _INTEGRATORS[2:]
+    implicit = model.opt.integrator in INTEGRATORS[2:]
     for field, types in affine.items():
         if types[actuator] != kinds[field]:
             continue
