@@ -33,6 +33,7 @@ NATIVE: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
     (("joint_friction", "elbow", (0.2,)),),
     (("gravity_tilt", None, (0.1, 0.05)),),
     (("integration", None, (0.0025,)),),
+    (("fluid_drag", "cart", (0.5,)),),
     (("actuator_gain", "lift", (0.7,)), ("armature", "elbow", (0.05,))),
 ]
 #: Effects that are forces, alone, together, and beside another step.
@@ -51,8 +52,8 @@ WRENCHED: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
 ]
 
 
-def engines() -> tuple[VariantEngine, VariantEngine]:
-    model = mujoco.MjModel.from_xml_string(ROUND)
+def engines(xml: str = ROUND) -> tuple[VariantEngine, VariantEngine]:
+    model = mujoco.MjModel.from_xml_string(xml)
     setting = plain_setting(model, parse_observation(model, None), SKIP)
     space = ParameterSpace(model, MASS)
     return VariantEngine(setting, space, num_threads=1, warp=True), VariantEngine(setting, space, num_threads=1)
@@ -96,10 +97,10 @@ def test_what_is_simulated_with_warp_is(monkeypatch: pytest.MonkeyPatch) -> None
         return found
 
     monkeypatch.setattr(Variants, "worlds", counted)
-    ours, theirs = engines()
-    dragged = variant((("fluid_drag", "cart", (0.5,)),), 0.7)
-    np.testing.assert_array_equal(simulated(ours, [dragged]), simulated(theirs, [dragged]))
+    outside, theirs = engines(ROUND.replace("<option", '<option noslip_iterations="2"'))
+    np.testing.assert_array_equal(*(simulated(engine, [variant((), 0.7)]) for engine in (outside, theirs)))
     assert asked == [False]
+    ours, _ = engines()
     simulated(ours, [variant(effects, mass) for effects in ((), WRENCHED[0]) for mass in (0.5, 0.9)])
     assert asked == [False, True, True]
     assert sum(e is not None for e in ours._warp._engines.values()) == 1
