@@ -207,13 +207,14 @@ def test_derived_weights_are_those_of_set_const(xml):
 
 REFUSED = """<mujoco><option solver="CG" integrator="discrete" noslip_iterations="3">
 <flag nativeccd="disable"/></option><default><geom mass="1"/></default><worldbody>
-<body><joint name="j"/><geom name="cyl" type="cylinder" size=".1 .2"/>
+<site name="above" pos=".3 .2 .5"/>
+<body><joint name="j"/><geom name="cyl" type="cylinder" size=".1 .2"/><site name="below" pos="-.3 .2 -.5"/>
 <body><joint name="k" type="ball"/><geom name="ell" type="ellipsoid" size=".1 .1 .1" pos="1 0 0"/></body></body>
 <body name="w" pos="3 0 0"><freejoint name="free"/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody>
-<tendon><fixed name="string" stiffness="3"><joint joint="j" coef="1"/></fixed></tendon>
-<equality><weld name="glue" body1="w"/></equality>
+<tendon><spatial name="string" stiffness="3"><site site="above"/><geom geom="cyl"/><site site="below"/></spatial>
+</tendon>
 <actuator><position name="ball_motor" joint="k" kp="1"/><general name="filtered" joint="j" dyntype="filter" dynprm="1"/>
-<position name="damped" joint="j" kp="1"/><motor name="on_string" tendon="string"/></actuator></mujoco>"""
+<position name="damped" joint="j" kp="1"/></actuator></mujoco>"""
 
 
 def test_one_error_names_everything_that_is_refused():
@@ -230,8 +231,8 @@ def test_one_error_names_everything_that_is_refused():
     message = str(caught.value)
     assert "\n" not in message
     for part in (
-        "integrator=discrete", "noslip", "'string'", "'glue'", "weld", "'ball_motor'", "'filtered'",
-        "'on_string'", "tendon", "'cyl'", "'ell'", "ellipsoid", "cylinder", "'size'", "geom_size", "'gear1'", "gear[0]",
+        "integrator=discrete", "noslip", "'string'", "wraps", "'ball_motor'", "'filtered'", "tendon", "'cyl'",
+        "'ell'", "ellipsoid", "cylinder", "'size'", "geom_size", "'gear1'", "gear[0]",
     ):  # fmt: skip
         assert part in message, f"{part} in {message}"
 
@@ -277,10 +278,12 @@ def test_no_differentiable_field_is_dead(model):
         .replace(
             "</worldbody>",
             '</worldbody><actuator><position joint="h" kp="1"/></actuator><equality><joint name="e" joint1="h"/>'
-            '</equality><contact><pair name="p" geom1="g1" geom2="g2"/></contact>',
+            '</equality><contact><pair name="p" geom1="g1" geom2="g2"/></contact>'
+            '<tendon><fixed name="t" stiffness="1"><joint joint="h" coef="1"/></fixed></tendon>',
         )
     )
     names = {"body": "c", "jnt": "h", "dof": "h", "qpos": "h", "actuator": "h", "eq": "e", "geom": "g1", "pair": "p"}
+    names["tendon"] = "t"
     for field in sorted(FIELDS):
         entry: dict = {"field": field, "bounds": [0.5, 1.0]}
         if not field.startswith("opt."):
