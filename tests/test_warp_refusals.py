@@ -62,7 +62,7 @@ def test_the_sound_model_is_simulated() -> None:
         ({"option": 'integrator="implicitfast"',
           "extra": '<tendon><fixed name="t" actuatorfrcrange="-1 1"><joint joint="j" coef="1"/></fixed></tendon>'
                    '<actuator><motor name="g" tendon="t"/></actuator>'},
-         "actuatorfrcrange of a tendon under implicitfast (1: 't')"),
+         "actuatorfrcrange of a tendon under implicit or implicitfast (1: 't')"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
