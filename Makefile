@@ -21,6 +21,7 @@ check: lint
 # What every change must pass.
 test: lint
 	$(PYTEST) --durations=8
+	DROPO_WARP_CONVEX=1 $(BIN)/python -m pytest -q tests/test_warp_convex.py
 
 coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term-missing

@@ -20,6 +20,7 @@ import fnmatch
 import importlib.util
 import json
 import math
+import os
 import time
 import warnings
 from collections import Counter
@@ -27,6 +28,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
+
+os.environ.setdefault("DROPO_WARP_CONVEX", "1")  # before the kernels are made
 
 import mujoco
 import numpy as np

@@ -23,7 +23,7 @@ from dropo_torch.simulators.warp.couplings import (
     tendon_columns,
     welds,
 )
-from dropo_torch.simulators.warp.layout import FIELDS
+from dropo_torch.simulators.warp.layout import FIELDS, WITH_CONVEX
 from dropo_torch.simulators.warp.meshes import mesh_tables
 from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_dofs
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
@@ -72,11 +72,14 @@ _CONVEX = {
 }  # fmt: skip
 #: Shapes that touch at one point only.
 _SMOOTH = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID)
-KINDS |= {
+#: Pairs that are simulated on request only, as :data:`KINDS`.
+GENERAL = {
     (one, two): (collide.CONVEX, 0, 1 if one in _SMOOTH or two in _SMOOTH else 4)
     for one, others in _CONVEX.items()
     for two in others
 }
+if WITH_CONVEX:
+    KINDS |= GENERAL
 
 
 def build_tables(
