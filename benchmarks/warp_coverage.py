@@ -29,7 +29,8 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-os.environ.setdefault("DROPO_WARP_CONVEX", "1")  # before the kernels are made
+if __name__ == "__main__":  # before the kernels are made
+    os.environ.setdefault("DROPO_WARP_CONVEX", "1")
 
 import mujoco
 import numpy as np

@@ -12,12 +12,16 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
+import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+
+if __name__ == "__main__":  # before the kernels are made
+    os.environ.setdefault("DROPO_WARP_CONVEX", "1")
 
 import mujoco
 import numpy as np
@@ -31,11 +35,11 @@ from dropo_torch.models.load import quiet_mujoco
 
 #: Trajectories of a log and logged steps of each; logged steps for which a control is held.
 EPISODES, LENGTH, HELD = 10, 10, 5
-#: Seconds of motion before a trajectory begins.
-SETTLING = 0.3
 #: True values, relative to the model's, and bounds of the search.
 MASS, FRICTION = 1.25, 1.3
 BOUNDS = (0.5, 2.5)
+#: Distance of a hand from the cube that it is to push.
+CLOSE = 0.01
 #: Damping from which on a joint is one that is not meant to move.
 STUCK = 1e5
 #: Relative error up to which a number is recovered.
@@ -53,6 +57,7 @@ class Task:
         geoms: whose friction is, all of them alike.
         skip: physics steps of a logged one.
         speed: of random velocities at the start: of free joints in m/s and rad/s, of others relative to their range.
+        settling: seconds of motion before a trajectory begins.
         build: makes the model of its file and the package's folder; by default it is loaded.
         place: changes the state in which all trajectories begin.
     """
@@ -63,6 +68,7 @@ class Task:
     geoms: tuple[str, ...]
     skip: int = 5
     speed: tuple[float, float] = (0.3, 0.3)
+    settling: float = 0.3
     build: Callable[[Path], mujoco.MjModel] = lambda path: mujoco.MjModel.from_xml_path(str(path))
     place: Callable[[mujoco.MjModel, mujoco.MjData], None] = lambda model, data: None
 
@@ -106,11 +112,16 @@ def bent(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def beside_hand(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Put the cube onto the table, touched by the hand."""
+    """Put the cube onto the table, and close to the hand above it."""
     data.qpos[:7] = [0, 0.75, 0, -2.0, 0, 2.75, np.pi / 4]
-    mujoco.mj_forward(model, data)
-    hand = data.body("robot0_right_hand").xpos
-    data.joint("cube").qpos[:2] = hand[0] + 0.1, hand[1]
+    mujoco.mj_kinematics(model, data)
+    hand, cube = data.body("robot0_right_hand").xpos.copy(), model.geom("cube").id
+    others = [g for g in range(model.ngeom) if chosen([model.geom(g).name], ["robot0_*collision"])]
+    for ahead in np.arange(0.3, 0.0, -0.005):
+        data.joint("cube").qpos[:2] = hand[0] + ahead, hand[1]
+        mujoco.mj_kinematics(model, data)
+        if min(mujoco.mj_geomDistance(model, data, g, cube, 1.0, None) for g in others) < CLOSE:
+            return
 
 
 def at_table(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -137,13 +148,13 @@ TASKS = {
     ),
     "robosuite-lift": Task("robosuite", _PANDA, "robot0_link5", ("cube",), build=lift, place=bent),
     "metaworld-push": Task(
-        "metaworld", "assets/sawyer_xyz/sawyer_push_v3.xml", "right_l6", ("objGeom",), speed=(0.3, 0.2)
+        "metaworld", "assets/sawyer_xyz/sawyer_push_v3.xml", "right_l6", ("objGeom",), speed=(1.0, 0.2)
     ),
     "manipulator": Task(
         "dm_control", "suite/manipulator.xml", "lower_arm", ("ball", "thumb*", "finger*", "palm*"), skip=10
     ),
     "quadruped": Task("dm_control", "suite/quadruped.xml", "torso", ("toe_*",), skip=2, build=level),
-    "franka-box": Task("robosuite", _PANDA, "cube", ("cube",), build=push, place=beside_hand),
+    "franka-box": Task("robosuite", _PANDA, "cube", ("cube",), build=push, place=beside_hand, settling=0.0),
     "hand-block": Task(
         "gymnasium_robotics", "envs/assets/hand/manipulate_block.xml", "object", ("object",), place=in_palm
     ),
@@ -215,7 +226,7 @@ def record(model: mujoco.MjModel, task: Task, seed: int) -> dict[str, np.ndarray
     for _ in range(EPISODES):
         mujoco.mj_resetData(model, data)
         task.place(model, data)
-        mujoco.mj_step(model, data, nstep=round(SETTLING / model.opt.timestep))
+        mujoco.mj_step(model, data, nstep=round(task.settling / model.opt.timestep))
         data.qvel += rng.normal(0, np.where(free, task.speed[0], task.speed[1] * span))
         for step in range(LENGTH):
             if step % HELD == 0:
