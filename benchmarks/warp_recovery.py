@@ -32,6 +32,7 @@ import dropo_torch as dropo
 from benchmarks.warp_coverage import package_folder
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
+from dropo_torch.simulators.hidden import prescribed_bodies
 
 #: Trajectories of a log and logged steps of each; logged steps for which a control is held.
 EPISODES, LENGTH, HELD = 10, 10, 5
@@ -233,7 +234,9 @@ def record(model: mujoco.MjModel, task: Task, seed: int) -> dict[str, np.ndarray
                 data.ctrl[:] = rng.uniform(low, high) * 0.3
             data.act[:] = 0.0
             log["observations"].append(np.concatenate([data.qpos, data.qvel]))
-            log["actions"].append(data.ctrl.copy())
+            held = model.body_mocapid[prescribed_bodies(model)]
+            poses = np.concatenate([data.mocap_pos[held], data.mocap_quat[held]], axis=1)
+            log["actions"].append(np.concatenate([data.ctrl, poses.ravel()]))
             mujoco.mj_step(model, data, nstep=task.skip)
             log["next_observations"].append(np.concatenate([data.qpos, data.qvel]))
             log["terminals"].append(np.array(step == LENGTH - 1))
