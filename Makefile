@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: demo check test test-convex coverage study-reduced test-slow fuzz lint format benchmarks clean
+.PHONY: demo check test coverage study-reduced test-slow fuzz lint format benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/dropo demo --out out/demo
@@ -27,10 +27,6 @@ coverage: $(STAMP)
 
 study-reduced: $(STAMP)
 	$(BIN)/dropo reproduce hopper --reduced --out out/study-reduced
-
-# Contacts that kernels hold on request only; three minutes of compiling the first time.
-test-convex: $(STAMP)
-	DROPO_WARP_CONVEX=1 $(BIN)/python -m pytest tests/test_warp_convex.py
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --durations=20

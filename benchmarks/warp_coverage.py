@@ -20,7 +20,6 @@ import fnmatch
 import importlib.util
 import json
 import math
-import os
 import time
 import warnings
 from collections import Counter
@@ -28,9 +27,6 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
-
-if __name__ == "__main__":  # before the kernels are made
-    os.environ.setdefault("DROPO_WARP_CONVEX", "1")
 
 import mujoco
 import numpy as np

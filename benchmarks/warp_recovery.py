@@ -12,16 +12,12 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-import os
 import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-
-if __name__ == "__main__":  # before the kernels are made
-    os.environ.setdefault("DROPO_WARP_CONVEX", "1")
 
 import mujoco
 import numpy as np

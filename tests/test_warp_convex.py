@@ -15,10 +15,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import WarpSimulator
-from dropo_torch.simulators.warp.layout import WITH_CONVEX
 from dropo_torch.testing import Tolerance, check_simulator, converged, mujoco_reference
-
-pytestmark = pytest.mark.skipif(not WITH_CONVEX, reason="kernels are made without convex collision")
 
 STONE = " ".join(f"{x:.4f}" for x in np.random.default_rng(3).normal(0, 0.12, 75))
 CUBE = " ".join(f"{0.1 * x} {0.15 * y} {0.2 * z}" for z in (-1, 1) for y in (-1, 1) for x in (-1, 1))

@@ -22,6 +22,7 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.warp import kernel_backward, kernel_forward
 from dropo_torch.simulators.warp.fields import Fields
 from dropo_torch.simulators.warp.pairs import candidate_pairs
+from dropo_torch.simulators.warp.parts import parts_of
 from dropo_torch.simulators.warp.start import LOADING, start_warp
 from dropo_torch.simulators.warp.support import check_support
 from dropo_torch.simulators.warp.tables import build_tables, convex_sizes
@@ -134,12 +135,16 @@ class Engine:
             "soft": m.nv * m.nv if m.full else m.nh, "full_body": m.nb * m.full, "full_dof": m.nv * m.full,
         }  # fmt: skip
         self._sizes |= convex_sizes(model, pairs, m.maxcon)
+        parts = parts_of(m, convex=self._sizes["convex"] > 0)
+        with LOADING:
+            self._simulate = kernel_forward.simulate_kernel(parts)
+            self._adjoint = kernel_backward.adjoint_kernel(parts)
         self._may_overflow = int(m.pair_most.numpy().sum()) > m.maxcon
         self._worlds: dict[tuple[int, bool], World] = {}
         self._free: list[dict[str, Any]] = []
         self._last: dict[str, Any] | None = None
         self._lock = threading.RLock()  # one call at a time in the scratch memory
-        self._loaded: set[str] = set()
+        self._loaded: set[Any] = set()
 
     def row_bytes(self, lag: int) -> int:
         """Bytes that one world keeps for its backward."""
@@ -177,7 +182,7 @@ class Engine:
                 trace = Trace(first, count, memory, wp.empty(count, dtype=wp.int32, device=self.device))
                 rows = wp.from_torch(out[first * batch.lag : (first + count) * batch.lag])
                 arguments = [*batch.arrays, trace.alive, rows]
-                calls.append(self._launches(kernel_forward.simulate_kernel, world, batch, trace, arguments, False))
+                calls.append(self._launches(self._simulate, world, batch, trace, arguments, False))
                 traces.append(trace)
             recorded = [[call(record_cmd=True).launch for call in slices] for slices in calls]
 
@@ -244,9 +249,7 @@ class Engine:
         rows = (count if keep else self._slots(count)) * _period(batch, keep) * self.tables.nstage
         memory = self._trajectory(rows) if keep else self._passing(rows)
         trace = Trace(first, count, memory, wp.empty(count, dtype=wp.int32, device=self.device))
-        self._launch(
-            kernel_forward.simulate_kernel, batch, trace, [*batch.arrays, trace.alive, wp.from_torch(out)], keep
-        )
+        self._launch(self._simulate, batch, trace, [*batch.arrays, trace.alive, wp.from_torch(out)], keep)
         self._check_contacts(trace)
         return trace
 
@@ -265,7 +268,7 @@ class Engine:
         bars = [wp.empty(shape, dtype=wp.float64, device=self.device) for shape in shapes]
         bars.append(wp.zeros((trace.count * batch.lag, controls.shape[1]), dtype=wp.float64, device=self.device))
         arguments = [theta, controls, trace.alive, self.columns, wp.from_torch(out_bar), *bars]
-        self._launch(kernel_backward.adjoint_kernel, batch, trace, arguments, True)
+        self._launch(self._adjoint, batch, trace, arguments, True)
         return bars
 
     def _add(self, batch: Batch, trace: Trace, bars: list[Any], totals: list[Any]) -> None:
@@ -284,16 +287,16 @@ class Engine:
 
     def _launch(self, kernel: Any, batch: Batch, trace: Trace, arguments: list[Any], keep: bool) -> None:
         """Launch a kernel on the worlds of a chunk."""
-        world = self._world(self._slots(trace.count), trace.memory, kernel is kernel_backward.adjoint_kernel)
+        world = self._world(self._slots(trace.count), trace.memory, kernel is self._adjoint)
         _at_once(self._launches(kernel, world, batch, trace, arguments, keep))
 
     def _launches(
         self, kernel: Any, world: Any, batch: Batch, trace: Trace, arguments: list[Any], keep: bool
     ) -> list[Callable[..., Any]]:
         """What launches a kernel on the worlds of a chunk: on a CPU one contiguous slice for each thread."""
-        if kernel.key not in self._loaded:  # compiled or loaded before threads launch it
+        if kernel.module not in self._loaded:  # compiled or loaded before threads launch it
             wp.load_module(kernel.module.name, device=self.device)
-            self._loaded.add(kernel.key)
+            self._loaded.add(kernel.module)
 
         def launch(local: int, number: int, slot: int) -> Callable[..., Any]:
             chunk = fill(Chunk(), {

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log, quat_mul
 from dropo_torch.simulators.warp.spatial import add_at, vec3_at, vec4_at
 from dropo_torch.simulators.warp.tendons import (
@@ -195,7 +196,7 @@ def sum_forces(m: Tables, w: World, r: int):
         if m.act_tendon[i] >= 0:
             w.ten_force[w.t, m.act_tendon[i]] += w.th[m.o_gear + 6 * i] * f
             w.ten_sum[w.t, m.act_tendon[i]] += f
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         f = tendon_actuation(m, w, k)
         if f != ZERO:
             tendon_add(m, w, k, f, w.work, w.t)
@@ -230,7 +231,7 @@ def tendon_actuation_adjoint(m: Tables, w: World, k: int, bar: f64):
 @wp.func(inline=True)
 def add_actuators(m: Tables, w: World, r: int):
     """Load from actuators, clamped per joint where the joint says so."""
-    if m.has_frclimit + m.nten == 0:
+    if m.has_frclimit + num_tendons(m) == 0:
         for i in range(m.nu):
             f = ranged_force(m, w, r, i)
             for k in range(m.act_ndof[i]):
@@ -258,11 +259,11 @@ def actuators_adjoint(m: Tables, w: World, r: int):
                 for k in range(m.link_ndof[j]):
                     w.work[w.t, d + k] = -w.lam[w.t, d + k]
     else:
-        if m.nten != 0:
+        if num_tendons(m) != 0:
             sum_forces(m, w, r)
         for i in range(m.nv):
             w.work[w.t, i] = -w.lam[w.t, i]
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         if w.ten_force[w.t, k] != ZERO:
             tendon_bar(m, w, k, tendon_actuation(m, w, k), w.work, w.t)
         tendon_actuation_adjoint(m, w, k, tendon_dot(m, w, k, w.work, w.t))
@@ -358,7 +359,7 @@ def add_forces(m: Tables, w: World, r: int):
         w.load[w.t, i] += v * (w.th[m.o_damping + i] + n * (w.th[ip] + n * w.th[ip + 1]))
     if m.has_spring != 0:
         add_springs(m, w, r)
-    if m.nten != 0:
+    if num_tendons(m) != 0:
         add_tendon_forces(m, w)
     add_actuators(m, w, r)
 
@@ -379,6 +380,6 @@ def forces_adjoint(m: Tables, w: World, r: int):
         w.grad[w.t, ip + 1] += jl * v * n * n
     if m.has_spring != 0:
         springs_adjoint(m, w, r)
-    if m.nten != 0:
+    if num_tendons(m) != 0:
         tendon_forces_adjoint(m, w, r)
     actuators_adjoint(m, w, r)

@@ -10,6 +10,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.forces import actuator_slope, actuator_slope_adjoint, damping_slope
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
+from dropo_torch.simulators.warp.parts import has_full_slope, num_tendons
 from dropo_torch.simulators.warp.rotations import (
     chart_rate,
     chart_rate_dual,
@@ -142,7 +143,7 @@ def tendon_slope(m: Tables, w: World, r: int, k: int) -> f64:
 def soften(m: Tables, w: World, r: int):
     """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``w.soft_hess[r]``."""
     matrix_mul(m, 0, w.mass, w.t, w.acc, r, w.soft, r)
-    if m.full != 0:
+    if has_full_slope(m):
         fill_slopes(m, w, r)
         for i in range(m.nv):
             w.soft_hess[r, i * m.nv + i] += m.h * implicit_slope(m, w, r, i)
@@ -153,7 +154,7 @@ def soften(m: Tables, w: World, r: int):
             w.soft_hess[r, i] = w.mass[w.t, i]
         for i in range(m.nv):
             w.soft_hess[r, packed(i, i)] += m.h * implicit_slope(m, w, r, i)
-        for k in range(m.nten * m.implicit_actuators):
+        for k in range(num_tendons(m) * m.implicit_actuators):
             y = m.h * tendon_slope(m, w, r, k)
             if y != ZERO:
                 add_outer(m, w, k, y, w.soft_hess, r)
@@ -179,7 +180,7 @@ def slope_adjoint(m: Tables, w: World, r: int):
             if m.act_tendon[a] < 0:
                 i = m.act_dof[a]
                 actuator_slope_adjoint(m, w, r, a, m.h * w.lam[w.t, i] * w.soft[r, i])
-        for k in range(m.nten):
+        for k in range(num_tendons(m)):
             _tendon_slope_adjoint(m, w, r, k)
         tendons_adjoint(m, w)
 
@@ -319,7 +320,7 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
                 # ā = M λ, with M λ = Σ_subtree s · I Λ + armature
                 inertial = wp.dot(w.motion[w.t, i], w.f_accel[w.t, m.dof_body[i]])
                 w.acc_bar[w.t, i] = inertial + w.th[m.o_armature + i] * w.lam[w.t, i]
-            for n in range(m.nten):
+            for n in range(num_tendons(m)):
                 outer_mul(m, w, n, w.th[m.o_ten_armature + n], w.lam, w.t, w.acc_bar, w.t)
         elif k > 0:
             c = stage_time(h, k)

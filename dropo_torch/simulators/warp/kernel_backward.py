@@ -5,6 +5,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import warp as wp
 
 from dropo_torch.simulators.warp.boxes import box_dual
@@ -13,16 +15,15 @@ from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, ellipsoid_slope_power
 from dropo_torch.simulators.warp.fluid import box_power, box_slope_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
+from dropo_torch.simulators.warp.parts import make_kernel
 from dropo_torch.simulators.warp.rotations import chart_rate_dual
 from dropo_torch.simulators.warp.spatial import theta_vec2, theta_vec3, theta_vec5
 from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals, Reals2, Tables, World, mat33, vec6
 
-# LLVM's own thresholds: what must be inlined says so, and more makes this kernel slower
-wp.set_module_options({"enable_backward": False, "cpu_compiler_flags": "-march=native"})
+wp.set_module_options({"enable_backward": False})
 
 
-@wp.kernel(enable_backward=False)
-def adjoint_kernel(
+def adjoint(
     m: Tables, w: World, chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints, out_bar: Reals2,
     theta_bar: Reals2, state_bar: Reals2, control_bar: Reals2,
 ):  # fmt: skip
@@ -71,8 +72,7 @@ def adjoint_kernel(
         theta_bar[i, j] = w.grad[w.t, columns[j]]
 
 
-@wp.kernel(enable_backward=True)
-def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
+def leaves(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     """Never launched: makes Warp emit the adjoints of the leaves and of all that they call.
 
     A function that ``wp.grad`` meets after the forward code has used what it calls gets no adjoint of those, and its
@@ -95,6 +95,13 @@ def leaves_kernel(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     y[5] = sphere_cylinder_dual(v, s, v, v, v, 0, s, v, v)
     y[6] = box_dual(v, r[0], v, v, r[0], v, 0, s, v, v)
     y[7] = chart_rate_dual(v, v, v)
+
+
+@cache
+def adjoint_kernel(parts: int) -> wp.Kernel:
+    """Return the kernel of :func:`adjoint` that has some parts, made once."""
+    make_kernel(leaves, parts, differentiated=True)
+    return make_kernel(adjoint, parts)
 
 
 @wp.kernel(enable_backward=False)

@@ -6,16 +6,16 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 import warp as wp
 
 from dropo_torch.simulators.warp.integrate import good, step
+from dropo_torch.simulators.warp.parts import make_kernel
 from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals2, Tables, World, f64
 
-wp.set_module_options({"enable_backward": False})
 
-
-@wp.kernel(enable_backward=False)
-def simulate_kernel(
+def simulate(
     m: Tables, w: World, chunk: Chunk, theta: Reals2, states: Reals2, controls: Reals2, alive: Ints, out: Reals2
 ):
     """Simulate the worlds of a chunk; ``out`` has a row per logged step.
@@ -56,3 +56,9 @@ def simulate_kernel(
                 y = w.qpos[r, j] if j < m.nq else w.qvel[r, j - m.nq]
             out[i * chunk.lag + logged, j] = y
     alive[i] = ok - w.full[w.t]
+
+
+@cache
+def simulate_kernel(parts: int) -> wp.Kernel:
+    """Return the kernel of :func:`simulate` that has some parts, made once."""
+    return make_kernel(simulate, parts)

@@ -13,6 +13,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.ellipsoid import ellipsoids_wrench
 from dropo_torch.simulators.warp.fluid import fluid_wrench
+from dropo_torch.simulators.warp.parts import has_medium
 from dropo_torch.simulators.warp.rotations import quat_matrix, rotation
 from dropo_torch.simulators.warp.spatial import (
     cross_force,
@@ -115,7 +116,7 @@ def inertial_forces(m: Tables, w: World):
             if m.has_gravcomp != 0:
                 a += join(vec3(), theta_vec3(w.th, m.o_gravity) * w.th[m.o_gravcomp + b])
             f = inertia_mul(i, a) + cross_force(v, inertia_mul(i, v))
-            if m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
+            if has_medium(m) and w.th[m.o_mass + b] >= MINVAL:
                 if m.body_nfluid[b] != 0:
                     f -= ellipsoids_wrench(m, w, b)
                 else:

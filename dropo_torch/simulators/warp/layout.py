@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-import os
-
-#: Whether kernels are made with MuJoCo's general convex collision: they are then twice as slow for any model, and take
-#: longer to compile, so it has to be asked for.
-WITH_CONVEX = os.environ.get("DROPO_WARP_CONVEX", "0") not in ("", "0")
-
 #: Sections of θ that are fields of MjModel: name in the tables, field, columns kept of each row (0: all).
 DIRECT = (
     ("gravity", "opt.gravity", 0), ("density", "opt.density", 0), ("viscosity", "opt.viscosity", 0),

@@ -13,6 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.impedance import regularisation
+from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
 from dropo_torch.simulators.warp.spatial import add_at, late, vec3_at, vec4_at
@@ -85,7 +86,7 @@ def row_dot(m: Tables, w: World, n: int, x: Reals2, r: int) -> f64:
     """J x of row ``n``."""
     c = w.row_coef[w.t, n]
     d = w.row_dof[w.t, n]
-    if m.nten != 0 and w.row_tendon[w.t, n] != 0:
+    if num_tendons(m) != 0 and w.row_tendon[w.t, n] != 0:
         z = c[0] * tendon_dot(m, w, d[0], x, r)
         if d[1] >= 0:
             z += c[1] * tendon_dot(m, w, d[1], x, r)
@@ -103,7 +104,7 @@ def row_add(m: Tables, w: World, n: int, y: f64, x: Reals2, r: int):
     """x += Jᵀ y of row ``n``."""
     c = w.row_coef[w.t, n]
     d = w.row_dof[w.t, n]
-    if m.nten != 0 and w.row_tendon[w.t, n] != 0:
+    if num_tendons(m) != 0 and w.row_tendon[w.t, n] != 0:
         tendon_add(m, w, d[0], c[0] * y, x, r)
         if d[1] >= 0:
             tendon_add(m, w, d[1], c[1] * y, x, r)
@@ -201,7 +202,7 @@ def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
             w.row_tendon[w.t, n] = 0
             _add_row(m, w, r, n, kind, index, vec3i(dof, dof2, dof3), coef, x, weighed)
             n += 1
-    if m.nten != 0:
+    if num_tendons(m) != 0:
         n = make_tendon_rows(m, w, r, n, weighed)
     return n
 
@@ -226,7 +227,7 @@ def _add_row(
 def make_tendon_rows(m: Tables, w: World, r: int, start: int, weighed: int) -> int:
     """List the rows of tendons after the ``start`` that there are, and return the number of all."""
     n = int(start)
-    for candidate in range(m.nteneq + 3 * m.nten):
+    for candidate in range(m.nteneq + 3 * num_tendons(m)):
         k = candidate - m.nteneq
         kind = int(ROW_EQUALITY)
         index = int(candidate)

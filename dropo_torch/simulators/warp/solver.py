@@ -14,6 +14,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, cone_of, cone_piece, cone_slopes
 from dropo_torch.simulators.warp.kinematics import packed
+from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.rows import row_add, row_dot, row_force, row_state
 from dropo_torch.simulators.warp.types import ONE, ZERO, Reals2, Tables, World, f64, mat33, vec3, vec6
 
@@ -115,7 +116,7 @@ def _add_contact_hessian(m: Tables, w: World, c: int, ll: mat33, la: mat33, aa: 
 @wp.func(inline=True)
 def _add_row_hessian(m: Tables, w: World, n: int, r: int):
     """H += Jᵀ D J of one scalar row."""
-    if m.nten != 0 and w.row_tendon[w.t, n] != 0:
+    if num_tendons(m) != 0 and w.row_tendon[w.t, n] != 0:
         _add_tendon_hessian(m, w, n, r)
     else:
         _add_dofs_hessian(m, w, n, r)

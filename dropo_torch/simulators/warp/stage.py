@@ -18,6 +18,7 @@ from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, fluid_centre,
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
 from dropo_torch.simulators.warp.forces import add_forces, forces_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
+from dropo_torch.simulators.warp.parts import has_full_slope, has_medium, num_tendons, num_welds, with_medium
 from dropo_torch.simulators.warp.rotations import quat_mul
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.slopes import fluid_slopes_adjoint, solve_full_transposed
@@ -55,7 +56,7 @@ def accelerate(m: Tables, w: World, r: int):
     sweep_out(m, w, r)
     inertial_forces(m, w)
     sweep_in(m, w)
-    if m.nten != 0:
+    if num_tendons(m) != 0:
         make_tendons(m, w, r)
         add_tendon_armature(m, w)
     add_forces(m, w, r)
@@ -87,14 +88,14 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
     _late = wp.grad(late)(ONE)
     nrow = int(0)
     ncon = int(0)
-    if m.nten != 0:
+    if num_tendons(m) != 0:
         make_tendons(m, w, r)
         clear_tendon_bars(m, w)
     if softening == 1:
         for b in range(m.nb):
             w.velocity[w.t, b] = vec6()
             w.bias[w.t, b] = vec6()
-        if m.full != 0:
+        if has_full_slope(m):
             solve_full_transposed(m, w.soft_hess, r, w.lam, w.t)
         else:
             solve(m, 0, w.soft_hess, r, w.lam, w.t)
@@ -109,11 +110,11 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         if kept > 1:
             ncon = find_contacts(m, w)
         solve(m, fills_in(m, w, ncon), w.hess, r, w.lam, w.t)
-    if m.nten != 0:
+    if num_tendons(m) != 0:
         tendon_armature_adjoint(m, w)
     carry_out(m, w)
-    posed = ncon + m.nweld + m.has_gravcomp + m.has_fluid + w.wrenched
-    if softening == 2:
+    posed = ncon + num_welds(m) + m.has_gravcomp + m.has_fluid + w.wrenched
+    if with_medium() and softening == 2:
         fluid_slopes_adjoint(m, w)
     else:
         bodies_adjoint(m, w, softening, posed)
@@ -124,7 +125,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         rows_adjoint(m, w, r, nrow)
         contacts_adjoint(m, w, ncon)
         welds_adjoint(m, w)
-        if m.nten != 0:
+        if num_tendons(m) != 0:
             tendons_adjoint(m, w)
     carry_in(m, w, posed)
     if softening == 0:
@@ -188,7 +189,7 @@ def bodies_adjoint(m: Tables, w: World, softening: int, posed: int):
             w.f_accel[w.t, b] = fa
             if m.want_inertial != 0:
                 _inertia_adjoint(m, w, b, dual, a, lv, v)
-            if softening == 0 and m.has_fluid != 0 and w.th[m.o_mass + b] >= MINVAL:
+            if softening == 0 and has_medium(m) and w.th[m.o_mass + b] >= MINVAL:
                 if m.body_nfluid[b] != 0:
                     _ellipsoids_adjoint(m, w, b, dual, v)
                 else:

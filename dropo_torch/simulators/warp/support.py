@@ -13,7 +13,7 @@ from dropo_torch.parameters import ParameterSpace, object_names, read_field
 from dropo_torch.simulators.warp.collide import CONVEX
 from dropo_torch.simulators.warp.couplings import acting_tendons, is_spatial
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
-from dropo_torch.simulators.warp.tables import GENERAL, KINDS, joint_dofs, link_table, turning_bodies
+from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table, turning_bodies
 from dropo_torch.simulators.warp.types import BALL
 
 #: Fields of which only the first columns act, and how many.
@@ -247,9 +247,7 @@ def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Itera
         kinds = tuple(mujoco.mjtGeom(model.geom_type[g]) for g in (g1, g2))
         if kinds not in KINDS or (KINDS[kinds][0] == CONVEX and not native):
             a, b = (kind.name[7:].lower() for kind in kinds)
-            why = " without DROPO_WARP_CONVEX=1 in the environment" if kinds in GENERAL else ""
-            if kinds in KINDS:
-                why = " without the flag nativeccd"
+            why = " without the flag nativeccd" if kinds in KINDS else ""
             yield Missing(f"contacts of {a} with {b}{why}", f"{names[g1]!r} with {names[g2]!r}")
 
 

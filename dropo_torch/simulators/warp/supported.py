@@ -13,7 +13,7 @@ import mujoco
 
 from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
 from dropo_torch.simulators.warp.support import HARMLESS, INERT, INTEGRATORS
-from dropo_torch.simulators.warp.tables import GENERAL, KINDS
+from dropo_torch.simulators.warp.tables import KINDS
 
 #: Where the lists stand.
 DOCS = Path(__file__).parents[3] / "docs" / "warp.md"
@@ -27,8 +27,8 @@ def _name(member: object) -> str:
 
 def contacts() -> str:
     """Which geoms may touch which, as a table."""
-    geoms = sorted({g for pair in KINDS | GENERAL for g in pair}, key=int)
-    said = dict.fromkeys(KINDS, "yes") | dict.fromkeys(GENERAL, "on request")
+    geoms = sorted({g for pair in KINDS for g in pair}, key=int)
+    said = dict.fromkeys(KINDS, "yes")
     rows = [["", *map(_name, geoms)], ["---"] * (1 + len(geoms))]
     for one in geoms:
         cells = [said.get((one, other), said.get((other, one), "")) for other in geoms]

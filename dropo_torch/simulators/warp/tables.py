@@ -23,7 +23,7 @@ from dropo_torch.simulators.warp.couplings import (
     tendon_columns,
     welds,
 )
-from dropo_torch.simulators.warp.layout import FIELDS, WITH_CONVEX
+from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.meshes import mesh_tables
 from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_dofs
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
@@ -72,14 +72,11 @@ _CONVEX = {
 }  # fmt: skip
 #: Shapes that touch at one point only.
 _SMOOTH = (_GEOM.mjGEOM_SPHERE, _GEOM.mjGEOM_ELLIPSOID)
-#: Pairs that are simulated on request only, as :data:`KINDS`.
-GENERAL = {
+KINDS |= {
     (one, two): (collide.CONVEX, 0, 1 if one in _SMOOTH or two in _SMOOTH else 4)
     for one, others in _CONVEX.items()
     for two in others
 }
-if WITH_CONVEX:
-    KINDS |= GENERAL
 
 
 def build_tables(
@@ -239,8 +236,6 @@ def _constraints(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]
     friction = np.flatnonzero(loses & on(_DISABLE.mjDSBL_FRICTIONLOSS))
     limited = model.jnt_limited.astype(bool) & (model.jnt_type != _JNT.mjJNT_FREE)  # of a free joint there is no limit
     limited = np.flatnonzero(limited & on(_DISABLE.mjDSBL_LIMIT))
-    ids = np.flatnonzero(model.eq_active0.astype(bool) & on(_DISABLE.mjDSBL_EQUALITY))
-    limited = np.flatnonzero(model.jnt_limited.astype(bool) & on(_DISABLE.mjDSBL_LIMIT))
     ids = active_equalities(model, _EQ.mjEQ_JOINT)
     joints = np.stack([model.eq_obj1id[ids], model.eq_obj2id[ids]], axis=1)
     first, second = model.jnt_bodyid[joints].T

@@ -14,6 +14,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.kinematics import packed
+from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.spatial import ang, at, cross_motion
 from dropo_torch.simulators.warp.types import MINVAL, ONE, THREE, TWO, ZERO, Reals2, Tables, World, f64, vec3, vec6
 
@@ -58,7 +59,7 @@ def along(x: vec3) -> vec3:
 @wp.func(inline=True)
 def make_tendons(m: Tables, w: World, r: int):
     """Length, J and velocity of every tendon."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         length = f64(0.0)
         for c in range(m.ten_start[k], m.ten_start[k + 1]):
             w.ten_jac[w.t, c] = m.ten_coef[c]
@@ -89,7 +90,7 @@ def _pull_along(m: Tables, w: World, k: int, g: int, p: vec3, f: vec3):
 @wp.func(inline=True)
 def clear_tendon_bars(m: Tables, w: World):
     """Adjoints of lengths and of J, empty."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         w.ten_length_bar[w.t, k] = ZERO
         for c in range(m.ten_start[k], m.ten_start[k + 1]):
             w.ten_jac_bar[w.t, c] = ZERO
@@ -98,7 +99,7 @@ def clear_tendon_bars(m: Tables, w: World):
 @wp.func(inline=True)
 def tendons_adjoint(m: Tables, w: World):
     """From the adjoints of lengths and J to that of the position."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         tendon_add(m, w, k, w.ten_length_bar[w.t, k], w.tangent, w.t)
         for g in range(m.ten_segment[k], m.ten_segment[k + 1]):
             p0 = segment_end(m, w, 2 * g)
@@ -152,7 +153,7 @@ def spring_stretch(m: Tables, w: World, k: int) -> f64:
 @wp.func(inline=True)
 def add_tendon_forces(m: Tables, w: World):
     """Load from springs, F = −x (k + p0 x + p1 x²), and dampers, F = −v (b + p0 |v| + p1 v²)."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         x = ZERO
         if m.ten_sprung[k] != 0:
             x = spring_stretch(m, w, k)
@@ -170,7 +171,7 @@ def add_tendon_forces(m: Tables, w: World):
 @wp.func(inline=True)
 def tendon_forces_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_tendon_forces`."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         jl = ZERO
         if m.ten_sprung[k] + m.ten_damped[k] != 0:
             jl = tendon_dot(m, w, k, w.lam, w.t)
@@ -273,7 +274,7 @@ def outer_mul(m: Tables, w: World, k: int, scale: f64, x: Reals2, rx: int, y: Re
 @wp.func(inline=True)
 def add_tendon_armature(m: Tables, w: World):
     """Add the armature of tendons to M."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         armature = w.th[m.o_ten_armature + k]
         if armature != ZERO:
             add_outer(m, w, k, armature, w.mass, w.t)
@@ -282,6 +283,6 @@ def add_tendon_armature(m: Tables, w: World):
 @wp.func(inline=True)
 def tendon_armature_adjoint(m: Tables, w: World):
     """Gradient of λᵀ M a in the armature of tendons, whose J is constant."""
-    for k in range(m.nten):
+    for k in range(num_tendons(m)):
         if m.ten_spatial[k] == 0:
             w.grad[w.t, m.o_ten_armature + k] += outer_dot(m, w, k, w.lam, w.t, w.qacc, w.t, ZERO)

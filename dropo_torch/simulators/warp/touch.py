@@ -14,7 +14,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp import boxes, collide, hull
 from dropo_torch.simulators.warp.convex_touch import convex_adjoint, convex_contacts, keep_contact
-from dropo_torch.simulators.warp.layout import WITH_CONVEX
+from dropo_torch.simulators.warp.parts import with_convex
 from dropo_torch.simulators.warp.spatial import pull, wrench
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
 
@@ -120,41 +120,21 @@ def _add_corners(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2
     return number
 
 
-if WITH_CONVEX:
-
-    @wp.func(inline=True)
-    def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
-        """Write the contacts of a pair of convex geoms from number ``n`` on and return the number of the next one."""
-        reach = margin + m.pair_gap[k]
-        number = n
-        for i in range(convex_contacts(m, w, k, reach)):
-            dist = w.clip_dist[w.t, i] + reach
-            if dist < margin:
-                p = w.clip_mid[w.t, i]
-                normal = w.clip_normal[w.t, 0]
-                x = collide.vec7(dist, p[0], p[1], p[2], normal[0], normal[1], normal[2])
-                _add(w, number, k, 0, x, vec3())
-                keep_contact(w, number, i)
-                number += 1
-        return number
-
-    @wp.func(inline=True)
-    def _convex_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar: vec3):
-        """Adjoint of a contact of convex geoms, as displacements of the two."""
-        y1, y2 = convex_adjoint(m, w, c, distbar, pbar, nbar)
-        return y1, y2
-
-else:
-
-    @wp.func(inline=True)
-    def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
-        """No contacts: these kernels are made without such pairs, whose tables refuse them."""
-        return n
-
-    @wp.func(inline=True)
-    def _convex_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar: vec3):
-        """Nothing: there are no such contacts."""
-        return vec6(), vec6()
+@wp.func(inline=True)
+def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
+    """Write the contacts of a pair of convex geoms from number ``n`` on and return the number of the next one."""
+    reach = margin + m.pair_gap[k]
+    number = n
+    for i in range(convex_contacts(m, w, k, reach)):
+        dist = w.clip_dist[w.t, i] + reach
+        if dist < margin:
+            p = w.clip_mid[w.t, i]
+            normal = w.clip_normal[w.t, 0]
+            x = collide.vec7(dist, p[0], p[1], p[2], normal[0], normal[1], normal[2])
+            _add(w, number, k, 0, x, vec3())
+            keep_contact(w, number, i)
+            number += 1
+    return number
 
 
 @wp.func(inline=True)
@@ -180,7 +160,7 @@ def find_contacts(m: Tables, w: World) -> int:
             n = _add_boxes(m, w, n, k, c1, geom_rotation(m, w, g1), c2, geom_rotation(m, w, g2), margin)
         elif near and kind == collide.PLANE_MESH:
             n = _add_corners(m, w, n, k, normal, c1, c2, geom_rotation(m, w, g2), margin)
-        elif near and kind == collide.CONVEX:
+        elif near and with_convex() and kind == collide.CONVEX:
             n = _add_convex(m, w, n, k, margin)
         elif near:
             size1 = m.geom_size[g1]
@@ -293,8 +273,8 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
         rot = geom_rotation(m, w, g2)
     y1 = vec6()
     y2 = vec6()
-    if kind == collide.CONVEX:
-        y1, y2 = _convex_adjoint(m, w, c, distbar, pbar, nbar)
+    if with_convex() and kind == collide.CONVEX:
+        y1, y2 = convex_adjoint(m, w, c, distbar, pbar, nbar)
     elif kind <= collide.PLANE_ELLIPSOID:
         # dist = n·(x − c1) − r, p = x − n (r + dist/2), x a point of the second geom
         radius = wp.where(kind <= collide.PLANE_CAPSULE, size[0], ZERO)

@@ -15,6 +15,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.impedance import regularisation
 from dropo_torch.simulators.warp.kinematics import packed
+from dropo_torch.simulators.warp.parts import num_welds
 from dropo_torch.simulators.warp.rotations import quat_matrix, quat_mul
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
 from dropo_torch.simulators.warp.spatial import (
@@ -155,10 +156,10 @@ def stiffen(soft: Soft) -> f64:
 @wp.func(inline=True)
 def make_welds(m: Tables, w: World, r: int):
     """Add the cost of all welds: JᵀD J to the matrix ``w.quad``, −JᵀD aref to the load."""
-    if m.nweld > 0:
+    if num_welds(m) > 0:
         for i in range(m.nh):
             w.quad[w.t, i] = w.mass[w.t, i]
-    for e in range(m.nweld):
+    for e in range(num_welds(m)):
         _make_weld(m, w, e)
 
 
@@ -200,7 +201,7 @@ def _make_weld(m: Tables, w: World, e: int):
 def welds_adjoint(m: Tables, w: World):
     """Add the gradient of Σ −f Jλ over the welds to the bodies' F and Y and to θ."""
     _late = wp.grad(late)(ONE)
-    for e in range(m.nweld):
+    for e in range(num_welds(m)):
         _weld_adjoint(m, w, e)
 
 
