@@ -23,7 +23,7 @@ import math
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -60,6 +60,8 @@ _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE
 DIED = "the run died"
 #: A hair's breadth: displacement of a state, or of the margins, that must not change which geoms touch.
 NUDGE = 1e-9
+#: Steps of central differences, relative to a parameter's size.
+MOVES = (1e-5, 1e-4)
 
 
 @dataclass
@@ -177,6 +179,26 @@ def _disturb(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generato
             move[address : address + 3] *= 0.1
     mujoco.mj_integratePos(model, data.qpos, move, 1.0)
     data.qvel[:] = rng.uniform(-1, 1, model.nv)
+    for mocap, held, _ in _holds(model, data):
+        number = model.body_mocapid[mocap]
+        data.mocap_pos[number], data.mocap_quat[number] = data.xpos[held], data.xquat[held]
+
+
+def take_hold(model: mujoco.MjModel, data: mujoco.MjData) -> None:
+    """Put mocap bodies where the bodies are that are welded to them, as environments do before they begin."""
+    for mocap, held, e in _holds(model, data):
+        model.body_pos[mocap], model.body_quat[mocap] = data.xpos[held], data.xquat[held]
+        model.eq_data[e, 3:10] = [0, 0, 0, 1, 0, 0, 0]
+
+
+def _holds(model: mujoco.MjModel, data: mujoco.MjData) -> Iterator[tuple[int, int, int]]:
+    """Mocap bodies, the bodies that are welded to them, and the welds, with the poses of ``data.qpos``."""
+    mujoco.mj_kinematics(model, data)
+    for e in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)):
+        pair = int(model.eq_obj1id[e]), int(model.eq_obj2id[e])
+        for mocap, held in (pair, pair[::-1]):
+            if model.body_mocapid[mocap] >= 0:
+                yield mocap, held, int(e)
 
 
 def random_controls(model: mujoco.MjModel, rng: np.random.Generator) -> np.ndarray:
@@ -219,12 +241,13 @@ def conformance(model: mujoco.MjModel, seed: int = 0) -> dict[str, Any]:
     """
     space, rng = varied(model), np.random.default_rng(seed)
     values = torch.from_numpy(_values(space) * rng.uniform(0.9, 1.1, len(space)))[None]
+    take_hold(model, mujoco.MjData(model))
     with quiet_mujoco():
         states = torch.from_numpy(random_states(model, STATES, seed))
     with poisoned():
         simulator = WarpSimulator(model, parameters=space, frame_skip=STEPS, num_threads=1)
         controls = np.zeros((STATES, 1, simulator.num_controls))
-        controls[:, 0] = [_inputs(model, simulator.num_controls, rng) for _ in range(STATES)]
+        controls[:, 0] = [_inputs(model, state, simulator.num_controls, rng) for state in states.numpy()]
         inputs = torch.from_numpy(controls)
         found = simulator.simulate(states, inputs, values)[:, 0]
         weights = torch.from_numpy(rng.normal(size=tuple(states.shape)))
@@ -236,8 +259,8 @@ def conformance(model: mujoco.MjModel, seed: int = 0) -> dict[str, Any]:
         other = _reference(space.on(_with_margins(model, margin))).simulate(states[ties], inputs[ties], values)[:, 0]
         errors[ties] = torch.minimum(errors[ties], _errors(found[ties], other))
     sound = torch.from_numpy(~ties)
-    true = _differences(reference, states[sound], inputs[sound], values, weights[sound])
-    gradient = _gradient_errors({name: slope[~ties] for name, slope in slopes.items()}, true, space)
+    trues = [_differences(reference, states[sound], inputs[sound], values, weights[sound], step) for step in MOVES]
+    gradient = _gradient_errors({name: slope[~ties] for name, slope in slopes.items()}, trues, space)
     return judged(errors.numpy(), ties, gradient) | {"contacts": _contacts(model, states.numpy())}
 
 
@@ -264,12 +287,16 @@ def _with_margins(model: mujoco.MjModel, change: float) -> mujoco.MjModel:
     return model
 
 
-def _inputs(model: mujoco.MjModel, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Controls, and then poses of mocap bodies near their own, ``(width,)``."""
+def _inputs(model: mujoco.MjModel, state: np.ndarray, width: int, rng: np.random.Generator) -> np.ndarray:
+    """Controls, and then poses of mocap bodies near those of what they hold, or near their own, ``(width,)``."""
+    data = mujoco.MjData(model)
+    data.qpos[:] = state[: model.nq]
+    held = {mocap: (data.xpos[body], data.xquat[body]) for mocap, body, _ in _holds(model, data)}
     poses = []
     for body in np.flatnonzero(model.body_mocapid >= 0)[: (width - model.nu) // 7]:
-        quat = model.body_quat[body] + rng.normal(0, 0.02, 4)
-        poses.append(np.r_[model.body_pos[body] + rng.normal(0, 0.01, 3), quat / np.linalg.norm(quat)])
+        pos, quat = held.get(int(body), (model.body_pos[body], model.body_quat[body]))
+        quat = quat + rng.normal(0, 0.02, 4)
+        poses.append(np.r_[pos + rng.normal(0, 0.01, 3), quat / np.linalg.norm(quat)])
     return np.concatenate([random_controls(model, rng), *poses])
 
 
@@ -298,7 +325,7 @@ def _differences(
     controls: torch.Tensor,
     values: torch.Tensor,
     weights: torch.Tensor,
-    step: float = 1e-5,
+    step: float,
 ) -> dict[str, np.ndarray]:
     """Central differences of the reference by the same."""
     sizes = step * torch.where(values[0] != 0, values[0].abs(), 0.1)
@@ -322,25 +349,36 @@ def _differences(
     return out
 
 
-def _gradient_errors(found: dict[str, np.ndarray], true: dict[str, Any], space: ParameterSpace) -> dict[str, Any]:
+def _gradient_errors(
+    found: dict[str, np.ndarray], trues: Sequence[dict[str, Any]], space: ParameterSpace
+) -> dict[str, Any]:
     """For each kind of parameter, states and controls: the errors of all derivatives that are not zero."""
-    kinds = {k: np.array([p.field == f for p in space.parameters], dtype=bool) for k, f in VARIED.items()}
-    parts = {k: (found["values"][:, own], true["values"][:, own]) for k, own in kinds.items() if own.any()}
-    parts |= {k: (found[k], true[k]) for k in ("states", "controls") if found[k].shape[1]}
-    return {kind: relative_errors(mine, its) for kind, (mine, its) in parts.items()}
+    kinds: dict[str, tuple[str, Any]] = {
+        kind: ("values", np.array([p.field == field for p in space.parameters], dtype=bool))
+        for kind, field in VARIED.items()
+    }
+    kinds |= {name: (name, slice(None)) for name in ("states", "controls")}
+    return {
+        kind: relative_errors(found[name][:, own], *(true[name][:, own] for true in trues))
+        for kind, (name, own) in kinds.items()
+        if found[name][:, own].shape[1]
+    }
 
 
-def relative_errors(found: np.ndarray, true: np.ndarray, floor: float = 1e-6) -> np.ndarray:
+def relative_errors(found: np.ndarray, *trues: np.ndarray, floor: float = 1e-6) -> np.ndarray:
     """Errors of derivatives, relative to their size, of those that either side has as different from zero.
 
-    Smaller ones than ``floor`` of the largest count as that large; where both are NaN there is no error.
+    Differences by a small step are blurred by rounding, those by a large one by curvature: the nearest of ``trues``
+    counts. Smaller derivatives than ``floor`` of the largest count as that large; where all are NaN there is no error.
     """
-    both = np.isnan(found) & np.isnan(true)
-    mine, its = found[~both], true[~both]
-    largest = floor * (1 + np.nan_to_num(np.abs(its)).max(initial=0.0))
-    acts = ~(np.abs(mine) <= largest) | ~(np.abs(its) <= largest)
-    error = np.abs(mine - its)[acts] / (np.abs(its)[acts] + largest)
-    return np.nan_to_num(error, nan=math.inf)
+    errors, acts = np.full(found.shape, math.inf), np.zeros(found.shape, dtype=bool)
+    for true in trues:
+        both = np.isnan(found) & np.isnan(true)
+        largest = floor * (1 + np.nan_to_num(np.abs(true)).max(initial=0.0))
+        acts |= ~both & (~(np.abs(found) <= largest) | ~(np.abs(true) <= largest))
+        error = np.abs(found - true) / (np.abs(true) + largest)
+        errors = np.fmin(errors, np.where(both, 0.0, error))
+    return errors[acts]
 
 
 def _is_tied(model: mujoco.MjModel, state: np.ndarray, rng: np.random.Generator) -> bool:

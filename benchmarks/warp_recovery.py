@@ -25,7 +25,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
 import dropo_torch as dropo
-from benchmarks.warp_coverage import package_folder
+from benchmarks.warp_coverage import package_folder, take_hold
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.simulators.hidden import prescribed_bodies
@@ -147,6 +147,9 @@ TASKS = {
     "metaworld-push": Task(
         "metaworld", "assets/sawyer_xyz/sawyer_push_v3.xml", "right_l6", ("objGeom",), speed=(1.0, 0.2)
     ),
+    "metaworld-push-back": Task(
+        "metaworld", "assets/sawyer_xyz/sawyer_push_back_v3.xml", "right_l6", ("objGeom",), speed=(1.0, 0.2)
+    ),
     "manipulator": Task(
         "dm_control", "suite/manipulator.xml", "lower_arm", ("ball", "thumb*", "finger*", "palm*"), skip=10
     ),
@@ -170,22 +173,11 @@ def load(task: Task, root: Path | None) -> mujoco.MjModel:
         raise InputError(f"{task.package}: there is no {task.path}; pip install -e '.[coverage-models]'")
     with quiet_mujoco():
         model = task.build(files[0])
-    _take_hold(model, task)
-    model.opt.iterations, model.opt.tolerance = max(model.opt.iterations, 100), 1e-12
-    return model
-
-
-def _take_hold(model: mujoco.MjModel, task: Task) -> None:
-    """Put mocap bodies where the bodies are that are welded to them, as environments do before they begin."""
     data = mujoco.MjData(model)
     task.place(model, data)
-    mujoco.mj_kinematics(model, data)
-    for e in np.flatnonzero(model.eq_type == int(mujoco.mjtEq.mjEQ_WELD)):
-        pair = model.eq_obj1id[e], model.eq_obj2id[e]
-        for mocap, held in (pair, pair[::-1]):
-            if model.body_mocapid[mocap] >= 0:
-                model.body_pos[mocap], model.body_quat[mocap] = data.xpos[held], data.xquat[held]
-                model.eq_data[e, 3:10] = [0, 0, 0, 1, 0, 0, 0]
+    take_hold(model, data)
+    model.opt.iterations, model.opt.tolerance = max(model.opt.iterations, 100), 1e-12
+    return model
 
 
 def chosen(names: Sequence[str], patterns: Sequence[str]) -> list[str]:

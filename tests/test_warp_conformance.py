@@ -494,3 +494,22 @@ def test_contacts(case, spread):
     if spread < 0.1:  # started at rest on the ground; the parameters that then do nothing are tested by the other
         case = replace(case, spread=spread, idle=tuple(case.parameters), length=24)
     check(case)
+
+
+def test_capsules_whose_axes_cross_part_across_both() -> None:
+    """In a planar robot the nearest points of two limbs that overlap are one; their normal then is perpendicular."""
+    rng = np.random.default_rng(5)
+    joints = "".join(f'<joint type="slide" axis="{axis}"/>' for axis in ("1 0 0", "0 1 0", "0 0 1"))
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><option gravity="0 0 0"/><worldbody>
+        <body name="a">{joints}<joint axis="0 1 0"/><geom type="capsule" size=".02 .2"/></body>
+        <body name="b">{joints}<joint axis="0 1 0"/><geom type="capsule" size=".03 .25"/></body>
+        </worldbody></mujoco>""")
+    space = ParameterSpace(model, {"mass": {"field": "body_mass", "name": "a", "bounds": [0.01, 9]}})
+    qpos = np.zeros((50, 8))
+    qpos[:, [0, 2, 4, 6]] = rng.uniform(-0.03, 0.03, (50, 4))
+    qpos[:, [3, 7]] = np.stack([rng.uniform(-3, 0, 50), rng.uniform(0.1, 3, 50)], axis=1)
+    states = torch.from_numpy(np.concatenate([qpos, rng.normal(0, 0.1, (50, 8))], axis=1))
+    controls, values = torch.zeros(50, 1, 0, dtype=torch.float64), torch.from_numpy(space.nominal)[None]
+    found = WarpSimulator(model, parameters=space, frame_skip=1).simulate(states, controls, values)
+    expected = mujoco_reference(space)(states, controls, values)[:, :, 0]
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-11)

@@ -164,13 +164,15 @@ def overlap_end(c1: vec3, a1: vec3, c2: vec3, a2: vec3, upper: int) -> int:
 
 
 @wp.func
-def balls(x1: vec3, x2: vec3, r1: f64, r2: f64) -> vec7:
-    """Contact of two balls about x1 and x2."""
+def balls(x1: vec3, x2: vec3, r1: f64, r2: f64, across: vec3) -> vec7:
+    """Contact of two balls about x1 and x2; where these coincide, its normal is along ``across``."""
     v = x2 - x1
     length = wp.length(v)
     n = vec3(ONE, ZERO, ZERO)
     if length > MINVAL:
         n = v / length
+    elif wp.length(across) > MINVAL:
+        n = wp.normalize(across)
     d = length - r1 - r2
     p = x1 + n * (r1 + HALF * d)
     return vec7(d, p[0], p[1], p[2], n[0], n[1], n[2])
@@ -180,7 +182,7 @@ def balls(x1: vec3, x2: vec3, r1: f64, r2: f64) -> vec7:
 def round_contact(c1: vec3, a1: vec3, r1: f64, c2: vec3, a2: vec3, r2: f64, which: int) -> vec7:
     """Contact of two spheres or capsules with half-axes a1, a2 (zero for a sphere)."""
     x = closest(c1, a1, c2, a2, which)
-    return balls(c1 + a1 * x[0], c2 + a2 * x[1], r1, r2)
+    return balls(c1 + a1 * x[0], c2 + a2 * x[1], r1, r2, wp.cross(a1, a2))  # axes cross where a robot is planar
 
 
 @wp.func
@@ -228,13 +230,13 @@ def sphere_cylinder(c1: vec3, radius: f64, c2: vec3, axis: vec3, size: vec3, pla
     v = c1 - c2
     x = wp.dot(axis, v)
     if place == SIDE:
-        return balls(c1, c2 + axis * x, radius, size[0])
+        return balls(c1, c2 + axis * x, radius, size[0], vec3())
     up = axis * wp.where(place % 2 == 1, ONE, -ONE)
     if place < RIM:
         y = plane_point(up, c2 + up * size[1], c1, radius)
         return vec7(y[0], y[1], y[2], y[3], -up[0], -up[1], -up[2])
     out = v - axis * x
-    return balls(c1, c2 + up * size[1] + out * (size[0] / wp.length(out)), radius, ZERO)
+    return balls(c1, c2 + up * size[1] + out * (size[0] / wp.length(out)), radius, ZERO, vec3())
 
 
 @wp.func

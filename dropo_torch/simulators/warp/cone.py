@@ -13,7 +13,21 @@ import warp as wp
 
 from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
 from dropo_torch.simulators.warp.spatial import theta_vec5
-from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat66, vec2, vec5, vec6
+from dropo_torch.simulators.warp.types import (
+    MINVAL,
+    ONE,
+    TWO,
+    ZERO,
+    Tables,
+    World,
+    f64,
+    mat33,
+    mat66,
+    vec2,
+    vec3,
+    vec5,
+    vec6,
+)
 
 #: Piece number of the curved part of an elliptic cone, where the cost is not quadratic.
 CURVED = wp.constant(2)
@@ -120,48 +134,73 @@ def cone_force(cone: Cone, w: vec6) -> vec6:
 @wp.func
 def cone_hessian(cone: Cone, w: vec6):
     """Hessian of the cost: blocks (directions, directions), (directions, rotations), (rotations, rotations)."""
-    hess = mat66()
-    d = cone.d
     piece = cone_piece(cone, w)
+    ll = mat33()
+    la = mat33()
+    aa = mat33()
     if cone.dim == 1:
         if piece == 1:
-            hess[0, 0] = d
+            ll[0, 0] = cone.d
     elif cone.elliptic == 0:
-        for k in range(1, cone.dim):
-            mu = cone.mu[k - 1]
-            plus = d * f64(piece % 2)
-            minus = d * f64((piece // 2) % 2)
-            piece = piece // 4
-            hess[0, 0] += plus + minus
-            hess[0, k] = mu * (plus - minus)
-            hess[k, 0] = hess[0, k]
-            hess[k, k] = mu * mu * (plus + minus)
-    else:
-        mu1 = cone.mu[0]
-        if piece == 1:
-            hess[0, 0] = d
-            for k in range(1, cone.dim):
-                mu = cone.mu[k - 1]
-                hess[k, k] = d * cone.impratio * mu * mu / (mu1 * mu1)
-        elif piece == CURVED:
-            reg = mu1 / wp.sqrt(cone.impratio)
-            tan = _tangential(cone, w)
-            n = w[0] * reg
-            dm = d / (reg * reg * (ONE + reg * reg))
-            # in cone coordinates: first row (1, −μ/T U), block μN/T³ U Uᵀ + (μ² − μN/T) I
-            hess[0, 0] = dm * reg * reg
-            for i in range(1, cone.dim):
-                ci = cone.mu[i - 1]
-                ui = ci * w[i]
-                hess[0, i] = -dm * reg * ci * reg / tan * ui
-                hess[i, 0] = hess[0, i]
-                for j in range(1, cone.dim):
-                    cj = cone.mu[j - 1]
-                    y = reg * n / (tan * tan * tan) * ui * (cj * w[j])
-                    if i == j:
-                        y += reg * reg - reg * n / tan
-                    hess[i, j] = y * dm * ci * cj
+        ll, la, aa = _pyramid_hessian(cone, piece)
+    elif piece == 1:
+        scale = cone.d * cone.impratio / (cone.mu[0] * cone.mu[0])
+        tangents, turns = _squared(cone)
+        ll = wp.diag(tangents * scale)
+        ll[0, 0] = cone.d
+        aa = wp.diag(turns * scale)
+    elif piece == CURVED:
+        ll, la, aa = _curved_hessian(cone, w)
+    return ll, la, aa
+
+
+@wp.func
+def _pyramid_hessian(cone: Cone, piece: int):
+    """Blocks of the Hessian of a pyramid, from the edges that act."""
+    hess = mat66()
+    for k in range(1, cone.dim):
+        mu = cone.mu[k - 1]
+        plus = cone.d * f64(piece % 2)
+        minus = cone.d * f64((piece // 2) % 2)
+        piece = piece // 4
+        hess[0, 0] += plus + minus
+        hess[0, k] = mu * (plus - minus)
+        hess[k, 0] = hess[0, k]
+        hess[k, k] = mu * mu * (plus + minus)
     return hess[0:3, 0:3], hess[0:3, 3:6], hess[3:6, 3:6]
+
+
+@wp.func
+def _squared(cone: Cone):
+    """Squared frictions along the directions, none along the normal, and about them, as far as they act."""
+    mu = cone.mu
+    third = wp.where(cone.dim > 3, mu[2] * mu[2], ZERO)
+    others = wp.where(cone.dim > 4, ONE, ZERO)
+    return vec3(ZERO, mu[0] * mu[0], mu[1] * mu[1]), vec3(third, mu[3] * mu[3] * others, mu[4] * mu[4] * others)
+
+
+@wp.func
+def _curved_hessian(cone: Cone, w: vec6):
+    """Blocks of the Hessian on the curved part of an elliptic cone.
+
+    In cone coordinates U = (μ₁ w₁, ...), T = |U|, N = μ w₀ the first row is (1, −μ/T U), and the rest
+    μN/T³ U Uᵀ + (μ² − μN/T) I.
+    """
+    tangents, turns = _squared(cone)
+    p = wp.cw_mul(tangents, wp.spatial_top(w))
+    q = wp.cw_mul(turns, wp.spatial_bottom(w))
+    reg = cone.mu[0] / wp.sqrt(cone.impratio)
+    tan = _tangential(cone, w)
+    dm = cone.d / (reg * reg * (ONE + reg * reg))
+    bend = dm * reg * reg * w[0] / tan
+    edge = dm * reg * reg / tan
+    own = dm * reg * reg - bend
+    normal = vec3(ONE, ZERO, ZERO)
+    ll = wp.outer(p, p) * (bend / (tan * tan)) - (wp.outer(normal, p) + wp.outer(p, normal)) * edge
+    ll = ll + wp.diag(tangents * own + normal * (dm * reg * reg))
+    la = wp.outer(p * (bend / (tan * tan)) - normal * edge, q)
+    aa = wp.outer(q, q) * (bend / (tan * tan)) + wp.diag(turns * own)
+    return ll, la, aa
 
 
 @wp.func

@@ -130,7 +130,7 @@ class Engine:
         self.wanted = torch.from_numpy(self.fields.wanted.astype(np.int64))
         self._sizes = {
             "qpos": m.nq, "dof": m.nv, "triangle": m.nh, "body": m.nb, "row": m.maxrow, "contact": m.maxcon,
-            "tendon": m.nten, "arm": len(m.ten_dof) if m.nten else 0,
+            "tendon": m.nten, "arm": len(m.ten_dof) if m.nten else 0, "geom": model.ngeom, "pair": m.npair,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
             "soft": m.nv * m.nv if m.full else m.nh, "full_body": m.nb * m.full, "full_dof": m.nv * m.full,
         }  # fmt: skip

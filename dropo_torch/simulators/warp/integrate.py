@@ -20,7 +20,6 @@ from dropo_torch.simulators.warp.rotations import (
     turn,
 )
 from dropo_torch.simulators.warp.slopes import factor_full, fill_slopes, solve_full
-from dropo_torch.simulators.warp.solver import factor, matrix_mul, solve
 from dropo_torch.simulators.warp.spatial import add_at, late, vec3_at, vec4_at
 from dropo_torch.simulators.warp.stage import accelerate, accelerate_adjoint
 from dropo_torch.simulators.warp.tendons import (
@@ -31,6 +30,7 @@ from dropo_torch.simulators.warp.tendons import (
     tendon_damping_slope,
     tendons_adjoint,
 )
+from dropo_torch.simulators.warp.triangle import factor, multiply, solve
 from dropo_torch.simulators.warp.types import BALL, HALF, ONE, RK4, THREE, TWO, ZERO, Reals2, Tables, World, f64, vec4
 
 LARGE = wp.constant(wp.float64(1.0e10))  # mjMAXVAL
@@ -142,7 +142,7 @@ def tendon_slope(m: Tables, w: World, r: int, k: int) -> f64:
 @wp.func(inline=True)
 def soften(m: Tables, w: World, r: int):
     """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``w.soft_hess[r]``."""
-    matrix_mul(m, 0, w.mass, w.t, w.acc, r, w.soft, r)
+    multiply(m.dof_parent, m.nv, 0, w.mass, w.t, w.acc, r, w.soft, r)
     if has_full_slope(m):
         fill_slopes(m, w, r)
         for i in range(m.nv):
@@ -158,8 +158,8 @@ def soften(m: Tables, w: World, r: int):
             y = m.h * tendon_slope(m, w, r, k)
             if y != ZERO:
                 add_outer(m, w, k, y, w.soft_hess, r)
-        factor(m, 0, w.soft_hess, r)
-        solve(m, 0, w.soft_hess, r, w.soft, r)
+        factor(m.dof_parent, m.nv, 0, w.soft_hess, r)
+        solve(m.dof_parent, m.nv, 0, w.soft_hess, r, w.soft, r)
 
 
 @wp.func(inline=True)

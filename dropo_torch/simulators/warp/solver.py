@@ -16,101 +16,26 @@ from dropo_torch.simulators.warp.cone import CURVED, cone_force, cone_hessian, c
 from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.rows import row_add, row_dot, row_force, row_state
-from dropo_torch.simulators.warp.types import ONE, ZERO, Reals2, Tables, World, f64, mat33, vec3, vec6
+from dropo_torch.simulators.warp.triangle import (
+    add_congruence,
+    add_jacobian_force,
+    factor,
+    jacobian_mul,
+    multiply,
+    solve,
+)
+from dropo_torch.simulators.warp.types import ONE, ZERO, Reals2, Tables, World, f64, vec6
 
 ITERATIONS = wp.constant(60)
 LINE_STEPS = wp.constant(50)
 
 
 @wp.func(inline=True)
-def factor(m: Tables, dense: int, hess: Reals2, r: int):
-    """H = Lᵀ D L in place, from the last dof to the first: no fill-in along the tree (dense = 0)."""
-    for back in range(m.nv):
-        k = m.nv - 1 - back
-        rk = packed(k, 0)
-        inv = ONE / hess[r, rk + k]
-        i = m.dof_parent[dense, k]
-        while i >= 0:
-            ri = packed(i, 0)
-            a = hess[r, rk + i] * inv
-            j = i
-            while j >= 0:
-                hess[r, ri + j] -= a * hess[r, rk + j]
-                j = m.dof_parent[dense, j]
-            hess[r, rk + i] = a
-            i = m.dof_parent[dense, i]
-
-
-@wp.func(inline=True)
-def solve(m: Tables, dense: int, hess: Reals2, r: int, x: Reals2, rx: int):
-    """x ← H⁻¹ x with the factor of :func:`factor`."""
-    for back in range(m.nv):
-        i = m.nv - 1 - back
-        xi = x[rx, i]
-        ri = packed(i, 0)
-        j = m.dof_parent[dense, i]
-        while j >= 0:
-            x[rx, j] -= hess[r, ri + j] * xi
-            j = m.dof_parent[dense, j]
-    for i in range(m.nv):
-        ri = packed(i, 0)
-        xi = x[rx, i] / hess[r, ri + i]
-        j = m.dof_parent[dense, i]
-        while j >= 0:
-            xi -= hess[r, ri + j] * x[rx, j]
-            j = m.dof_parent[dense, j]
-        x[rx, i] = xi
-
-
-@wp.func(inline=True)
-def matrix_mul(m: Tables, dense: int, matrix: Reals2, r: int, x: Reals2, rx: int, y: Reals2, ry: int):
-    """y ← A x, A packed in row ``r`` and as sparse as the tree (dense = 0)."""
-    for i in range(m.nv):
-        y[ry, i] = ZERO
-    for i in range(m.nv):
-        ri = packed(i, 0)
-        xi = x[rx, i]
-        yi = matrix[r, ri + i] * xi
-        j = m.dof_parent[dense, i]
-        while j >= 0:
-            aij = matrix[r, ri + j]
-            yi += aij * x[rx, j]
-            y[ry, j] += aij * xi
-            j = m.dof_parent[dense, j]
-        y[ry, i] += yi
-
-
-@wp.func(inline=True)
 def contact_dot(m: Tables, w: World, c: int, x: Reals2, r: int) -> vec6:
     """J x of contact ``c``."""
-    y = vec6()
     k = w.con_pair[w.t, c]
     first = m.pair_dofadr[k]
-    for a in range(m.pair_dofadr[k + 1] - first):
-        y += w.con_jac[w.t, c * m.nv + a] * x[r, m.pair_dof[first + a]]
-    return y
-
-
-@wp.func(inline=True)
-def _add_contact_hessian(m: Tables, w: World, c: int, ll: mat33, la: mat33, aa: mat33, r: int):
-    """H += Jᵀ C J of one contact."""
-    base = c * m.nv
-    k = w.con_pair[w.t, c]
-    first = m.pair_dofadr[k]
-    for a in range(m.pair_dofadr[k + 1] - first):
-        ri = packed(m.pair_dof[first + a], 0)
-        ja = w.con_jac[w.t, base + a]
-        cl = ll * wp.spatial_top(ja)
-        ca = vec3()
-        if m.pair_dim[k] > 3:
-            cl += la * wp.spatial_bottom(ja)
-            ca = wp.transpose(la) * wp.spatial_top(ja) + aa * wp.spatial_bottom(ja)
-        for b in range(a + 1):
-            x = w.con_jac[w.t, base + b]
-            y = wp.dot(cl, wp.spatial_top(x))
-            if m.pair_dim[k] > 3:
-                y += wp.dot(ca, wp.spatial_bottom(x))
-            w.hess[r, ri + m.pair_dof[first + b]] += y
+    return jacobian_mul(m.pair_dof, first, m.pair_dofadr[k + 1] - first, w.con_jac, w.t, c * m.nv, x, r)
 
 
 @wp.func(inline=True)
@@ -172,10 +97,12 @@ def assemble(m: Tables, w: World, nrow: int, ncon: int, r: int):
         if cone_piece(cone, jar6) != 0:
             f = cone_force(cone, jar6)
             first = m.pair_dofadr[k]
-            for a in range(m.pair_dofadr[k + 1] - first):
-                w.step[w.t, m.pair_dof[first + a]] += wp.dot(w.con_jac[w.t, c * m.nv + a], f)
+            count = m.pair_dofadr[k + 1] - first
+            add_jacobian_force(m.pair_dof, first, count, w.con_jac, w.t, c * m.nv, f, w.step, w.t)
             ll, la, aa = cone_hessian(cone, jar6)
-            _add_contact_hessian(m, w, c, ll, la, aa, r)
+            add_congruence(
+                m.pair_dof, first, count, w.con_jac, w.t, c * m.nv, ll, la, aa, int(m.pair_dim[k] > 3), w.hess, r
+            )
 
 
 @wp.func(inline=True)
@@ -201,7 +128,7 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
 @wp.func(inline=True)
 def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
     """The root of φ' along the step: Newton's iteration kept in a bracket, roughly where cones are curved."""
-    matrix_mul(m, m.quad_dense, w.quad, w.t, w.step, w.t, w.work, w.t)
+    multiply(m.dof_parent, m.nv, m.quad_dense, w.quad, w.t, w.step, w.t, w.work, w.t)
     linear = ZERO
     quad = ZERO
     for i in range(m.nv):
@@ -238,7 +165,7 @@ def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
 @wp.func(inline=True)
 def _unconstrained_gradient(m: Tables, w: World, r: int):
     """quad · a + load, into ``w.product``."""
-    matrix_mul(m, m.quad_dense, w.quad, w.t, w.acc, r, w.product, w.t)
+    multiply(m.dof_parent, m.nv, m.quad_dense, w.quad, w.t, w.acc, r, w.product, w.t)
     for i in range(m.nv):
         w.product[w.t, i] += w.load[w.t, i]
 
@@ -254,10 +181,10 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
     done = int(0)
     for _k in range(ITERATIONS):
         assemble(m, w, nrow, ncon, r)
-        factor(m, dense, w.hess, r)
+        factor(m.dof_parent, m.nv, dense, w.hess, r)
         if done != 0:
             break
-        solve(m, dense, w.hess, r, w.step, w.t)
+        solve(m.dof_parent, m.nv, dense, w.hess, r, w.step, w.t)
         same = int(1)
         curved = int(0)
         for n in range(nrow):

@@ -22,7 +22,7 @@ from dropo_torch.simulators.warp.parts import has_full_slope, has_medium, num_te
 from dropo_torch.simulators.warp.rotations import quat_mul
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.slopes import fluid_slopes_adjoint, solve_full_transposed
-from dropo_torch.simulators.warp.solver import factor, newton, solve
+from dropo_torch.simulators.warp.solver import newton
 from dropo_torch.simulators.warp.spatial import (
     add_at,
     ang,
@@ -45,6 +45,7 @@ from dropo_torch.simulators.warp.tendons import (
     tendons_adjoint,
 )
 from dropo_torch.simulators.warp.touch import find_contacts
+from dropo_torch.simulators.warp.triangle import factor, solve
 from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, vec3, vec4, vec6
 from dropo_torch.simulators.warp.welds import make_welds, welds_adjoint
 from dropo_torch.simulators.warp.wrenches import outer_wrench_adjoint
@@ -67,10 +68,10 @@ def accelerate(m: Tables, w: World, r: int):
     if nrow + ncon == 0:
         for i in range(m.nh):
             w.hess[r, i] = w.quad[w.t, i]
-        factor(m, m.quad_dense, w.hess, r)
+        factor(m.dof_parent, m.nv, m.quad_dense, w.hess, r)
         for i in range(m.nv):
             w.acc[r, i] = -w.load[w.t, i]
-        solve(m, m.quad_dense, w.hess, r, w.acc, r)
+        solve(m.dof_parent, m.nv, m.quad_dense, w.hess, r, w.acc, r)
     else:
         make_contacts(m, w, ncon)
         newton(m, w, nrow, ncon, fills_in(m, w, ncon), r)
@@ -98,7 +99,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         if has_full_slope(m):
             solve_full_transposed(m, w.soft_hess, r, w.lam, w.t)
         else:
-            solve(m, 0, w.soft_hess, r, w.lam, w.t)
+            solve(m.dof_parent, m.nv, 0, w.soft_hess, r, w.lam, w.t)
     elif softening == 3:
         gravity = w.bias[w.t, 0]
         for b in range(m.nb):
@@ -109,7 +110,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
             nrow = make_rows(m, w, r, 0)
         if kept > 1:
             ncon = find_contacts(m, w)
-        solve(m, fills_in(m, w, ncon), w.hess, r, w.lam, w.t)
+        solve(m.dof_parent, m.nv, fills_in(m, w, ncon), w.hess, r, w.lam, w.t)
     if num_tendons(m) != 0:
         tendon_armature_adjoint(m, w)
     carry_out(m, w)

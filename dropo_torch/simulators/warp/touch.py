@@ -16,7 +16,23 @@ from dropo_torch.simulators.warp import boxes, collide, hull
 from dropo_torch.simulators.warp.convex_touch import convex_adjoint, convex_contacts, keep_contact
 from dropo_torch.simulators.warp.parts import with_convex
 from dropo_torch.simulators.warp.spatial import pull, wrench
-from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, Tables, World, f64, mat33, vec3, vec6
+from dropo_torch.simulators.warp.types import (
+    HALF,
+    MINVAL,
+    ONE,
+    TWO,
+    ZERO,
+    Ints,
+    Ints2,
+    Reals,
+    Tables,
+    Vec3s2,
+    World,
+    f64,
+    mat33,
+    vec3,
+    vec6,
+)
 
 
 @wp.func(inline=True)
@@ -138,22 +154,139 @@ def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
 
 
 @wp.func(inline=True)
+def _extent(m: Tables, w: World, g: int, direction: vec3) -> f64:
+    """How far the bounding box of a geom reaches in a direction from the geom's centre."""
+    local = wp.transpose(m.geom_mat[g]) * (wp.transpose(w.xmat[w.t, m.geom_body[g]]) * direction)
+    half = m.geom_half[g]
+    spread = half[0] * wp.abs(local[0]) + half[1] * wp.abs(local[1]) + half[2] * wp.abs(local[2])
+    return spread + wp.dot(m.geom_mid[g], local)
+
+
+@wp.func(inline=True)
+def _may_touch(m: Tables, w: World, g1: int, g2: int, apart: vec3, margin: f64) -> bool:
+    """Whether the bounding boxes of two geoms overlap, or nearly so, as seen along the line of their centres."""
+    length = wp.length(apart)
+    near = bool(True)
+    if length > MINVAL:
+        d = apart / length
+        near = length - _extent(m, w, g1, d) - _extent(m, w, g2, -d) < margin
+    return near
+
+
+@wp.func(inline=True)
+def _add_formula(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2: vec3, margin: f64) -> int:
+    """Write the contacts of a pair that has a formula from number ``n`` on and return the number of the next one."""
+    kind = m.pair_kind[k]
+    g1 = m.pair_geom1[k]
+    g2 = m.pair_geom2[k]
+    size1 = m.geom_size[g1]
+    size2 = m.geom_size[g2]
+    axis = geom_axis(m, w, g2)
+    a1 = vec3()
+    a2 = axis * size2[1]
+    rot = mat33()
+    parallel = bool(False)
+    first = int(0)
+    second = int(0)
+    if kind == collide.ROUND:
+        a1 = half_axis(m, w, g1)
+        parallel = collide.are_parallel(a1, a2)
+    elif kind > collide.PLANE_CAPSULE and kind != collide.SPHERE_CYLINDER:
+        rot = geom_rotation(m, w, g2)
+    if kind == collide.CAPSULE_BOX and size1[1] > ZERO:  # a sphere has only the place 0
+        a1 = half_axis(m, w, g1)
+        back = wp.transpose(rot)
+        limit = margin + TWO * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
+        first, second = collide.capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
+    number = n
+    for i in range(m.pair_points[k]):
+        possible = bool(True)
+        which = i
+        hint = vec3()
+        x = collide.vec7()
+        if kind <= collide.PLANE_ELLIPSOID:
+            radius = wp.where(kind <= collide.PLANE_CAPSULE, size2[0], ZERO)
+            if kind == collide.PLANE_CAPSULE:
+                hint = axis
+            elif kind == collide.PLANE_BOX:  # the first four corners on the plane's side of the centre
+                possible = wp.dot(normal, rot * collide.corner(i, size2)) <= ZERO and number - n < 4
+            elif kind == collide.PLANE_CYLINDER:  # the near rim, then the far one and two points near
+                possible = i == 0 or number > n
+            x = collide.plane_point(normal, c1, _towards_plane(kind, normal, c2, axis, rot, size2, i), radius)
+        elif kind == collide.ROUND:
+            which = int(0)
+            possible = i == 0 or parallel
+            if parallel:
+                which = collide.overlap_end(c1, a1, c2, a2, i)
+            x = collide.round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
+        elif kind == collide.SPHERE_CYLINDER:
+            which = collide.cylinder_place(c1 - c2, axis, size2)
+            x = collide.sphere_cylinder(c1, size1[0], c2, axis, size2, which)
+        else:
+            which = wp.where(i == 0, first, second)
+            possible = which >= 0
+            if possible:
+                x = collide.capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
+        if possible and x[0] < margin:
+            _add(w, number, k, which, x, hint)
+            number += 1
+    return number
+
+
+@wp.func_native("""
+    const int* kinds = &wp::index(kind, 0);
+    const double* margins = &wp::index(theta, o_margin);
+    const double* bounds = &wp::index(bound, 0);
+    const int* one = &wp::index(geom1, 0);
+    const int* two = &wp::index(geom2, 0);
+    const wp::vec_t<3, double>* c = &wp::index(centre, t, 0);
+    int* list = &wp::index(near, t, 0);
+    int n = 0;
+    for (int k = 0; k < count; ++k) {
+        const double* p = c[one[k]].c;
+        const double* q = c[two[k]].c;
+        const double x = q[0] - p[0], y = q[1] - p[1], z = q[2] - p[2];
+        const double reach = margins[k] + bounds[k];
+        list[n] = k;
+        n += (kinds[k] <= last_plane) | (x * x + y * y + z * z < reach * reach);
+    }
+    return n;
+""")
+def _near_pairs(
+    kind: Ints, geom1: Ints, geom2: Ints, bound: Reals, theta: Reals, o_margin: int, count: int, last_plane: int,
+    centre: Vec3s2, near: Ints2, t: int,
+) -> int:  # fmt: skip
+    """List the pairs whose bounding spheres are within the margin, and all of planes; return their number."""
+
+
+@wp.func(inline=True)
 def find_contacts(m: Tables, w: World) -> int:
     """List the contacts of a configuration and return their number."""
+    for i in range(m.ntouching):
+        g = m.touching[i]
+        w.centre[w.t, g] = geom_centre(m, w, g)
+    close = int(0)
+    if m.npair > 0:
+        close = _near_pairs(
+            m.pair_kind, m.pair_geom1, m.pair_geom2, m.pair_bound, w.th, m.o_pair_margin, m.npair,
+            collide.PLANE_ELLIPSOID, w.centre, w.near, w.t,
+        )  # fmt: skip
     n = int(0)
-    for k in range(m.npair):
+    for i in range(close):
+        k = w.near[w.t, i]
         kind = m.pair_kind[k]
+        margin = w.th[m.o_pair_margin + k]
         g1 = m.pair_geom1[k]
         g2 = m.pair_geom2[k]
-        margin = w.th[m.o_pair_margin + k]
-        c1 = geom_centre(m, w, g1)
-        c2 = geom_centre(m, w, g2)
-        reach = margin + m.pair_bound[k]
+        c1 = w.centre[w.t, g1]
+        c2 = w.centre[w.t, g2]
         normal = vec3()
-        near = wp.length_sq(c2 - c1) < reach * reach
+        near = bool(True)
         if kind <= collide.PLANE_ELLIPSOID:
             normal = geom_axis(m, w, g1)
-            near = wp.dot(normal, c2 - c1) < reach
+            near = wp.dot(normal, c2 - c1) < margin + m.pair_bound[k]
+        else:
+            near = _may_touch(m, w, g1, g2, c2 - c1, margin)
         if near and n + m.pair_most[k] > m.maxcon:
             w.full[w.t] = 1
         elif near and kind == collide.BOX_BOX:
@@ -163,57 +296,7 @@ def find_contacts(m: Tables, w: World) -> int:
         elif near and with_convex() and kind == collide.CONVEX:
             n = _add_convex(m, w, n, k, margin)
         elif near:
-            size1 = m.geom_size[g1]
-            size2 = m.geom_size[g2]
-            axis = geom_axis(m, w, g2)
-            a1 = vec3()
-            a2 = axis * size2[1]
-            rot = mat33()
-            parallel = bool(False)
-            first = int(0)
-            second = int(0)
-            if kind == collide.ROUND:
-                a1 = half_axis(m, w, g1)
-                parallel = collide.are_parallel(a1, a2)
-            elif kind > collide.PLANE_CAPSULE and kind != collide.SPHERE_CYLINDER:
-                rot = geom_rotation(m, w, g2)
-            if kind == collide.CAPSULE_BOX and size1[1] > ZERO:  # a sphere has only the place 0
-                a1 = half_axis(m, w, g1)
-                back = wp.transpose(rot)
-                limit = margin + TWO * (size1[0] + size1[1] + size2[0] + size2[1] + size2[2])
-                first, second = collide.capsule_box_codes(back * (c1 - c2), back * a1, size2, limit)
-            start = n
-            for i in range(m.pair_points[k]):
-                possible = bool(True)
-                which = i
-                hint = vec3()
-                x = collide.vec7()
-                if kind <= collide.PLANE_ELLIPSOID:
-                    radius = wp.where(kind <= collide.PLANE_CAPSULE, size2[0], ZERO)
-                    if kind == collide.PLANE_CAPSULE:
-                        hint = axis
-                    elif kind == collide.PLANE_BOX:  # the first four corners on the plane's side of the centre
-                        possible = wp.dot(normal, rot * collide.corner(i, size2)) <= ZERO and n - start < 4
-                    elif kind == collide.PLANE_CYLINDER:  # the near rim, then the far one and two points near
-                        possible = i == 0 or n > start
-                    x = collide.plane_point(normal, c1, _towards_plane(kind, normal, c2, axis, rot, size2, i), radius)
-                elif kind == collide.ROUND:
-                    which = int(0)
-                    possible = i == 0 or parallel
-                    if parallel:
-                        which = collide.overlap_end(c1, a1, c2, a2, i)
-                    x = collide.round_contact(c1, a1, size1[0], c2, a2, size2[0], which)
-                elif kind == collide.SPHERE_CYLINDER:
-                    which = collide.cylinder_place(c1 - c2, axis, size2)
-                    x = collide.sphere_cylinder(c1, size1[0], c2, axis, size2, which)
-                else:
-                    which = wp.where(i == 0, first, second)
-                    possible = which >= 0
-                    if possible:
-                        x = collide.capsule_box_contact(c1, a1, size1[0], c2, rot, size2, which)
-                if possible and x[0] < margin:
-                    _add(w, n, k, which, x, hint)
-                    n += 1
+            n = _add_formula(m, w, n, k, normal, c1, c2, margin)
     return n
 
 

@@ -56,6 +56,8 @@ Ints2: Any = wp.array2d(dtype=wp.int32)
 Reals: Any = wp.array(dtype=wp.float64)
 Reals2: Any = wp.array2d(dtype=wp.float64)
 Vec3s: Any = wp.array(dtype=vec3)
+Vec3s2: Any = wp.array2d(dtype=vec3)
+Vec6s2: Any = wp.array2d(dtype=vec6)
 Mats: Any = wp.array(dtype=mat33)
 
 
@@ -73,8 +75,8 @@ def fill(struct: Any, fields: dict[str, Any]) -> Any:
 
 #: Numbers of things, switches of what a model has, and what gradients are wanted of.
 _COUNTS = (
-    "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq", "norigin",
-    "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
+    "nb", "nv", "nq", "nu", "nlink", "npair", "ntouching", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq",
+    "norigin", "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
     "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
     "want_inertial", "want_inertia", "want_ipos", "want_soft",
@@ -93,14 +95,14 @@ _INDICES = (
     "ten_sprung", "ten_damped", "ten_frictional", "ten_limited", "ten_frclimited", "teneq_id", "teneq_tendon",
     "pair_kind", "pair_points", "pair_body1", "pair_body2", "pair_geom1", "pair_geom2", "pair_dim", "pair_dense",
     "pair_most", "pair_dofadr", "pair_dof", "pair_sign",
-    "geom_body", "geom_kind",
+    "geom_body", "geom_kind", "touching",
     "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
     "poly_adr", "poly_num", "poly_vert",
     "body_fluid", "body_nfluid", "fluid_geom", "body_turning",
 )  # fmt: skip
 _VECTORS = (
-    "body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert", "poly_normal", "weld_pos",
-    "seg_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass", "fluid_inertia",
+    "body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "geom_mid", "geom_half", "hull_vert",
+    "poly_normal", "weld_pos", "seg_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass", "fluid_inertia",
 )  # fmt: skip
 _ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat")
 
@@ -155,6 +157,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "row_x": (f64, "row"),  # position less margin
     "row_aref": (f64, "row"), "row_d": (f64, "row"), "row_loss": (f64, "row"),  # D = 1/R
     "row_jar": (f64, "row"), "row_dir": (f64, "row"),  # J a − aref, J step
+    "centre": (vec3, "geom"), "near": (wp.int32, "pair"),  # of the geoms that may touch; pairs that are close
     # contacts; the frame has rows n, t1, t2, and what is along J stands along these, then about them
     "con_pair": (wp.int32, "contact"), "con_which": (wp.int32, "contact"), "con_dist": (f64, "contact"),
     "con_point": (vec3, "contact"), "con_frame": (mat33, "contact"), "con_hint": (vec3, "contact"),
