@@ -60,6 +60,8 @@ _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE
 DIED = "the run died"
 #: A hair's breadth: displacement of a state, or of the margins, that must not change which geoms touch.
 NUDGE = 1e-9
+#: Nudged states of each; and how far a contact must not be shifted by a nudge, in metres.
+NUDGES, SHIFT = 8, 1e-4
 #: Steps of central differences, relative to a parameter's size.
 MOVES = (1e-5, 1e-4)
 
@@ -178,7 +180,9 @@ def _disturb(model: mujoco.MjModel, data: mujoco.MjData, rng: np.random.Generato
         elif model.jnt_type[j] == _FREE:
             move[address : address + 3] *= 0.1
     mujoco.mj_integratePos(model, data.qpos, move, 1.0)
-    data.qvel[:] = rng.uniform(-1, 1, model.nv)
+    # what is damped away within a step, such as a base that is only posed, does not move
+    slowed = 1 + model.opt.timestep * model.dof_damping / np.maximum(model.dof_M0, 1e-9)
+    data.qvel[:] = rng.uniform(-1, 1, model.nv) / slowed
     for mocap, held, _ in _holds(model, data):
         number = model.body_mocapid[mocap]
         data.mocap_pos[number], data.mocap_quat[number] = data.xpos[held], data.xquat[held]
@@ -255,13 +259,25 @@ def conformance(model: mujoco.MjModel, seed: int = 0) -> dict[str, Any]:
     reference = _reference(space)
     errors = _errors(found, reference.simulate(states, inputs, values)[:, 0])
     ties = np.array([_is_tied(model, s, rng) for s in states.numpy()])
-    for margin in (NUDGE, -NUDGE) if ties.any() else ():
-        other = _reference(space.on(_with_margins(model, margin))).simulate(states[ties], inputs[ties], values)[:, 0]
+    for other in _answers_nearby(space, states[ties], inputs[ties], values, rng) if ties.any() else ():
         errors[ties] = torch.minimum(errors[ties], _errors(found[ties], other))
     sound = torch.from_numpy(~ties)
     trues = [_differences(reference, states[sound], inputs[sound], values, weights[sound], step) for step in MOVES]
     gradient = _gradient_errors({name: slope[~ties] for name, slope in slopes.items()}, trues, space)
     return judged(errors.numpy(), ties, gradient) | {"contacts": _contacts(model, states.numpy())}
+
+
+def _answers_nearby(
+    space: ParameterSpace, states: torch.Tensor, inputs: torch.Tensor, values: torch.Tensor, rng: np.random.Generator
+) -> Iterator[torch.Tensor]:
+    """The reference's next states of margins and of poses that are a hair's breadth off."""
+    model = space.model
+    assert model is not None
+    for margin in (NUDGE, -NUDGE):
+        yield _reference(space.on(_with_margins(model, margin))).simulate(states, inputs, values)[:, 0]
+    reference = _reference(space)
+    for moved in zip(*(_nudged(model, state, rng) for state in states.numpy()), strict=True):
+        yield reference.simulate(torch.from_numpy(np.array(moved)), inputs, values)[:, 0]
 
 
 def _values(space: ParameterSpace) -> np.ndarray:
@@ -297,7 +313,20 @@ def _inputs(model: mujoco.MjModel, state: np.ndarray, width: int, rng: np.random
         pos, quat = held.get(int(body), (model.body_pos[body], model.body_quat[body]))
         quat = quat + rng.normal(0, 0.02, 4)
         poses.append(np.r_[pos + rng.normal(0, 0.01, 3), quat / np.linalg.norm(quat)])
-    return np.concatenate([random_controls(model, rng), *poses])
+    return np.concatenate([_endured(model, state, random_controls(model, rng)), *poses])
+
+
+def _endured(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray) -> np.ndarray:
+    """Controls that are small enough for a step to end at speeds below 100."""
+    data = mujoco.MjData(model)
+    for _ in range(30):
+        mujoco.mj_resetData(model, data)
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], controls
+        mujoco.mj_step(model, data)
+        if not any(w.number for w in data.warning) and np.abs(data.qvel).max() < 100:
+            break
+        controls = controls / 2
+    return controls
 
 
 def _errors(found: torch.Tensor, true: torch.Tensor) -> torch.Tensor:
@@ -382,26 +411,35 @@ def relative_errors(found: np.ndarray, *trues: np.ndarray, floor: float = 1e-6) 
 
 
 def _is_tied(model: mujoco.MjModel, state: np.ndarray, rng: np.random.Generator) -> bool:
-    """Whether a hair's breadth, of the pose or of the margins, changes which geoms touch."""
+    """Whether a hair's breadth, of the pose or of the margins, changes which geoms touch, or at which points."""
     data = mujoco.MjData(model)
-
-    def touching(model: mujoco.MjModel, qpos: np.ndarray) -> list[tuple[int, int]]:
-        data.qpos[:] = qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        mujoco.mj_collision(model, data)
-        return sorted((int(c.geom[0]), int(c.geom[1])) for c in data.contact if not c.exclude)
-
     own = state[: model.nq]
-    expected = touching(model, own)
-    if any(touching(_with_margins(model, change), own) != expected for change in (NUDGE, -NUDGE)):
-        return True
-    for _ in range(4):
-        qpos = own.copy()
-        mujoco.mj_integratePos(model, qpos, rng.normal(size=model.nv), NUDGE)
-        if touching(model, qpos) != expected:
-            return True
-    return False
+    expected = _touching(model, data, own)
+    others = [_touching(_with_margins(model, change), data, own) for change in (NUDGE, -NUDGE)]
+    others += [_touching(model, data, moved[: model.nq]) for moved in _nudged(model, state, rng)]
+    return any(
+        pairs != expected[0] or np.abs(points - expected[1]).max(initial=0.0) > SHIFT for pairs, points in others
+    )
+
+
+def _touching(model: mujoco.MjModel, data: mujoco.MjData, qpos: np.ndarray) -> tuple[list[tuple[int, int]], np.ndarray]:
+    """Pairs of geoms that touch, and the points where they do."""
+    data.qpos[:] = qpos
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_collision(model, data)
+    found = [c for c in data.contact if not c.exclude]
+    found.sort(key=lambda c: (int(c.geom[0]), int(c.geom[1])))
+    points = np.array([c.pos for c in found]).reshape(-1, 3)
+    return [(int(c.geom[0]), int(c.geom[1])) for c in found], points
+
+
+def _nudged(model: mujoco.MjModel, state: np.ndarray, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    """States a hair's breadth from one."""
+    for _ in range(NUDGES):
+        moved = state.copy()
+        mujoco.mj_integratePos(model, moved[: model.nq], rng.normal(size=model.nv), NUDGE)
+        yield moved
 
 
 def _contacts(model: mujoco.MjModel, states: np.ndarray) -> int:
