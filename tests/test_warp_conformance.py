@@ -67,6 +67,7 @@ class Case:
     push: float = 1.0
     length: int = 25
     seed: int = 0
+    lag: int = 1
     idle: tuple[str, ...] = ()  # parameters without effect on this motion
 
     def model(self) -> mujoco.MjModel:
@@ -79,6 +80,9 @@ def check(case: Case, count: int = 12) -> None:
     model = case.model()
     space = ParameterSpace(model, case.parameters)
     states, controls = rollouts(model, count, spread=case.spread, push=case.push, length=case.length, seed=case.seed)
+    if case.lag > 1:
+        later = np.random.default_rng(case.seed).uniform(-case.push, case.push, (count, case.lag - 1, model.nu))
+        controls = np.concatenate([controls, later], 1)
     simulator = WarpSimulator(model, parameters=space, frame_skip=case.skip, num_threads=1)
     report = check_simulator(
         simulator,
@@ -160,6 +164,14 @@ TURNED = """<motor name="turn" joint="jb" gear="1 .5 -.3" forcerange="-.4 .4"/>
 <position name="pa" joint="ja" kp="20" kv="1.5"/>"""
 
 
+FILTERED = """<general name="pa" joint="ja" dyntype="filter" dynprm=".02" gaintype="affine" biastype="affine"
+ gainprm="9 .5 -.3" biasprm=".2 -9 -.5" ctrlrange="-.9 .9"/>
+<general name="vb" joint="jb" dyntype="filterexact" dynprm=".015" gainprm="2" actlimited="true" actrange="-.4 .5"
+ actearly="true"/>
+<general name="gc" joint="jc" dyntype="filterexact" dynprm=".03" gaintype="affine" gainprm="2 0 -1.5" gear="1.5"
+ forcerange="-1 1.2"/><motor name="plain" joint="jc"/>"""
+
+
 def arm(**changes: str) -> str:
     settings = {"integrator": "Euler", "option": "", "loss": "0", "second": "hinge", "limit": "", "extra": "",
                 "actuators": SERVOS} | changes  # fmt: skip
@@ -191,6 +203,11 @@ DRIVES = {
     "bias0": p("actuator_biasprm", "gc", 0), "bias2": p("actuator_biasprm", "gc", 2),
     "forcerange": p("actuator_forcerange", "pa", 1), "ctrlrange": p("actuator_ctrlrange", "vc", 0),
 }  # fmt: skip
+FILTERS = {
+    "tau": p("actuator_dynprm", "pa", 0, (1e-3, 1)), "early": p("actuator_dynprm", "vb", 0, (1e-3, 1)),
+    "exact": p("actuator_dynprm", "gc", 0, (1e-3, 1)), "actrange": p("actuator_actrange", "vb", 1),
+    "gain2": p("actuator_gainprm", "gc", 2), "mass": p("body_mass", "b"),
+}  # fmt: skip
 LOSS = {"loss": p("dof_frictionloss", "ja"), "mass": p("body_mass", "b")}
 STUCK = {"dof_solref": p("dof_solref", "ja", 0), "dof_solimp": p("dof_solimp", "ja", 0), "mass": p("body_mass", "b")}
 EQUALITY = '<equality><joint joint1="jc" joint2="ja" polycoef=".01 .05 .1 .02 .03"/></equality>'
@@ -200,6 +217,9 @@ TREES = [
     Case("Euler", arm(), JOINTS | DRIVES),
     Case("RK4", arm(integrator="RK4"), JOINTS | DRIVES),
     Case("implicitfast", arm(integrator="implicitfast"), JOINTS | DRIVES),
+    Case("filters", arm(actuators=FILTERED), FILTERS, lag=3),
+    Case("filters RK4", arm(actuators=FILTERED, integrator="RK4"), FILTERS, lag=3),
+    Case("filters implicitfast", arm(actuators=FILTERED, integrator="implicitfast"), FILTERS, lag=3),
     Case("frictionloss", arm(loss="0.8"), JOINTS | LOSS, most=1e-2),
     Case("frictionloss RK4", arm(loss="0.8", integrator="RK4"), JOINTS | LOSS, most=1e-2),
     Case("stuck", arm(loss="30"), STUCK, most=1e-2),

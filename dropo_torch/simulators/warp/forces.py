@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from dropo_torch.simulators.warp.activations import clamp, clamp_adjoint, drive, drive_adjoint
 from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log, quat_mul
 from dropo_torch.simulators.warp.spatial import add_at, vec3_at, vec4_at
@@ -103,43 +104,6 @@ def damping_slope(m: Tables, w: World, v: f64, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def clamp(w: World, o: int, x: f64) -> f64:
-    """x within the range that stands at ``o`` in θ."""
-    return wp.min(wp.max(x, w.th[o]), w.th[o + 1])
-
-
-@wp.func(inline=True)
-def clamp_adjoint(w: World, o: int, x: f64, bar: f64) -> f64:
-    """Adjoint of x before :func:`clamp`: where it is clamped its end of the range has it."""
-    out = bar
-    if x < w.th[o]:
-        w.grad[w.t, o] += bar
-        out = ZERO
-    elif x > w.th[o + 1]:
-        w.grad[w.t, o + 1] += bar
-        out = ZERO
-    return out
-
-
-@wp.func(inline=True)
-def control(m: Tables, w: World, i: int) -> f64:
-    """Control of an actuator, clamped to its range."""
-    u = w.ctrl[w.rc, i]
-    if m.act_ctrllimited[i] != 0:
-        u = clamp(w, m.o_ctrlrange + 2 * i, u)
-    return u
-
-
-@wp.func(inline=True)
-def control_adjoint(m: Tables, w: World, i: int, bar: f64):
-    """Adjoint of :func:`control`."""
-    ubar = bar
-    if m.act_ctrllimited[i] != 0:
-        ubar = clamp_adjoint(w, m.o_ctrlrange + 2 * i, w.ctrl[w.rc, i], bar)
-    w.ctrl_bar[w.rb, i] += ubar
-
-
-@wp.func(inline=True)
 def actuator_length(m: Tables, w: World, r: int, i: int) -> f64:
     """Length of an actuator: gear · q of a hinge or slide; of a free joint it is none, of a ball it is not needed."""
     y = ZERO
@@ -163,13 +127,13 @@ def actuator_rate(m: Tables, w: World, r: int, i: int) -> f64:
 
 @wp.func(inline=True)
 def actuator_force(m: Tables, w: World, r: int, i: int) -> f64:
-    """gain(l, l̇) u + bias(l, l̇) with length l and velocity l̇, before the force range."""
+    """gain(l, l̇) u + bias(l, l̇) with length l, velocity l̇ and drive u, before the force range."""
     og = m.o_gain + 3 * i
     ob = m.o_bias + 3 * i
     gain = w.th[og]
     if m.act_affine_gain[i] != 0:
         gain += w.th[og + 1] * actuator_length(m, w, r, i) + w.th[og + 2] * actuator_rate(m, w, r, i)
-    force = gain * control(m, w, i)
+    force = gain * drive(m, w, r, i)
     if m.act_affine_bias[i] != 0:
         force += w.th[ob] + w.th[ob + 1] * actuator_length(m, w, r, i) + w.th[ob + 2] * actuator_rate(m, w, r, i)
     return force
@@ -274,7 +238,7 @@ def actuators_adjoint(m: Tables, w: World, r: int):
         oe = m.o_gear + 6 * i
         length = actuator_length(m, w, r, i)
         rate = actuator_rate(m, w, r, i)
-        u = control(m, w, i)
+        u = drive(m, w, r, i)
         f = actuator_force(m, w, r, i)
         fbar = ZERO  # ∂/∂force
         for k in range(m.act_ndof[i]):
@@ -312,7 +276,7 @@ def actuators_adjoint(m: Tables, w: World, r: int):
             rate_bar(m, w, k, fbar * slope_v * w.th[oe], w.vel_bar, r)
             lever = slope_l * w.ten_length[w.t, k] + slope_v * w.ten_rate[w.t, k]
             w.grad[w.t, oe] += f * w.ten_force[w.t, k] + fbar * lever
-        control_adjoint(m, w, i, fbar * gain)
+        drive_adjoint(m, w, r, i, fbar * gain)
 
 
 @wp.func(inline=True)
@@ -323,7 +287,7 @@ def actuator_slope(m: Tables, w: World, r: int, a: int) -> f64:
     if m.act_affine_bias[a] != 0:
         y += w.th[m.o_bias + 3 * a + 2]
     if m.act_affine_gain[a] != 0:
-        y += w.th[m.o_gain + 3 * a + 2] * control(m, w, a)
+        y += w.th[m.o_gain + 3 * a + 2] * drive(m, w, r, a)
     if m.act_frclimited[a] != 0:
         f = actuator_force(m, w, r, a)
         o = m.o_forcerange + 2 * a
@@ -343,8 +307,8 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
             w.grad[w.t, m.o_bias + 3 * a + 2] += bar * gear * gear
         if m.act_affine_gain[a] != 0:
             o = m.o_gain + 3 * a + 2
-            w.grad[w.t, o] += bar * gear * gear * control(m, w, a)
-            control_adjoint(m, w, a, bar * gear * gear * w.th[o])
+            w.grad[w.t, o] += bar * gear * gear * drive(m, w, r, a)
+            drive_adjoint(m, w, r, a, bar * gear * gear * w.th[o])
 
 
 @wp.func(inline=True)

@@ -18,6 +18,8 @@ from dropo_torch.simulators.warp.types import BALL
 
 #: Fields of which only the first columns act, and how many.
 _KEPT = {field: keep for _, field, keep in DIRECT if keep}
+#: Dynamics of activations, as numbered in ``types``.
+_ACTIVE = ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT", "MUSCLE")
 # compared with numpy integers, which do not equal MuJoCo's enumerations from the right
 _TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 INTEGRATORS = (
@@ -27,6 +29,9 @@ INTEGRATORS = (
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_DYNAMICS = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in _ACTIVE)
+#: How many constants the dynamics have.
+_CONSTANTS = dict(zip(_DYNAMICS, (0, 0, 1, 1, 3), strict=True))
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 _COUPLED = (int(mujoco.mjtEq.mjEQ_TENDON),)
@@ -128,8 +133,7 @@ def _options(model: mujoco.MjModel) -> Iterator[Missing]:
 
 
 def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
-    counts = {"nplugin": "plugins", "nhistory": "delays or history buffers", "nplastic": "plastic springs",
-              "na": "activation states of actuators"}  # fmt: skip
+    counts = {"nplugin": "plugins", "nhistory": "delays or history buffers", "nplastic": "plastic springs"}
     yield from (Missing(what) for number, what in counts.items() if getattr(model, number, 0))
     yield from (
         Missing("flex", repr(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i) or i)) for i in range(model.nflex)
@@ -177,7 +181,7 @@ def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing
                 Missing(f"actuator of a free or ball joint with {what}", where)
                 for what in _beyond_moments(model, i, varied)
             )
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
+        if model.actuator_dyntype[i] not in _DYNAMICS:
             yield Missing(f"actuator dynamics {mujoco.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()}", where)
         if model.actuator_gaintype[i] not in _GAINS:
             yield Missing(f"actuator gain {mujoco.mjtGain(model.actuator_gaintype[i]).name[7:].lower()}", where)
@@ -279,6 +283,12 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
         dofs = int(joint_dofs(model)[model.actuator_trnid[index // width, 0]])
         if column >= dofs:
             return f"effects of {field}[{column}], only of " + ", ".join(f"{field}[{i}]" for i in range(dofs))
+    if field in ("actuator_dynprm", "actuator_actrange"):
+        actuator = index // width
+        if field == "actuator_actrange" and not model.actuator_actlimited[actuator]:
+            return f"effects of {field} where activation is not limited"
+        if field == "actuator_dynprm" and column >= _CONSTANTS[int(model.actuator_dyntype[actuator])]:
+            return f"effects of {field}[{column}] in these dynamics"
     if field == "qpos_spring":
         kinds, _joints, _dofs, starts = link_table(model)
         if ((kinds == BALL) & (starts <= index) & (index < starts + 4)).any():

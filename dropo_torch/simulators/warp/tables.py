@@ -219,6 +219,9 @@ def _actuators(model: mujoco.MjModel) -> dict[str, Any]:
         "act_affine_bias": model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
         "act_ctrllimited": model.actuator_ctrllimited * (not _disabled(model, _DISABLE.mjDSBL_CLAMPCTRL)),
         "act_frclimited": model.actuator_forcelimited,
+        "na": model.na if acting else 0, "act_state": model.actuator_actadr, "act_dyn": model.actuator_dyntype,
+        "act_early": model.actuator_actearly, "act_statelimited": model.actuator_actlimited,
+        "state_act": np.flatnonzero(model.actuator_actnum),
         "has_frclimit": int(acting and bool(model.jnt_actfrclimited.any())),
     }  # fmt: skip
 

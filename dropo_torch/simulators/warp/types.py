@@ -51,6 +51,12 @@ EULER = wp.constant(0)
 RK4 = wp.constant(1)
 IMPLICITFAST = wp.constant(2)
 
+#: Dynamics of an activation.
+INTEGRATOR = wp.constant(1)
+FILTER = wp.constant(2)
+FILTEREXACT = wp.constant(3)
+MUSCLE = wp.constant(4)
+
 Ints: Any = wp.array(dtype=wp.int32)
 Ints2: Any = wp.array2d(dtype=wp.int32)
 Reals: Any = wp.array(dtype=wp.float64)
@@ -73,7 +79,7 @@ def fill(struct: Any, fields: dict[str, Any]) -> Any:
 
 #: Numbers of things, switches of what a model has, and what gradients are wanted of.
 _COUNTS = (
-    "nb", "nv", "nq", "nu", "nlink", "npair", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq", "norigin",
+    "nb", "nv", "nq", "nu", "na", "nlink", "npair", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq", "norigin",
     "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
     "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
@@ -86,7 +92,7 @@ _INDICES = (
     "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
     "dof_body", "dof_ndof", "dof_alone",
     "act_dof", "act_ndof", "act_tendon", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited",
-    "act_frclimited",
+    "act_frclimited", "act_state", "act_dyn", "act_early", "act_statelimited", "state_act",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "weld_id", "weld_body", "weld_turns", "weld_sites", "weld_dense",
     "ten_spatial", "ten_start", "ten_dof", "ten_qpos", "ten_column", "ten_segment", "seg_body",
@@ -122,6 +128,7 @@ Tables: Any = _struct(
 #: Memory of a trajectory, one row per stage of a step: name → (type, numbers in a row).
 TRAJECTORY: dict[str, tuple[Any, str]] = {
     "qpos": (f64, "qpos"), "qvel": (f64, "dof"), "acc": (f64, "dof"),
+    "act": (f64, "activation"),
     "rate": (f64, "dof"),  # RK4: rate of the position in the chart at the start of the step
     "hess": (f64, "triangle"),  # factor of H
 }  # fmt: skip
@@ -196,6 +203,9 @@ ADJOINT: dict[str, tuple[Any, str]] = {
     "pos_bar": (f64, "dof"), "rate_bar": (f64, "dof"),  # adjoint of the state at the end of a step
     "kept": (f64, "dof"),  # a velocity while another stands in its place
     "pos_bar0": (f64, "dof"),  # and of the position at its start
+    # activations: of a stage and its rate, of the state at the end and at the start of a step, of all stages' rates
+    "act_bar": (f64, "activation"), "act_rate_bar": (f64, "activation"), "act_end_bar": (f64, "activation"),
+    "act_bar0": (f64, "activation"), "stage_act_rate_bar": (f64, "stage_activation"),
     "grad": (f64, "theta"),
 }  # fmt: skip
 
@@ -215,9 +225,9 @@ World: Any = _struct(
     },
 )
 
-#: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each`` and parameter
-#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``. ``applied``,
-#: ``wrenched``: see the world's.
+#: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each``, initial state
+#: ``world // start_each`` and parameter vector ``world % nparam``; all stages are kept, or the last two steps of
+#: ``period``. ``applied``, ``wrenched``: see the world's.
 Chunk: Any = _struct(
     "Chunk",
     dict.fromkeys(
@@ -226,6 +236,7 @@ Chunk: Any = _struct(
             "local",
             "nparam",
             "each",
+            "start_each",
             "lag",
             "skip",
             "period",

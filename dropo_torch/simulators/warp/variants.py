@@ -142,7 +142,7 @@ class Variants:
         return engine
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
-        if remarks(model):  # it stands in for MuJoCo with these very options
+        if remarks(model) or model.na:  # it stands in for MuJoCo with these very options, and without activations
             return None
         try:
             return Engine(model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device)
