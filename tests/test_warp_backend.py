@@ -222,7 +222,7 @@ def test_one_error_names_everything_that_is_refused():
     space = ParameterSpace(
         model,
         {
-            "size": {"field": "geom_size", "name": "box", "index": 0, "bounds": [0.1, 1]},
+            "place": {"field": "site_pos", "name": "below", "index": 1, "bounds": [0.1, 1]},
             "gear1": {"field": "actuator_gear", "name": "damped", "index": 3, "bounds": [0.1, 1]},
         },
     )
@@ -232,7 +232,7 @@ def test_one_error_names_everything_that_is_refused():
     assert "\n" not in message
     for part in (
         "integrator=discrete", "noslip", "'string'", "wraps", "'ball_motor'", "'own'", "user", "tendon", "'cyl'",
-        "'ell'", "ellipsoid", "cylinder", "'size'", "geom_size", "'gear1'", "gear[0]",
+        "'ell'", "ellipsoid", "cylinder", "'place'", "site_pos", "'gear1'", "gear[0]",
     ):  # fmt: skip
         assert part in message, f"{part} in {message}"
 

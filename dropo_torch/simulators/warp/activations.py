@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import warp as wp
 
+from dropo_torch.simulators.warp.parts import is_activated, num_activations
 from dropo_torch.simulators.warp.spatial import add_at, late, theta_vec3
 from dropo_torch.simulators.warp.types import (
     FILTEREXACT,
@@ -90,14 +91,14 @@ def activation_power(dynamics: int, u: f64, act: f64, prm: vec3, bar: f64) -> f6
     return rate * bar
 
 
-@wp.func
+@wp.func(inline=True)
 def activation_rate(m: Tables, w: World, r: int, i: int) -> f64:
     """Rate of the activation of actuator ``i`` in row ``r``."""
     act = w.act[r, m.act_state[i]]
     return activation_power(m.act_dyn[i], control(m, w, i), act, theta_vec3(w.th, m.o_dynprm + 3 * i), ONE)
 
 
-@wp.func
+@wp.func(inline=True)
 def reach(m: Tables, w: World, i: int) -> f64:
     """What the rate of an activation is multiplied by over a step."""
     y = m.h
@@ -107,7 +108,7 @@ def reach(m: Tables, w: World, i: int) -> f64:
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def stepped(m: Tables, w: World, i: int, act: f64, rate: f64) -> f64:
     """An activation a step later, at a rate."""
     y = act + reach(m, w, i) * rate
@@ -116,7 +117,7 @@ def stepped(m: Tables, w: World, i: int, act: f64, rate: f64) -> f64:
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def stepped_adjoint(m: Tables, w: World, i: int, act: f64, rate: f64, bar: f64) -> f64:
     """Adjoint of the activation in :func:`stepped`; times :func:`reach` it is the rate's."""
     y = bar
@@ -130,7 +131,7 @@ def stepped_adjoint(m: Tables, w: World, i: int, act: f64, rate: f64, bar: f64) 
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def _activation(m: Tables, w: World, r: int, i: int) -> f64:
     """Activation that acts in row ``r``."""
     y = w.act[r, m.act_state[i]]
@@ -142,15 +143,13 @@ def _activation(m: Tables, w: World, r: int, i: int) -> f64:
 @wp.func(inline=True)
 def drive(m: Tables, w: World, r: int, i: int) -> f64:
     """What the force of an actuator goes by: its control, its activation, or that at the end of the step."""
-    y = ZERO
-    if m.act_state[i] < 0:
-        y = control(m, w, i)
-    if m.act_state[i] >= 0:
+    y = control(m, w, i)
+    if is_activated(m, i):
         y = _activation(m, w, r, i)
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def _activation_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
     """Adjoint of :func:`_activation`."""
     k = m.act_state[i]
@@ -165,20 +164,20 @@ def _activation_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
 @wp.func(inline=True)
 def drive_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
     """Adjoint of :func:`drive`."""
-    if m.act_state[i] < 0:
-        control_adjoint(m, w, i, bar)
-    else:
+    if is_activated(m, i):
         _activation_adjoint(m, w, r, i, bar)
+    else:
+        control_adjoint(m, w, i, bar)
 
 
-@wp.func
+@wp.func(inline=True)
 def move_activations(m: Tables, w: World, r: int, k: int, c: f64):
     """Activations of stage ``k`` of RK4, ``c`` after those of the start at the rates of the stage before."""
     for j in range(m.na):
         w.act[r + k, j] = w.act[r, j] + c * activation_rate(m, w, r + k - 1, m.state_act[j])
 
 
-@wp.func
+@wp.func(inline=True)
 def mean_rate(m: Tables, w: World, r: int, i: int) -> f64:
     """Rate of an activation over the step whose stages begin in row ``r``."""
     y = activation_rate(m, w, r, i)
@@ -188,7 +187,7 @@ def mean_rate(m: Tables, w: World, r: int, i: int) -> f64:
     return y
 
 
-@wp.func
+@wp.func(inline=True)
 def step_activations(m: Tables, w: World, r: int, nxt: int):
     """Activations at the end of a step, in row ``nxt``."""
     for j in range(m.na):
@@ -196,7 +195,7 @@ def step_activations(m: Tables, w: World, r: int, nxt: int):
         w.act[nxt, j] = stepped(m, w, i, w.act[r, j], mean_rate(m, w, r, i))
 
 
-@wp.func
+@wp.func(inline=True)
 def step_activations_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`step_activations`: from ``w.act_end_bar`` to the start and the rates of all stages."""
     for j in range(m.na):
@@ -214,12 +213,12 @@ def step_activations_adjoint(m: Tables, w: World, r: int):
 @wp.func(inline=True)
 def begin_activations_adjoint(m: Tables, w: World, k: int):
     """Adjoints of the activations of stage ``k`` and of their rates, before that of what depends on them."""
-    for j in range(m.na):
+    for j in range(num_activations(m)):
         w.act_bar[w.t, j] = ZERO
         w.act_rate_bar[w.t, j] = w.stage_act_rate_bar[w.t, k * m.na + j]
 
 
-@wp.func
+@wp.func(inline=True)
 def end_activations_adjoint(m: Tables, w: World, r: int, k: int, c: f64):
     """Adjoint of the rates of stage ``k``, row ``r``, and of :func:`move_activations`; of stage 0 ``c`` is zero."""
     _late = wp.grad(late)(ONE)

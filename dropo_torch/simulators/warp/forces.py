@@ -12,7 +12,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.activations import clamp, clamp_adjoint, drive, drive_adjoint
-from dropo_torch.simulators.warp.parts import num_tendons
+from dropo_torch.simulators.warp.parts import is_thrust, num_tendons
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log, quat_mul
 from dropo_torch.simulators.warp.spatial import add_at, vec3_at, vec4_at
 from dropo_torch.simulators.warp.tendons import (
@@ -23,6 +23,7 @@ from dropo_torch.simulators.warp.tendons import (
     tendon_dot,
     tendon_forces_adjoint,
 )
+from dropo_torch.simulators.warp.thrust import thrust, thrust_adjoint
 from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
 
 
@@ -211,6 +212,15 @@ def add_actuators(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
+def add_thrust(m: Tables, w: World, r: int):
+    """Subtract from the bodies' forces those of actuators at sites."""
+    for i in range(m.nu):
+        if is_thrust(m, i):
+            b = m.act_body[i]
+            w.force[w.t, b] = w.force[w.t, b] - thrust(m, w, i) * ranged_force(m, w, r, i)
+
+
+@wp.func(inline=True)
 def actuators_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_actuators`; ``w.work`` comes to hold ∂(−λτ)/∂τ before the joints' ranges."""
     if m.has_frclimit != 0:
@@ -245,6 +255,8 @@ def actuators_adjoint(m: Tables, w: World, r: int):
             fbar += w.th[oe + k] * w.work[w.t, d + k]
         if m.act_tendon[i] >= 0:
             fbar = w.th[oe] * w.ten_force[w.t, m.act_tendon[i]] + w.ten_sum[w.t, m.act_tendon[i]]
+        if is_thrust(m, i):
+            fbar = -wp.dot(w.dual[w.t, m.act_body[i]], thrust(m, w, i))
         if m.act_frclimited[i] != 0:
             fbar = clamp_adjoint(w, m.o_forcerange + 2 * i, f, fbar)
             f = clamp(w, m.o_forcerange + 2 * i, f)
@@ -276,6 +288,8 @@ def actuators_adjoint(m: Tables, w: World, r: int):
             rate_bar(m, w, k, fbar * slope_v * w.th[oe], w.vel_bar, r)
             lever = slope_l * w.ten_length[w.t, k] + slope_v * w.ten_rate[w.t, k]
             w.grad[w.t, oe] += f * w.ten_force[w.t, k] + fbar * lever
+        if is_thrust(m, i):
+            thrust_adjoint(m, w, i, f)
         drive_adjoint(m, w, r, i, fbar * gain)
 
 

@@ -17,7 +17,7 @@ from dropo_torch.simulators.warp.activations import (
 )
 from dropo_torch.simulators.warp.forces import actuator_slope, actuator_slope_adjoint, damping_slope
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
-from dropo_torch.simulators.warp.parts import has_full_slope, num_tendons
+from dropo_torch.simulators.warp.parts import has_full_slope, num_activations, num_tendons
 from dropo_torch.simulators.warp.rotations import (
     chart_rate,
     chart_rate_dual,
@@ -238,7 +238,7 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
                     w.qvel[r + k, i] = w.qvel[r, i] + c * w.acc[r + k - 1, i]
                     w.acc[r + k, i] = w.acc[r + k - 1, i]  # the guess of a stage
                 chart_rates(m, w, r + k, c)
-                if m.na != 0:
+                if num_activations(m) != 0:
                     move_activations(m, w, r, k, c)
             else:
                 for i in range(m.nv):
@@ -260,7 +260,7 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
                 w.qvel[nxt, i] = v
                 w.work[w.t, i] = v
         move(m, w, r, w.work, w.t, h, nxt)
-        if m.na != 0:
+        if num_activations(m) != 0:
             step_activations(m, w, r, nxt)
         for i in range(m.nv):
             w.acc[nxt, i] = w.acc[r + m.nstage - 1, i]
@@ -274,7 +274,7 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
     h = m.h
     nv = m.nv
     _end_adjoint(m, w, r, nxt)
-    if m.na != 0:
+    if num_activations(m) != 0:
         step_activations_adjoint(m, w, r)
     passes = m.nstage + m.implicit * (1 + m.implicit_fluid + 2 * m.has_turning)
     for back in range(passes):
@@ -339,14 +339,14 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
                 outer_mul(m, w, n, w.th[m.o_ten_armature + n], w.lam, w.t, w.acc_bar, w.t)
         elif k > 0:
             c = stage_time(h, k)
-            if m.na != 0:
+            if num_activations(m) != 0:
                 end_activations_adjoint(m, w, r + k, k, c)
             chart_rates_adjoint(m, w, r + k, c, k * nv)
             for i in range(nv):
                 w.stage_vel_bar[w.t, i] += w.vel_bar[w.t, i]
                 w.stage_acc_bar[w.t, (k - 1) * nv + i] += c * w.vel_bar[w.t, i]
             move_adjoint(m, w, w.rate, r + k - 1, c, w.tangent, w.stage_rate_bar, (k - 1) * nv)
-        elif m.na != 0:
+        elif num_activations(m) != 0:
             end_activations_adjoint(m, w, r, 0, ZERO)
     for i in range(nv):
         w.pos_bar[w.t, i] = w.pos_bar0[w.t, i] + w.tangent[w.t, i]

@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from dropo_torch.simulators.warp.integrate import good, step
-from dropo_torch.simulators.warp.parts import make_kernel
+from dropo_torch.simulators.warp.parts import make_kernel, num_activations
 from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals2, Tables, World, f64
 
 
@@ -38,7 +38,7 @@ def simulate(
     for j in range(m.nv):
         w.qvel[base, j] = states[world // chunk.start_each, m.nq + j]
         w.acc[base, j] = ZERO
-    for j in range(m.na):
+    for j in range(num_activations(m)):
         w.act[base, j] = states[world // chunk.start_each, m.nq + m.nv + j]
     ok = int(1)
     n = int(0)
@@ -57,7 +57,7 @@ def simulate(
             if ok != 0:
                 y = w.qpos[r, j] if j < m.nq else w.qvel[r, j - m.nq]
             out[i * chunk.lag + logged, j] = y
-        for j in range(m.na):
+        for j in range(num_activations(m)):
             out[i * chunk.lag + logged, m.nq + m.nv + j] = w.act[r, j]
     alive[i] = ok - w.full[w.t]
 

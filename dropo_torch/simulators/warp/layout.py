@@ -28,10 +28,18 @@ MIXED = (
     "geom_friction", "geom_solref", "geom_solimp", "geom_margin", "pair_friction", "pair_solref",
     "pair_solreffriction", "pair_solimp", "pair_margin",
 )  # fmt: skip
+#: What actuators add to their joints, times the gear's square: field of the actuators → that of the dofs.
+ADDED = {
+    "actuator_damping": "dof_damping", "actuator_dampingpoly": "dof_dampingpoly", "actuator_armature": "dof_armature",
+}  # fmt: skip
+#: Fields of frames, those of bodies, joints and geoms: in θ stand those that vary.
+FRAMES = ("body_pos", "body_quat", "jnt_axis", "jnt_pos", "geom_pos", "geom_quat", "geom_size")
 #: Numbers of a pair of geoms: what is mixed, and the sum of the two bodies' inverse weights.
 PAIR = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 1, "invweight": 1}
 #: Fields that θ is made of: those that a parameter may write and the adjoint differentiates.
-FIELDS = (*(field for _, field, _ in DIRECT), *MIXED)
+FIELDS = (*(field for _, field, _ in DIRECT), *MIXED, *FRAMES, *ADDED)
 #: All sections of θ, in order.
-SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight", "weld_invweight",
-            "ten_invweight")  # fmt: skip
+SECTIONS = (
+    *(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight", "weld_invweight",
+    "ten_invweight", "body_frame", "link_frame", "geom_frame",
+)  # fmt: skip

@@ -81,9 +81,9 @@ def fill(struct: Any, fields: dict[str, Any]) -> Any:
 _COUNTS = (
     "nb", "nv", "nq", "nu", "na", "nlink", "npair", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq", "norigin",
     "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
-    "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full",
+    "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full", "has_thrust",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
-    "want_inertial", "want_inertia", "want_ipos", "want_soft",
+    "want_inertial", "want_inertia", "want_ipos", "want_soft", "want_frames", "want_geoms",
     "ccd_iterations", "nclip_normal",
 )  # fmt: skip
 #: Of bodies, links (the joints, a free joint as two), dofs, actuators, scalar constraints and pairs of geoms.
@@ -91,8 +91,8 @@ _INDICES = (
     "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive", "body_pose",
     "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
     "dof_body", "dof_ndof", "dof_alone",
-    "act_dof", "act_ndof", "act_tendon", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited",
-    "act_frclimited", "act_state", "act_dyn", "act_early", "act_statelimited", "state_act",
+    "act_dof", "act_ndof", "act_tendon", "act_body", "act_qpos", "act_affine_gain", "act_affine_bias",
+    "act_ctrllimited", "act_frclimited", "act_state", "act_dyn", "act_early", "act_statelimited", "state_act",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "weld_id", "weld_body", "weld_turns", "weld_sites", "weld_dense",
     "ten_spatial", "ten_start", "ten_dof", "ten_qpos", "ten_column", "ten_segment", "seg_body",
@@ -103,12 +103,13 @@ _INDICES = (
     "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
     "poly_adr", "poly_num", "poly_vert",
     "body_fluid", "body_nfluid", "fluid_geom", "body_turning",
+    "body_frame", "link_frame", "geom_frame",
 )  # fmt: skip
 _VECTORS = (
     "body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "hull_vert", "poly_normal", "weld_pos",
-    "seg_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass", "fluid_inertia",
+    "seg_pos", "act_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass", "fluid_inertia",
 )  # fmt: skip
-_ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat")
+_ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat", "act_mat")
 
 #: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
 Tables: Any = _struct(
