@@ -33,12 +33,14 @@ import numpy as np
 import torch
 import warp as wp
 
+from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, object_names
+from dropo_torch.simulators.hidden import filters_of
 from dropo_torch.simulators.mujoco import MujocoSimulator
 from dropo_torch.simulators.warp import WarpSimulator
 from dropo_torch.simulators.warp.pairs import candidate_pairs
-from dropo_torch.simulators.warp.support import missing, summary
+from dropo_torch.simulators.warp.support import Missing, missing, summary
 from dropo_torch.testing import converged
 
 #: Name of a distribution → the folder of its modules.
@@ -142,6 +144,10 @@ def varied(model: mujoco.MjModel) -> ParameterSpace:
 def examine(path: str, model: mujoco.MjModel) -> Model:
     """Whether the backend takes a model, and what it lacks."""
     found = missing(model, varied(model), candidate_pairs(model))
+    try:
+        filters_of(model)
+    except InputError:
+        found.append(Missing("activations that no log holds"))
     return Model(path, int(model.nv), list(dict.fromkeys(m.what for m in found)), summary(found))
 
 

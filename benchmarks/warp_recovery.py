@@ -220,7 +220,6 @@ def record(model: mujoco.MjModel, task: Task, seed: int) -> dict[str, np.ndarray
         for step in range(LENGTH):
             if step % HELD == 0:
                 data.ctrl[:] = rng.uniform(low, high) * 0.3
-            data.act[:] = 0.0
             log["observations"].append(np.concatenate([data.qpos, data.qvel]))
             held = model.body_mocapid[prescribed_bodies(model)]
             poses = np.concatenate([data.mocap_pos[held], data.mocap_quat[held]], axis=1)

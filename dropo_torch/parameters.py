@@ -41,6 +41,8 @@ _SERVO = {
     "actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)),
     "actuator_kv": (("actuator_biasprm", 2, -1.0),),
 }
+#: Fields of directions and of rotations: what is written there is normalised.
+UNIT_FIELDS = frozenset({"body_quat", "geom_quat", "site_quat", "jnt_axis"})
 _FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear", "actuator_gainprm"})
 #: First word of a field → the kind of object that carries it.
 _OBJECTS = {kind: kind for kind in ("body", "geom", "actuator", "site", "tendon", "pair", "flex")}
@@ -222,11 +224,15 @@ class ParameterSpace:
         """Write parameter vectors ``(K, d)`` into per-simulation model fields ``(K, ...)``, in place."""
         for column, target in self.targets:
             fields[target.field].reshape(len(values), -1)[:, target.index] = target.factor * values[:, column]
+        for field in UNIT_FIELDS.intersection(self.fields):
+            _normalise(field, fields[field])
 
     def write_into(self, model: mujoco.MjModel, vector: Sequence[float] | np.ndarray) -> None:
         """Write values ``(d,)`` into a model, but not yet what is derived from them."""
         for column, target in self.targets:
             write_field(model, target.field, target.index, target.factor * vector[column])
+        for field in UNIT_FIELDS.intersection(self.fields):
+            _normalise(field, getattr(model, field))
 
     def apply(self, values: np.ndarray | Mapping[str, float]) -> mujoco.MjModel:
         """Return a copy of the model with the given values and everything derived from them."""
@@ -237,6 +243,13 @@ class ParameterSpace:
         self.write_into(model, vector)
         mujoco.mj_setConst(model, mujoco.MjData(model))
         return model
+
+
+def _normalise(field: str, array: np.ndarray) -> None:
+    """Give the directions or quaternions of a field length 1, in place; those of length 0 stay."""
+    rows = array.reshape(-1, 4 if field.endswith("quat") else 3)
+    length = np.linalg.norm(rows, axis=1, keepdims=True)
+    rows /= np.where(length > 0, length, 1.0)
 
 
 #: Fields that move a frame; ``body_sameframe`` marks one as coinciding, so that MuJoCo need not compute it.
@@ -516,7 +529,7 @@ def _refuse_derived(space: ParameterSpace) -> None:
     except mujoco.FatalError as error:
         raise InputError(f"parameters: MuJoCo refuses the middle of the bounds: {error}") from None
     for column, t in space.targets:
-        if not np.isclose(t.read(model), t.factor * values[column], rtol=1e-6):
+        if t.field not in UNIT_FIELDS and not np.isclose(t.read(model), t.factor * values[column], rtol=1e-6):
             where = f"parameters.{space.names[column]}"
             raise InputError(f"{where}: MuJoCo derives {t.field} from other fields; vary those instead")
 

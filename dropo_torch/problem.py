@@ -107,7 +107,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         since = first_known(effects, space, trajectories, simulator.timestep or 1.0)
     else:
         simulator = _backend(config, source, frame_skip, space)
-    if config.backend == "mujoco" and (memory := filter_memory(space)):
+    if config.backend != "gymnasium" and (memory := filter_memory(space)):
         known = filters_known(memory, frame_skip, np.bincount(trajectories.episodes))
         since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
@@ -129,7 +129,7 @@ def _ahead(model: mujoco.MjModel | None, frame_skip: int) -> float:
 def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
     """The simulator of the config's backend."""
     means: dict[str, Any] = {"num_threads": config.threads, "chunk_size": config.chunk_size, "device": config.device}
-    if config.backend == "mujoco":
+    if config.backend != "gymnasium":
         means["history"] = math.ceil(filter_memory(space) / frame_skip)
     return make_simulator(config.backend, source, parameters=space, frame_skip=frame_skip, **means)
 

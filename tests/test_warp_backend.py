@@ -213,7 +213,7 @@ REFUSED = """<mujoco><option solver="CG" integrator="discrete" noslip_iterations
 <body name="w" pos="3 0 0"><freejoint name="free"/><geom name="box" type="box" size=".1 .1 .1"/></body></worldbody>
 <tendon><spatial name="string" stiffness="3"><site site="above"/><geom geom="cyl"/><site site="below"/></spatial>
 </tendon>
-<actuator><position name="ball_motor" joint="k" kp="1"/><general name="filtered" joint="j" dyntype="filter" dynprm="1"/>
+<actuator><position name="ball_motor" joint="k" kp="1"/><general name="own" joint="j" dyntype="user" actdim="1"/>
 <position name="damped" joint="j" kp="1"/></actuator></mujoco>"""
 
 
@@ -222,7 +222,7 @@ def test_one_error_names_everything_that_is_refused():
     space = ParameterSpace(
         model,
         {
-            "size": {"field": "geom_size", "name": "box", "index": 0, "bounds": [0.1, 1]},
+            "place": {"field": "site_pos", "name": "below", "index": 1, "bounds": [0.1, 1]},
             "gear1": {"field": "actuator_gear", "name": "damped", "index": 3, "bounds": [0.1, 1]},
         },
     )
@@ -231,8 +231,8 @@ def test_one_error_names_everything_that_is_refused():
     message = str(caught.value)
     assert "\n" not in message
     for part in (
-        "integrator=discrete", "noslip", "'string'", "wraps", "'ball_motor'", "'filtered'", "tendon", "'cyl'",
-        "'ell'", "ellipsoid", "cylinder", "'size'", "geom_size", "'gear1'", "gear[0]",
+        "integrator=discrete", "noslip", "'string'", "wraps", "'ball_motor'", "'own'", "user", "tendon", "'cyl'",
+        "'ell'", "ellipsoid", "cylinder", "'place'", "site_pos", "'gear1'", "gear[0]",
     ):  # fmt: skip
         assert part in message, f"{part} in {message}"
 

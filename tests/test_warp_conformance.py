@@ -67,6 +67,7 @@ class Case:
     push: float = 1.0
     length: int = 25
     seed: int = 0
+    lag: int = 1
     idle: tuple[str, ...] = ()  # parameters without effect on this motion
 
     def model(self) -> mujoco.MjModel:
@@ -79,6 +80,9 @@ def check(case: Case, count: int = 12) -> None:
     model = case.model()
     space = ParameterSpace(model, case.parameters)
     states, controls = rollouts(model, count, spread=case.spread, push=case.push, length=case.length, seed=case.seed)
+    if case.lag > 1:
+        later = np.random.default_rng(case.seed).uniform(-case.push, case.push, (count, case.lag - 1, model.nu))
+        controls = np.concatenate([controls, later], 1)
     simulator = WarpSimulator(model, parameters=space, frame_skip=case.skip, num_threads=1)
     report = check_simulator(
         simulator,
@@ -160,6 +164,18 @@ TURNED = """<motor name="turn" joint="jb" gear="1 .5 -.3" forcerange="-.4 .4"/>
 <position name="pa" joint="ja" kp="20" kv="1.5"/>"""
 
 
+FILTERED = """<general name="pa" joint="ja" dyntype="filter" dynprm=".02" gaintype="affine" biastype="affine"
+ gainprm="9 .5 -.3" biasprm=".2 -9 -.5" ctrlrange="-.9 .9"/>
+<general name="vb" joint="jb" dyntype="filterexact" dynprm=".015" gainprm="2" actlimited="true" actrange="-.4 .5"
+ actearly="true"/>
+<general name="gc" joint="jc" dyntype="filterexact" dynprm=".03" gaintype="affine" gainprm="2 0 -1.5" gear="1.5"
+ forcerange="-1 1.2"/><motor name="plain" joint="jc"/>"""
+
+GEARED = """<position name="pa" joint="ja" kp="20" gear="1.5" damping=".3 .2 .1"/>
+<motor name="gc" joint="jc" gear="2" armature=".1" damping=".2"/>
+<motor name="mc" joint="jc" gear=".5" armature=".3"/>"""
+
+
 def arm(**changes: str) -> str:
     settings = {"integrator": "Euler", "option": "", "loss": "0", "second": "hinge", "limit": "", "extra": "",
                 "actuators": SERVOS} | changes  # fmt: skip
@@ -191,6 +207,16 @@ DRIVES = {
     "bias0": p("actuator_biasprm", "gc", 0), "bias2": p("actuator_biasprm", "gc", 2),
     "forcerange": p("actuator_forcerange", "pa", 1), "ctrlrange": p("actuator_ctrlrange", "vc", 0),
 }  # fmt: skip
+FILTERS = {
+    "tau": p("actuator_dynprm", "pa", 0, (1e-3, 1)), "early": p("actuator_dynprm", "vb", 0, (1e-3, 1)),
+    "exact": p("actuator_dynprm", "gc", 0, (1e-3, 1)), "actrange": p("actuator_actrange", "vb", 1),
+    "gain2": p("actuator_gainprm", "gc", 2), "mass": p("body_mass", "b"),
+}  # fmt: skip
+GEARS = {
+    "damping": p("actuator_damping", "gc", bounds=(0, 10)), "poly": p("actuator_dampingpoly", "pa", 1),
+    "armature": p("actuator_armature", "mc", bounds=(0, 10)), "gear": p("actuator_gear", "gc"),
+    "inertia": p("body_inertia", "c", 1),
+}  # fmt: skip
 LOSS = {"loss": p("dof_frictionloss", "ja"), "mass": p("body_mass", "b")}
 STUCK = {"dof_solref": p("dof_solref", "ja", 0), "dof_solimp": p("dof_solimp", "ja", 0), "mass": p("body_mass", "b")}
 EQUALITY = '<equality><joint joint1="jc" joint2="ja" polycoef=".01 .05 .1 .02 .03"/></equality>'
@@ -200,6 +226,17 @@ TREES = [
     Case("Euler", arm(), JOINTS | DRIVES),
     Case("RK4", arm(integrator="RK4"), JOINTS | DRIVES),
     Case("implicitfast", arm(integrator="implicitfast"), JOINTS | DRIVES),
+    Case("filters", arm(actuators=FILTERED), FILTERS, lag=3),
+    Case("filters RK4", arm(actuators=FILTERED, integrator="RK4"), FILTERS, lag=3),
+    Case("filters implicitfast", arm(actuators=FILTERED, integrator="implicitfast"), FILTERS, lag=3),
+    Case("geared damping", arm(actuators=GEARED), GEARS),
+    Case("geared damping RK4", arm(actuators=GEARED, integrator="RK4"), GEARS),
+    Case("geared damping implicitfast", arm(actuators=GEARED, integrator="implicitfast"), GEARS),
+    Case(
+        "gravity compensation by actuators",
+        arm().replace('gravcomp="0.6"', 'gravcomp="-.4"').replace('name="ja"', 'name="ja" actuatorgravcomp="true"'),
+        {"mass": p("body_mass", "b"), "kp": p("actuator_kp", "pa")},
+    ),
     Case("frictionloss", arm(loss="0.8"), JOINTS | LOSS, most=1e-2),
     Case("frictionloss RK4", arm(loss="0.8", integrator="RK4"), JOINTS | LOSS, most=1e-2),
     Case("stuck", arm(loss="30"), STUCK, most=1e-2),
@@ -297,6 +334,20 @@ RAFT = {
     "gear": p("actuator_gear", "push", 0), "gear4": p("actuator_gear", "brake", 4), "mass": p("body_mass", "raft"),
     "gain2": p("actuator_gainprm", "brake", 2), "bias2": p("actuator_biasprm", "brake", 2),
 }  # fmt: skip
+#: A vehicle of four propellers, one of them behind a filter, that carries something on a hinge.
+FLOWN = """<body name="drone" pos="0 0 1"><freejoint/><geom type="box" size=".2 .15 .03" mass="1.2"/>
+<site name="p1" pos=".2 .15 .02" quat="1 .05 0 0"/><site name="p2" pos="-.2 .15 .02" quat="1 0 -.05 0"/>
+<site name="p3" pos="-.2 -.15 .02"/><body pos="0 0 -.05"><joint name="swing" axis="0 1 0" damping=".02"/>
+<geom type="capsule" fromto="0 0 0 .05 0 -.2" size=".02" mass=".2"/><site name="p4" pos="0 .1 -.2" quat=".8 0 .1 .2"/>
+</body></body>"""
+FLYING = """<actuator><general name="t1" site="p1" gear="0 0 4 0 0 -.1" ctrlrange="-.7 .8" forcerange="-.6 .6"/>
+<general name="t2" site="p2" gear="0 0 4 0 0 .1" dyntype="filterexact" dynprm=".03" biastype="affine" biasprm=".3"/>
+<motor name="t3" site="p3" gear=".2 -.1 3 .1 .2 .3"/><motor name="t4" site="p4" gear="1 2 0 0 .1 0"/></actuator>"""
+FLIGHT = {
+    "gear": p("actuator_gear", "t1", 2), "torque": p("actuator_gear", "t3", 4), "gain": p("actuator_gainprm", "t2"),
+    "bias": p("actuator_biasprm", "t2", 0), "mass": p("body_mass", "drone"), "range": p("actuator_forcerange", "t1", 1),
+    "tau": p("actuator_dynprm", "t2", 0, (1e-3, 1)),
+}  # fmt: skip
 BOX = free("box", "0 0 .11", 'type="box" size=".15 .1 .1"')
 CYLINDER = free("cylinder", "0 0 .13", 'type="cylinder" size=".1 .12"', "0.9 0.2 0 0.1")
 ELLIPSOID = free("ellipsoid", "0 0 .1", 'type="ellipsoid" size=".15 .1 .08"', "0.9 0.2 0.1 0.1")
@@ -327,6 +378,9 @@ def contact_parameters(body: str) -> dict:
 CONTACTS = [
     Case("afloat", scene(AFLOAT.format(range=""), extra=PUSHED), RAFT),
     Case("afloat RK4", scene(AFLOAT.format(range='actuatorfrcrange="-.1 .1"'), extra=PUSHED, integrator="RK4"), RAFT),
+    Case("flown", scene(FLOWN, extra=FLYING), FLIGHT, lag=2),
+    Case("flown RK4", scene(FLOWN, extra=FLYING, integrator="RK4"), FLIGHT, lag=2),
+    Case("flown implicitfast", scene(FLOWN, extra=FLYING, integrator="implicitfast"), FLIGHT, lag=2),
     Case("box slides", scene(BOX), contact_parameters("box"), length=40),
     Case("box, elliptic", scene(BOX, cone="elliptic", impratio="3"), contact_parameters("box"), length=40, states=1e-8),
     Case("box, condim 4", scene(BOX, condim="4"), contact_parameters("box"), length=40),

@@ -41,6 +41,9 @@ DRIVES = """<actuator><motor name="m" tendon="t" gear="2" forcerange="-3 3"/>
 <position name="p" tendon="s" kp="1" kv=".2" gear=".7" forcerange="-4 4"/>
 <general name="g" tendon="t" gaintype="affine" biastype="affine" gainprm="2 .5 -.3" biasprm=".2 -1 -.5" gear="1.5"/>
 </actuator>"""
+FILTERED = """<actuator><general name="m" tendon="t" gear="2" dyntype="filter" dynprm=".02" forcerange="-3 3"/>
+<general name="g" tendon="t" gaintype="affine" biastype="affine" gainprm="2 .5 -.3" biasprm=".2 -1 -.5" gear="1.5"
+ dyntype="filterexact" dynprm=".01" actearly="true"/></actuator>"""
 SOFT = 'solref=".05 1" solimp=".7 .95 .5 .4 3"'
 EQUAL = """<equality><tendon name="e" tendon1="t" tendon2="s" polycoef=".01 .5 .3 .2 .1" solref=".05 1"/>
 <tendon name="f" tendon1="s" polycoef=".02 0 0 0 0" solref=".1 1"/></equality>"""
@@ -77,6 +80,10 @@ POLYNOMIAL = {"c1": p("eq_data", "e", 1), "c3": p("eq_data", "e", 3), "solref": 
 WELD = {
     "anchor": p("eq_data", "e", 0), "place": p("eq_data", "e", 4), "turn": p("eq_data", "e", 7),
     "scale": p("eq_data", "e", 10), "solref": p("eq_solref", "e", 1), "gravity": p("opt.gravity", index=0),
+}  # fmt: skip
+TAUS = {
+    "tau": p("actuator_dynprm", "m", 0, (1e-3, 1)), "exact": p("actuator_dynprm", "g", 0, (1e-3, 1)),
+    "gain2": p("actuator_gainprm", "g", 2),
 }  # fmt: skip
 TO_HAND = f"""<equality><weld name="e" body1="hand" body2="c" relpose=".02 .03 .1 .9 .1 .2 .3" anchor=".05 .02 .1"
 torquescale=".7" {SOFT}/></equality>"""
@@ -116,6 +123,7 @@ CASES = [
     Case("tendon equality", rig(tendons(SPATIAL) + EQUAL), INERTIAL | POLYNOMIAL),
     Case("fixed drives", rig(tendons(FIXED) + DRIVES, "implicitfast"), INERTIAL | SERVOS),
     Case("spatial drives", rig(tendons(SPATIAL) + DRIVES, "implicitfast", "ball"), INERTIAL | SERVOS, push=3.0),
+    Case("filtered drives", rig(tendons(SPATIAL) + FILTERED, "implicitfast", "ball"), TAUS, push=3.0, lag=2),
     Case(
         "range of all actuators",
         rig(tendons(SPATIAL, 'actuatorfrcrange="-1 1"') + DRIVES).replace('"jc"', '"jc" actuatorfrcrange="-.5 .5"', 1),
@@ -151,6 +159,25 @@ def test_derived_weights_of_tendons_and_welds_are_mujocos() -> None:
     welded = model.body_invweight0[[model.body("c").id, model.body("d").id]].sum(0)
     np.testing.assert_allclose(theta[fields.columns("ten_invweight")], model.tendon_invweight0, rtol=1e-9)
     np.testing.assert_allclose(theta[fields.columns("weld_invweight")], welded, rtol=1e-9)
+
+
+def test_filters_are_replayed_beside_poses_of_mocap_bodies() -> None:
+    """Controls come first in the inputs of a step, before a transition, too."""
+    driven = '<actuator><general joint="ja" gear="3" dyntype="filterexact" dynprm=".02" ctrlrange="-1 1"/></actuator>'
+    model = mujoco.MjModel.from_xml_string(rig(TO_HAND + driven))
+    space, rng, count = ParameterSpace(model, INERTIAL), np.random.default_rng(0), 4
+    (hand,) = prescribed_bodies(model)
+    states = np.concatenate([model.qpos0, np.zeros(model.nv)]) + rng.normal(0, 0.1, (count, model.nq + model.nv))
+    pose = np.concatenate([model.body_pos[hand], model.body_quat[hand]])
+    controls = np.concatenate([np.zeros(model.nu), pose]) + rng.normal(0, 0.02, (count, 5, model.nu + 7))
+    controls[..., 0] = rng.uniform(-2, 2, (count, 5))
+    found, expected = (
+        kind(converged(space).model, parameters=converged(space), frame_skip=2, num_threads=1, history=3).rollout(
+            torch.from_numpy(states), torch.from_numpy(controls), torch.from_numpy(space.nominal[None])
+        )
+        for kind in (WarpSimulator, MujocoSimulator)
+    )
+    np.testing.assert_allclose(found.numpy(), expected.numpy(), atol=1e-9)
 
 
 @pytest.mark.parametrize("integrator", ["Euler", "RK4"])

@@ -46,8 +46,10 @@ def test_the_sound_model_is_simulated() -> None:
         ({"flag": 'diagexact="enable"'}, "flag diagexact enabled"),
         ({"option": 'actuatorgroupdisable="0"'}, "option actuatorgroupdisable"),
         ({"flag": 'override="enable"'}, "flag override enabled"),
-        ({"body": 'gravcomp="-1"'}, "negative gravcomp of body (1: 'b', which"),
-        ({"body": 'gravcomp="1"', "second": 'actuatorgravcomp="true"'}, "actuatorgravcomp on body (1: 'b')"),
+        ({"body": 'gravcomp="1"', "second": 'actuatorgravcomp="true" actuatorfrcrange="-1 1"'},
+         "actuatorgravcomp within actuatorfrcrange (1: 'k')"),
+        ({"actuator": '<general name="g" joint="root" gear="1 0 0 0 0 0" damping="1"/>'},
+         "actuator damping or armature of anything but a hinge or a slide (1: 'g')"),
         ({"actuator": '<general name="g" joint="k" gaintype="user"/>'}, "actuator gain user (1: 'g')"),
         (
             {"actuator": '<motor name="g" jointinparent="root"/>'},
@@ -63,6 +65,8 @@ def test_the_sound_model_is_simulated() -> None:
           "extra": '<tendon><fixed name="t" actuatorfrcrange="-1 1"><joint joint="j" coef="1"/></fixed></tendon>'
                    '<actuator><motor name="g" tendon="t"/></actuator>'},
          "actuatorfrcrange of a tendon under implicit or implicitfast (1: 't')"),
+        ({"world": '<site name="w"/><body pos="9 0 0"><joint/><geom size=".1"/><site name="s"/></body>',
+          "actuator": '<motor name="g" site="s" refsite="w"/>'}, "actuator at a site with a reference site (1: 'g')"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip
@@ -80,7 +84,8 @@ def test_a_part_that_warp_lacks_is_named(parts: dict[str, str], words: str) -> N
          {"extra": '<equality><connect name="e" body1="a" body2="b" anchor="0 0 0"/></equality>'},
          "effects of eq_data[8], only of eq_data[0], eq_data[1], eq_data[2]"),
         ({"field": "qpos_spring", "name": "root", "index": 4}, {}, "gradients of qpos_spring of a quaternion"),
-        ({"field": "geom_size", "name": "a", "index": 0}, {}, "gradients of geom_size"),
+        ({"field": "geom_size", "name": "a", "index": 1}, {}, "gradients of geom_size[1] of a sphere"),
+        ({"field": "body_iquat", "name": "a", "index": 1}, {}, "gradients of body_iquat"),
     ],
     ids=lambda x: x if isinstance(x, str) else "",
 )  # fmt: skip

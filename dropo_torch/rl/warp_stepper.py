@@ -19,8 +19,8 @@ from dropo_torch.simulators.warp.engine import Batch, Engine
 class WarpStepper(BatchStepper):
     """Environments on :class:`~dropo_torch.simulators.warp.WarpSimulator`'s kernels, in float64.
 
-    A state is all that is kept between steps: the kernels solve every step's constraints to convergence, from a cold
-    start.
+    A state is all that is kept between steps, with activations that are zero when an episode starts: the kernels solve
+    every step's constraints to convergence, from a cold start.
 
     Args:
         space: what varies, over the model that is simulated.
@@ -53,13 +53,14 @@ class WarpStepper(BatchStepper):
         self._device = wp.device_to_torch(device)
         base = torch.from_numpy(self._engine.fields.constant())
         self._theta = base.repeat(num_envs, 1).to(self._device)
-        self._states = torch.zeros(num_envs, self.num_states, dtype=torch.float64, device=self._device)
+        width = self.num_states + self._engine.tables.na
+        self._states = torch.zeros(num_envs, width, dtype=torch.float64, device=self._device)
 
     def reset(self, rows: torch.Tensor, states: torch.Tensor, values: torch.Tensor) -> None:
         """Start new episodes; see :meth:`BatchStepper.reset`."""
-        at = rows.to(self._device)
+        at, width = rows.to(self._device), self._states.shape[1]
         self._theta[at] = self._engine.fields(values.cpu()).to(self._device)
-        self._states[at] = states.to(self._device)
+        self._states[at] = torch.nn.functional.pad(states, (0, width - states.shape[1])).to(self._device)
 
     def step(self, controls: torch.Tensor) -> torch.Tensor:
         """Make an environment step; see :meth:`BatchStepper.step`."""
@@ -67,9 +68,9 @@ class WarpStepper(BatchStepper):
         given = controls.to(self._device, torch.float64).contiguous()
         skip = self.frame_skip * self._finer // count
         flat, _ = self._engine.simulate(Batch(self._theta, self._states, given, skip, paired=True), keep=False)
-        path = flat.view(self.num_envs, count, self.num_states)
-        self._states = path[:, -1].contiguous()
-        return path
+        path = flat.view(self.num_envs, count, -1)
+        self._states = path[:, -1].clone()  # apart from what is returned: a reset writes into it
+        return path[..., : self.num_states]
 
     def state_dict(self) -> dict[str, Any]:
         """Return the states; see :meth:`BatchStepper.state_dict`."""

@@ -46,7 +46,7 @@ def make_simulator(
         num_threads: threads, 0 for all processors.
         chunk_size: simulations held in memory at once.
         device: of the ``"warp"`` backend, ``"cpu"`` or a GPU such as ``"cuda:0"``.
-        history: of the ``"mujoco"`` backend, logged steps of controls before each transition, for actuators' filters.
+        history: logged steps of controls before each transition, for actuators' filters; not of ``"gymnasium"``.
 
     Raises:
         InputError: an unknown backend, or a model that it does not support.
@@ -69,4 +69,5 @@ def make_simulator(
         chunk_size=min(chunk_size, 4096) if device == "cpu" else chunk_size,
         num_threads=num_threads or None,
         device=device,
+        history=history,
     )

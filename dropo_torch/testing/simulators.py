@@ -14,7 +14,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Simulator
-from dropo_torch.simulators.hidden import POSE, control_range, filters_of, prescribed_bodies
+from dropo_torch.simulators.hidden import POSE, filters_of, prescribed_bodies
 from dropo_torch.testing.laws import Broken, NotApplicable, Report, require, require_same, try_laws
 
 #: ``reference(states (T, n), controls (T, lag, nu), values (K, d)) -> (T, K, lag, n)``
@@ -119,9 +119,8 @@ def stepped(model: mujoco.MjModel, state: np.ndarray, controls: np.ndarray, fram
     """
     data = mujoco.MjData(model)
     data.qpos[:], data.qvel[:] = state[: model.nq], state[model.nq :]
-    first = np.clip(controls[0, : model.nu], *control_range(model))
     filters = filters_of(model)
-    data.act[filters.activations] = first[filters.controls]
+    data.act[filters.activations] = filters.settled(model, controls[0])
     states = []
     for control in controls:
         data.ctrl[:] = control[: model.nu]

@@ -38,6 +38,7 @@ from dropo_torch.simulators.warp.convex import (
     gjk,
 )
 from dropo_torch.simulators.warp.epa import epa
+from dropo_torch.simulators.warp.frames import geom_position, geom_size, geom_turn
 from dropo_torch.simulators.warp.spatial import pull
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, ZERO, Tables, World, f64, mat33, vec2, vec3, vec6
 
@@ -56,9 +57,9 @@ def shape_of(m: Tables, w: World, g: int, inflation: f64) -> Shape:
     s.climbs = m.geom_climbs[g]
     s.place = -1
     s.inflation = inflation
-    s.size = m.geom_size[g]
-    s.pos = w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
-    s.rot = w.xmat[w.t, b] * m.geom_mat[g]
+    s.size = geom_size(m, w, g)
+    s.pos = w.xpos[w.t, b] + w.xmat[w.t, b] * geom_position(m, w, g)
+    s.rot = w.xmat[w.t, b] * geom_turn(m, w, g)
     return s
 
 

@@ -40,7 +40,7 @@ class Batch:
 
     Attributes:
         theta: parameter vectors as θ, ``(K, P)``.
-        states: initial states, ``(T, nq + nv)``.
+        states: initial states with activations, ``(T, nq + nv + na)``, or one for each world, ``(T·K, nq + nv + na)``.
         controls: controls of every logged step, ``(T, lag, nu)``, and what else acts in it, behind them.
         skip: physics steps of a logged step.
         paired: whether each transition has a parameter vector of its own (``T = K``); otherwise each is simulated
@@ -70,7 +70,7 @@ class Batch:
     @property
     def worlds(self) -> int:
         """Number of simulations."""
-        return len(self.states) * self.each
+        return len(self.controls) * self.each
 
     @cached_property
     def arrays(self) -> list[Any]:
@@ -133,6 +133,7 @@ class Engine:
             "tendon": m.nten, "arm": len(m.ten_dof) if m.nten else 0, "geom": model.ngeom, "pair": m.npair,
             "jacobian": m.maxcon * m.nv, "stage": 4 * m.nv, "theta": self.fields.size,
             "soft": m.nv * m.nv if m.full else m.nh, "full_body": m.nb * m.full, "full_dof": m.nv * m.full,
+            "activation": m.na, "stage_activation": 4 * m.na,
         }  # fmt: skip
         self._sizes |= convex_sizes(model, pairs, m.maxcon)
         parts = parts_of(m, convex=self._sizes["convex"] > 0)
@@ -153,7 +154,7 @@ class Engine:
         return 8 * (lag * self.skip + 1) * self.tables.nstage * width
 
     def simulate(self, batch: Batch, keep: bool) -> tuple[torch.Tensor, list[Trace]]:
-        """Return the states after each logged step ``(T·K·lag, nq + nv)``, and the traces of the chunks if kept."""
+        """Return states after logged steps ``(T·K·lag, nq + nv + na)``, and the traces of the chunks if kept."""
         out = batch.empty(batch.worlds * batch.lag, batch.states.shape[1])
         traces = []
         with self._lock, self._stream(batch):
@@ -170,7 +171,7 @@ class Engine:
 
         Args:
             batch: what is simulated.
-            out: the states after each logged step, ``(T·K·lag, nq + nv)``.
+            out: the states after each logged step, ``(T·K·lag, nq + nv + na)``.
         """
         calls, traces = [], []
         with self._lock, self._stream(batch):
@@ -217,11 +218,11 @@ class Engine:
 
         Args:
             batch: what is simulated.
-            directions: covectors of the last states, ``(J, nq + nv)``, the same for every world.
+            directions: covectors of the last states, ``(J, nq + nv + na)``, the same for every world.
 
         Returns:
-            States ``(T·K, nq + nv)``, and products with the Jacobians by the wanted columns of θ
-            ``(T·K, J, wanted)`` and by the initial states ``(T·K, J, nq + nv)``.
+            States ``(T·K, nq + nv + na)``, and products with the Jacobians by the wanted columns of θ
+            ``(T·K, J, wanted)`` and by the initial states ``(T·K, J, nq + nv + na)``.
         """
         last = slice(batch.lag - 1, None, batch.lag)
         parts = []
@@ -278,11 +279,12 @@ class Engine:
             kernel_backward.sum_over_transitions, dim=(parameters, len(self.wanted)), device=self.device,
             inputs=[bars[0], totals[0], first, count, parameters],
         )  # fmt: skip
-        touched = (first + count - 1) // parameters - first // parameters + 1
-        for bar, total, width in zip(bars[1:], totals[1:], (1, batch.lag), strict=True):
+        each = (batch.worlds // len(batch.states), parameters)
+        for bar, total, width, shared in zip(bars[1:], totals[1:], (1, batch.lag), each, strict=True):
+            touched = (first + count - 1) // shared - first // shared + 1
             wp.launch(
                 kernel_backward.sum_over_parameters, dim=(touched, width, bar.shape[1]), device=self.device,
-                inputs=[bar, total, first, count, parameters, width],
+                inputs=[bar, total, first, count, shared, width],
             )  # fmt: skip
 
     def _launch(self, kernel: Any, batch: Batch, trace: Trace, arguments: list[Any], keep: bool) -> None:
@@ -301,6 +303,7 @@ class Engine:
         def launch(local: int, number: int, slot: int) -> Callable[..., Any]:
             chunk = fill(Chunk(), {
                 "first": trace.first + local, "local": local, "nparam": len(batch.theta), "each": batch.each,
+                "start_each": batch.worlds // len(batch.states),
                 "lag": batch.lag, "skip": batch.skip, "period": _period(batch, keep), "slot": slot,
                 "slot_stride": int(not self.is_cpu), "keep": int(keep),
                 "applied": int(batch.applied), "wrenched": int(batch.wrenched),
@@ -393,14 +396,14 @@ class Simulate(torch.autograd.Function):
     def forward(
         ctx: Any, theta: torch.Tensor, states: torch.Tensor, controls: torch.Tensor, engine: Engine
     ) -> torch.Tensor:
-        """Return ``(T, K, lag, nq + nv)`` of θ ``(K, P)``, states ``(T, nq + nv)`` and controls ``(T, lag, nu)``."""
+        """Return ``(T, K, lag, nq + nv + na)`` of θ, states and controls; see :class:`Batch`."""
         batch = Batch(theta, states, controls, engine.skip)
         wanted = any(ctx.needs_input_grad[:3])
         keep = wanted and batch.worlds * engine.row_bytes(batch.lag) <= KEEP_BYTES
         out, traces = engine.simulate(batch, keep)
         ctx.save_for_backward(theta, states, controls)
         ctx.engine, ctx.traces = engine, traces
-        return out.view(len(states), len(theta), batch.lag, -1)
+        return out.view(len(controls), len(theta), batch.lag, -1)
 
     @staticmethod
     @torch.autograd.function.once_differentiable

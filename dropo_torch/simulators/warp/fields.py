@@ -16,17 +16,19 @@ import torch
 
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.couplings import equality_bodies, has_dofs, welds
-from dropo_torch.simulators.warp.layout import DIRECT, MIXED, PAIR
+from dropo_torch.simulators.warp.layout import ADDED, DIRECT, FRAMES, MIXED, PAIR
 from dropo_torch.simulators.warp.pairs import mixing
+from dropo_torch.simulators.warp.varied import Frames, Pose, Section
 from dropo_torch.support.threads import single_thread
 
 _INERTIAL = frozenset({"body_mass", "body_inertia", "body_ipos", "dof_armature", "tendon_armature"})
 #: The fields that are read: name of the section, field, columns kept of each row (0: all).
-_READ = (*DIRECT, *((field, field, 0) for field in MIXED))
+_READ = (*DIRECT, *((field, field, 0) for field in (*MIXED, *FRAMES, *ADDED)))
+#: Frames that the inverse weights depend on.
+_POSED = frozenset({"body_pos", "body_quat", "jnt_axis", "jnt_pos"})
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
 _MINVAL = 1e-15
 _MINMU = 1e-5
-#: The numbers of a section by its name, ``(K, n, width)``.
-Section = Callable[[str], torch.Tensor]
 
 
 class Fields:
@@ -55,17 +57,24 @@ class Fields:
             columns[field] = np.where(kept.ravel(), kept.cumsum() - 1 + start, -1)
             self._raw_sections[name] = (start, size, keep or int(np.prod(array.shape[1:], dtype=int)))
             start += size
-        self._raw = torch.from_numpy(_raw(model))
+        self._adding = _Adding(model, space, columns)
+        self._own = torch.from_numpy(_raw(model))  # as it stands in the model, and with what actuators add
+        self._raw = self._adding(self._own[None])[0]
         self.sections = {name: self._raw_sections[name][:2] for name, _f, _k in DIRECT}
         self._direct = self.size = sum(size for _, size in self.sections.values())
+        self._frames = Frames(model, space)
         widths = {f"pair_{name}": width * len(pairs) for name, width in PAIR.items()}
         widths |= {"dof_invweight": model.nv, "weld_invweight": 2 * len(welds(model)), "ten_invweight": model.ntendon}
+        rows = {kind: len(own) for kind, own in self._frames.rows.items()}
+        widths |= {"body_frame": 7 * rows["body"], "link_frame": 6 * rows["jnt"], "geom_frame": 10 * rows["geom"]}
         for name, width in widths.items():
             self.sections[name] = (self.size, width)
             self.size += width
         self._anchors = _Anchors(model, space, columns["eq_data"])
         self._targets(space, columns)
-        self._derive: tuple[Callable[[Section], torch.Tensor], ...] = (_Mixing(model, pairs), _Weights(model, pairs))
+        posed = bool(_POSED & set(space.fields))
+        self._derive: tuple[Callable[[Section], torch.Tensor], ...]
+        self._derive = (_Mixing(model, pairs), _Weights(model, pairs, posed=posed), self._frames)
         self._constant = self._derived(self._raw[None])
 
     def _targets(self, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
@@ -75,10 +84,15 @@ class Fields:
         self._written = torch.tensor([int(columns[t.field][t.index]) for _, t in targets], dtype=torch.long)
         self._factors = torch.tensor([t.factor for _, t in targets], dtype=torch.float64)
         self._sources = torch.tensor([source for source, _ in targets], dtype=torch.long)
-        self._varies = bool(fields & set(MIXED)), bool(fields & _INERTIAL)
-        derived = [name for name in self.sections if name.startswith("pair_") or name.endswith("invweight")]
-        own = [self.columns(name) for name in derived if self._varies[name.endswith("invweight")]]
-        direct = np.concatenate([self._written.numpy(), self._anchors.derived])
+        inertial = _INERTIAL | _POSED | ({"actuator_armature", "actuator_gear"} if len(self._adding.factors) else set())
+        self._varies = tuple(bool(fields & set(causes)) for causes in (MIXED, inertial, FRAMES))
+        derived = (
+            [f"pair_{name}" for name in PAIR if name != "invweight"],
+            ["pair_invweight", "dof_invweight", "weld_invweight", "ten_invweight"],
+            ["body_frame", "link_frame", "geom_frame"],
+        )
+        own = [self.columns(n) for names, varies in zip(derived, self._varies, strict=True) if varies for n in names]
+        direct = np.concatenate([self._written.numpy(), self._anchors.derived, self._adding.into.numpy()])
         direct = direct[direct < self._direct]
         self.wanted = np.unique(np.concatenate([direct, *own])).astype(np.int32)
 
@@ -101,7 +115,7 @@ class Fields:
 
     def of(self, models: Sequence[mujoco.MjModel]) -> torch.Tensor:
         """Return θ ``(K, P)`` of models that differ from this one in fields of θ only."""
-        raw = torch.from_numpy(np.stack([_raw(model) for model in models]))
+        raw = self._adding(torch.from_numpy(np.stack([_raw(model) for model in models])))
         return torch.cat([raw[:, : self._direct], *self._derived(raw)], dim=1)
 
     def _derived(self, raw: torch.Tensor) -> list[torch.Tensor]:
@@ -114,8 +128,8 @@ class Fields:
 
     def __call__(self, values: torch.Tensor) -> torch.Tensor:
         """Return θ ``(K, P)`` of parameter vectors ``(K, d)``, differentiable."""
-        raw = self._raw.expand(len(values), -1)
-        raw = raw.index_copy(1, self._written, values[:, self._sources] * self._factors)
+        raw = self._own.expand(len(values), -1)
+        raw = self._adding(raw.index_copy(1, self._written, values[:, self._sources] * self._factors))
         raw = self._anchors(raw)
         derived = [
             derive(partial(self._section, raw)) if varies else constant.expand(len(values), -1)
@@ -134,6 +148,35 @@ def _raw(model: mujoco.MjModel) -> np.ndarray:
     if model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_GRAVITY):
         raw[:3] = 0.0
     return raw
+
+
+class _Adding:
+    """What actuators add to damping and armature of hinges and slides.
+
+    Attributes:
+        factors: columns of the gears.
+        into: columns to which is added.
+    """
+
+    def __init__(self, model: mujoco.MjModel, space: ParameterSpace, columns: dict[str, np.ndarray]) -> None:
+        written = {(t.field, t.index) for _, t in space.targets}
+        found = []
+        for i in range(model.nactuator):
+            joint = model.actuator_trnid[i, 0]
+            if model.actuator_trntype[i] != mujoco.mjtTrn.mjTRN_JOINT or model.jnt_type[joint] < _SLIDE:
+                continue
+            for field, dofs in ADDED.items():
+                own = np.atleast_1d(read_field(model, field)[i])
+                for k in np.flatnonzero([x != 0 or (field, i * len(own) + k) in written for k, x in enumerate(own)]):
+                    place = model.jnt_dofadr[joint] * len(own) + k
+                    found.append(
+                        (columns[field][i * len(own) + k], columns["actuator_gear"][6 * i], columns[dofs][place])
+                    )
+        self._from, self.factors, self.into = torch.tensor(found, dtype=torch.long).reshape(-1, 3).T
+
+    def __call__(self, raw: torch.Tensor) -> torch.Tensor:
+        """Return the model's own numbers ``(K, n)`` with what is added."""
+        return raw.index_add(1, self.into, raw[:, self._from] * raw[:, self.factors] ** 2) if len(self.into) else raw
 
 
 class _Mixing:
@@ -196,9 +239,12 @@ class _Anchors:
 
 
 class _Weights:
-    """``body_invweight0`` and ``dof_invweight0`` as functions of the inertial parameters."""
+    """``body_invweight0`` and ``dof_invweight0`` as functions of the inertial parameters and of frames.
 
-    def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
+    ``posed`` says that frames of bodies or joints vary.
+    """
+
+    def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]], *, posed: bool) -> None:
         model, data = copy.copy(model), mujoco.MjData(model)
         model.body_mass[:], model.body_ipos[:] = 1.0, 0.0  # Jacobians go by centres of mass, and would round by them
         mujoco.mj_kinematics(model, data)
@@ -206,14 +252,15 @@ class _Weights:
         jac = np.zeros((2, model.nbody, 3, model.nv))
         for b in range(1, model.nbody):
             mujoco.mj_jac(model, data, jac[0, b], jac[1, b], data.xpos[b], b)
-        self.linear, self.angular = torch.from_numpy(jac)
+        frames = (torch.tensor(x).reshape(1, -1, 3, 3) for x in (data.xmat, data.ximat))
+        self.pose = *torch.from_numpy(jac)[:, None], *frames
+        self.varying = Pose(model) if posed else None
         mujoco.mj_tendon(model, data)
         self.arms = torch.zeros(model.ntendon, model.nv, dtype=torch.float64)
         for k in range(model.ntendon):
             own = slice(model.ten_J_rowadr[k], model.ten_J_rowadr[k] + model.ten_J_rownnz[k])
             self.arms[k].index_add_(0, torch.tensor(model.ten_J_colind[own]).long(), torch.tensor(data.ten_J[own]))
         self.related = torch.from_numpy(_related(model))
-        self.rotation, self.principal = (torch.tensor(x).reshape(-1, 3, 3) for x in (data.xmat, data.ximat))
         self.moving = torch.tensor([has_dofs(model, b) for b in range(model.nbody)])
         self.simple = torch.tensor(model.body_simple == 2)
         self.dof_body = torch.tensor(model.dof_bodyid, dtype=torch.long)
@@ -230,11 +277,13 @@ class _Weights:
         A pair's is the sum of its two bodies' for translations, a weld has that and the one for rotations.
         """
         mass, armature, inertia = section("mass")[..., 0], section("armature")[..., 0], section("inertia")
-        arm = torch.einsum("bij,kbj->kbi", self.rotation, section("ipos"))
-        linear = self.linear + torch.linalg.cross(self.angular.expand(len(arm), -1, -1, -1), arm[..., None], dim=2)
-        local = self.principal.transpose(1, 2) @ self.angular
+        linear, angular, rotation, principal = self.varying(section) if self.varying else self.pose
+        arm = (rotation @ section("ipos")[..., None]).expand(len(mass), -1, -1, angular.shape[-1])
+        angular = angular.expand_as(arm)
+        linear = linear + torch.linalg.cross(angular, arm, dim=2)
+        local = (principal.transpose(2, 3) @ angular).expand_as(arm)
         matrix = torch.einsum("kb,kbij,kbil->kjl", mass, linear, linear)
-        matrix = matrix + torch.einsum("kbi,bij,bil->kjl", inertia, local, local) + torch.diag_embed(armature)
+        matrix = matrix + torch.einsum("kbi,kbij,kbil->kjl", inertia, local, local) + torch.diag_embed(armature)
         if len(self.arms):
             tendons = torch.einsum("kt,ti,tj->kij", section("ten_armature")[..., 0], self.arms, self.arms)
             matrix = matrix + tendons * self.related
@@ -242,7 +291,7 @@ class _Weights:
         body = torch.einsum("kbij,kjl,kbil->kb", linear, inverse, linear) / 3
         light = 1 / mass.clamp(min=_MINVAL)
         body = torch.where(self.moving, torch.where(self.simple, light, body), torch.zeros_like(body))
-        turning = torch.einsum("bij,kjl,bil->kb", self.angular, inverse, self.angular) / 3
+        turning = torch.einsum("kbij,kjl,kbil->kb", angular, inverse, angular) / 3
         turning = torch.where(self.moving & ~self.simple, turning, torch.zeros_like(turning))
         dof = torch.diagonal(inverse, dim1=1, dim2=2) @ self.average
         dof = torch.where(self.simple[self.dof_body], light[:, self.dof_body], dof)

@@ -11,7 +11,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.parts import num_tendons
+from dropo_torch.simulators.warp.activations import clamp, clamp_adjoint, drive, drive_adjoint
+from dropo_torch.simulators.warp.parts import is_thrust, num_tendons
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log, quat_mul
 from dropo_torch.simulators.warp.spatial import add_at, vec3_at, vec4_at
 from dropo_torch.simulators.warp.tendons import (
@@ -22,6 +23,7 @@ from dropo_torch.simulators.warp.tendons import (
     tendon_dot,
     tendon_forces_adjoint,
 )
+from dropo_torch.simulators.warp.thrust import thrust, thrust_adjoint
 from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, THREE, TWO, ZERO, Tables, World, f64, vec3, vec4
 
 
@@ -103,43 +105,6 @@ def damping_slope(m: Tables, w: World, v: f64, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def clamp(w: World, o: int, x: f64) -> f64:
-    """x within the range that stands at ``o`` in θ."""
-    return wp.min(wp.max(x, w.th[o]), w.th[o + 1])
-
-
-@wp.func(inline=True)
-def clamp_adjoint(w: World, o: int, x: f64, bar: f64) -> f64:
-    """Adjoint of x before :func:`clamp`: where it is clamped its end of the range has it."""
-    out = bar
-    if x < w.th[o]:
-        w.grad[w.t, o] += bar
-        out = ZERO
-    elif x > w.th[o + 1]:
-        w.grad[w.t, o + 1] += bar
-        out = ZERO
-    return out
-
-
-@wp.func(inline=True)
-def control(m: Tables, w: World, i: int) -> f64:
-    """Control of an actuator, clamped to its range."""
-    u = w.ctrl[w.rc, i]
-    if m.act_ctrllimited[i] != 0:
-        u = clamp(w, m.o_ctrlrange + 2 * i, u)
-    return u
-
-
-@wp.func(inline=True)
-def control_adjoint(m: Tables, w: World, i: int, bar: f64):
-    """Adjoint of :func:`control`."""
-    ubar = bar
-    if m.act_ctrllimited[i] != 0:
-        ubar = clamp_adjoint(w, m.o_ctrlrange + 2 * i, w.ctrl[w.rc, i], bar)
-    w.ctrl_bar[w.rb, i] += ubar
-
-
-@wp.func(inline=True)
 def actuator_length(m: Tables, w: World, r: int, i: int) -> f64:
     """Length of an actuator: gear · q of a hinge or slide; of a free joint it is none, of a ball it is not needed."""
     y = ZERO
@@ -163,13 +128,13 @@ def actuator_rate(m: Tables, w: World, r: int, i: int) -> f64:
 
 @wp.func(inline=True)
 def actuator_force(m: Tables, w: World, r: int, i: int) -> f64:
-    """gain(l, l̇) u + bias(l, l̇) with length l and velocity l̇, before the force range."""
+    """gain(l, l̇) u + bias(l, l̇) with length l, velocity l̇ and drive u, before the force range."""
     og = m.o_gain + 3 * i
     ob = m.o_bias + 3 * i
     gain = w.th[og]
     if m.act_affine_gain[i] != 0:
         gain += w.th[og + 1] * actuator_length(m, w, r, i) + w.th[og + 2] * actuator_rate(m, w, r, i)
-    force = gain * control(m, w, i)
+    force = gain * drive(m, w, r, i)
     if m.act_affine_bias[i] != 0:
         force += w.th[ob] + w.th[ob + 1] * actuator_length(m, w, r, i) + w.th[ob + 2] * actuator_rate(m, w, r, i)
     return force
@@ -247,6 +212,15 @@ def add_actuators(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
+def add_thrust(m: Tables, w: World, r: int):
+    """Subtract from the bodies' forces those of actuators at sites."""
+    for i in range(m.nu):
+        if is_thrust(m, i):
+            b = m.act_body[i]
+            w.force[w.t, b] = w.force[w.t, b] - thrust(m, w, i) * ranged_force(m, w, r, i)
+
+
+@wp.func(inline=True)
 def actuators_adjoint(m: Tables, w: World, r: int):
     """Adjoint of :func:`add_actuators`; ``w.work`` comes to hold ∂(−λτ)/∂τ before the joints' ranges."""
     if m.has_frclimit != 0:
@@ -274,13 +248,15 @@ def actuators_adjoint(m: Tables, w: World, r: int):
         oe = m.o_gear + 6 * i
         length = actuator_length(m, w, r, i)
         rate = actuator_rate(m, w, r, i)
-        u = control(m, w, i)
+        u = drive(m, w, r, i)
         f = actuator_force(m, w, r, i)
         fbar = ZERO  # ∂/∂force
         for k in range(m.act_ndof[i]):
             fbar += w.th[oe + k] * w.work[w.t, d + k]
         if m.act_tendon[i] >= 0:
             fbar = w.th[oe] * w.ten_force[w.t, m.act_tendon[i]] + w.ten_sum[w.t, m.act_tendon[i]]
+        if is_thrust(m, i):
+            fbar = -wp.dot(w.dual[w.t, m.act_body[i]], thrust(m, w, i))
         if m.act_frclimited[i] != 0:
             fbar = clamp_adjoint(w, m.o_forcerange + 2 * i, f, fbar)
             f = clamp(w, m.o_forcerange + 2 * i, f)
@@ -312,7 +288,9 @@ def actuators_adjoint(m: Tables, w: World, r: int):
             rate_bar(m, w, k, fbar * slope_v * w.th[oe], w.vel_bar, r)
             lever = slope_l * w.ten_length[w.t, k] + slope_v * w.ten_rate[w.t, k]
             w.grad[w.t, oe] += f * w.ten_force[w.t, k] + fbar * lever
-        control_adjoint(m, w, i, fbar * gain)
+        if is_thrust(m, i):
+            thrust_adjoint(m, w, i, f)
+        drive_adjoint(m, w, r, i, fbar * gain)
 
 
 @wp.func(inline=True)
@@ -323,7 +301,7 @@ def actuator_slope(m: Tables, w: World, r: int, a: int) -> f64:
     if m.act_affine_bias[a] != 0:
         y += w.th[m.o_bias + 3 * a + 2]
     if m.act_affine_gain[a] != 0:
-        y += w.th[m.o_gain + 3 * a + 2] * control(m, w, a)
+        y += w.th[m.o_gain + 3 * a + 2] * drive(m, w, r, a)
     if m.act_frclimited[a] != 0:
         f = actuator_force(m, w, r, a)
         o = m.o_forcerange + 2 * a
@@ -343,8 +321,8 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
             w.grad[w.t, m.o_bias + 3 * a + 2] += bar * gear * gear
         if m.act_affine_gain[a] != 0:
             o = m.o_gain + 3 * a + 2
-            w.grad[w.t, o] += bar * gear * gear * control(m, w, a)
-            control_adjoint(m, w, a, bar * gear * gear * w.th[o])
+            w.grad[w.t, o] += bar * gear * gear * drive(m, w, r, a)
+            drive_adjoint(m, w, r, a, bar * gear * gear * w.th[o])
 
 
 @wp.func(inline=True)

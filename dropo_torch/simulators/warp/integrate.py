@@ -8,9 +8,16 @@ from __future__ import annotations
 
 import warp as wp
 
+from dropo_torch.simulators.warp.activations import (
+    begin_activations_adjoint,
+    end_activations_adjoint,
+    move_activations,
+    step_activations,
+    step_activations_adjoint,
+)
 from dropo_torch.simulators.warp.forces import actuator_slope, actuator_slope_adjoint, damping_slope
 from dropo_torch.simulators.warp.kinematics import packed, sweep_out
-from dropo_torch.simulators.warp.parts import has_full_slope, num_tendons
+from dropo_torch.simulators.warp.parts import has_full_slope, num_activations, num_tendons
 from dropo_torch.simulators.warp.rotations import (
     chart_rate,
     chart_rate_dual,
@@ -231,6 +238,8 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
                     w.qvel[r + k, i] = w.qvel[r, i] + c * w.acc[r + k - 1, i]
                     w.acc[r + k, i] = w.acc[r + k - 1, i]  # the guess of a stage
                 chart_rates(m, w, r + k, c)
+                if num_activations(m) != 0:
+                    move_activations(m, w, r, k, c)
             else:
                 for i in range(m.nv):
                     w.rate[r, i] = w.qvel[r, i]
@@ -251,6 +260,8 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
                 w.qvel[nxt, i] = v
                 w.work[w.t, i] = v
         move(m, w, r, w.work, w.t, h, nxt)
+        if num_activations(m) != 0:
+            step_activations(m, w, r, nxt)
         for i in range(m.nv):
             w.acc[nxt, i] = w.acc[r + m.nstage - 1, i]
     return ok
@@ -263,6 +274,8 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
     h = m.h
     nv = m.nv
     _end_adjoint(m, w, r, nxt)
+    if num_activations(m) != 0:
+        step_activations_adjoint(m, w, r)
     passes = m.nstage + m.implicit * (1 + m.implicit_fluid + 2 * m.has_turning)
     for back in range(passes):
         left = passes - 1 - back
@@ -281,6 +294,8 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
         for i in range(nv):
             w.tangent[w.t, i] = ZERO
             w.vel_bar[w.t, i] = ZERO
+        if back == 0 or m.nstage > 1:
+            begin_activations_adjoint(m, w, k)
         if softening == 3:
             # ∂c/∂v a' = (c(v + h a') − c(v − h a')) / 2 h, for c is quadratic in v
             for i in range(nv):
@@ -324,11 +339,15 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
                 outer_mul(m, w, n, w.th[m.o_ten_armature + n], w.lam, w.t, w.acc_bar, w.t)
         elif k > 0:
             c = stage_time(h, k)
+            if num_activations(m) != 0:
+                end_activations_adjoint(m, w, r + k, k, c)
             chart_rates_adjoint(m, w, r + k, c, k * nv)
             for i in range(nv):
                 w.stage_vel_bar[w.t, i] += w.vel_bar[w.t, i]
                 w.stage_acc_bar[w.t, (k - 1) * nv + i] += c * w.vel_bar[w.t, i]
             move_adjoint(m, w, w.rate, r + k - 1, c, w.tangent, w.stage_rate_bar, (k - 1) * nv)
+        elif num_activations(m) != 0:
+            end_activations_adjoint(m, w, r, 0, ZERO)
     for i in range(nv):
         w.pos_bar[w.t, i] = w.pos_bar0[w.t, i] + w.tangent[w.t, i]
         w.rate_bar[w.t, i] = w.stage_vel_bar[w.t, i] + w.stage_rate_bar[w.t, i] + w.vel_bar[w.t, i]

@@ -9,13 +9,14 @@ from functools import cache
 
 import warp as wp
 
+from dropo_torch.simulators.warp.activations import activation_power
 from dropo_torch.simulators.warp.boxes import box_dual
 from dropo_torch.simulators.warp.collide import capsule_box_dual, round_dual, sphere_cylinder_dual, support_dual
 from dropo_torch.simulators.warp.cone import contact_scalars, elliptic_power
 from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, ellipsoid_slope_power
 from dropo_torch.simulators.warp.fluid import box_power, box_slope_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
-from dropo_torch.simulators.warp.parts import make_kernel
+from dropo_torch.simulators.warp.parts import make_kernel, num_activations
 from dropo_torch.simulators.warp.rotations import chart_rate_dual
 from dropo_torch.simulators.warp.spatial import theta_vec2, theta_vec3, theta_vec5
 from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals, Reals2, Tables, World, mat33, vec6
@@ -41,7 +42,7 @@ def adjoint(
     base = i * chunk.period * m.nstage
     seen = ZERO
     for row in range(i * chunk.lag, (i + 1) * chunk.lag):
-        for k in range(m.nq + m.nv):
+        for k in range(m.nq + m.nv + num_activations(m)):
             seen += wp.abs(out_bar[row, k])
     # a gradient that arrives at a simulation that diverged
     blank = wp.where(alive[i] <= 0 and seen != ZERO, wp.float64(wp.nan), ZERO)
@@ -50,6 +51,8 @@ def adjoint(
     for j in range(m.nv):
         w.pos_bar[w.t, j] = blank
         w.rate_bar[w.t, j] = blank
+    for j in range(num_activations(m)):
+        w.act_end_bar[w.t, j] = blank
     for row in range(i * chunk.lag, (i + 1) * chunk.lag):
         for k in range(control_bar.shape[1]):
             control_bar[row, k] = blank
@@ -62,12 +65,16 @@ def adjoint(
             to_tangent(m, w, end, out_bar, w.rb)
             for j in range(m.nv):
                 w.rate_bar[w.t, j] += out_bar[w.rb, m.nq + j]
+            for j in range(num_activations(m)):
+                w.act_end_bar[w.t, j] += out_bar[w.rb, m.nq + m.nv + j]
             for k in range(chunk.skip):
                 r = end - (k + 1) * m.nstage
                 step_adjoint(m, w, r, r + m.nstage)
     from_tangent(m, w, base, state_bar, i)
     for j in range(m.nv):
         state_bar[i, m.nq + j] = w.rate_bar[w.t, j]
+    for j in range(num_activations(m)):
+        state_bar[i, m.nq + m.nv + j] = w.act_end_bar[w.t, j]
     for j in range(columns.shape[0]):
         theta_bar[i, j] = w.grad[w.t, columns[j]]
 
@@ -95,6 +102,7 @@ def leaves(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):
     y[5] = sphere_cylinder_dual(v, s, v, v, v, 0, s, v, v)
     y[6] = box_dual(v, r[0], v, v, r[0], v, 0, s, v, v)
     y[7] = chart_rate_dual(v, v, v)
+    y[12] = activation_power(4, s, s, v, s)
 
 
 @cache

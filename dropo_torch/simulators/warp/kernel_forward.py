@@ -11,7 +11,7 @@ from functools import cache
 import warp as wp
 
 from dropo_torch.simulators.warp.integrate import good, step
-from dropo_torch.simulators.warp.parts import make_kernel
+from dropo_torch.simulators.warp.parts import make_kernel, num_activations
 from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals2, Tables, World, f64
 
 
@@ -34,10 +34,12 @@ def simulate(
     w.full[w.t] = 0
     base = wp.where(chunk.keep != 0, i, w.t) * chunk.period * m.nstage
     for j in range(m.nq):
-        w.qpos[base, j] = states[tr, j]
+        w.qpos[base, j] = states[world // chunk.start_each, j]
     for j in range(m.nv):
-        w.qvel[base, j] = states[tr, m.nq + j]
+        w.qvel[base, j] = states[world // chunk.start_each, m.nq + j]
         w.acc[base, j] = ZERO
+    for j in range(num_activations(m)):
+        w.act[base, j] = states[world // chunk.start_each, m.nq + m.nv + j]
     ok = int(1)
     n = int(0)
     for logged in range(chunk.lag):
@@ -55,6 +57,8 @@ def simulate(
             if ok != 0:
                 y = w.qpos[r, j] if j < m.nq else w.qvel[r, j - m.nq]
             out[i * chunk.lag + logged, j] = y
+        for j in range(num_activations(m)):
+            out[i * chunk.lag + logged, m.nq + m.nv + j] = w.act[r, j]
     alive[i] = ok - w.full[w.t]
 
 

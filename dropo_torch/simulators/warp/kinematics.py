@@ -13,6 +13,7 @@ import warp as wp
 
 from dropo_torch.simulators.warp.ellipsoid import ellipsoids_wrench
 from dropo_torch.simulators.warp.fluid import fluid_wrench
+from dropo_torch.simulators.warp.frames import body_position, body_rotation, link_axis, link_position
 from dropo_torch.simulators.warp.parts import has_medium
 from dropo_torch.simulators.warp.rotations import quat_matrix, rotation
 from dropo_torch.simulators.warp.spatial import (
@@ -48,8 +49,8 @@ def sweep_out(m: Tables, w: World, r: int):
     for b in range(1, m.nb):
         p = m.body_parent[b]
         rp = w.xmat[w.t, p]
-        pos = w.xpos[w.t, p] + rp * m.body_pos[b]
-        rot = rp * m.body_mat[b]
+        pos = w.xpos[w.t, p] + rp * body_position(m, w, b)
+        rot = rp * body_rotation(m, w, b)
         i = m.body_pose[b]
         if i >= 0:
             pos = vec3_at(w.ctrl, w.rc, i) - o
@@ -63,15 +64,17 @@ def sweep_out(m: Tables, w: World, r: int):
             iq = m.link_qpos[k]
             sv = vec6()
             if kind == HINGE:
-                axis = rot * m.link_axis[k]
-                anchor = pos + rot * m.link_pos[k]
-                rot = rot * rotation(m.link_axis[k], w.qpos[r, iq] - m.link_ref[k])
-                pos = anchor - rot * m.link_pos[k]
+                local = link_axis(m, w, k)
+                place = link_position(m, w, k)
+                axis = rot * local
+                anchor = pos + rot * place
+                rot = rot * rotation(local, w.qpos[r, iq] - m.link_ref[k])
+                pos = anchor - rot * place
                 sd = join(axis, wp.cross(anchor, axis))
                 w.motion[w.t, d] = sd
                 sv = sd * w.qvel[r, d]
             elif kind == SLIDE:
-                axis = rot * m.link_axis[k]
+                axis = rot * link_axis(m, w, k)
                 pos += axis * (w.qpos[r, iq] - m.link_ref[k])
                 sd = join(vec3(), axis)
                 w.motion[w.t, d] = sd
@@ -82,9 +85,10 @@ def sweep_out(m: Tables, w: World, r: int):
                     w.motion[w.t, d + i] = join(vec3(), w.xmat[w.t, 0][i])
                 sv = join(vec3(), vec3_at(w.qvel, r, d))
             else:
-                anchor = pos + rot * m.link_pos[k]
+                place = link_position(m, w, k)
+                anchor = pos + rot * place
                 rot = rot * quat_matrix(vec4_at(w.qpos, r, iq))
-                pos = anchor - rot * m.link_pos[k]
+                pos = anchor - rot * place
                 for i in range(3):
                     axis = vec3(rot[0, i], rot[1, i], rot[2, i])
                     sd = join(axis, wp.cross(anchor, axis))

@@ -12,7 +12,8 @@ DIRECT = (
     ("damping", "dof_damping", 0), ("dampingpoly", "dof_dampingpoly", 0), ("armature", "dof_armature", 0),
     ("frictionloss", "dof_frictionloss", 0), ("dof_solref", "dof_solref", 0), ("dof_solimp", "dof_solimp", 0),
     ("gain", "actuator_gainprm", 3), ("bias", "actuator_biasprm", 3), ("gear", "actuator_gear", 0),
-    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0), ("eq_data", "eq_data", 0),
+    ("forcerange", "actuator_forcerange", 0), ("ctrlrange", "actuator_ctrlrange", 0),
+    ("dynprm", "actuator_dynprm", 3), ("actrange", "actuator_actrange", 0), ("eq_data", "eq_data", 0),
     ("eq_solref", "eq_solref", 0), ("eq_solimp", "eq_solimp", 0),
     ("ten_stiffness", "tendon_stiffness", 0), ("ten_stiffnesspoly", "tendon_stiffnesspoly", 0),
     ("ten_damping", "tendon_damping", 0), ("ten_dampingpoly", "tendon_dampingpoly", 0),
@@ -27,10 +28,18 @@ MIXED = (
     "geom_friction", "geom_solref", "geom_solimp", "geom_margin", "pair_friction", "pair_solref",
     "pair_solreffriction", "pair_solimp", "pair_margin",
 )  # fmt: skip
+#: What actuators add to their joints, times the gear's square: field of the actuators → that of the dofs.
+ADDED = {
+    "actuator_damping": "dof_damping", "actuator_dampingpoly": "dof_dampingpoly", "actuator_armature": "dof_armature",
+}  # fmt: skip
+#: Fields of frames, those of bodies, joints and geoms: in θ stand those that vary.
+FRAMES = ("body_pos", "body_quat", "jnt_axis", "jnt_pos", "geom_pos", "geom_quat", "geom_size")
 #: Numbers of a pair of geoms: what is mixed, and the sum of the two bodies' inverse weights.
 PAIR = {"friction": 5, "solref": 2, "solreffriction": 2, "solimp": 5, "margin": 1, "invweight": 1}
 #: Fields that θ is made of: those that a parameter may write and the adjoint differentiates.
-FIELDS = (*(field for _, field, _ in DIRECT), *MIXED)
+FIELDS = (*(field for _, field, _ in DIRECT), *MIXED, *FRAMES, *ADDED)
 #: All sections of θ, in order.
-SECTIONS = (*(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight", "weld_invweight",
-            "ten_invweight")  # fmt: skip
+SECTIONS = (
+    *(name for name, _, _ in DIRECT), *(f"pair_{name}" for name in PAIR), "dof_invweight", "weld_invweight",
+    "ten_invweight", "body_frame", "link_frame", "geom_frame",
+)  # fmt: skip

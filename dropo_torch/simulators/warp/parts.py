@@ -22,6 +22,10 @@ CONVEX = 1
 COUPLINGS = 2
 #: Forces of a medium, and the full slope of forces that an implicit integrator takes.
 MEDIUM = 4
+#: Activations of actuators, and actuators at sites.
+DRIVES = 8
+#: Frames and sizes that vary.
+FRAMES = 16
 
 
 def _part(bit: int) -> str:
@@ -49,6 +53,16 @@ def with_couplings() -> bool:
 @wp.func_native(_part(MEDIUM))
 def with_medium() -> bool:
     """Whether this kernel is made with forces of a medium and full slopes."""
+
+
+@wp.func_native(_part(DRIVES))
+def with_drives() -> bool:
+    """Whether this kernel is made with activations and actuators at sites."""
+
+
+@wp.func_native(_part(FRAMES))
+def with_frames() -> bool:
+    """Whether this kernel is made with frames and sizes that vary."""
 
 
 @wp.func(inline=True)
@@ -81,6 +95,45 @@ def has_full_slope(m: Tables) -> bool:
     return with_medium() and m.full != 0
 
 
+@wp.func(inline=True)
+def num_activations(m: Tables) -> int:
+    """Number of activations, none where the kernel is made without."""
+    n = 0
+    if with_drives():
+        n = m.na
+    return n
+
+
+@wp.func(inline=True)
+def is_activated(m: Tables, i: int) -> bool:
+    """Whether actuator ``i`` has an activation."""
+    return with_drives() and m.act_state[i] >= 0
+
+
+@wp.func(inline=True)
+def has_thrust(m: Tables) -> bool:
+    """Whether there are actuators at sites."""
+    return with_drives() and m.has_thrust != 0
+
+
+@wp.func(inline=True)
+def is_thrust(m: Tables, i: int) -> bool:
+    """Whether actuator ``i`` is at a site."""
+    return with_drives() and m.act_body[i] >= 0
+
+
+@wp.func(inline=True)
+def has_frames(m: Tables) -> bool:
+    """Whether frames of bodies or joints vary."""
+    return with_frames() and m.want_frames != 0
+
+
+@wp.func(inline=True)
+def has_geoms(m: Tables) -> bool:
+    """Whether frames or sizes of geoms vary."""
+    return with_frames() and m.want_geoms != 0
+
+
 def make_kernel(function: Callable[..., None], parts: int, *, differentiated: bool = False) -> wp.Kernel:
     """Return the kernel of a function that has some parts, in a module of its own for each set of them.
 
@@ -100,6 +153,11 @@ def make_kernel(function: Callable[..., None], parts: int, *, differentiated: bo
 
 def parts_of(tables: Tables, *, convex: bool) -> int:
     """Return the parts that a model has, as bits; ``convex`` if it has pairs of general convex geoms."""
-    has_medium = tables.has_fluid or tables.full
-    couplings = tables.nten or tables.nweld
-    return (CONVEX if convex else 0) | (COUPLINGS if couplings else 0) | (MEDIUM if has_medium else 0)
+    found = {
+        CONVEX: convex,
+        COUPLINGS: tables.nten or tables.nweld,
+        MEDIUM: tables.has_fluid or tables.full,
+        DRIVES: tables.na or tables.has_thrust,
+        FRAMES: tables.want_frames or tables.want_geoms,
+    }
+    return sum(part for part, has in found.items() if has)

@@ -16,9 +16,18 @@ import warp as wp
 from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make_contacts
 from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, fluid_centre, fluid_frame
 from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
-from dropo_torch.simulators.warp.forces import add_forces, forces_adjoint
+from dropo_torch.simulators.warp.forces import add_forces, add_thrust, forces_adjoint
+from dropo_torch.simulators.warp.frames import before_link, beyond, body_frame_adjoint, link_frame_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
-from dropo_torch.simulators.warp.parts import has_full_slope, has_medium, num_tendons, num_welds, with_medium
+from dropo_torch.simulators.warp.parts import (
+    has_frames,
+    has_full_slope,
+    has_medium,
+    has_thrust,
+    num_tendons,
+    num_welds,
+    with_medium,
+)
 from dropo_torch.simulators.warp.rotations import quat_mul
 from dropo_torch.simulators.warp.rows import make_rows, rows_adjoint
 from dropo_torch.simulators.warp.slopes import fluid_slopes_adjoint, solve_full_transposed
@@ -46,7 +55,7 @@ from dropo_torch.simulators.warp.tendons import (
 )
 from dropo_torch.simulators.warp.touch import find_contacts
 from dropo_torch.simulators.warp.triangle import factor, solve
-from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, vec3, vec4, vec6
+from dropo_torch.simulators.warp.types import MINVAL, ONE, TWO, ZERO, Tables, World, mat33, vec3, vec4, vec6
 from dropo_torch.simulators.warp.welds import make_welds, welds_adjoint
 from dropo_torch.simulators.warp.wrenches import outer_wrench_adjoint
 
@@ -56,6 +65,8 @@ def accelerate(m: Tables, w: World, r: int):
     """Acceleration of the state in row ``r``, from the guess in ``acc[r]``; leaves the factor of H in ``hess[r]``."""
     sweep_out(m, w, r)
     inertial_forces(m, w)
+    if has_thrust(m):
+        add_thrust(m, w, r)
     sweep_in(m, w)
     if num_tendons(m) != 0:
         make_tendons(m, w, r)
@@ -128,7 +139,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
         welds_adjoint(m, w)
         if num_tendons(m) != 0:
             tendons_adjoint(m, w)
-    carry_in(m, w, posed)
+    carry_in(m, w, r, posed)
     if softening == 0:
         add_at(w.grad, w.t, m.o_gravity, -lin(w.f_accel[w.t, 0]))
 
@@ -282,12 +293,13 @@ def pose_adjoint(m: Tables, w: World, b: int, y: vec6):
 
 
 @wp.func(inline=True)
-def carry_in(m: Tables, w: World, posed: int):
+def carry_in(m: Tables, w: World, r: int, posed: int):
     """Adjoints of positions and velocities, from the leaves to the root.
 
     In a frame that is displaced along s with everything beyond the joint, only what comes from before the joint
     moves: each of V, A, U, Λ there by X × s. So L_q = Σ_X F_X · (X × s) + Y · s and L_v = F_V · s + F_A · (V × s),
     X before the joint, with F_V += v s ×* F_A between the two. ``posed`` 0 says that there is no F_U and no Y.
+    Frames that vary get their adjoints on the way.
     """
     for reverse in range(1, m.nb):
         b = m.nb - reverse
@@ -306,6 +318,13 @@ def carry_in(m: Tables, w: World, posed: int):
         dual = w.dual[w.t, b]
         first = m.body_link[b]
         count = m.body_nlink[b]
+        after = vec6()
+        pos = vec3()
+        rot = mat33()
+        if has_frames(m):
+            after = beyond(v, a, u, dual, fv, fa, fu, fl, fy)
+            pos = w.xpos[w.t, b]
+            rot = w.xmat[w.t, b]
         for step in range(count):
             k = first + count - 1 - step
             d = m.link_dof[k]
@@ -331,8 +350,17 @@ def carry_in(m: Tables, w: World, posed: int):
             for i in range(d, d + m.link_ndof[k]):
                 w.vel_bar[w.t, i] += wp.dot(w.motion[w.t, i], g)
                 w.tangent[w.t, i] += wp.dot(w.motion[w.t, i], y)
+            if has_frames(m):
+                place, inner = before_link(m, w, r, k, pos, rot)
+                pull = g * w.qd[w.t, d] + (fu + fa) * w.qacc[w.t, d] + fl * w.lam[w.t, d]
+                link_frame_adjoint(m, w, r, k, place, inner, rot, after, y, pull)
+                after = y
+                pos = place
+                rot = inner
         if m.body_pose[b] >= 0:
             pose_adjoint(m, w, b, fy - cross_force(a, fa))
+        if has_frames(m):
+            body_frame_adjoint(m, w, b, after)
         w.f_velocity[w.t, p] = w.f_velocity[w.t, p] + fv
         w.f_accel[w.t, p] = w.f_accel[w.t, p] + fa
         if posed != 0:

@@ -10,14 +10,16 @@ import numpy as np
 
 from dropo_torch.errors import UnsupportedModel
 from dropo_torch.parameters import ParameterSpace, object_names, read_field
-from dropo_torch.simulators.warp.collide import CONVEX
+from dropo_torch.simulators.warp import collide
 from dropo_torch.simulators.warp.couplings import acting_tendons, is_spatial
-from dropo_torch.simulators.warp.layout import DIRECT, FIELDS
+from dropo_torch.simulators.warp.layout import ADDED, DIRECT, FIELDS, FRAMES
 from dropo_torch.simulators.warp.tables import KINDS, joint_dofs, link_table, turning_bodies
 from dropo_torch.simulators.warp.types import BALL
 
 #: Fields of which only the first columns act, and how many.
 _KEPT = {field: keep for _, field, keep in DIRECT if keep}
+#: Dynamics of activations, as numbered in ``types``.
+_ACTIVE = ("NONE", "INTEGRATOR", "FILTER", "FILTEREXACT", "MUSCLE")
 # compared with numpy integers, which do not equal MuJoCo's enumerations from the right
 _TRANSMISSIONS = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
 INTEGRATORS = (
@@ -27,6 +29,20 @@ INTEGRATORS = (
 _TENDON = int(mujoco.mjtTrn.mjTRN_TENDON)
 _IMPLICIT = (int(mujoco.mjtIntegrator.mjINT_IMPLICIT), int(mujoco.mjtIntegrator.mjINT_IMPLICITFAST))
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
+_SLIDE = int(mujoco.mjtJoint.mjJNT_SLIDE)
+#: How many sizes of a geom may vary.
+_SIZES = {
+    mujoco.mjtGeom.mjGEOM_SPHERE: 1, mujoco.mjtGeom.mjGEOM_CAPSULE: 2, mujoco.mjtGeom.mjGEOM_CYLINDER: 2,
+    mujoco.mjtGeom.mjGEOM_BOX: 3, mujoco.mjtGeom.mjGEOM_ELLIPSOID: 3,
+}  # fmt: skip
+#: Kinds of contacts that give gradients of sizes.
+_SIZED = frozenset((
+    collide.PLANE_SPHERE, collide.PLANE_CAPSULE, collide.PLANE_BOX, collide.PLANE_CYLINDER, collide.PLANE_ELLIPSOID,
+    collide.ROUND, collide.CAPSULE_BOX, collide.SPHERE_CYLINDER,
+))  # fmt: skip
+_DYNAMICS = tuple(int(getattr(mujoco.mjtDyn, f"mjDYN_{name}")) for name in _ACTIVE)
+#: How many constants the dynamics have.
+_CONSTANTS = dict(zip(_DYNAMICS, (0, 0, 1, 1, 3), strict=True))
 _GAINS = (int(mujoco.mjtGain.mjGAIN_FIXED), int(mujoco.mjtGain.mjGAIN_AFFINE))
 _BIASES = (int(mujoco.mjtBias.mjBIAS_NONE), int(mujoco.mjtBias.mjBIAS_AFFINE))
 _COUPLED = (int(mujoco.mjtEq.mjEQ_TENDON),)
@@ -78,8 +94,7 @@ def missing(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int,
     """Return everything that the backend lacks for ``model`` and ``space``; see :func:`check_support`."""
     return [
         *_options(model), *_structure(model), *_joints(model), *_tendons(model, space), *_actuators(model, space),
-        *_equalities(model),
-        *_contacts(model, pairs), *_parameters(model, space),
+        *_equalities(model), *_contacts(model, space, pairs), *_parameters(model, space),
     ]  # fmt: skip
 
 
@@ -128,8 +143,7 @@ def _options(model: mujoco.MjModel) -> Iterator[Missing]:
 
 
 def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
-    counts = {"nplugin": "plugins", "nhistory": "delays or history buffers", "nplastic": "plastic springs",
-              "na": "activation states of actuators"}  # fmt: skip
+    counts = {"nplugin": "plugins", "nhistory": "delays or history buffers", "nplastic": "plastic springs"}
     yield from (Missing(what) for number, what in counts.items() if getattr(model, number, 0))
     yield from (
         Missing("flex", repr(mujoco.mj_id2name(model, mujoco.mjtObj.mjOBJ_FLEX, i) or i)) for i in range(model.nflex)
@@ -138,16 +152,19 @@ def _structure(model: mujoco.MjModel) -> Iterator[Missing]:
         yield Missing("actuators with several controls or outputs")
     flags = {"flg_surfacevel": "surface velocity", "flg_adhesion": "adhesion"}
     yield from (Missing(f"geom {what}") for flag, what in flags.items() if getattr(model, flag, False))
-    acting = set(model.jnt_bodyid[model.jnt_actgravcomp.astype(bool)])  # bodies compensated through actuators
-    for i in range(1, model.nbody):
-        if model.body_parentid[i] in acting:
-            acting.add(i)
-        if model.body_gravcomp[i] < 0:
-            yield Missing(
-                "negative gravcomp of body", f"{model.body(i).name!r}, which MuJoCo ignores unless another is positive"
-            )
-        if model.body_gravcomp[i] and i in acting:
-            yield Missing("actuatorgravcomp on body", repr(model.body(i).name))
+    if model.ngravcomp:
+        yield from _compensated(model)
+
+
+def _compensated(model: mujoco.MjModel) -> Iterator[Missing]:
+    """Gravity compensation through actuators where that is more than another name of the force."""
+    disable, names = mujoco.mjtDisableBit, object_names(model, "jnt")
+    apart = disable.mjDSBL_ACTUATION | disable.mjDSBL_SPRING | disable.mjDSBL_DAMPER
+    for j in np.flatnonzero(model.jnt_actgravcomp):
+        if model.jnt_actfrclimited[j]:
+            yield Missing("actuatorgravcomp within actuatorfrcrange", repr(names[j]))
+        elif not model.nactuator or model.opt.disableflags & int(apart):
+            yield Missing("actuatorgravcomp without actuators or passive forces", repr(names[j]))
 
 
 def _joints(model: mujoco.MjModel) -> Iterator[Missing]:
@@ -170,6 +187,8 @@ def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing
         where = repr(names[i])
         if model.actuator_trntype[i] == _TENDON:
             pass
+        elif model.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_SITE:
+            yield from (Missing(f"actuator at a site with {what}", where) for what in _beyond_thrust(model, i, varied))
         elif model.actuator_trntype[i] not in _TRANSMISSIONS:
             yield Missing(f"actuator transmission {mujoco.mjtTrn(model.actuator_trntype[i]).name[6:].lower()}", where)
         elif model.jnt_type[model.actuator_trnid[i, 0]] in (_FREE, _BALL):
@@ -177,14 +196,35 @@ def _actuators(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing
                 Missing(f"actuator of a free or ball joint with {what}", where)
                 for what in _beyond_moments(model, i, varied)
             )
-        if model.actuator_dyntype[i] != mujoco.mjtDyn.mjDYN_NONE:
+        if model.actuator_dyntype[i] not in _DYNAMICS:
             yield Missing(f"actuator dynamics {mujoco.mjtDyn(model.actuator_dyntype[i]).name[6:].lower()}", where)
+        if model.actuator_actnum[i] > 1:
+            yield Missing("actuator with several activations", where)
         if model.actuator_gaintype[i] not in _GAINS:
             yield Missing(f"actuator gain {mujoco.mjtGain(model.actuator_gaintype[i]).name[7:].lower()}", where)
         if model.actuator_biastype[i] not in _BIASES:
             yield Missing(f"actuator bias {mujoco.mjtBias(model.actuator_biastype[i]).name[7:].lower()}", where)
-        if model.actuator_damping[i] or model.actuator_dampingpoly[i].any() or model.actuator_armature[i]:
-            yield Missing("actuator damping or armature", where)
+        if any(np.any(read_field(model, field)[i]) for field in ADDED) and not _adds(model, i):
+            yield Missing("actuator damping or armature of anything but a hinge or a slide", where)
+
+
+def _adds(model: mujoco.MjModel, actuator: int) -> bool:
+    """Whether damping and armature of an actuator go to a hinge or a slide."""
+    on_joint = model.actuator_trntype[actuator] == mujoco.mjtTrn.mjTRN_JOINT
+    return bool(on_joint and model.jnt_type[model.actuator_trnid[actuator, 0]] >= _SLIDE)
+
+
+def _beyond_thrust(model: mujoco.MjModel, actuator: int, varied: set[tuple[str, int]]) -> Iterator[str]:
+    """What of an actuator at a site is more than a force and a torque by its drive."""
+    if model.actuator_trnid[actuator, 1] >= 0:
+        yield "a reference site"
+    if model.jnt_actfrclimited.any():
+        yield "joints of an actuatorfrcrange"
+    for field, types in (("actuator_gainprm", model.actuator_gaintype), ("actuator_biasprm", model.actuator_biastype)):
+        width = read_field(model, field).shape[1]
+        acts = read_field(model, field)[actuator, 2] != 0 or (field, actuator * width + 2) in varied
+        if types[actuator] == mujoco.mjtGain.mjGAIN_AFFINE and acts:
+            yield "a force by the velocity"
 
 
 def _beyond_moments(model: mujoco.MjModel, actuator: int, varied: set[tuple[str, int]]) -> Iterator[str]:
@@ -240,15 +280,17 @@ def _equalities(model: mujoco.MjModel) -> Iterator[Missing]:
                 yield Missing("equality of a free or ball joint", repr(name))
 
 
-def _contacts(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> Iterator[Missing]:
-    names = object_names(model, "geom")
+def _contacts(model: mujoco.MjModel, space: ParameterSpace, pairs: list[tuple[int, int, int]]) -> Iterator[Missing]:
+    names, sized = object_names(model, "geom"), {t.index // 3 for _, t in space.targets if t.field == "geom_size"}
     native = not model.opt.disableflags & int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
     for g1, g2, _pair in pairs:
         kinds = tuple(mujoco.mjtGeom(model.geom_type[g]) for g in (g1, g2))
-        if kinds not in KINDS or (KINDS[kinds][0] == CONVEX and not native):
+        if kinds not in KINDS or (KINDS[kinds][0] == collide.CONVEX and not native):
             a, b = (kind.name[7:].lower() for kind in kinds)
             why = " without the flag nativeccd" if kinds in KINDS else ""
             yield Missing(f"contacts of {a} with {b}{why}", f"{names[g1]!r} with {names[g2]!r}")
+        elif sized & {g1, g2} and KINDS[kinds][0] not in _SIZED:
+            yield Missing("gradients of geom_size in contacts", f"{names[g1]!r} with {names[g2]!r}")
 
 
 def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missing]:
@@ -261,6 +303,13 @@ def _parameters(model: mujoco.MjModel, space: ParameterSpace) -> Iterator[Missin
             if reason:
                 yield Missing(reason, f"parameter {parameter.name!r}")
                 break
+
+
+def _moored(model: mujoco.MjModel) -> bool:
+    """Whether there is something whose constants ``mj_setConst`` takes from where bodies are in ``qpos0``."""
+    ties = (int(mujoco.mjtEq.mjEQ_CONNECT), int(mujoco.mjtEq.mjEQ_WELD))
+    tied = bool((model.eq_active0.astype(bool) & np.isin(model.eq_type, ties)).any())
+    return tied or bool((model.wrap_type == int(mujoco.mjtWrap.mjWRAP_SITE)).any())
 
 
 def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
@@ -279,6 +328,18 @@ def _dead(model: mujoco.MjModel, field: str, index: int) -> str:
         dofs = int(joint_dofs(model)[model.actuator_trnid[index // width, 0]])
         if column >= dofs:
             return f"effects of {field}[{column}], only of " + ", ".join(f"{field}[{i}]" for i in range(dofs))
+    if field == "body_gravcomp" and (model.body_gravcomp < 0).any():
+        return "gradients of body_gravcomp beside a negative one"
+    if field in ADDED and not _adds(model, index // width):
+        return f"{field} on anything but a hinge or a slide"
+    if field in FRAMES:
+        return _fixed(model, field, index // width, column)
+    if field in ("actuator_dynprm", "actuator_actrange"):
+        actuator = index // width
+        if field == "actuator_actrange" and not model.actuator_actlimited[actuator]:
+            return f"effects of {field} where activation is not limited"
+        if field == "actuator_dynprm" and column >= _CONSTANTS[int(model.actuator_dyntype[actuator])]:
+            return f"effects of {field}[{column}] in these dynamics"
     if field == "qpos_spring":
         kinds, _joints, _dofs, starts = link_table(model)
         if ((kinds == BALL) & (starts <= index) & (index < starts + 4)).any():
@@ -298,3 +359,28 @@ def _dead_data(model: mujoco.MjModel, equality: int, column: int) -> str:
     if column in acting:
         return ""
     return f"effects of eq_data[{column}], only of " + (", ".join(f"eq_data[{i}]" for i in acting) or "none")
+
+
+def _fixed(model: mujoco.MjModel, field: str, row: int, column: int) -> str:
+    """Why a number of a frame does nothing here, or an empty string."""
+    kind = field.split("_")[0]
+    if kind == "body":
+        first = model.body_jntadr[row]
+        free = model.body_jntnum[row] and model.jnt_type[first] == _FREE
+        if row == 0 or free or model.body_mocapid[row] >= 0:
+            return f"effects of {field} of a free or mocap body, or of the world"
+        if _moored(model):
+            return f"gradients of {field} beside connect and weld equalities, or spatial tendons"
+    elif kind == "jnt":
+        joint = model.jnt_type[row]
+        if joint == _FREE or (joint == _BALL and field == "jnt_axis") or (joint == _SLIDE and field == "jnt_pos"):
+            return f"effects of {field} of a {mujoco.mjtJoint(joint).name[6:].lower()} joint"
+        if model.body_simple[model.jnt_bodyid[row]]:
+            return f"{field} of a body that MuJoCo has compiled as simple"
+        if _moored(model):
+            return f"gradients of {field} beside connect and weld equalities, or spatial tendons"
+    elif model.geom_fluid[row, 0] > 0:
+        return f"gradients of {field} of a geom that a medium acts on as an ellipsoid"
+    elif field == "geom_size" and column >= _SIZES.get(mujoco.mjtGeom(model.geom_type[row]), 0):
+        return f"gradients of {field}[{column}] of a {mujoco.mjtGeom(model.geom_type[row]).name[7:].lower()}"
+    return ""

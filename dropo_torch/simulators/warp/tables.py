@@ -27,6 +27,7 @@ from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.meshes import mesh_tables
 from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_dofs
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
+from dropo_torch.simulators.warp.varied import varied
 
 _JNT, _GEOM, _DISABLE, _EQ = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit, mujoco.mjtEq
 _INTEGRATOR = {
@@ -87,9 +88,8 @@ def build_tables(
     device: str,
 ) -> Tables:
     """Return the tables of a supported model on a device."""
-    columns = _bodies(model) | _links(model) | _actuators(model) | _constraints(model, space) | _pairs(model, pairs)
-    columns |= mesh_tables(model, pairs)
-    columns |= _welds(model) | _tendons(model, space)
+    columns = _bodies(model) | _links(model) | _actuators(model) | _constraints(model, space) | _frames(model, space)
+    columns |= _pairs(model, pairs, space) | mesh_tables(model, pairs) | _welds(model) | _tendons(model, space)
     columns["always_dense"] |= columns["quad_dense"] | columns.pop("tendons_dense")
     columns["maxrow"] += columns["nteneq"] + 3 * columns["nten"]
     columns |= _ellipsoids(model)
@@ -204,21 +204,45 @@ def joint_dofs(model: mujoco.MjModel) -> np.ndarray:
     return np.array([6, 3, 1, 1])[model.jnt_type]
 
 
+def _frames(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
+    """Where in θ frames stand that vary, and −1 of those in the tables."""
+    rows = varied(space, model)
+
+    def places(kind: str, count: int) -> np.ndarray:
+        out = np.full(count, -1)
+        out[rows[kind]] = np.arange(len(rows[kind]))
+        return out
+
+    return {
+        "body_frame": places("body", model.nbody), "geom_frame": places("geom", model.ngeom),
+        "link_frame": places("jnt", model.njnt)[link_table(model)[1]], "want_geoms": int(bool(rows["geom"])),
+        "want_frames": int(bool(rows["body"] or rows["jnt"])),
+    }  # fmt: skip
+
+
 def _actuators(model: mujoco.MjModel) -> dict[str, Any]:
     acting = not _disabled(model, _DISABLE.mjDSBL_ACTUATION)
     by_tendon = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_TENDON)
-    joints = np.where(by_tendon, 0, model.actuator_trnid[:, 0])
+    at_site = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_SITE)
+    joints = np.where(by_tendon | at_site, 0, model.actuator_trnid[:, 0])
+    sites = np.where(at_site, model.actuator_trnid[:, 0], 0)[: None if model.nsite else 0]
     dofs, starts, qs = joint_dofs(model), model.jnt_dofadr, model.jnt_qposadr
     if not model.njnt:
         dofs, starts, qs = (np.zeros(1, dtype=int) for _ in range(3))
     return {
         "nu": model.nu if acting else 0, "act_dof": starts[joints], "act_qpos": qs[joints],
         "act_tendon": np.where(by_tendon, model.actuator_trnid[:, 0], -1),
-        "act_ndof": np.where(by_tendon, 0, dofs[joints]),
+        "act_ndof": np.where(by_tendon | at_site, 0, dofs[joints]),
+        "has_thrust": int(acting and bool(at_site.any())), "act_pos": model.site_pos[sites],
+        "act_mat": _matrices(model.site_quat[sites]),
+        "act_body": np.where(at_site, model.site_bodyid[sites] if model.nsite else -1, -1),
         "act_affine_gain": model.actuator_gaintype == mujoco.mjtGain.mjGAIN_AFFINE,
         "act_affine_bias": model.actuator_biastype == mujoco.mjtBias.mjBIAS_AFFINE,
         "act_ctrllimited": model.actuator_ctrllimited * (not _disabled(model, _DISABLE.mjDSBL_CLAMPCTRL)),
         "act_frclimited": model.actuator_forcelimited,
+        "na": model.na if acting else 0, "act_state": model.actuator_actadr, "act_dyn": model.actuator_dyntype,
+        "act_early": model.actuator_actearly, "act_statelimited": model.actuator_actlimited,
+        "state_act": np.flatnonzero(model.actuator_actnum),
         "has_frclimit": int(acting and bool(model.jnt_actfrclimited.any())),
     }  # fmt: skip
 
@@ -326,7 +350,7 @@ def _branches(model: mujoco.MjModel, dofs: np.ndarray) -> bool:
     return not set(dofs.tolist()) <= chain
 
 
-def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str, Any]:
+def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]], space: ParameterSpace) -> dict[str, Any]:
     table = np.array(pairs, dtype=int).reshape(-1, 3)
     kinds = [KINDS[_GEOM(model.geom_type[g1]), _GEOM(model.geom_type[g2])] for g1, g2, _pair in pairs]
     kind, points, most = (np.array([int(k[i]) for k in kinds], dtype=int) for i in range(3))
@@ -340,12 +364,13 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> dict[str
     gap = model.geom_gap[table[:, 0]] + model.geom_gap[table[:, 1]]
     explicit = table[:, 2] >= 0
     gap[explicit] = model.pair_gap[table[explicit, 2]]
+    bound = model.geom_rbound.copy()
+    bound[[index // 3 for index in _targets(space, "geom_size")]] = 1e5  # wherever it may be
     return {
         "npair": len(pairs), "maxcon": min(int(most.sum()), MOST_CONTACTS), "pair_kind": kind, "pair_points": points,
         "pair_most": most, "pair_dofadr": np.cumsum([0, *map(len, moving)]), "pair_dof": dofs[:, 0],
-        "pair_sign": dofs[:, 1],
-        "pair_bound": (model.geom_rbound[table[:, 1]] + model.geom_rbound[table[:, 0]]) * (1 + 1e-9),
-        "pair_gap": gap,
+        "pair_sign": dofs[:, 1], "pair_gap": gap,
+        "pair_bound": (bound[table[:, 1]] + bound[table[:, 0]]) * (1 + 1e-9),
         "pair_body1": bodies[:, 0], "pair_body2": bodies[:, 1], "pair_geom1": table[:, 0], "pair_geom2": table[:, 1],
         "pair_dim": np.array([condim(model, *p) for p in pairs], dtype=int),
         "pair_dense": np.array([joins_branches(model, int(a), int(b)) for a, b in bodies], dtype=int),
@@ -419,7 +444,7 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
     def acts(*fields: str) -> bool:
         return wanted(*fields) or any(np.any(read_field(model, field)) for field in fields)
 
-    damper = damped and acts("dof_damping", "dof_dampingpoly")
+    damper = damped and acts("dof_damping", "dof_dampingpoly", "actuator_damping", "actuator_dampingpoly")
     implicit_damper = integrator == EULER and damper and not _disabled(model, _DISABLE.mjDSBL_EULERDAMP)
     turning = turning_bodies(model)
     passive = damped or sprung  # without springs and dampers MuJoCo leaves out all passive forces
@@ -430,7 +455,7 @@ def _switches(model: mujoco.MjModel, space: ParameterSpace) -> dict[str, Any]:
         "refsafe": not _disabled(model, _DISABLE.mjDSBL_REFSAFE), "implicit_actuators": integrator == IMPLICITFAST,
         "implicit": integrator == IMPLICITFAST or implicit_damper, "has_damper": damper,
         "has_spring": sprung and acts("jnt_stiffness", "jnt_stiffnesspoly"),
-        "has_gravcomp": passive and acts("body_gravcomp"),
+        "has_gravcomp": passive and (wanted("body_gravcomp") or model.ngravcomp > 0),
         "has_fluid": passive and acts("opt.density", "opt.viscosity"), "has_turning": bool(turning.any()),
     }  # fmt: skip
     switches["implicit_fluid"] = integrator == IMPLICITFAST and switches["has_fluid"]

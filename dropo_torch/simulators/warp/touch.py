@@ -14,7 +14,14 @@ import warp as wp
 
 from dropo_torch.simulators.warp import boxes, collide, hull
 from dropo_torch.simulators.warp.convex_touch import convex_adjoint, convex_contacts, keep_contact
-from dropo_torch.simulators.warp.parts import with_convex
+from dropo_torch.simulators.warp.frames import (
+    geom_frame_adjoint,
+    geom_position,
+    geom_size,
+    geom_size_adjoint,
+    geom_turn,
+)
+from dropo_torch.simulators.warp.parts import has_geoms, with_convex
 from dropo_torch.simulators.warp.spatial import pull, wrench
 from dropo_torch.simulators.warp.types import (
     HALF,
@@ -39,25 +46,25 @@ from dropo_torch.simulators.warp.types import (
 def geom_centre(m: Tables, w: World, g: int) -> vec3:
     """Centre of a geom, from the origin of the sweep."""
     b = m.geom_body[g]
-    return w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
+    return w.xpos[w.t, b] + w.xmat[w.t, b] * geom_position(m, w, g)
 
 
 @wp.func(inline=True)
 def geom_rotation(m: Tables, w: World, g: int) -> mat33:
     """Rotation of a geom."""
-    return w.xmat[w.t, m.geom_body[g]] * m.geom_mat[g]
+    return w.xmat[w.t, m.geom_body[g]] * geom_turn(m, w, g)
 
 
 @wp.func(inline=True)
 def geom_axis(m: Tables, w: World, g: int) -> vec3:
     """Third axis of a geom: a plane's normal, the axis of a capsule."""
-    return w.xmat[w.t, m.geom_body[g]] * m.geom_mat[g][:, 2]
+    return w.xmat[w.t, m.geom_body[g]] * geom_turn(m, w, g)[:, 2]
 
 
 @wp.func(inline=True)
 def half_axis(m: Tables, w: World, g: int) -> vec3:
     """Half-axis of a capsule, zero for a sphere (whose second size is zero)."""
-    return geom_axis(m, w, g) * m.geom_size[g][1]
+    return geom_axis(m, w, g) * geom_size(m, w, g)[1]
 
 
 @wp.func(inline=True)
@@ -167,7 +174,7 @@ def _may_touch(m: Tables, w: World, g1: int, g2: int, apart: vec3, margin: f64) 
     """Whether the bounding boxes of two geoms overlap, or nearly so, as seen along the line of their centres."""
     length = wp.length(apart)
     near = bool(True)
-    if length > MINVAL:
+    if length > MINVAL and not has_geoms(m):  # the boxes are those of the sizes in the model
         d = apart / length
         near = length - _extent(m, w, g1, d) - _extent(m, w, g2, -d) < margin
     return near
@@ -179,8 +186,8 @@ def _add_formula(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2
     kind = m.pair_kind[k]
     g1 = m.pair_geom1[k]
     g2 = m.pair_geom2[k]
-    size1 = m.geom_size[g1]
-    size2 = m.geom_size[g2]
+    size1 = geom_size(m, w, g1)
+    size2 = geom_size(m, w, g2)
     axis = geom_axis(m, w, g2)
     a1 = vec3()
     a2 = axis * size2[1]
@@ -350,7 +357,10 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
     nbar = nbar - ybar * along - hint * wp.dot(n, ybar)
     c1 = geom_centre(m, w, g1)
     c2 = geom_centre(m, w, g2)
-    size = m.geom_size[g2]
+    size1 = geom_size(m, w, g1)
+    size = geom_size(m, w, g2)
+    size1bar = vec3()
+    sizebar = vec3()
     rot = mat33()
     if kind != collide.ROUND and kind != collide.PLANE_SPHERE and kind != collide.SPHERE_CYLINDER:
         rot = geom_rotation(m, w, g2)
@@ -370,36 +380,50 @@ def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar
         xbar = pbar + n * slope
         nbar = nbar + (x - c1) * slope - pbar * (radius + HALF * w.con_dist[w.t, c])
         if kind >= collide.PLANE_CYLINDER:
-            _k, nb, cb, rb, _sb, _w, _x = wp.grad(collide.support_dual)(kind, n, c2, rot, size, which, xbar)
+            _k, nb, cb, rb, sizebar, _w, _x = wp.grad(collide.support_dual)(kind, n, c2, rot, size, which, xbar)
             nbar = nbar + nb
             y2 = pull(cb, c2, _turned(rot, rb))
         elif kind == collide.PLANE_CAPSULE:  # its axis is the hint
             y2 = pull(xbar, x, wp.cross(hint, ybar - n * wp.dot(n, ybar)))
+            sizebar[1] = wp.dot(hint, xbar) * (ONE - TWO * f64(which))
         else:
             y2 = wrench(xbar, x)
+            if kind == collide.PLANE_BOX:
+                sizebar = wp.cw_mul(collide.corner(which, vec3(ONE, ONE, ONE)), wp.transpose(rot) * xbar)
+        if kind <= collide.PLANE_CAPSULE:
+            sizebar[0] = -distbar - HALF * wp.dot(pbar, n)
         y1 = pull(n * -slope, c1, wp.cross(n, nbar))
     elif kind == collide.ROUND:
         a1 = half_axis(m, w, g1)
         a2 = half_axis(m, w, g2)
-        c1b, a1b, _r1, c2b, a2b, _r2, _w, _d, _p, _n = wp.grad(collide.round_dual)(
-            c1, a1, m.geom_size[g1][0], c2, a2, size[0], which, distbar, pbar, nbar
+        c1b, a1b, r1b, c2b, a2b, r2b, _w, _d, _p, _n = wp.grad(collide.round_dual)(
+            c1, a1, size1[0], c2, a2, size[0], which, distbar, pbar, nbar
         )
         y1 = pull(c1b, c1, wp.cross(a1, a1b))
         y2 = pull(c2b, c2, wp.cross(a2, a2b))
+        size1bar = vec3(r1b, wp.dot(geom_axis(m, w, g1), a1b), ZERO)
+        sizebar = vec3(r2b, wp.dot(geom_axis(m, w, g2), a2b), ZERO)
     elif kind == collide.SPHERE_CYLINDER:
         axis = geom_axis(m, w, g2)
-        c1b, _r1, c2b, axisb, _sb, _w, _d, _p, _n = wp.grad(collide.sphere_cylinder_dual)(
-            c1, m.geom_size[g1][0], c2, axis, size, which, distbar, pbar, nbar
+        c1b, r1b, c2b, axisb, sizebar, _w, _d, _p, _n = wp.grad(collide.sphere_cylinder_dual)(
+            c1, size1[0], c2, axis, size, which, distbar, pbar, nbar
         )
+        size1bar = vec3(r1b, ZERO, ZERO)
         y1 = wrench(c1b, c1)
         y2 = pull(c2b, c2, wp.cross(axis, axisb))
     elif kind == collide.BOX_BOX:
-        y1, y2 = _boxes_adjoint(c1, geom_rotation(m, w, g1), m.geom_size[g1], c2, rot, size, which, distbar, pbar, nbar)
+        y1, y2 = _boxes_adjoint(c1, geom_rotation(m, w, g1), size1, c2, rot, size, which, distbar, pbar, nbar)
     else:
         a1 = half_axis(m, w, g1)
-        c1b, a1b, _r1, cb, rb, _sb, _w, _d, _p, _n = wp.grad(collide.capsule_box_dual)(
-            c1, a1, m.geom_size[g1][0], c2, rot, size, which, distbar, pbar, nbar
+        c1b, a1b, r1b, cb, rb, sizebar, _w, _d, _p, _n = wp.grad(collide.capsule_box_dual)(
+            c1, a1, size1[0], c2, rot, size, which, distbar, pbar, nbar
         )
         y1 = pull(c1b, c1, wp.cross(a1, a1b))
         y2 = pull(cb, c2, _turned(rot, rb))
+        size1bar = vec3(r1b, wp.dot(geom_axis(m, w, g1), a1b), ZERO)
+    if has_geoms(m):
+        geom_frame_adjoint(m, w, g1, y1)
+        geom_frame_adjoint(m, w, g2, y2)
+        geom_size_adjoint(m, w, g1, size1bar)
+        geom_size_adjoint(m, w, g2, sizebar)
     return y1, y2

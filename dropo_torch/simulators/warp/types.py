@@ -51,6 +51,12 @@ EULER = wp.constant(0)
 RK4 = wp.constant(1)
 IMPLICITFAST = wp.constant(2)
 
+#: Dynamics of an activation.
+INTEGRATOR = wp.constant(1)
+FILTER = wp.constant(2)
+FILTEREXACT = wp.constant(3)
+MUSCLE = wp.constant(4)
+
 Ints: Any = wp.array(dtype=wp.int32)
 Ints2: Any = wp.array2d(dtype=wp.int32)
 Reals: Any = wp.array(dtype=wp.float64)
@@ -75,11 +81,11 @@ def fill(struct: Any, fields: dict[str, Any]) -> Any:
 
 #: Numbers of things, switches of what a model has, and what gradients are wanted of.
 _COUNTS = (
-    "nb", "nv", "nq", "nu", "nlink", "npair", "ntouching", "nfriction", "nlimit", "neq", "nweld", "nten", "nteneq",
-    "norigin", "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
-    "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full",
+    "nb", "nv", "nq", "nu", "na", "nlink", "npair", "ntouching", "nfriction", "nlimit", "neq", "nweld", "nten",
+    "nteneq", "norigin", "nh", "maxcon", "maxrow", "integrator", "nstage", "elliptic", "refsafe",
+    "implicit", "implicit_actuators", "implicit_fluid", "symmetric_fluid", "has_turning", "full", "has_thrust",
     "has_ball", "has_spring", "has_damper", "has_gravcomp", "has_fluid", "has_frclimit", "always_dense", "quad_dense",
-    "want_inertial", "want_inertia", "want_ipos", "want_soft",
+    "want_inertial", "want_inertia", "want_ipos", "want_soft", "want_frames", "want_geoms",
     "ccd_iterations", "nclip_normal",
 )  # fmt: skip
 #: Of bodies, links (the joints, a free joint as two), dofs, actuators, scalar constraints and pairs of geoms.
@@ -87,8 +93,8 @@ _INDICES = (
     "body_parent", "body_link", "body_nlink", "body_dof", "body_ndof", "body_lastdof", "body_massive", "body_pose",
     "link_kind", "link_body", "link_dof", "link_ndof", "link_qpos", "link_jnt", "link_frclimited", "origin_qpos",
     "dof_body", "dof_ndof", "dof_alone",
-    "act_dof", "act_ndof", "act_tendon", "act_qpos", "act_affine_gain", "act_affine_bias", "act_ctrllimited",
-    "act_frclimited",
+    "act_dof", "act_ndof", "act_tendon", "act_body", "act_qpos", "act_affine_gain", "act_affine_bias",
+    "act_ctrllimited", "act_frclimited", "act_state", "act_dyn", "act_early", "act_statelimited", "state_act",
     "friction_dof", "limit_link", "eq_id", "eq_dof", "eq_qpos",
     "weld_id", "weld_body", "weld_turns", "weld_sites", "weld_dense",
     "ten_spatial", "ten_start", "ten_dof", "ten_qpos", "ten_column", "ten_segment", "seg_body",
@@ -99,12 +105,14 @@ _INDICES = (
     "geom_hull", "geom_nhull", "geom_climbs", "hull_id", "hull_edgeadr", "hull_edge", "hull_polyadr", "hull_poly",
     "poly_adr", "poly_num", "poly_vert",
     "body_fluid", "body_nfluid", "fluid_geom", "body_turning",
+    "body_frame", "link_frame", "geom_frame",
 )  # fmt: skip
 _VECTORS = (
     "body_pos", "link_axis", "link_pos", "origin_axis", "geom_pos", "geom_size", "geom_mid", "geom_half", "hull_vert",
-    "poly_normal", "weld_pos", "seg_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass", "fluid_inertia",
+    "poly_normal", "weld_pos", "seg_pos", "act_pos", "fluid_size", "fluid_drag", "fluid_lift", "fluid_mass",
+    "fluid_inertia",
 )  # fmt: skip
-_ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat")
+_ROTATIONS = ("body_mat", "body_imat", "geom_mat", "weld_mat", "act_mat")
 
 #: Structure of a model: sizes, trees, joints, actuators, constraint and contact candidates, offsets in θ.
 Tables: Any = _struct(
@@ -124,6 +132,7 @@ Tables: Any = _struct(
 #: Memory of a trajectory, one row per stage of a step: name → (type, numbers in a row).
 TRAJECTORY: dict[str, tuple[Any, str]] = {
     "qpos": (f64, "qpos"), "qvel": (f64, "dof"), "acc": (f64, "dof"),
+    "act": (f64, "activation"),
     "rate": (f64, "dof"),  # RK4: rate of the position in the chart at the start of the step
     "hess": (f64, "triangle"),  # factor of H
 }  # fmt: skip
@@ -199,6 +208,9 @@ ADJOINT: dict[str, tuple[Any, str]] = {
     "pos_bar": (f64, "dof"), "rate_bar": (f64, "dof"),  # adjoint of the state at the end of a step
     "kept": (f64, "dof"),  # a velocity while another stands in its place
     "pos_bar0": (f64, "dof"),  # and of the position at its start
+    # activations: of a stage and its rate, of the state at the end and at the start of a step, of all stages' rates
+    "act_bar": (f64, "activation"), "act_rate_bar": (f64, "activation"), "act_end_bar": (f64, "activation"),
+    "act_bar0": (f64, "activation"), "stage_act_rate_bar": (f64, "stage_activation"),
     "grad": (f64, "theta"),
 }  # fmt: skip
 
@@ -218,9 +230,9 @@ World: Any = _struct(
     },
 )
 
-#: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each`` and parameter
-#: vector ``world % nparam``; all stages are kept, or the last two steps of ``period``. ``applied``,
-#: ``wrenched``: see the world's.
+#: Which worlds a launch simulates: ``first + i`` in row ``local + i``, with transition ``world // each``, initial state
+#: ``world // start_each`` and parameter vector ``world % nparam``; all stages are kept, or the last two steps of
+#: ``period``. ``applied``, ``wrenched``: see the world's.
 Chunk: Any = _struct(
     "Chunk",
     dict.fromkeys(
@@ -229,6 +241,7 @@ Chunk: Any = _struct(
             "local",
             "nparam",
             "each",
+            "start_each",
             "lag",
             "skip",
             "period",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -14,7 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.warp.engine import Batch, Engine
-from dropo_torch.simulators.warp.layout import FIELDS
+from dropo_torch.simulators.warp.layout import FIELDS, FRAMES
 from dropo_torch.simulators.warp.support import remarks
 
 #: Engines that are kept.
@@ -111,6 +111,7 @@ class Variants:
         self._space, self._device, self._threads = space, device, num_threads
         self._engines: dict[bytes, Engine | None] = {}
         self._tabled: tuple[str, ...] = ()
+        self._free = _in_theta(space)
 
     def worlds(self, models: Sequence[mujoco.MjModel], each: int) -> Worlds | None:
         """Return worlds of variants, with their derived constants, each in ``each`` rows.
@@ -121,7 +122,7 @@ class Variants:
         members: dict[bytes, list[int]] = {}
         self._tabled = self._tabled or tabled_fields(models[0])
         for k, model in enumerate(models):
-            members.setdefault(_structure(model, self._tabled), []).append(k)
+            members.setdefault(_structure(model, self._tabled, self._free), []).append(k)
         found = []
         for structure, own in members.items():
             engine = self._of(structure, models[own[0]])
@@ -142,7 +143,7 @@ class Variants:
         return engine
 
     def _engine(self, model: mujoco.MjModel) -> Engine | None:
-        if remarks(model):  # it stands in for MuJoCo with these very options
+        if remarks(model) or model.na:  # it stands in for MuJoCo with these very options, and without activations
             return None
         try:
             return Engine(model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device)
@@ -158,14 +159,31 @@ def tabled_fields(model: mujoco.MjModel) -> tuple[str, ...]:
     arrays = [name for name in dir(model) if not name.startswith(("_", *_IDLE)) and name not in _DERIVED]
     arrays = [name for name in arrays if isinstance(found := getattr(model, name), np.ndarray) and found.size]
     options = [f"opt.{name}" for name in dir(model.opt) if not name.startswith("_")]
-    return tuple(field for field in (*options, *arrays) if field not in FIELDS)
+    return tuple(field for field in (*options, *arrays) if field not in FIELDS or field in FRAMES)
 
 
-def _structure(model: mujoco.MjModel, tabled: Sequence[str]) -> bytes:
-    """What an engine's tables, and whether there may be one, follow from; of numbers in θ only which are zero."""
+def _in_theta(space: ParameterSpace) -> dict[str, list[int]]:
+    """Numbers of frames that parameters write, by field: they stand in θ; and bounds of geoms whose size does."""
+    found: dict[str, list[int]] = {}
+    for _, target in space.targets:
+        if target.field in FRAMES:
+            found.setdefault(target.field, []).append(target.index)
+    return found | {"geom_rbound": [index // 3 for index in found.get("geom_size", ())]}
+
+
+def _structure(model: mujoco.MjModel, tabled: Sequence[str], free: Mapping[str, list[int]] | None = None) -> bytes:
+    """What an engine's tables, and whether there may be one, follow from; of numbers in θ only which are zero.
+
+    Args:
+        model: the model.
+        tabled: its :func:`tabled_fields`.
+        free: numbers of these that stand in θ for all that.
+    """
     numbers = [np.sign(read_field(model, field)) for field in _SIGNS]
     numbers += [np.any(read_field(model, field)) for field in _ANY]
-    arrays = (*numbers, *(np.asarray(read_field(model, field)) for field in tabled))
+    arrays = [*numbers, *(np.array(read_field(model, field)) for field in tabled)]
+    for field, array in zip(tabled, arrays[len(numbers) :], strict=True):
+        array.reshape(-1)[(free or {}).get(field, [])] = 0
     return hashlib.blake2b(b"|".join(array.tobytes() for array in arrays)).digest()
 
 
@@ -173,6 +191,7 @@ def _structure(model: mujoco.MjModel, tabled: Sequence[str]) -> bytes:
 _SIGNS = (
     "dof_frictionloss", "body_gravcomp", "actuator_gainprm", "actuator_biasprm", "tendon_stiffness",
     "tendon_stiffnesspoly", "tendon_damping", "tendon_dampingpoly", "tendon_armature", "tendon_frictionloss",
+    "actuator_damping", "actuator_dampingpoly", "actuator_armature",
 )  # fmt: skip
 _ANY = ("dof_damping", "dof_dampingpoly", "jnt_stiffness", "jnt_stiffnesspoly", "opt.density", "opt.viscosity")
 #: What fields begin with that show things, name them, or measure.
