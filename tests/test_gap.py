@@ -44,7 +44,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, ref
 from dropo_torch.gap.remaining import Remaining
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
-from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears
+from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears, significant
 from dropo_torch.gap.scene import outstanding, searched, short_windows
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Ended, Naming, believed, start
@@ -159,19 +159,60 @@ def test_many_numbers_account_for_nothing_while_much_remains(
     assert accounts(named, wrong, Rules()) == enough
 
 
-@pytest.mark.parametrize(("own", "finest", "enough"), [(1.0, 1.0, True), (40.0, 1.0, True), (40.0, 30.0, False)])
-def test_a_rest_of_the_own_step_hides_no_small_effect(
-    own: float, finest: float, enough: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("own", "finer", "without", "enough"),
+    [(1.0, 1.0, 400.0, True), (40.0, 1.0, 400.0, True), (40.0, 30.0, 400.0, False), (1.0, 1.0, 1.0, False)],
+)  # fmt: skip
+def test_a_rest_of_the_own_step_hides_no_small_effect_and_needs_none(
+    own: float, finer: float, without: float, enough: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A late sensor explains two thousandths of a gap, which is all that friction leaves but for the model's step."""
+    """A late sensor explains two thousandths of a gap, which is all that friction leaves but for the model's step.
+
+    Unless a finer step leaves no more than noise without it.
+    """
 
     def fitted(reduced: float) -> SimpleNamespace:
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3))
 
-    monkeypatch.setattr(accept, "resolved", lambda *_, **__: SimpleNamespace(fit=fitted(finest)))
+    bare, fine = fitted(500), {True: fitted(without), False: fitted(finer)}
+    monkeypatch.setattr(accept, "resolved", lambda _, r, **__: SimpleNamespace(fit=fine[r is bare]))
     ground = SimpleNamespace(rules=Rules(), part=None)
-    assert accept.matters(ground, fitted(180_000), fitted(own), fitted(500)) == enough
-    assert not accept.matters(ground, fitted(180_000), fitted(400), fitted(500))
+    assert accept.matters(ground, fitted(180_000), fitted(own), bare) == enough
+    assert not accept.matters(ground, fitted(180_000), fitted(400), bare)
+
+
+@pytest.mark.parametrize(("step", "friction", "named"), [(0.01, 2.0, True), (0.005, 4.0, False)])
+def test_a_step_is_named_where_it_is_no_small_part_of_the_gap(step: float, friction: float, named: bool) -> None:
+    """Four hundredths of it, or two thousandths: with either step friction leaves many times what noise makes."""
+    truth = Effect("joint_friction", "rail", {"friction": friction})
+    scene = prepare(load(simulate_truth(coarse(CART_POLE, step), [truth], 3, **SIZE)))
+    own, finer = find_effect("joint_friction"), find_effect("integration")
+    ground = Ground(scene.evidence, (own, finer), short=scene.noisy, few=16)
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    without = ground.refit(scene.begin.with_effects([Placed(own, "rail", (friction,))]))
+    whole = ground.refit(without.hypothesis.with_effects([Placed(finer, None, (step / 8,))]))
+    assert without.cost.reduced > 10
+    assert not significant(whole.cost, ground.rules)
+    assert accept.matters(ground, state.base, whole, without) == named
+    assert accept.is_of_step(ground, without)
+    assert not accept.is_of_step(ground, state.base)
+
+
+@pytest.mark.parametrize(("stale", "fitted", "of_step"), [(20.0, 1.0, True), (20.0, 15.0, False), (300.0, 1.0, False)])
+def test_what_a_finer_step_mostly_explains_is_fitted_there(
+    stale: float, fitted: float, of_step: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Derivatives that the own step distorts may leave more than noise where the finer step's own do not."""
+
+    def leaving(reduced: float) -> SimpleNamespace:
+        cost = Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis(()), linear=None)
+
+    last = SimpleNamespace(fit=leaving(stale), evidence=None)
+    monkeypatch.setattr(accept, "resolved", lambda *_, **__: last)
+    monkeypatch.setattr(accept, "refit", lambda *_, **__: leaving(fitted))
+    assert accept.is_of_step(SimpleNamespace(rules=Rules(), part=None), leaving(500.0)) == of_step
 
 
 def test_many_numbers_that_leave_more_than_the_step_imitate() -> None:

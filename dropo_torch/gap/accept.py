@@ -9,7 +9,7 @@ from dataclasses import replace
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.ground import FEWER, Ground, State
-from dropo_torch.gap.refit import Refit, refit, resolved
+from dropo_torch.gap.refit import ANEW, Refit, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import accounts, beyond_free, remains, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
@@ -47,16 +47,32 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
 def matters(ground: Ground, base: Refit, whole: Refit, without: Refit) -> bool:
     """Return whether an effect removes enough of the first excess, or all that is left where that is a small part.
 
-    What the model's own step leaves is no part of what is left.
+    What the model's own step leaves is no part of what is left, and an effect that removes no more than that is not
+    needed.
     """
     rules = ground.rules
     if without.cost.excess - whole.cost.excess >= rules.least * base.cost.above(whole.cost):
         return True
     if not significant(without.cost, rules) or whole.cost.left_of(without.cost) > 1 - rules.most:
         return False
-    if not significant(whole.cost, rules):
+    clear = not significant(whole.cost, rules) or is_of_step(ground, whole)
+    return clear and not is_of_step(ground, without)
+
+
+def is_of_step(ground: Ground, fitted: Refit) -> bool:
+    """Return whether all that a hypothesis leaves is of the model's own step: a finer one leaves no more than noise.
+
+    Where a finer step explains most of it with the derivatives of the own one, but not all, it has its own: what a
+    coarse step distorts, such as friction that is larger near rest, is not found by the others.
+    """
+    rules, last = ground.rules, resolved(ground.part, fitted, anew=True)
+    if not significant(last.fit.cost, rules):
         return True
-    return not significant(resolved(ground.part, whole, anew=True).fit.cost, rules)
+    if last.fit.cost.left_of(fitted.cost) > 1 - rules.most:
+        return False
+    linear = last.fit.linear
+    again = refit(last.evidence, last.fit.hypothesis, linear=linear, iterations=ANEW, slopes=False)
+    return not significant(again.cost, rules)
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
@@ -89,7 +105,7 @@ def is_done(ground: Ground, state: State) -> bool:
         return accounts(current, base, rules) or current.cost.misfit < 0.5 * rules.gate * current.cost.sigma
     if current.cost.left_of(base.cost) >= rules.least:
         return False
-    return not significant(resolved(ground.part, current).fit.cost, rules)
+    return is_of_step(ground, current)
 
 
 def add(ground: Ground, state: State) -> State:
