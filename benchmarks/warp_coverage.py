@@ -63,9 +63,9 @@ DIED = "the run died"
 #: A hair's breadth: displacement of a state, or of the margins, that must not change which geoms touch.
 NUDGE = 1e-9
 #: Nudged states of each; and how far a contact must not be shifted by a nudge, in metres.
-NUDGES, SHIFT = 8, 1e-4
+NUDGES, SHIFT = 32, 1e-4
 #: Steps of central differences, relative to a parameter's size.
-MOVES = (1e-5, 1e-4)
+MOVES = (1e-5, 1e-4, 1e-3)
 
 
 @dataclass
@@ -417,9 +417,15 @@ def relative_errors(found: np.ndarray, *trues: np.ndarray, floor: float = 1e-6) 
 
 
 def _is_tied(model: mujoco.MjModel, state: np.ndarray, rng: np.random.Generator) -> bool:
-    """Whether a hair's breadth, of the pose or of the margins, changes which geoms touch, or at which points."""
+    """Whether a hair's breadth, of the pose or of the margins, changes which geoms touch, or at which points.
+
+    Or a joint is so near to a limit that differences reach across it.
+    """
     data = mujoco.MjData(model)
     own = state[: model.nq]
+    limited = model.jnt_limited.astype(bool) & (model.jnt_type >= _SLIDE)
+    if (np.abs(own[model.jnt_qposadr[limited], None] - model.jnt_range[limited]) < MOVES[0]).any():
+        return True
     expected = _touching(model, data, own)
     others = [_touching(_with_margins(model, change), data, own) for change in (NUDGE, -NUDGE)]
     others += [_touching(model, data, moved[: model.nq]) for moved in _nudged(model, state, rng)]

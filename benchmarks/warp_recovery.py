@@ -39,6 +39,8 @@ BOUNDS = (0.5, 2.5)
 CLOSE = 0.01
 #: Damping from which on a joint is one that is not meant to move.
 STUCK = 1e5
+#: Time constants after which a filter has forgotten its state, to rounding.
+FORGOTTEN = 37
 #: Relative error up to which a number is recovered.
 RECOVERED = 0.01
 
@@ -211,13 +213,17 @@ def record(model: mujoco.MjModel, task: Task, seed: int) -> dict[str, np.ndarray
     span = np.where(model.jnt_limited, model.jnt_range[:, 1] - model.jnt_range[:, 0], 1.0)[model.dof_jntid]
     span *= model.dof_damping < STUCK
     low, high = np.where(model.actuator_ctrllimited[:, None], model.actuator_ctrlrange, [-1.0, 1.0]).T
+    episodes, length = EPISODES, LENGTH
+    if model.na:  # one motion, whose first half is long enough for filters to forget what was before
+        memory = FORGOTTEN * model.actuator_dynprm[:, 0].max() / (model.opt.timestep * task.skip)
+        episodes, length = 1, 2 * int(memory) + EPISODES * LENGTH
     log: dict[str, list[np.ndarray]] = {k: [] for k in ("observations", "next_observations", "actions", "terminals")}
-    for _ in range(EPISODES):
+    for _ in range(episodes):
         mujoco.mj_resetData(model, data)
         task.place(model, data)
         mujoco.mj_step(model, data, nstep=round(task.settling / model.opt.timestep))
         data.qvel += rng.normal(0, np.where(free, task.speed[0], task.speed[1] * span))
-        for step in range(LENGTH):
+        for step in range(length):
             if step % HELD == 0:
                 data.ctrl[:] = rng.uniform(low, high) * 0.3
             log["observations"].append(np.concatenate([data.qpos, data.qvel]))
@@ -226,7 +232,7 @@ def record(model: mujoco.MjModel, task: Task, seed: int) -> dict[str, np.ndarray
             log["actions"].append(np.concatenate([data.ctrl, poses.ravel()]))
             mujoco.mj_step(model, data, nstep=task.skip)
             log["next_observations"].append(np.concatenate([data.qpos, data.qvel]))
-            log["terminals"].append(np.array(step == LENGTH - 1))
+            log["terminals"].append(np.array(step == length - 1))
     return {k: np.array(v) for k, v in log.items()}
 
 
