@@ -96,6 +96,6 @@ def test_the_certificate_of_the_hopper_is_exact(config: Path, tmp_path: Path, ca
 def test_a_model_outside_the_subset_names_what_is_outside(
     config: Path, tmp_path: Path, capsys: pytest.CaptureFixture
 ) -> None:
-    parameters = "{size: {field: 'geom_size[0]', name: foot_geom, bounds: [0.05, 0.08]}}"
+    parameters = "{step: {field: opt.timestep, bounds: [0.001, 0.004]}}"
     assert main(["certify", str(config), "--out", str(tmp_path / "out"), "--parameters", parameters]) == 2
-    assert "gradients of geom_size" in capsys.readouterr().err
+    assert "gradients of opt.timestep" in capsys.readouterr().err
