@@ -2,8 +2,9 @@
 
 Every MJCF in a package's folder that compiles and has 1 to 120 degrees of freedom is tried, with its masses, frictions
 and dampings as parameters. With ``--conformance`` each one that is taken is simulated for two steps from random states
-and compared with C MuJoCo: the states, and the gradients by those parameters with central differences. The packages
-are found without being imported (extra ``coverage-models``), or in ``--from FOLDER``, a folder for each package.
+and compared with C MuJoCo: the states, and the gradients by those parameters with central differences, both with a
+search for contacts of curved shapes that goes on until it is done (``ccd_tolerance`` of 1e-12). The packages are found
+without being imported (extra ``coverage-models``), or in ``--from FOLDER``, a folder for each package.
 
     python benchmarks/warp_coverage.py [--conformance] [--only dm_control] [--models '*humanoid*'] [--out coverage.json]
 
@@ -62,8 +63,11 @@ _FREE, _SLIDE = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_SLIDE
 DIED = "the run died"
 #: A hair's breadth: displacement of a state, or of the margins, that must not change which geoms touch.
 NUDGE = 1e-9
-#: Nudged states of each; and how far a contact must not be shifted by a nudge, in metres.
-NUDGES, SHIFT = 32, 1e-4
+#: Nudged states of each, how often as many more are tried where no answer is near; and how far a contact must not be
+#: shifted by a nudge, in metres.
+NUDGES, ROUNDS, SHIFT = 32, 32, 1e-4
+#: Tolerance in metres and iterations of a search for contacts that is done.
+FINISHED = 1e-12, 400
 #: Steps of central differences, relative to a parameter's size.
 MOVES = (1e-5, 1e-4, 1e-3)
 
@@ -255,21 +259,26 @@ def conformance(model: mujoco.MjModel, seed: int = 0) -> dict[str, Any]:
     with quiet_mujoco():
         states = torch.from_numpy(random_states(model, STATES, seed))
     with poisoned():
-        simulator = WarpSimulator(model, parameters=space, frame_skip=STEPS, num_threads=1)
+        simulator = _simulator(space)
         controls = np.zeros((STATES, 1, simulator.num_controls))
         controls[:, 0] = [_inputs(model, state, simulator.num_controls, rng) for state in states.numpy()]
         inputs = torch.from_numpy(controls)
         found = simulator.simulate(states, inputs, values)[:, 0]
         weights = torch.from_numpy(rng.normal(size=tuple(states.shape)))
-        slopes = _slopes(simulator, states, inputs, values, weights)
+        finished = _finished(space)
+        slopes = _slopes(_simulator(finished), states, inputs, values, weights)
     reference = _reference(space)
     errors = _errors(found, reference.simulate(states, inputs, values)[:, 0])
     ties = np.array([_is_tied(model, s, rng) for s in states.numpy()])
     for other in _answers_nearby(space, states[ties], inputs[ties], values, rng) if ties.any() else ():
         errors[ties] = torch.minimum(errors[ties], _errors(found[ties], other))
-    sound = torch.from_numpy(~ties)
+        if (errors[ties] <= TIE_ERROR).all():
+            break
+    assert finished.model is not None
+    smooth = ~ties & ~np.array([_is_tied(finished.model, s, rng) for s in states.numpy()])
+    sound, reference = torch.from_numpy(smooth), _reference(finished)
     trues = [_differences(reference, states[sound], inputs[sound], values, weights[sound], step) for step in MOVES]
-    gradient = _gradient_errors({name: slope[~ties] for name, slope in slopes.items()}, trues, space)
+    gradient = _gradient_errors({name: slope[smooth] for name, slope in slopes.items()}, trues, space)
     return judged(errors.numpy(), ties, gradient) | {"contacts": _contacts(model, states.numpy())}
 
 
@@ -282,8 +291,27 @@ def _answers_nearby(
     for margin in (NUDGE, -NUDGE):
         yield _reference(space.on(_with_margins(model, margin))).simulate(states, inputs, values)[:, 0]
     reference = _reference(space)
-    for moved in zip(*(_nudged(model, state, rng) for state in states.numpy()), strict=True):
-        yield reference.simulate(torch.from_numpy(np.array(moved)), inputs, values)[:, 0]
+    for _ in range(ROUNDS):
+        for moved in zip(*(_nudged(model, state, rng) for state in states.numpy()), strict=True):
+            yield reference.simulate(torch.from_numpy(np.array(moved)), inputs, values)[:, 0]
+
+
+def _finished(space: ParameterSpace) -> ParameterSpace:
+    """The same of a model whose search for contacts of curved shapes ends when it is done.
+
+    By default it ends within a micrometre, with a normal that is off by as much over the size of the shapes, and
+    differences are those of where it ends.
+    """
+    model = copy.copy(space.model)
+    assert model is not None
+    model.opt.ccd_tolerance = min(FINISHED[0], model.opt.ccd_tolerance)
+    model.opt.ccd_iterations = max(FINISHED[1], model.opt.ccd_iterations)
+    return space.on(model)
+
+
+def _simulator(space: ParameterSpace) -> WarpSimulator:
+    assert space.model is not None
+    return WarpSimulator(space.model, parameters=space, frame_skip=STEPS, num_threads=1)
 
 
 def _values(space: ParameterSpace) -> np.ndarray:

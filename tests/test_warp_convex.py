@@ -172,6 +172,35 @@ def test_gradients_are_those_of_the_same_shapes_with_a_formula(same: str) -> Non
         assert float((found - expected).abs().max() / scale) < 1e-4
 
 
+#: Shapes, how they lie on a floor, and how high: a drum's side touches along a line, and points above the diagonal of a
+#: square may be found on that instead of the face.
+LYING = {
+    "drum along y": ('type="cylinder" size=".1 .15"', (1, 1, 0, 0), 0.1),
+    "drum along x": ('type="cylinder" size=".1 .15"', (1, 1, 1, 1), 0.1),
+    "rolled drum": ('type="cylinder" size=".1 .15"', (0.3, 0.3, 0.2, -0.2), 0.1),
+    "egg": ('type="ellipsoid" size=".1 .15 .2"', (1, 0, 0, 0), 0.2),
+    "rolled egg": ('type="ellipsoid" size=".1 .15 .2"', (1, 1, 0.1, 0.1), 0.1513),
+}
+
+
+@pytest.mark.parametrize("lying", LYING)
+def test_what_lies_on_a_box_rolls_as_on_a_plane(lying: str) -> None:
+    shape, quat, height = LYING[lying]
+    results = []
+    for room in (ROOM.format("box", -1), ROOM.format("plane", 0)):
+        model = mujoco.MjModel.from_xml_string(
+            f'<mujoco><option cone="elliptic" {FINISHED}/><worldbody>{room}{BODY.format(shape)}</worldbody></mujoco>'
+        )
+        space = ParameterSpace(model, PARAMETERS)
+        pose = [0.03, 0.03, height - 5e-4, *np.array(quat) / np.linalg.norm(quat)]
+        state = torch.tensor([[*pose, 0.1, -0.2, -0.1, 0.3, -0.2, 0.1]], dtype=torch.float64)
+        simulator = WarpSimulator(model, parameters=space, frame_skip=2, num_threads=1)
+        values = torch.from_numpy(space.nominal[None])
+        results.append(simulator.jacobian(state, torch.zeros(1, 1, 0, dtype=torch.float64), values))
+    for found, expected in zip(*results, strict=True):
+        assert float((found - expected).abs().max() / expected.abs().max()) < 1e-5
+
+
 @pytest.mark.parametrize("pair", [("box", "stone"), ("capsule", "stone"), ("cylinder", "cube")], ids="-".join)
 def test_margin_and_gap(pair: tuple[str, str]) -> None:
     model = two(*pair, option=FINISHED if "cylinder" in pair else "", geom='margin=".02" gap=".01"')

@@ -257,28 +257,41 @@ def _stride(r: f64) -> f64:
 
 
 @wp.func
-def _as_vertex(c: vec6) -> vec6:
-    return vec6(c[0], c[1], c[2], ZERO, ZERO, ZERO)
+def _flats(c: vec6) -> int:
+    """In how many directions a surface is flat."""
+    r = _radii(c)
+    return wp.where(r[0] < ZERO, 1, 0) + wp.where(r[1] < ZERO, 1, 0)
 
 
 @wp.func
-def _settled(c1: vec6, c2: vec6) -> vec6:
-    """The second curve, as a vertex where the two leave a direction free: then any point may be held."""
-    r1 = _radii(c1)
-    r2 = _radii(c2)
-    free1 = wp.where(r1[0] < ZERO, 1, 0) + wp.where(r1[1] < ZERO, 1, 0)
-    free2 = wp.where(r2[0] < ZERO, 1, 0) + wp.where(r2[1] < ZERO, 1, 0)
+def _held(c: vec6) -> vec6:
+    """A surface whose point is held where it is in the directions in which it is flat."""
+    return vec6(c[0], c[1], c[2], wp.max(c[3], ZERO), wp.max(c[4], ZERO), ZERO)
+
+
+@wp.func
+def _settled(c1: vec6, c2: vec6):
+    """The two curves, the less flat one held where both leave a direction free: any point of it may be the one."""
+    free1 = _flats(c1)
+    free2 = _flats(c2)
     parallel = free1 == 1 and free2 == 1 and wp.length(wp.cross(_tangent(c1), _tangent(c2))) < f64(1.0e-9)
-    return _as_vertex(c2) if free1 + free2 > 2 or parallel else c2
+    one = c1
+    two = c2
+    if free1 + free2 > 2 or parallel:
+        if free1 < free2:
+            one = _held(c1)
+        else:
+            two = _held(c2)
+    return one, two
 
 
 @wp.func
-def single_adjoint(n: vec3, d: f64, mid: vec3, c1: vec6, c2a: vec6, dbar: f64, pbar: vec3, nbar0: vec3):
+def single_adjoint(n: vec3, d: f64, mid: vec3, c1a: vec6, c2a: vec6, dbar: f64, pbar: vec3, nbar0: vec3):
     """From adjoints of distance, midpoint and normal of two witnesses to spatial forces on the two bodies."""
     nbar = nbar0 + pbar * (HALF * d)
     nbar = nbar - n * wp.dot(n, nbar)
     slope = dbar + HALF * wp.dot(n, pbar)
-    c2 = _settled(c1, c2a)
+    c1, c2 = _settled(c1a, c2a)
     t1 = _tangent(c1)
     u1 = wp.cross(n, t1)
     t2 = _tangent(c2)
