@@ -209,3 +209,31 @@ def test_frames_without_gradients_are_refused(extra: str, parameter: dict, words
     with pytest.raises(InputError) as caught:
         WarpSimulator(model, parameters=ParameterSpace(model, {"p": parameter}), frame_skip=1)
     assert words in str(caught.value)
+
+
+#: Inertial frames and those of the geom and the site, that differ by less than 1e-6, and the marks that MuJoCo makes.
+NEARLY = {
+    "body": ("3e-7 -2e-7 4e-7", "1 4e-7 -3e-7 2e-7", "0 0 0", "1 0 0 0", 1),
+    "inertia": (".02 .01 0", ".9 .1 .3 .2", ".0200004 .0099997 0", ".9 .1000004 .3 .2000003", 2),
+    "turned as the body": ("3e-4 0 0", "1 4e-7 -3e-7 2e-7", "-.001 0 0", "1 3e-7 0 4e-7", 3),
+    "turned as the inertia": (".02 .01 0", ".9 .1 .3 .2", "0 0 0", ".9 .1000004 .3 .2000003", 4),
+}
+
+
+@pytest.mark.parametrize("which", NEARLY)
+def test_frames_that_mujoco_takes_as_the_same_are_the_same(which: str) -> None:
+    pos, quat, geom_pos, geom_quat, mark = NEARLY[which]
+    model = mujoco.MjModel.from_xml_string(f"""<mujoco><worldbody><geom type="plane" size="1 1 1"/>
+<body name="b" pos="0 0 .1"><freejoint/><inertial pos="{pos}" quat="{quat}" mass="1" diaginertia=".02 .03 .04"/>
+<geom name="g" type="box" size=".1 .1 .1" pos="{geom_pos}" quat="{geom_quat}"/>
+<site name="s" pos="{geom_pos}" quat="{geom_quat}"/></body></worldbody>
+<actuator><motor site="s" gear="1 2 3 .1 .2 .3"/></actuator></mujoco>""")
+    assert model.geom_sameframe[1] == mark
+    space = ParameterSpace(model, {"mass": {"field": "body_mass", "name": "b", "bounds": [0.1, 10]}})
+    states = torch.zeros(8, 13, dtype=torch.float64)
+    states[:, 2], states[:, 3] = 0.09, 1.0
+    states += 0.05 * torch.from_numpy(np.random.default_rng(6).normal(size=(8, 13)))
+    values, controls = torch.from_numpy(space.nominal[None]), torch.ones(8, 1, 1, dtype=torch.float64)
+    found = WarpSimulator(model, parameters=space, frame_skip=3, num_threads=1).simulate(states, controls, values)
+    expected = mujoco_reference(converged(space), 3)(states, controls, values)[:, 0, -1]
+    assert float((found[:, 0] - expected).abs().max()) < 1e-11

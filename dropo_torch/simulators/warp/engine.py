@@ -27,6 +27,7 @@ from dropo_torch.simulators.warp.start import LOADING, start_warp
 from dropo_torch.simulators.warp.support import check_support
 from dropo_torch.simulators.warp.tables import build_tables, convex_sizes
 from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJECTORY, Chunk, World, fill
+from dropo_torch.simulators.warp.varied import coinciding
 
 #: Stages kept from the forward for the backward, at most; beyond it the backward simulates again, chunk by chunk.
 KEEP_BYTES = 1 << 30
@@ -115,6 +116,7 @@ class Engine:
     ) -> None:
         pairs = candidate_pairs(model)
         check_support(model, space, pairs)
+        model = coinciding(model, space)
         self.fields = Fields(model, space, pairs)
         self.skip, self.chunk_size, self.device = skip, chunk_size, device
         start_warp()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable
 
 import mujoco
 import numpy as np
 import torch
 
-from dropo_torch.parameters import ParameterSpace
+from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.layout import FRAMES
 
 _FREE, _BALL = int(mujoco.mjtJoint.mjJNT_FREE), int(mujoco.mjtJoint.mjJNT_BALL)
@@ -24,6 +25,34 @@ def varied(space: ParameterSpace, model: mujoco.MjModel) -> dict[str, list[int]]
         if target.field in FRAMES:
             rows[target.field.split("_")[0]].add(target.index // getattr(model, target.field).shape[1])
     return {kind: sorted(own) for kind, own in rows.items()}
+
+
+def coinciding(model: mujoco.MjModel, space: ParameterSpace) -> mujoco.MjModel:
+    """Return a copy with frames that MuJoCo takes as coinciding (``geom_sameframe`` and the like) where it takes them.
+
+    The compiler marks frames that differ by less than 1e-6, and MuJoCo then copies the other one. The marks of what the
+    parameters move do not count: see :func:`~dropo_torch.parameters.unmark_frames`.
+    """
+    model = copy.copy(model)
+    same = mujoco.mjtSameFrame
+    of_body = {int(same.mjSAMEFRAME_BODY), int(same.mjSAMEFRAME_BODYROT)}
+    whole = {int(same.mjSAMEFRAME_BODY), int(same.mjSAMEFRAME_INERTIA)}
+    fields = ("body_ipos", "geom_pos", "geom_quat")
+    rows = {(t.field, t.index // read_field(model, t.field).shape[1]) for _c, t in space.targets if t.field in fields}
+    moved = {row for field, row in rows if field == "body_ipos"}
+    for kind, bodies in (("body_i", range(model.nbody)), ("geom_", model.geom_bodyid), ("site_", model.site_bodyid)):
+        marks, pos, quat = (
+            getattr(model, name) for name in (kind.split("_")[0] + "_sameframe", kind + "pos", kind + "quat")
+        )
+        for i, body in enumerate(bodies):
+            own = {(kind + "pos", i), (kind + "quat", i)}
+            if not marks[i] or body in moved or rows & own:
+                continue
+            inertial = int(marks[i]) not in of_body
+            quat[i] = model.body_iquat[body] if inertial else (1.0, 0.0, 0.0, 0.0)
+            if int(marks[i]) in whole:
+                pos[i] = model.body_ipos[body] if inertial else 0.0
+    return model
 
 
 class Frames:
