@@ -172,8 +172,9 @@ def test_a_rest_of_the_own_step_hides_no_small_effect_and_needs_none(
     """
 
     def fitted(reduced: float) -> SimpleNamespace:
-        return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3))
+        return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
+    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
     bare, fine = fitted(500), {True: fitted(without), False: fitted(finer)}
     monkeypatch.setattr(accept, "resolved", lambda _, r, **__: SimpleNamespace(fit=fine[r is bare]))
     ground = SimpleNamespace(rules=Rules(), part=None)
@@ -197,6 +198,42 @@ def test_a_step_is_named_where_it_is_no_small_part_of_the_gap(step: float, frict
     assert accept.matters(ground, state.base, whole, without) == named
     assert accept.is_of_step(ground, without)
     assert not accept.is_of_step(ground, state.base)
+    assert accept.step_shows(ground, state.base)
+
+
+def test_a_step_that_only_named_effects_show_has_no_name() -> None:
+    """Friction that is larger near rest, resolved by a step that is fine enough for the model without it."""
+    law = dict(zip(("coulomb", "static", "velocity"), (0.0015, 0.0026, 0.52), strict=True))
+    scene = prepare(load(simulate_truth(SERVO_ARM, [Effect("joint_stribeck", "wrist", law)], 3, **SIZE)))
+    own, finer = find_effect("joint_stribeck"), find_effect("integration")
+    ground = Ground(scene.evidence, (own, finer), short=scene.noisy, few=16)
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    without = ground.refit(scene.begin.with_effects([Placed(own, "wrist", (0.0015, 0.0022, 0.7))]))
+    step = finer.quantities(scene.setting, None)[0].low
+    whole = ground.refit(without.hypothesis.with_effects([Placed(finer, None, (step,))]))
+    assert significant(without.cost, ground.rules)
+    assert without.cost.excess - whole.cost.excess > 2 * ground.rules.least * state.base.cost.above(whole.cost)
+    assert not accept.step_shows(ground, state.base)
+    assert not accept.matters(ground, state.base, whole, without)
+    assert accept.matters(ground, state.base, without, state.base)
+    assert accept.is_done(ground, dataclasses.replace(state, current=without))
+
+
+@pytest.mark.parametrize(("name", "needed"), [("integration", False), ("actuator_delay", True)])
+def test_an_effect_that_is_a_finer_step_needs_no_other_one(
+    name: str, needed: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What leaves no more than noise with it leaves no more with a finer step, wherever else a fit with one ends."""
+
+    def fitted(reduced: float, *names: str) -> SimpleNamespace:
+        placed = tuple(Placed(find_effect(n), None, (0.0,)) for n in names)
+        cost = Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis((), placed))
+
+    monkeypatch.setattr(accept, "is_of_step", lambda *_: False)
+    without, whole = fitted(40.0, "joint_friction"), fitted(1.0, "joint_friction", name)
+    assert accept.matters(SimpleNamespace(rules=Rules()), fitted(180_000), whole, without) == needed
 
 
 @pytest.mark.parametrize(("stale", "fitted", "of_step"), [(20.0, 1.0, True), (20.0, 15.0, False), (300.0, 1.0, False)])
@@ -210,6 +247,7 @@ def test_what_a_finer_step_mostly_explains_is_fitted_there(
         return SimpleNamespace(cost=cost, hypothesis=Hypothesis(()), linear=None)
 
     last = SimpleNamespace(fit=leaving(stale), evidence=None)
+    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
     monkeypatch.setattr(accept, "resolved", lambda *_, **__: last)
     monkeypatch.setattr(accept, "refit", lambda *_, **__: leaving(fitted))
     assert accept.is_of_step(SimpleNamespace(rules=Rules(), part=None), leaving(500.0)) == of_step
@@ -438,13 +476,16 @@ def test_a_small_part_of_a_large_gap_is_named_where_it_leaves_nothing() -> None:
 
 
 @pytest.mark.parametrize(("excess", "done"), [(30.0, True), (98.0, False), (400.0, False)])
-def test_search_goes_on_while_what_is_left_is_too_much_to_be_named(excess: float, done: bool) -> None:
+def test_search_goes_on_while_what_is_left_is_too_much_to_be_named(
+    excess: float, done: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A gap of 50 standard deviations of χ²: a tenth of it is no more than noise may be, and yet too much."""
 
     def fitted(excess: float) -> SimpleNamespace:
         cost = Cost(np.full(20, 10 + excess / 20), np.zeros(20), 200.0)
         return SimpleNamespace(cost=cost, hypothesis=Hypothesis(()))
 
+    monkeypatch.setattr(accept, "step_shows", lambda *_: True)
     assert fitted(98.0).cost.excess == pytest.approx(4.9 * fitted(98.0).cost.sigma)
     ground = SimpleNamespace(rules=Rules(least_reduced=1.0), clears=lambda base, current: False)
     assert is_done(ground, SimpleNamespace(base=fitted(1000.0), current=fitted(excess))) == done
@@ -487,7 +528,9 @@ def test_all_windows_decide_where_few_leave_it_open(few: float, every: float | N
 
 @pytest.mark.parametrize(("left", "named"), [(1.0, True), (1.04, True), (1.2, False)])
 @pytest.mark.parametrize("inflated", [0.0, 30.0])
-def test_noise_that_contacts_inflate_is_no_rest(left: float, named: bool, inflated: float) -> None:
+def test_noise_that_contacts_inflate_is_no_rest(
+    left: float, named: bool, inflated: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Whether names account for a gap does not depend on by how much noise before a contact widens what follows."""
 
     def fitted(reduced: float, *effects: Placed) -> SimpleNamespace:
@@ -499,6 +542,7 @@ def test_noise_that_contacts_inflate_is_no_rest(left: float, named: bool, inflat
     base, whole = fitted(2.0), fitted(left, placed("joint_friction", 0.3))
     assert accounts(whole, base, Rules()) == named
     assert whole.cost.left_of(base.cost) == pytest.approx(left - 1)
+    monkeypatch.setattr(accept, "step_shows", lambda *_: True)
     ground = SimpleNamespace(rules=Rules(), clears=lambda base, current: False)
     assert is_done(ground, SimpleNamespace(base=base, current=whole)) == named
 

@@ -6,10 +6,13 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
+import numpy as np
+
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
+from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
-from dropo_torch.gap.refit import ANEW, Refit, refit, resolved
+from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import accounts, beyond_free, remains, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
@@ -19,6 +22,8 @@ from dropo_torch.gap.sound import absurd
 MANY = 3
 #: Dry friction as MuJoCo has it by default.
 SOFT = "joint_soft_friction"
+#: A finer step as an effect.
+STEP = "integration"
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
@@ -48,31 +53,59 @@ def matters(ground: Ground, base: Refit, whole: Refit, without: Refit) -> bool:
     """Return whether an effect removes enough of the first excess, or all that is left where that is a small part.
 
     What the model's own step leaves is no part of what is left, and an effect that removes no more than that is not
-    needed.
+    needed; of a large part, only where no step shows in the model as given: see :func:`step_shows`.
     """
     rules = ground.rules
     if without.cost.excess - whole.cost.excess >= rules.least * base.cost.above(whole.cost):
-        return True
+        return not without.hypothesis.placed or step_shows(ground, base) or not _step_does(ground, whole, without)
     if not significant(without.cost, rules) or whole.cost.left_of(without.cost) > 1 - rules.most:
         return False
     clear = not significant(whole.cost, rules) or is_of_step(ground, whole)
-    return clear and not is_of_step(ground, without)
+    return clear and not _step_does(ground, whole, without)
+
+
+def _step_does(ground: Ground, whole: Refit, without: Refit) -> bool:
+    """Whether a finer step leaves no more than noise without an effect; one that is such a step says so itself."""
+    own, rest = ({p.key for p in r.hypothesis.placed} for r in (whole, without))
+    if own - rest == {(STEP, None)}:
+        return not significant(whole.cost, ground.rules)
+    return is_of_step(ground, without)
+
+
+def step_shows(ground: Ground, base: Refit) -> bool:
+    """Return whether the model as given moves otherwise with a finer step, by more than noise.
+
+    If not, its step is fine enough for it: what a finer one explains beside named effects is how the step resolves
+    these, such as dry friction, and nothing that the model lacks.
+    """
+    change = change_of_step(ground.part, base)
+    return change is None or float((change**2).sum()) > ground.rules.gate * base.cost.sigma
 
 
 def is_of_step(ground: Ground, fitted: Refit) -> bool:
     """Return whether all that a hypothesis leaves is of the model's own step: a finer one leaves no more than noise.
 
-    Where a finer step explains most of it with the derivatives of the own one, but not all, it has its own: what a
-    coarse step distorts, such as friction that is larger near rest, is not found by the others.
+    Where a finer step explains most of it with the derivatives of the own one, by numbers and by initial states, but
+    not all, it has its own: what a coarse step distorts, such as friction that is larger near rest, is not found by
+    the others.
     """
-    rules, last = ground.rules, resolved(ground.part, fitted, anew=True)
+    rules, change = ground.rules, change_of_step(ground.part, fitted)
+    if change is not None and significant(_least_beside(ground, fitted, change), rules):
+        return False
+    last = resolved(ground.part, fitted, anew=True)
     if not significant(last.fit.cost, rules):
         return True
     if last.fit.cost.left_of(fitted.cost) > 1 - rules.most:
         return False
-    linear = last.fit.linear
-    again = refit(last.evidence, last.fit.hypothesis, linear=linear, iterations=ANEW, slopes=False)
+    again = refit(last.evidence, last.fit.hypothesis, iterations=ANEW, slopes=False)
     return not significant(again.cost, rules)
+
+
+def _least_beside(ground: Ground, fitted: Refit, change: np.ndarray) -> Cost:
+    """The least that a finer step can leave, by how much it changes the residuals ``(W, N)`` of a fit."""
+    own = fitted.residual * np.reshape(ground.part.caps, (-1, 1))
+    share = min(1.0, float(np.linalg.norm(change)) / max(float(np.linalg.norm(own)), 1e-300))
+    return ground.part.cost(fitted.residual * (1 - share), fitted.linear, len(fitted.scale))
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
@@ -94,7 +127,9 @@ def imitates(ground: Ground, fitted: Refit) -> bool:
 
 
 def is_done(ground: Ground, state: State) -> bool:
-    """Return whether what is left is noise, or so small a part of the gap that the model's own step makes it.
+    """Return whether what is left is noise, or what the model's own step makes of the effects that were found.
+
+    The latter where it is a small part of the gap, or where the model as given shows no step.
 
     Of a gap that is itself little more than noise, what is left may be both no more than that and too much to be named.
     """
@@ -103,7 +138,7 @@ def is_done(ground: Ground, state: State) -> bool:
         return True
     if not significant(current.cost, rules):
         return accounts(current, base, rules) or current.cost.misfit < 0.5 * rules.gate * current.cost.sigma
-    if current.cost.left_of(base.cost) >= rules.least:
+    if current.cost.left_of(base.cost) >= rules.least and step_shows(ground, base):
         return False
     return is_of_step(ground, current)
 

@@ -325,12 +325,10 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
         anew: whether to fit with the derivatives of the finer steps where more than noise remains with the others:
             what a coarse step distorts may be far from where it is with a finer one. Such fits are not extrapolated.
     """
-    effect, vector = find_effect("integration"), fitted.hypothesis.vector
+    vector, finest = fitted.hypothesis.vector, finest_step(evidence, fitted.hypothesis)
     own = Resolved(fitted, evidence, np.zeros(len(vector)))
-    declared = STEP_FIELD in evidence.twin.space.fields
-    if declared or any(p.effect is effect for p in fitted.hypothesis.placed):
+    if finest is None:
         return own
-    finest = effect.quantities(evidence.twin.setting, None)[0].low
     finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
     anew = anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules)
     if anew:
@@ -342,6 +340,26 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
     ahead = fine.hypothesis.vector if anew else fine.hypothesis.vector + change
     there = fine.hypothesis.at(np.clip(ahead, limits.low, limits.high))
     return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change))
+
+
+def finest_step(evidence: Evidence, hypothesis: Hypothesis) -> float | None:
+    """Return the finest step with which a hypothesis is compared, ``None`` where it says itself what the step is."""
+    effect = find_effect("integration")
+    if STEP_FIELD in evidence.twin.space.fields or any(p.effect is effect for p in hypothesis.placed):
+        return None
+    return effect.quantities(evidence.twin.setting, None)[0].low
+
+
+def change_of_step(evidence: Evidence, fitted: Refit) -> np.ndarray | None:
+    """Return by how much the finest step changes what a fit leaves, ``(W, N)``, as the windows' caps weigh it.
+
+    ``None`` where the hypothesis says itself what the step is.
+    """
+    if (finest := finest_step(evidence, fitted.hypothesis)) is None:
+        return None
+    finer = replace(evidence, twin=evidence.twin.finer(finest))
+    own, there = (e.project(e.residuals([fitted.hypothesis.variant])[0][0], fitted.linear) for e in (evidence, finer))
+    return np.asarray((there - own) * np.reshape(evidence.caps, (-1, 1)))
 
 
 def half_widths(last: Resolved) -> np.ndarray:
