@@ -37,6 +37,8 @@ MASS, FRICTION = 1.25, 1.3
 BOUNDS = (0.5, 2.5)
 #: Distance of a hand from the cube that it is to push.
 CLOSE = 0.01
+#: Speed in m/s at which it goes there.
+TOWARDS = 0.5
 #: Damping from which on a joint is one that is not meant to move.
 STUCK = 1e5
 #: Time constants after which a filter has forgotten its state, to rounding.
@@ -111,8 +113,8 @@ def bent(model: mujoco.MjModel, data: mujoco.MjData) -> None:
 
 
 def beside_hand(model: mujoco.MjModel, data: mujoco.MjData) -> None:
-    """Put the cube onto the table, and close to the hand above it."""
-    data.qpos[:7] = [0, 0.75, 0, -2.0, 0, 2.75, np.pi / 4]
+    """Put the cube onto the table, close to the hand, which moves towards it: a mass shows where it is pushed."""
+    data.qpos[:7] = [0, 1.2, 0, -1.6, 0, 2.8, np.pi / 4]
     mujoco.mj_kinematics(model, data)
     hand, cube = data.body("robot0_right_hand").xpos.copy(), model.geom("cube").id
     others = [g for g in range(model.ngeom) if chosen([model.geom(g).name], ["robot0_*collision"])]
@@ -120,7 +122,11 @@ def beside_hand(model: mujoco.MjModel, data: mujoco.MjData) -> None:
         data.joint("cube").qpos[:2] = hand[0] + ahead, hand[1]
         mujoco.mj_kinematics(model, data)
         if min(mujoco.mj_geomDistance(model, data, g, cube, 1.0, None) for g in others) < CLOSE:
-            return
+            break
+    mujoco.mj_comPos(model, data)
+    jac = np.zeros((6, model.nv))
+    mujoco.mj_jacBody(model, data, jac[:3], jac[3:], model.body("robot0_right_hand").id)
+    data.qvel[:7] = np.linalg.pinv(jac[:, :7]) @ [TOWARDS, 0, 0, 0, 0, 0]
 
 
 def at_table(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -156,7 +162,9 @@ TASKS = {
         "dm_control", "suite/manipulator.xml", "lower_arm", ("ball", "thumb*", "finger*", "palm*"), skip=10
     ),
     "quadruped": Task("dm_control", "suite/quadruped.xml", "torso", ("toe_*",), skip=2, build=level),
-    "franka-box": Task("robosuite", _PANDA, "cube", ("cube",), build=push, place=beside_hand, settling=0.0),
+    "franka-box": Task(
+        "robosuite", _PANDA, "cube", ("cube",), build=push, place=beside_hand, settling=0.0, speed=(0.3, 0.02)
+    ),
     "hand-block": Task(
         "gymnasium_robotics", "envs/assets/hand/manipulate_block.xml", "object", ("object",), place=in_palm
     ),
