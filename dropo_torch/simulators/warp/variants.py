@@ -16,6 +16,7 @@ from dropo_torch.simulators.base import DIVERGED
 from dropo_torch.simulators.warp.engine import Batch, Engine
 from dropo_torch.simulators.warp.layout import FIELDS, FRAMES
 from dropo_torch.simulators.warp.support import remarks
+from dropo_torch.simulators.warp.varied import inertial_frames
 
 #: Engines that are kept.
 KEPT = 64
@@ -181,6 +182,7 @@ def _structure(model: mujoco.MjModel, tabled: Sequence[str], free: Mapping[str, 
     """
     numbers = [np.sign(read_field(model, field)) for field in _SIGNS]
     numbers += [np.any(read_field(model, field)) for field in _ANY]
+    numbers += list(inertial_frames(model))
     arrays = [*numbers, *(np.array(read_field(model, field)) for field in tabled)]
     for field, array in zip(tabled, arrays[len(numbers) :], strict=True):
         array.reshape(-1)[(free or {}).get(field, [])] = 0

@@ -55,6 +55,17 @@ def coinciding(model: mujoco.MjModel, space: ParameterSpace) -> mujoco.MjModel:
     return model
 
 
+def inertial_frames(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and quaternions of the inertial frames that geoms or sites are taken to coincide with."""
+    same = mujoco.mjtSameFrame
+    inertial = (int(same.mjSAMEFRAME_INERTIA), int(same.mjSAMEFRAME_INERTIAROT))
+    marked = np.concatenate([
+        model.geom_bodyid[np.isin(model.geom_sameframe, inertial)],
+        model.site_bodyid[np.isin(model.site_sameframe, inertial)],
+    ])  # fmt: skip
+    return model.body_ipos[marked], model.body_iquat[marked]
+
+
 class Frames:
     """Frames of the bodies, joints and geoms of which some number varies, as they stand in θ."""
 
