@@ -68,7 +68,7 @@ def judge(case: Case, document: Mapping[str, Any]) -> dict[str, Any]:
     """Return what is right and wrong in an answer."""
     entries = [e for e in document.get("effects") or [] if e["effect"] != "unnamed"]
     unnamed = any(e["effect"] == "unnamed" for e in document.get("effects") or [])
-    matches = _matches(case, entries)
+    matches = _matches(case, entries, document.get("verdict") == "explained")
     scored = [_strength(case, h, entries[m]) for h, m in matches.items()]
     scored = [s for s in scored if s is not None]
     complete = len(matches) == len(case.effects) and len(entries) == len(case.effects)
@@ -114,19 +114,22 @@ def _left(gap: Mapping[str, Any]) -> float | None:
         return None
 
 
-def _names(entry: Mapping[str, Any]) -> set[Pair]:
-    """An answer's (effect, target), and what it says cannot be told from it."""
-    others = entry.get("indistinguishable_from") or []
+def _names(entry: Mapping[str, Any], ties: bool = True) -> set[Pair]:
+    """An answer's (effect, target) and, if ties count, what it says cannot be told from it."""
+    others = (ties and entry.get("indistinguishable_from")) or []
     return {(e["effect"], e.get("target")) for e in (entry, *others)}
 
 
-def _matches(case: Case, entries: Sequence[Mapping[str, Any]]) -> dict[int, int]:
-    """Which entry names each hidden effect: an effect's own name first, then its equivalents."""
+def _matches(case: Case, entries: Sequence[Mapping[str, Any]], explained: bool) -> dict[int, int]:
+    """Which entry names each hidden effect: an effect's own name first, then its equivalents.
+
+    What an answer says to be as good as its names counts only where these leave nothing that must be said.
+    """
     found: dict[int, int] = {}
     for hidden, (effect, equals) in enumerate(zip(case.effects, case.equivalents, strict=True)):
         own = (effect.name, effect.target)
         for accepted in (lambda e, own=own: own == (e["effect"], e.get("target")),
-                         lambda e, own=own, equals=equals: bool(_names(e) & {own, *equals})):  # fmt: skip
+                         lambda e, own=own, equals=equals: bool(_names(e, explained) & {own, *equals})):  # fmt: skip
             free = [n for n, e in enumerate(entries) if n not in found.values() and accepted(e)]
             if free and hidden not in found:
                 found[hidden] = free[0]

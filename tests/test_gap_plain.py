@@ -25,7 +25,7 @@ from dropo_torch.gap.log import cut_windows, spread
 from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import NamedEffect, Strength
-from dropo_torch.gap.search import start, start_anywhere
+from dropo_torch.gap.search import Ended, Naming, start, start_anywhere, with_ties
 from dropo_torch.gap.ties import _one_for_two, rivals_of_all
 from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem
@@ -322,6 +322,30 @@ def test_what_is_one_effect_is_not_told_as_two() -> None:
     assert [p.key for p in found.current.hypothesis.placed] == [("gravity_tilt", None)]
     assert abs(found.current.hypothesis.placed[0].values[1]) == pytest.approx(0.1, abs=1e-3)
     assert tied == [()]
+
+
+def test_what_surpasses_a_name_takes_its_place() -> None:
+    """Though the search came to the other first; and it goes on from there."""
+
+    def change(model: mujoco.MjModel) -> None:
+        model.dof_damping[0] += 2.0
+        model.dof_frictionloss[1] = 0.1
+
+    scene = scene_of(RAIL, change, pushes)
+    names = ("joint_damping", "armature", "joint_friction")
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in names))
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    wrong = ground.refit(state.base.hypothesis.with_effects([Placed(VOCABULARY["armature"], "rail", (1.0,))]))
+    naming = Naming(ground.evidence, state.base, state.first, wrong, gap=True, named=True)
+    for late in ("", "looking for ties"):
+        known = Ended(ground, replace(state, current=wrong, number=1), replace(naming, unfinished=late))
+        found = with_ties(known)
+        assert found.named != bool(late)  # one of two effects does not account for the gap
+        assert found.unfinished == late
+        keys = {p.key for p in found.final.hypothesis.placed}
+        assert ("armature", "rail") not in keys
+        assert late or keys == {("joint_damping", "rail"), ("joint_friction", "pole")}
 
 
 @pytest.mark.parametrize("order", [("inertia", "center_of_mass"), ("center_of_mass", "inertia")])

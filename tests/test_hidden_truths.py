@@ -459,6 +459,7 @@ def test_a_case_has_the_gap_that_was_asked_for() -> None:
 
 def answer(*effects: tuple, equivalents: tuple = (), noise: dict | None = None) -> dict:
     return {
+        "verdict": "explained",
         "noise": noise or {},
         "chi2_per_degree": {"before": 50.0, "after": 1.2},
         "effects": [
@@ -488,6 +489,8 @@ def test_judging() -> None:
     assert judge(case, answer(("actuator_damping", "leg_motor", {"damping": 0.1})))["right"]
     named_as_equivalent = answer(("joint_friction", "leg_joint", {}), equivalents=(("joint_damping", "leg_joint"),))
     assert judge(case, named_as_equivalent)["right"]
+    assert not judge(case, named_as_equivalent | {"verdict": "partly explained"})["right"]
+    assert judge(case, answer(("actuator_damping", "leg_motor", {})) | {"verdict": "partly explained"})["right"]
     assert not judge(case, answer(("joint_damping", "foot_joint", {"damping": 2.0})))["right"]
     assert not judge(case, answer(("joint_damping", "leg_joint", {}), ("armature", "leg_joint", {})))["right"]
     assert not judge(case, answer())["right"]

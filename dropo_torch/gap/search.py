@@ -19,7 +19,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, family_accounts, remains, significant
-from dropo_torch.gap.ties import canonical, rivals_of_all
+from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
 from dropo_torch.support.checkpoint import Checkpoint
 
 #: Why what a log is too short for has no name.
@@ -251,13 +251,26 @@ def judged(ground: Ground, state: State, found: Refit, unnamed: Naming) -> Namin
 
 
 def with_ties(ended: Ended) -> Naming:
-    """Return what was found, and what ties with it."""
+    """Return what was found, and what ties with it; first what surpasses it, where the search did not come by that."""
     naming, ground = ended.naming, ended.ground
     if not naming.named or naming.family:
         return naming
     tied, shares, state = rivals_of_all(ground, ended.state)
+    if surpasses(ground, state.current, ended.state.current):
+        return with_ties(continued(ground, state, naming.unfinished))
     state, told = canonical(ground, state, tied)
     return replace(naming, final=state.current, ties=told, shares=tuple(shares), attempts=state.attempts)
+
+
+def continued(ground: Ground, state: State, unfinished: str) -> Ended:
+    """Return where a search ends that goes on from a better hypothesis; one whose time was over only judges it."""
+    state = renewed(ground, state)
+    full = state.number >= ground.rules.effects
+    state = replace(state, done=bool(unfinished) or full or is_done(ground.at(state), state))
+    while not state.done:
+        state = step(ground.at(state), state)
+    ended = conclude(ground.at(state), state)
+    return replace(ended, naming=replace(ended.naming, unfinished=unfinished))
 
 
 def resort(ground: Ground, naming: Naming) -> Naming:

@@ -9,9 +9,10 @@ from itertools import permutations
 import numpy as np
 
 from dropo_torch.effects.base import Placed
+from dropo_torch.gap.accept import nonsense
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.rules import Alike
+from dropo_torch.gap.rules import Alike, significant
 from dropo_torch.gap.screen import Candidate, Focus, left_by
 
 #: Shares of the way from where a candidate begins to where it is predicted that are tried, too.
@@ -26,6 +27,8 @@ ROUND = -1
 
 def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
     """Return candidates that tie with a named effect, the excess that it accounts for, and the state with attempts.
+
+    Where one of them surpasses the effect, the state has it in its place.
 
     First by linear algebra, of all candidates or of those that the first screening leaves open: what the effect
     explains must lie in the span of a candidate's derivatives and of those of all other numbers. A refit then
@@ -49,18 +52,23 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
         looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully, iterations=ITERATIONS
     )
     tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
-    return tied, without.cost.excess - current.cost.excess, replace(state, attempts=found.attempts)
+    best = next((r for r in rivals if surpasses(ground, r, current) and not nonsense(ground, r)), current)
+    return tied, without.cost.excess - current.cost.excess, replace(state, current=best, attempts=found.attempts)
 
 
 def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]], list[float], State]:
     """Return :func:`ties` of every named effect, with one effect in the place of two wherever it does for both.
 
     A search that takes one effect at a time may have explained by two, each a part of it, what one explains alone.
+    Where a rival surpasses one of them, it is no tie: the state has it in its place, and the others are not looked at.
     """
     while True:
-        tied, shares = [], []
+        tied, shares = list[tuple[Placed, ...]](), list[float]()
         for index in range(len(state.current.hypothesis.placed)):
+            before = state.current
             rivals, share, state = ties(ground, state, index)
+            if state.current is not before:
+                return tied, shares, state
             tied.append(rivals)
             shares.append(share)
         if (fewer := _one_for_two(ground, state, tied)) is None:
@@ -123,6 +131,11 @@ def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
         return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0, slopes=False).loss
 
     return min((candidate.placed, candidate.start, *between), key=loss)
+
+
+def surpasses(ground: Ground, better: Refit, own: Refit) -> bool:
+    """Return whether a hypothesis removes most of what another leaves, and that is more than noise."""
+    return significant(own.cost, ground.rules) and better.cost.left_of(own.cost) < 1 - ground.rules.most
 
 
 def as_good(ground: Ground, state: State, rival: Refit) -> bool:
