@@ -14,7 +14,7 @@ from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
 from dropo_torch.gap.renew import with_base
-from dropo_torch.gap.rules import accounts, beyond_free, remains, significant, simplest
+from dropo_torch.gap.rules import accounts, allowance, beyond_free, most_left, remains, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -126,6 +126,14 @@ def imitates(ground: Ground, fitted: Refit) -> bool:
     return resolved(ground.part, fitted).fit.cost.reduced > wrong
 
 
+def accounts_finely(ground: Ground, fitted: Refit, base: Refit) -> bool:
+    """Return whether effects account for a gap, where what is wrong besides may be the model's own step."""
+    rules = ground.rules
+    if accounts(fitted, base, rules) or fitted.cost.left_of(base.cost) > allowance(fitted.hypothesis, rules):
+        return accounts(fitted, base, rules)
+    return resolved(ground.part, fitted).fit.cost.reduced <= rules.sound.wrong
+
+
 def is_done(ground: Ground, state: State) -> bool:
     """Return whether what is left is noise, or what the model's own step makes of the effects that were found.
 
@@ -173,7 +181,9 @@ def add(ground: Ground, state: State) -> State:
             tried = sound(ground, tried)
             if tried and tried[0].cost.left_of(best.cost) < rules.tried.clearer:
                 best = tried[0]
-    hopeless = best.cost.left_of(current.cost) > rules.hopeless or not matters(ground, state.base, best, current)
+    hopeless = best.cost.left_of(current.cost) > most_left(current, rules) or not matters(
+        ground, state.base, best, current
+    )
     if hopeless or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best)

@@ -263,7 +263,8 @@ class Rules:
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         free: numbers of the named effects beyond which each halves what they may leave, for many numbers together
             imitate what none of them is; what they leave must be less than ``sound.wrong`` then.
-        hopeless: share of the excess that the best candidate of a round may leave, or the search ends.
+        hopeless: share of the excess that the best candidate of a round may leave, or the search ends;
+        imitating: the share where what is named has more numbers than are ``free``, and is still wrong.
         least: share of the first excess below which an effect is not named.
         effects: the most effects that are named.
         chance, alike, tried, family, sound, cut, weighed, forces, shown: see there.
@@ -275,6 +276,7 @@ class Rules:
     accounted: float = 0.95
     free: int = 3
     hopeless: float = 0.8
+    imitating: float = 0.5
     least: float = 3e-3
     effects: int = 4
     chance: Chance = field(default_factory=Chance)
@@ -314,6 +316,12 @@ def beyond_free(hypothesis: Hypothesis, rules: Rules) -> int:
 def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
     """Return the share of the first excess that named effects may leave."""
     return (1 - rules.accounted) * 0.5 ** beyond_free(hypothesis, rules)
+
+
+def most_left(current: Refit, rules: Rules) -> float:
+    """Return the share of its excess that the best candidate beside a hypothesis may leave, or the search ends."""
+    imitates = beyond_free(current.hypothesis, rules) and current.cost.reduced > rules.sound.wrong
+    return rules.imitating if imitates else rules.hopeless
 
 
 def accounts(named: Refit, base: Refit, rules: Rules) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
-from dropo_torch.gap.accept import add, everywhere, extend, imitates, is_done, nonsense, prune, swap
+from dropo_torch.gap.accept import accounts_finely, add, everywhere, extend, imitates, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.family import family_ties, has_family, shares_of, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
@@ -242,7 +242,7 @@ def judged(ground: Ground, state: State, found: Refit, unnamed: Naming) -> Namin
     if reasons := nonsense(ground, state.current):
         return replace(unnamed, refused=reasons[0])
     placed, partial = state.current.hypothesis.placed, ground.clears(base, state.current)
-    if not placed or not (partial or accounts(state.current, base, rules)):
+    if not placed or not (partial or accounts_finely(ground, state.current, base)):
         unsure = found.hypothesis.placed and accounts(found, base, rules)
         return replace(unnamed, refused=UNSURE if unsure else state.refused)
     if not partial and imitates(ground, state.current):
