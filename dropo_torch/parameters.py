@@ -235,13 +235,21 @@ class ParameterSpace:
             _normalise(field, getattr(model, field))
 
     def apply(self, values: np.ndarray | Mapping[str, float]) -> mujoco.MjModel:
-        """Return a copy of the model with the given values and everything derived from them."""
+        """Return a copy of the model with the given values and everything derived from them.
+
+        Raises:
+            InputError: no model, other names, or the centre of mass of a body that is compiled as simple.
+        """
         if self.model is None:
             raise InputError("parameters: these belong to no MuJoCo model")
         vector = self.vector(values) if isinstance(values, Mapping) else np.asarray(values, dtype=np.float64)
         model = copy.copy(self.model)
         self.write_into(model, vector)
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        try:
+            mujoco.mj_setConst(model, mujoco.MjData(model))
+        except mujoco.FatalError:
+            _check_centres(self.model, self)
+            raise
         return model
 
 
@@ -264,21 +272,28 @@ def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
     Raises:
         InputError: the centre of mass of a body that is compiled as simple.
     """
+    _check_centres(model, space)
     none = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
-    for column, target in space.targets:
+    for _column, target in space.targets:
         if target.field not in _FRAMES:
             continue
         row = target.index // read_field(model, target.field).shape[-1]
         getattr(model, target.field.split("_")[0] + "_sameframe")[row] = none
         if target.field not in CENTRES:
             continue
-        if model.body_simple[row]:
+        model.geom_sameframe[model.geom_bodyid == row] = none  # some coincide with the body's inertial frame
+        model.site_sameframe[model.site_bodyid == row] = none
+
+
+def _check_centres(model: mujoco.MjModel, space: ParameterSpace) -> None:
+    """Raise an :class:`InputError` for the centre of mass of a body that is compiled as simple."""
+    for column, target in space.targets:
+        row = target.index // read_field(model, target.field).shape[-1] if target.field in CENTRES else 0
+        if target.field in CENTRES and model.body_simple[row]:
             raise InputError(
                 f"parameters: {space.names[column]!r}: body {row} ({model.body(row).name}) is compiled as simple, its "
                 'centre of mass in its frame; give the path of the model, or compile it with simple="false"'
             )
-        model.geom_sameframe[model.geom_bodyid == row] = none  # some coincide with the body's inertial frame
-        model.site_sameframe[model.site_bodyid == row] = none
 
 
 def read_field(model: mujoco.MjModel, field: str) -> np.ndarray:

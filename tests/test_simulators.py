@@ -455,3 +455,13 @@ def test_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
     space = ParameterSpace(model, {"x": {"field": "body_ipos[0]", "name": "link", "bounds": [-0.4, 0.4]}})
     with pytest.raises(InputError, match=r"'x': body 1 \(link\) is compiled as simple"):
         MujocoSimulator(model, parameters=space)
+
+
+def test_moving_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
+    model = mujoco.MjModel.from_xml_string(BOX_XML)
+    assert model.body_simple[1]
+    space = ParameterSpace(model, {"x": {"field": "body_ipos[0]", "name": model.body(1).name, "bounds": [-0.4, 0.4]}})
+    with pytest.raises(InputError, match=r"'x': body 1 \(.*\) is compiled as simple"):
+        space.apply([0.1])
+    with pytest.raises(InputError, match="is compiled as simple"):
+        MujocoSimulator(model, parameters=space)
