@@ -160,9 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     given = parser.parse_args(arguments)
     truth = SIM.truth if given.robot else None
     try:
-        log = record(
-            variant=given.variant, episodes=given.episodes, steps=given.steps, seed=given.seed, truth=truth
-        )
+        log = record(variant=given.variant, episodes=given.episodes, steps=given.steps, seed=given.seed, truth=truth)
         log.save(given.path)
     except (InputError, OSError) as error:
         parser.error(str(error))
