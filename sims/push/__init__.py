@@ -1,4 +1,4 @@
-"""Pushing a box: five parameters of the box and its friction to find, as in the paper's experiments with a Panda arm."""
+"""A pushed box: five parameters of it and its friction to find, as in the paper's experiments with a Panda arm."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Record logs of a simulated arm that pushes a box: ``python -m dropo_sims.push.record LOG.npz --variant distribution``.
+"""Record logs of an arm that pushes a box: ``python -m dropo_sims.push.record LOG.npz --variant distribution``.
 
 Every episode is one push, straight ahead, at a side of the box and with a heading and a speed of its own. The variants:
 
@@ -28,6 +28,8 @@ VARIANTS = ("point", "noisy", "distribution")
 NOISE = (1e-4, 1e-3)
 #: Standard deviations of the parameters in the distribution variant.
 SPREAD = {"mass": 0.3, "friction_x": 0.2, "friction_y": 0.2, "com_x": 0.001, "com_y": 0.001}
+#: The box's quaternion in a state, the last of the positions.
+QUATERNION = slice(10, 14)
 #: How far pushes are beside the box's middle (m) and from straight ahead (rad), at most, and their speeds, m/s.
 SIDE, HEADING, SPEEDS = 0.03, 0.25, (0.2, 0.4)
 
@@ -88,7 +90,7 @@ def record(
     parts = [_episode(space.apply(values), _push(generator), steps) for values in drawn]
     states, actions = (np.stack(part) for part in zip(*parts, strict=True))
     if variant == "noisy":
-        states = _measured(states, space.model.nq, generator)
+        states = _measured(states, generator)
     terminals = np.zeros((episodes, steps), dtype=bool)
     terminals[:, -1] = True
     width = states.shape[-1]
@@ -140,11 +142,11 @@ def _transition(model: mujoco.MjModel, state: np.ndarray, action: np.ndarray) ->
     return np.concatenate([data.qpos, data.qvel])
 
 
-def _measured(states: np.ndarray, nq: int, generator: np.random.Generator) -> np.ndarray:
+def _measured(states: np.ndarray, generator: np.random.Generator) -> np.ndarray:
     """States with noise, their quaternions of length 1."""
-    level = np.where(np.arange(states.shape[-1]) < nq, *NOISE)
+    level = np.where(np.arange(states.shape[-1]) < QUATERNION.stop, *NOISE)
     found = states + level * generator.standard_normal(states.shape)
-    found[..., nq - 4 : nq] /= np.linalg.norm(found[..., nq - 4 : nq], axis=-1, keepdims=True)
+    found[..., QUATERNION] /= np.linalg.norm(found[..., QUATERNION], axis=-1, keepdims=True)
     return found
 
 
