@@ -274,7 +274,7 @@ def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
     """
     _check_centres(model, space)
     none = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
-    for _column, target in space.targets:
+    for _, target in space.targets:
         if target.field not in _FRAMES:
             continue
         row = target.index // read_field(model, target.field).shape[-1]
@@ -288,8 +288,10 @@ def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
 def _check_centres(model: mujoco.MjModel, space: ParameterSpace) -> None:
     """Raise an :class:`InputError` for the centre of mass of a body that is compiled as simple."""
     for column, target in space.targets:
-        row = target.index // read_field(model, target.field).shape[-1] if target.field in CENTRES else 0
-        if target.field in CENTRES and model.body_simple[row]:
+        if target.field not in CENTRES:
+            continue
+        row = target.index // read_field(model, target.field).shape[-1]
+        if model.body_simple[row]:
             raise InputError(
                 f"parameters: {space.names[column]!r}: body {row} ({model.body(row).name}) is compiled as simple, its "
                 'centre of mass in its frame; give the path of the model, or compile it with simple="false"'

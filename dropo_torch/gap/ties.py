@@ -28,11 +28,9 @@ ROUND = -1
 def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
     """Return candidates that tie with a named effect, the excess that it accounts for, and the state with attempts.
 
-    Where one of them surpasses the effect, the state has it in its place.
-
     First by linear algebra, of all candidates or of those that the first screening leaves open: what the effect
     explains must lie in the span of a candidate's derivatives and of those of all other numbers. A refit then
-    confirms it, or not.
+    confirms it, or not. Where one of them surpasses the effect, the state has it in its place.
 
     Args:
         ground: what the search stands on.
