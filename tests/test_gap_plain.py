@@ -26,7 +26,7 @@ from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.search import Ended, Naming, start, start_anywhere, with_ties
-from dropo_torch.gap.ties import _one_for_two, rivals_of_all
+from dropo_torch.gap.ties import _one_for_two, rivals_of_all, size
 from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem
 
@@ -358,13 +358,33 @@ def test_a_tie_of_one_effect_may_stand_for_two(order: tuple[str, str]) -> None:
     two = ground.refit(state.base.hypothesis.with_effects([Placed(VOCABULARY[n], "upper", values[n]) for n in order]))
     assert two.cost.reduced == pytest.approx(1, abs=0.1)
     payload = Placed(VOCABULARY["payload"], "upper", (0.3, 0.03, 0.0, 0.0))
-    fewer = _one_for_two(ground, replace(state, current=two), [(payload,), ()])
+    tied = ground.refit(two.hypothesis.without(0).with_effects([payload]))
+    fewer = _one_for_two(ground, replace(state, current=two), [(tied,), ()])
     assert fewer is not None
     mass, x, _, z = fewer.hypothesis.placed[0].values
     assert [p.key for p in fewer.hypothesis.placed] == [payload.key]
     assert (mass * x, mass * z) == pytest.approx((0.02, 0.02), abs=5e-4)
-    elsewhere = Placed(VOCABULARY["payload"], "lower", payload.values)
+    elsewhere = replace(tied, hypothesis=two.hypothesis.without(0).with_effects([replace(payload, target="lower")]))
     assert _one_for_two(ground, replace(state, current=two), [(elsewhere,), ()]) is None
+
+
+def test_what_fades_beside_a_tie_is_dropped() -> None:
+    scene = scene_of(PENDULUM, load, lambda time, phases: np.zeros((len(time), 0)), shape=(6, 150))
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in ("payload", "inertia", "center_of_mass")))
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    lower, payload = (
+        Placed(VOCABULARY[n], body, values)
+        for n, body, values in (("inertia", "lower", (1.0,)), ("payload", "upper", (0.3, 0.03, 0.0, 0.0)))
+    )
+    tied = ground.refit(state.base.hypothesis.with_effects([lower, payload]))
+    assert size(ground, tied.hypothesis.placed[0]) == pytest.approx(0, abs=1e-3)
+    center = Placed(VOCABULARY["center_of_mass"], "upper", (0.0, 0.0, 0.05))
+    for before, fades in ((1.2, True), (tied.hypothesis.placed[0].values[0], False)):
+        two = replace(tied, hypothesis=state.base.hypothesis.with_effects([lower.at((before,)), center]))
+        fewer = _one_for_two(ground, replace(state, current=two), [(), (tied,)])
+        assert (fewer is not None) == fades
+        assert fewer is None or [p.key for p in fewer.hypothesis.placed] == [payload.key]
 
 
 def test_a_wave_longer_than_the_motion_is_no_ripple() -> None:

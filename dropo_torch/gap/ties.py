@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
@@ -25,8 +26,8 @@ SETTLED = 40
 ROUND = -1
 
 
-def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], float, State]:
-    """Return candidates that tie with a named effect, the excess that it accounts for, and the state with attempts.
+def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Refit, ...], float, State]:
+    """Return fits with what ties with a named effect, the excess that it accounts for, and the state with attempts.
 
     First by linear algebra, of all candidates or of those that the first screening leaves open: what the effect
     explains must lie in the span of a candidate's derivatives and of those of all other numbers. A refit then
@@ -49,48 +50,63 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Placed, ...], 
     rivals, found = ground.refits(
         looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully, iterations=ITERATIONS
     )
-    tied = tuple(r.hypothesis.placed[-1] for r in rivals if as_good(ground, state, r))
+    tied = tuple(r for r in rivals if as_good(ground, state, r))
     best = next((r for r in rivals if surpasses(ground, r, current) and not nonsense(ground, r)), current)
     return tied, without.cost.excess - current.cost.excess, replace(state, current=best, attempts=found.attempts)
 
 
 def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]], list[float], State]:
-    """Return :func:`ties` of every named effect, with one effect in the place of two wherever it does for both.
+    """Return the ties of every named effect, with one effect in the place of two wherever it does for both.
 
     A search that takes one effect at a time may have explained by two, each a part of it, what one explains alone.
     Where a rival surpasses one of them, it is no tie: the state has it in its place, and the others are not looked at.
     """
     while True:
-        tied, shares = list[tuple[Placed, ...]](), list[float]()
+        tied, shares = list[tuple[Refit, ...]](), list[float]()
         for index in range(len(state.current.hypothesis.placed)):
             before = state.current
             rivals, share, state = ties(ground, state, index)
             if state.current is not before:
-                return tied, shares, state
+                return [told(t) for t in tied], shares, state
             tied.append(rivals)
             shares.append(share)
         if (fewer := _one_for_two(ground, state, tied)) is None:
-            return tied, shares, state
+            return [told(t) for t in tied], shares, state
         state = replace(state, current=fewer)
 
 
-def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]) -> Refit | None:
+def told(tied: Sequence[Refit]) -> tuple[Placed, ...]:
+    """Return what ties with an effect, of fits in which it stands last."""
+    return tuple(r.hypothesis.placed[-1] for r in tied)
+
+
+def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Refit, ...]]) -> Refit | None:
     """A fit in which what ties with one named effect stands in the place of two, and explains the log as well.
 
-    Tried are ties of both, and ties of one that are at the target of the other: a payload ties with an inertia beside a
-    shifted centre of mass, and needs neither.
+    Tried are ties of both, ties of one that are at the target of the other, and those beside which less than half of
+    the other is needed: a payload ties with an inertia beside a shifted centre of mass, and needs neither.
     """
     hypothesis = state.current.hypothesis
     for one, other in permutations(range(len(tied)), 2):
-        shared, target = {p.key for p in tied[other]}, hypothesis.placed[other].target
-        for rival in tied[one]:
-            if not ((rival.key in shared and one < other) or (target is not None and rival.target == target)):
+        shared, own = {p.key for p in told(tied[other])}, hypothesis.placed[other]
+        for fitted in tied[one]:
+            *others, rival = fitted.hypothesis.placed
+            both = rival.key in shared and one < other
+            near = own.target is not None and rival.target == own.target
+            beside = size(ground, others[other - (other > one)])
+            if not (both or near or beside < 0.5 * size(ground, own)):
                 continue
             ground.report("looking for ties", 0.9)
             fewer = ground.refit(hypothesis.instead(one, rival).without(other), SETTLED)
             if as_good(ground, state, fewer):
                 return fewer
     return None
+
+
+def size(ground: Ground, placed: Placed) -> float:
+    """Return by how many scales the numbers of an effect differ from those with which it is absent."""
+    quantities = placed.effect.quantities(ground.setting, placed.target)
+    return math.hypot(*((v - q.neutral) / q.scale for q, v in zip(quantities, placed.values, strict=True)))
 
 
 def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Alike) -> list[Candidate]:
@@ -148,11 +164,11 @@ def canonical(
 ) -> tuple[State, tuple[tuple[Placed, ...], ...]]:
     """Among exact ties name the one with the fewest numbers that the vocabulary lists first."""
     order = {effect.name: i for i, effect in enumerate(ground.effects)}
-    told = list(tied)
-    for index, rivals in enumerate(told):
+    listed = list(tied)
+    for index, rivals in enumerate(listed):
         own = state.current.hypothesis.placed[index]
         first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name]))
         if first is not own:
             state = replace(state, current=ground.refit(state.current.hypothesis.instead(index, first)))
-            told[index] = tuple(own if p is first else p for p in rivals)
-    return state, tuple(told)
+            listed[index] = tuple(own if p is first else p for p in rivals)
+    return state, tuple(listed)
