@@ -1,4 +1,4 @@
-"""Adam, exact scores and certificates on the Warp backend."""
+"""Adam, exact derivatives and certificates on the Warp backend."""
 
 import numpy as np
 import pytest
@@ -117,7 +117,7 @@ def test_both_backends_find_the_same_distribution() -> None:
         for backend in ("mujoco", "warp")
     ]
     np.testing.assert_allclose(fits[0].distribution.mean, fits[1].distribution.mean, rtol=0.02)
-    assert fits[1].log_likelihood > fits[0].log_likelihood - 1  # exact scores lose nothing
+    assert fits[1].log_likelihood > fits[0].log_likelihood - 1
 
 
 def test_a_certificate_holds_on_the_hopper_and_fails_for_a_wrong_gradient(

@@ -15,6 +15,8 @@ from dropo_torch.optimizers.least_squares import damped_step
 
 #: Damping beyond which no step is tried.
 MAX_DAMPING = 1e2
+#: Damping after a step that was no good, at least: with less, the next one would be the same.
+LEAST_RAISED = 0.05
 
 
 @dataclass
@@ -83,7 +85,7 @@ class Ascent(abc.ABC):
         elif self.candidate is None:
             self.reason = "no simulation succeeded at the starting point"
         elif not self.narrows:
-            self.damping *= 8
+            self.damping = max(8 * self.damping, LEAST_RAISED)
             if self.damping > MAX_DAMPING:
                 self.reason = "no step improves the likelihood"
         self.iterations += 1

@@ -21,6 +21,8 @@ from dropo_torch.support.random import stratified_uniforms
 NOISY_ROUNDS = 6
 #: The means have converged when no refit moves them by more than this share of their box.
 AT_REST = 1e-3
+#: Iterations of the means that may gain little.
+PATIENCE = 8
 #: Change of σ, as a share of it or of 1/20 of the search width, below which it has converged; and how often it is
 #: fitted anew.
 CONVERGED = 0.1
@@ -32,8 +34,7 @@ class FisherOptimizer(LikelihoodOptimizer):
 
     On a log whose initial states are noisy, the noise is propagated at the current μ and the means are
     refitted until convergence; the scoring then works on that covariance. Where the
-    simulation bends within the distribution, the scoring goes on over ``samples`` samples; with exact
-    gradients of their likelihood where the simulator has them.
+    simulation bends within the distribution, the scoring goes on over ``samples`` samples.
 
     With ``entropy`` β, the scoring maximises the log-likelihood plus β Σ log σ: the entropy of p_φ but for a
     constant, as in E-DROPO (arXiv 2506.10133). It keeps σ open where the log alone would close it.
@@ -49,10 +50,8 @@ class FisherOptimizer(LikelihoodOptimizer):
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
-        # the exact scores know nothing of the bonus
-        self._differentiable = objective.simulator.differentiable and not settings.entropy
         self._uniforms = stratified_uniforms(settings.samples, len(self._space), settings.seed, 2)
-        self._means = MeansStage(self._box.low, self._box.high, self._box.middle)
+        self._means = self._means_from(self._box.middle)
         self._scoring: SigmaPointStage | SampledStage | None = None
         self._round = 0
         self._linearised: np.ndarray | None = self._means.point if self._noisy else None
@@ -68,7 +67,6 @@ class FisherOptimizer(LikelihoodOptimizer):
             evaluations=1,
             linearise_at=self._linearised,
             linearise_std=self._explained,
-            gradient=self._differentiable and isinstance(stage, SampledStage),
             is_stencil=stage is self._means,
         )
 
@@ -80,8 +78,6 @@ class FisherOptimizer(LikelihoodOptimizer):
             if self._means.reason is not None:
                 self._after_means()
             return
-        if gradient is not None and isinstance(stage, SampledStage):
-            sums = stage.with_exact_scores(sums, gradient)
         if self._settings.entropy:
             sums = stage.with_entropy(sums, self._settings.entropy)
         stage.tell(sums)
@@ -110,6 +106,10 @@ class FisherOptimizer(LikelihoodOptimizer):
         stage = self._scoring
         return [(self._means.point, self._box.min_std) if stage is None else (stage.mean, stage.std)]
 
+    def _means_from(self, point: np.ndarray) -> MeansStage:
+        """The stage of the means; where they gain little, σ has to explain what is left, and the scoring moves both."""
+        return MeansStage(self._box.low, self._box.high, point, patience=PATIENCE)
+
     def _after_means(self) -> None:
         """Refit the means around the noise propagated at them until convergence, then go on to σ."""
         point, before = self._means.point, self._linearised
@@ -118,7 +118,7 @@ class FisherOptimizer(LikelihoodOptimizer):
             converged = bool((np.abs(point - before) <= AT_REST * self._box.width).all())
             if self._round < NOISY_ROUNDS and not converged:
                 self._round += 1
-                self._means = MeansStage(self._box.low, self._box.high, point)
+                self._means = self._means_from(point)
                 return
         self._scoring = SigmaPointStage(self._box, point, self._means.first_std(self._box))
 

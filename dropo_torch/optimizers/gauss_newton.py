@@ -18,6 +18,10 @@ from dropo_torch.optimizers.least_squares import bounded_step
 #: Step of the forward differences, as a share of the search width.
 DIFFERENCE_STEP = 1e-5
 MAX_ITERATIONS = 40
+#: Damping after a step that was no good, at least: with less, the next one would be the same.
+LEAST_RAISED = 1e-3
+#: Share by which the cost must fall for the patience of a stage to begin anew.
+NOTABLE = 0.01
 #: Points spread over the box from which to begin where the first one loses transitions.
 STARTS = 16
 
@@ -31,20 +35,26 @@ class MeansStage:
         point: the best μ so far, ``(d,)``.
         shape: transitions and columns of the log, where the residuals' own size is to tell when μ is good enough;
             by default C tells.
+        patience: iterations after which it ends, if they have not made the cost notably smaller.
         cost: ½ Σ rᵀC⁻¹r at ``point``, over the transitions that do not diverge there.
         lost: how many do; no cost outweighs one.
         starts: other points to try before any step, the next one last, ``(d,)`` each.
+        mark: the cost when it last became notably smaller.
+        idle: iterations since then.
     """
 
     low: np.ndarray
     high: np.ndarray
     point: np.ndarray
     shape: tuple[int, int] | None = None
+    patience: int = MAX_ITERATIONS
     damping: float = 1e-3
     cost: float = np.inf
     lost: float = np.inf
     starts: list[np.ndarray] = field(default_factory=list)
     iterations: int = 0
+    mark: float = np.inf
+    idle: int = 0
     reason: str | None = None
     candidate: np.ndarray | None = None
     gradient: np.ndarray = field(default_factory=lambda: np.zeros(0))
@@ -87,10 +97,12 @@ class MeansStage:
         elif not tries_starts and step < 1e-9:
             self.reason = "the steps of the means have become too small"
         elif not tries_starts:
-            self.damping *= 6
-        self.iterations += not tries_starts
+            self.damping = max(6 * self.damping, LEAST_RAISED)
+        self._wait(0 if tries_starts else 1)
         if self.iterations >= MAX_ITERATIONS and self.reason is None:
             self.reason = f"{MAX_ITERATIONS} iterations of the means"
+        if self.idle >= self.patience and self.reason is None:
+            self.reason = f"{self.patience} iterations of the means have gained little"
         if self.reason is None and self.starts:
             self.candidate = self.starts[-1]
         elif self.reason is None:
@@ -99,6 +111,14 @@ class MeansStage:
             self.candidate = np.clip(self.point + move, self.low, self.high)
             if np.array_equal(self.candidate, self.point):
                 self.reason = "the means rest at the bounds"
+
+    def _wait(self, iterations: int) -> None:
+        """Count iterations, and those since the cost became notably smaller."""
+        self.iterations += iterations
+        if self.cost < (1 - NOTABLE) * self.mark:
+            self.mark, self.idle = self.cost, 0
+        else:
+            self.idle += iterations
 
     def _spread(self) -> list[np.ndarray]:
         """Points that fill the box evenly, ``(d,)`` each."""

@@ -11,17 +11,14 @@ and scramble. No episode ends early. The variants are those of the paper's simul
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
-import mujoco
 import numpy as np
 
-from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
 
+from ..recorder import Log, check_names, check_request, columns, run_recorder, transition
 from . import LINKS, SIM
 
 VARIANTS = ("point", "noisy", "unmodeled", "distribution")
@@ -33,32 +30,14 @@ SPREAD = {"thigh_mass": 0.25, "leg_mass": 0.25, "foot_mass": 0.25}
 
 
 @dataclass(frozen=True)
-class HopperLog:
-    """A recorded log.
+class HopperLog(Log):
+    """A recorded log: qpos without the horizontal position, then qvel, ``(T, 11)``; torques in [-1, 1], ``(T, 3)``.
 
     Attributes:
-        observations, next_observations: ``(T, 11)``, qpos without the horizontal position, then qvel.
-        actions: ``(T, 3)``, in [-1, 1].
-        terminals: ``(T,)`` bool.
         masses: the masses in force at each step, ``(T, 4)``, kg.
     """
 
-    observations: np.ndarray
-    next_observations: np.ndarray
-    actions: np.ndarray
-    terminals: np.ndarray
     masses: np.ndarray
-
-    def save(self, path: str | Path) -> None:
-        """Write the log as ``.npz``, without the masses: a robot does not log those."""
-        with open(path, "wb") as stream:  # numpy would append .npz to a path without it
-            np.savez_compressed(
-                stream,
-                observations=self.observations,
-                next_observations=self.next_observations,
-                actions=self.actions,
-                terminals=self.terminals,
-            )
 
 
 def nominal_masses() -> dict[str, float]:
@@ -87,13 +66,8 @@ def record(
     Raises:
         InputError: an unknown variant, mass or number.
     """
-    if episodes < 1 or steps < 1 or seed < 0:
-        raise InputError(f"episodes {episodes}, steps {steps}, seed {seed}: expected 1 or more, 1 or more, 0 or more")
-    for name in masses or {}:
-        if name not in SIM.parameters:
-            raise InputError(f"masses: unknown name {name!r}" + choices(name, SIM.parameters))
-    if variant not in VARIANTS:
-        raise InputError(f"variant: unknown {variant!r}; expected one of {', '.join(VARIANTS)}")
+    check_request(variant, VARIANTS, episodes, steps, seed)
+    check_names("masses", masses or {}, SIM.parameters)
     generator = np.random.default_rng(seed)
     truth = nominal_masses() | dict(masses or {})
     if variant == "unmodeled":
@@ -103,15 +77,7 @@ def record(
     measured = states[..., 1:]
     if variant == "noisy":
         measured = measured + np.sqrt(NOISE_VARIANCE) * generator.standard_normal(measured.shape)
-    terminals = np.zeros((episodes, steps), dtype=bool)
-    terminals[:, -1] = True
-    return HopperLog(
-        observations=measured[:, :-1].reshape(-1, 11),
-        next_observations=measured[:, 1:].reshape(-1, 11),
-        actions=actions.reshape(-1, 3),
-        terminals=terminals.reshape(-1),
-        masses=used.reshape(-1, len(LINKS)),
-    )
+    return HopperLog(**columns(measured, actions), masses=used.reshape(-1, len(LINKS)))
 
 
 def _episode(
@@ -127,17 +93,9 @@ def _episode(
         if variant == "distribution" and step % HOLD == 0:
             drawn = {name: truth[name] + sigma * generator.standard_normal() for name, sigma in SPREAD.items()}
             model = space.apply({**truth, **drawn})
-        states.append(_transition(model, states[-1], actions[step]))
+        states.append(transition(model, states[-1], actions[step], SIM.frame_skip))
         used.append(model.body_mass[1:].copy())
     return np.stack(states), actions, np.stack(used)
-
-
-def _transition(model: mujoco.MjModel, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """One logged transition from a cold solver: a transition is a function of its state alone."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.ctrl[:] = state[:6], state[6:], action
-    mujoco.mj_step(model, data, nstep=SIM.frame_skip)
-    return np.concatenate([data.qpos, data.qvel])
 
 
 def _smooth_noise(steps: int, width: int, generator: np.random.Generator) -> np.ndarray:
@@ -151,26 +109,12 @@ def _smooth_noise(steps: int, width: int, generator: np.random.Generator) -> np.
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Record a log from the command line."""
-    parser = argparse.ArgumentParser(description="Record a log of a simulated Hopper.")
-    parser.add_argument("path", type=Path, help="the .npz file to write")
-    parser.add_argument("--variant", choices=VARIANTS, default="point")
-    parser.add_argument("--episodes", type=int, default=2)
-    parser.add_argument("--steps", type=int, default=500)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--robot", action="store_true", help="the masses of the bundled log instead of the model's")
-    given = parser.parse_args(arguments)
-    try:
-        log = record(
-            variant=given.variant,
-            episodes=given.episodes,
-            steps=given.steps,
-            seed=given.seed,
-            masses=SIM.truth if given.robot else None,
-        )
-        log.save(given.path)
-    except (InputError, OSError) as error:
-        parser.error(str(error))
-    print(f"{len(log.actions)} transitions in {given.path}")
+
+    def recorded(variant: str, episodes: int, steps: int, seed: int, robot: bool) -> HopperLog:
+        masses = SIM.truth if robot else None
+        return record(variant=variant, episodes=episodes, steps=steps, seed=seed, masses=masses)
+
+    run_recorder(recorded, arguments, what="a simulated Hopper", variants=VARIANTS, episodes=2, steps=500)
 
 
 if __name__ == "__main__":

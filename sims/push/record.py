@@ -9,17 +9,15 @@ Every episode is one push, straight ahead, at a side of the box and with a headi
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import mujoco
 import numpy as np
 
-from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
 
+from ..recorder import Log, check_names, check_request, columns, run_recorder, transition
 from . import SIM
 from .policy import Push, Pusher
 
@@ -35,27 +33,14 @@ SIDE, HEADING, SPEEDS = 0.03, 0.25, (0.2, 0.4)
 
 
 @dataclass(frozen=True)
-class PushLog:
-    """A recorded log.
+class PushLog(Log):
+    """A recorded log: the joints, the box's position and quaternion, then velocities; asked velocities of the joints.
 
     Attributes:
-        observations, next_observations: ``(T, 27)``: joints, the box's position and quaternion, then velocities.
-        actions: ``(T, 7)``, velocities of the joints that were asked for, rad/s.
-        terminals: ``(T,)`` bool.
         parameters: those in force at each push, ``(E, 5)``.
     """
 
-    observations: np.ndarray
-    next_observations: np.ndarray
-    actions: np.ndarray
-    terminals: np.ndarray
     parameters: np.ndarray
-
-    def save(self, path: str | Path) -> None:
-        """Write the log as ``.npz``, without the parameters: a robot does not log those."""
-        columns = ("observations", "next_observations", "actions", "terminals")
-        with open(path, "wb") as stream:  # numpy would append .npz to a path without it
-            np.savez_compressed(stream, **{name: getattr(self, name) for name in columns})
 
 
 def record(
@@ -75,13 +60,8 @@ def record(
     Raises:
         InputError: an unknown variant, parameter or number.
     """
-    if episodes < 1 or steps < 1 or seed < 0:
-        raise InputError(f"episodes {episodes}, steps {steps}, seed {seed}: expected 1 or more, 1 or more, 0 or more")
-    for name in (*(truth or {}), *(spread or {})):
-        if name not in SIM.parameters:
-            raise InputError(f"truth: unknown name {name!r}" + choices(name, SIM.parameters))
-    if variant not in VARIANTS:
-        raise InputError(f"variant: unknown {variant!r}; expected one of {', '.join(VARIANTS)}")
+    check_request(variant, VARIANTS, episodes, steps, seed)
+    check_names("truth", {**(truth or {}), **(spread or {})}, SIM.parameters)
     space = ParameterSpace(SIM.model, SIM.parameters)
     generator = np.random.default_rng(seed)
     mean = space.named(space.nominal) | dict(truth or {})
@@ -91,16 +71,8 @@ def record(
     states, actions = (np.stack(part) for part in zip(*parts, strict=True))
     if variant == "noisy":
         states = _measured(states, generator)
-    terminals = np.zeros((episodes, steps), dtype=bool)
-    terminals[:, -1] = True
-    width = states.shape[-1]
-    return PushLog(
-        observations=states[:, :-1].reshape(-1, width),
-        next_observations=states[:, 1:].reshape(-1, width),
-        actions=actions.reshape(-1, 7),
-        terminals=terminals.reshape(-1),
-        parameters=np.array([[values[name] for name in SIM.parameters] for values in drawn]),
-    )
+    drawn_values = np.array([[values[name] for name in SIM.parameters] for values in drawn])
+    return PushLog(**columns(states, actions), parameters=drawn_values)
 
 
 def _drawn(mean: Mapping[str, float], spread: Mapping[str, float], generator: np.random.Generator) -> dict[str, float]:
@@ -130,16 +102,8 @@ def _episode(model: mujoco.MjModel, push: Push, steps: int) -> tuple[np.ndarray,
     states, actions = [start], []
     for step in range(steps):
         actions.append(pusher.velocities(states[-1][:7], push, step * model.opt.timestep * SIM.frame_skip))
-        states.append(_transition(model, states[-1], actions[-1]))
+        states.append(transition(model, states[-1], actions[-1], SIM.frame_skip))
     return np.stack(states), np.stack(actions)
-
-
-def _transition(model: mujoco.MjModel, state: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """One logged transition from a cold solver: a transition is a function of its state alone."""
-    data = mujoco.MjData(model)
-    data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], action
-    mujoco.mj_step(model, data, nstep=SIM.frame_skip)
-    return np.concatenate([data.qpos, data.qvel])
 
 
 def _measured(states: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -152,21 +116,13 @@ def _measured(states: np.ndarray, generator: np.random.Generator) -> np.ndarray:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Record a log from the command line."""
-    parser = argparse.ArgumentParser(description="Record a log of a simulated arm that pushes a box.")
-    parser.add_argument("path", type=Path, help="the .npz file to write")
-    parser.add_argument("--variant", choices=VARIANTS, default="point")
-    parser.add_argument("--episodes", type=int, default=20)
-    parser.add_argument("--steps", type=int, default=30)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--robot", action="store_true", help="the box of the bundled log instead of the model's")
-    given = parser.parse_args(arguments)
-    truth = SIM.truth if given.robot else None
-    try:
-        log = record(variant=given.variant, episodes=given.episodes, steps=given.steps, seed=given.seed, truth=truth)
-        log.save(given.path)
-    except (InputError, OSError) as error:
-        parser.error(str(error))
-    print(f"{len(log.actions)} transitions in {given.path}")
+
+    def recorded(variant: str, episodes: int, steps: int, seed: int, robot: bool) -> PushLog:
+        truth = SIM.truth if robot else None
+        return record(variant=variant, episodes=episodes, steps=steps, seed=seed, truth=truth)
+
+    about = "a simulated arm that pushes a box"
+    run_recorder(recorded, arguments, what=about, variants=VARIANTS, episodes=20, steps=30)
 
 
 if __name__ == "__main__":

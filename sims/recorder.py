@@ -1,0 +1,99 @@
+"""What the recorders of bundled simulations share: the columns of a log, one transition of it, the command line."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Collection, Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from dropo_torch.errors import InputError, choices
+
+
+@dataclass(frozen=True)
+class Log:
+    """A recorded log.
+
+    Attributes:
+        observations, next_observations: ``(T, n)``.
+        actions: ``(T, m)``.
+        terminals: ``(T,)`` bool.
+    """
+
+    observations: np.ndarray
+    next_observations: np.ndarray
+    actions: np.ndarray
+    terminals: np.ndarray
+
+    def save(self, path: str | Path) -> None:
+        """Write the log as ``.npz``, and nothing that a robot does not log."""
+        columns = ("observations", "next_observations", "actions", "terminals")
+        with open(path, "wb") as stream:  # numpy would append .npz to a path without it
+            np.savez_compressed(stream, **{name: getattr(self, name) for name in columns})
+
+
+def columns(states: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:
+    """Return a log's columns of measured states ``(E, steps + 1, n)`` and actions ``(E, steps, m)``."""
+    terminals = np.zeros(actions.shape[:2], dtype=bool)
+    terminals[:, -1] = True
+    return {
+        "observations": states[:, :-1].reshape(-1, states.shape[-1]),
+        "next_observations": states[:, 1:].reshape(-1, states.shape[-1]),
+        "actions": actions.reshape(-1, actions.shape[-1]),
+        "terminals": terminals.reshape(-1),
+    }
+
+
+def transition(model: mujoco.MjModel, state: np.ndarray, action: np.ndarray, frame_skip: int) -> np.ndarray:
+    """Return the state ``(nq + nv,)`` after one logged step, from a cold solver: it depends on its arguments alone."""
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], action
+    mujoco.mj_step(model, data, nstep=frame_skip)
+    return np.concatenate([data.qpos, data.qvel])
+
+
+def check_request(variant: str, variants: Collection[str], episodes: int, steps: int, seed: int) -> None:
+    """Raise an :class:`InputError` for a log that cannot be recorded."""
+    if episodes < 1 or steps < 1 or seed < 0:
+        raise InputError(f"episodes {episodes}, steps {steps}, seed {seed}: expected 1 or more, 1 or more, 0 or more")
+    if variant not in variants:
+        raise InputError(f"variant: unknown {variant!r}; expected one of {', '.join(variants)}")
+
+
+def check_names(key: str, given: Iterable[str], known: Collection[str]) -> None:
+    """Raise an :class:`InputError` for a parameter that a simulation does not have."""
+    for name in given:
+        if name not in known:
+            raise InputError(f"{key}: unknown name {name!r}" + choices(name, known))
+
+
+def run_recorder(
+    record: Callable[[str, int, int, int, bool], Log], arguments: Sequence[str] | None, *, what: str,
+    variants: Sequence[str], episodes: int, steps: int,
+) -> None:  # fmt: skip
+    """Record a log from the command line.
+
+    Args:
+        record: called with variant, episodes, steps, seed, and whether the bundled log's robot is to be recorded.
+        arguments: those of the command line, by default the process's own.
+        what: what is simulated.
+        variants: kinds of logs.
+        episodes, steps: of a log, by default.
+    """
+    parser = argparse.ArgumentParser(description=f"Record a log of {what}.")
+    parser.add_argument("path", type=Path, help="the .npz file to write")
+    parser.add_argument("--variant", choices=variants, default=variants[0])
+    parser.add_argument("--episodes", type=int, default=episodes)
+    parser.add_argument("--steps", type=int, default=steps)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--robot", action="store_true", help="the robot of the bundled log, not the model as it is")
+    given = parser.parse_args(arguments)
+    try:
+        log = record(given.variant, given.episodes, given.steps, given.seed, given.robot)
+        log.save(given.path)
+    except (InputError, OSError) as error:
+        parser.error(str(error))
+    print(f"{len(log.actions)} transitions in {given.path}")
