@@ -7,14 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from dropo_torch.distribution import DRAWN_STD
 from dropo_torch.report import figures
+from dropo_torch.report.recovery import draw_recovery, panel
+from dropo_torch.studies.recovery import Result, pick
+
+from . import SIM
 
 _COLOURS = {"dropo": "#0072b2", "dropo (noise given)": "#56b4e9", "droid": "#d55e00", "bayessim (mdnn)": "#009e73",
             "bayessim (mdrff)": "#cc79a7"}  # fmt: skip
 _LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31", "#7b8794", "#999933")
-
-Result = dict[str, Any]
 
 
 def label(result: Result) -> str:
@@ -22,11 +23,6 @@ def label(result: Result) -> str:
     cell = result["cell"]
     notes = [cell["features"]] * bool(cell["features"]) + ["noise given"] * cell["knows_noise"]
     return str(cell["method"]) + "".join(f" ({note})" for note in notes)
-
-
-def drawn_std(result: Result, parameter: str) -> float:
-    """Return the standard deviation of a fit's draws: they end two σ from the mean."""
-    return float(DRAWN_STD * result["fit"]["parameters"][parameter]["std"])
 
 
 def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
@@ -40,43 +36,16 @@ def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]])
 
 
 def recovery(results: Sequence[Result]) -> Any:
-    """Draw the fitted normals of the redrawn masses over the realised ones, first seed; points as upright lines."""
-    chosen = [r for r in results if r["cell"]["block"] == "recovery" and r["cell"]["seed"] == 0]
-    names = list(chosen[0]["fit"]["parameters"])
-    figure = figures.new_figure(230 * len(names), 230)
-    for i, name in enumerate(names):
-        axes = _part(figure, i, len(names))
-        truth = chosen[0]["truth"][name]
-        curves = {"realised": (truth["mean"], truth["std"])} | {
-            label(r): (r["fit"]["parameters"][name]["mean"], drawn_std(r, name)) for r in chosen
-        }
-        reach = 3.5 * max(std for _, std in curves.values())
-        for method, (mean, std) in curves.items():
-            x, density = _bell(mean, std, 1e-2 * reach)
-            style = {"color": "#1f2933", "linestyle": "--", "zorder": 3} if method == "realised" else {}
-            axes.plot(x, density, **{"color": _COLOURS.get(method), "linewidth": 1.4, "label": method, **style})
-        centers = [mean for mean, _ in curves.values()]
-        axes.set_xlim(min(centers) - reach, max(centers) + reach)
-        axes.set_yticks([])
-        axes.set_xlabel(f"{name} (kg)")
-    lines, labels = figure.axes[0].get_legend_handles_labels()
-    figure.legend(lines, labels, loc="upper center", ncol=5, frameon=False, fontsize=9)
-    return figure
-
-
-def _bell(mean: float, std: float, narrow: float) -> tuple[np.ndarray, np.ndarray]:
-    """A normal density of height 1, ``(n,)`` each; an upright line where it is narrow."""
-    if std < narrow:
-        return np.full(2, mean), np.array([0.0, 1.0])
-    z = np.linspace(-4, 4, 201)
-    return mean + std * z, np.exp(-0.5 * z**2)
+    """Draw the fitted normals of the redrawn masses over the realised ones, first seed."""
+    chosen = pick(results, "recovery", seed=0)
+    return draw_recovery(chosen, label, _COLOURS, {name: p["unit"] for name, p in SIM.parameters.items()})
 
 
 def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
     """Draw error and mean standard deviation against ε, a line a case, the ε chosen marked."""
     figure = figures.new_figure(920, 320)
     for i, (key, title) in enumerate((("mse", "mean squared error"), ("mean_std", "mean standard deviation (kg)"))):
-        axes = _part(figure, i, 2)
+        axes = panel(figure, i, 2)
         for colour, row in zip(_LINES, rows, strict=False):
             noise = "" if row["noise_variance"] is None else f", ε of {row['stands_for']}"
             words = row["case"] + noise if i == 0 else None
@@ -92,7 +61,7 @@ def sweeps(rows: Sequence[dict[str, Any]]) -> Any:
 def against_noise(rows: Sequence[dict[str, Any]]) -> Any:
     """Draw the ε that is chosen against the noise's variance, a line a kind of noise and of sweep."""
     figure = figures.new_figure(560, 340)
-    axes = _part(figure, 0, 1)
+    axes = panel(figure, 0, 1)
     kinds = list(dict.fromkeys((r["noise_on"], r["stands_for"]) for r in rows))
     for number, (colour, kind) in enumerate(zip(_LINES[:3], kinds, strict=False)):
         own = sorted((r["noise_variance"], r["chosen"]) for r in rows if (r["noise_on"], r["stands_for"]) == kind)
@@ -114,7 +83,7 @@ def sizes(rows: Sequence[dict[str, Any]]) -> Any:
     names = list(dict.fromkeys(r["parameter"] for r in rows))
     figure = figures.new_figure(460 * len(cases), 320)
     for i, case in enumerate(cases):
-        axes = _part(figure, i, len(cases))
+        axes = panel(figure, i, len(cases))
         for shift, (colour, name) in enumerate(zip(_LINES, names, strict=False)):
             own = [r for r in rows if (r["case"], r["parameter"]) == (case, name)]
             x = np.array([r["transitions"] for r in own]) * 1.06**shift
@@ -129,11 +98,3 @@ def sizes(rows: Sequence[dict[str, Any]]) -> Any:
         axes.set_ylabel("error of the mean (%)")
     figure.legend(loc="upper center", ncol=4, frameon=False, fontsize=9)
     return figure
-
-
-def _part(figure: Any, index: int, count: int) -> Any:
-    """Axes of one of several panels side by side."""
-    width = float(figure.get_size_inches()[0]) * 72 / count
-    left = index * width + 52
-    total = float(figure.get_size_inches()[0]) * 72
-    return figures.new_axes(figure, (left, 40, total - left - width + 66, 44))

@@ -2,22 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from dropo_torch.commands.folder import versions
-from dropo_torch.report import write_study_report
-from dropo_torch.report.figures import to_svg
-from dropo_torch.studies.study import SCHEMA, Finding, Section, findings_section, grouped, markdown
+from dropo_torch.report.recovery import write_recovery_study
+from dropo_torch.studies.recovery import (
+    Result,
+    drawn_std,
+    draws,
+    farthest_off,
+    largest_error,
+    mean_error,
+    methods_section,
+    number,
+    pick,
+    recovery_rows,
+    widest,
+)
+from dropo_torch.studies.study import Finding, Section, grouped
 from dropo_torch.studies.sweep import elbow, likeliest
-from dropo_torch.support.files import write_atomically, write_json
 
 from .record import NOISE_VARIANCE
-from .study_figures import Result, draw_all, drawn_std, label
+from .study_figures import draw_all, label
 
 #: A standard deviation below this share of the search box has collapsed to a point; one above the other is wide.
 COLLAPSED, WIDE = 1e-3, 1e-2
@@ -32,7 +42,6 @@ INTRODUCTION = (
 
 def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) -> list[str]:
     """Write ``study.json``, ``tables.md``, ``report.html`` and the figures; return the findings as sentences."""
-    findings = all_findings(results)
     tables = {
         "table": table_rows(results, "table"),
         "recovery": table_rows(results, "recovery"),
@@ -41,51 +50,15 @@ def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) ->
         "size": size_rows(results),
         "cma": cma_rows(results),
     }
-    document = {"schema": SCHEMA, "plan": plan, "findings": [asdict(f) for f in findings], "tables": tables}
-    write_json(out / "study.json", document)
-    page, figures = [findings_section(findings), *sections(tables)], draw_all(results, tables)
-    for name, figure in figures.items():
-        figure.savefig(out / name, dpi=110, facecolor="white", metadata={"Software": None})
-    write_atomically(out / "tables.md", markdown(TITLE, INTRODUCTION, page).encode())
-    write_study_report(
-        out / "report.html",
-        title=TITLE,
-        lead=INTRODUCTION,
-        tables=[(section.title, section.head, section.rows) for section in page],
-        figures={s.title: to_svg(figures[s.figure], s.figure) for s in page if s.figure},
-        versions=versions(),
-    )
-    return [finding.sentence() for finding in findings]
-
-
-def pick(results: Iterable[Result], block: str, **wanted: Any) -> list[Result]:
-    """Return the results of a block whose cells have the wanted entries."""
-    return [r for r in results if r["cell"]["block"] == block and all(r["cell"][key] == v for key, v in wanted.items())]
+    return write_recovery_study(
+        out, title=TITLE, lead=INTRODUCTION, plan=plan, findings=all_findings(results), tables=tables,
+        sections=sections(tables), drawn=draw_all(results, tables), versions=versions(),
+    )  # fmt: skip
 
 
 def table_rows(results: Sequence[Result], block: str) -> list[dict[str, Any]]:
-    """Return one row for each case, parameter and method: means over the seeds, and the range of the means."""
-    rows = []
-    for variant, case in grouped(pick(results, block), lambda r: r["cell"]["variant"]).items():
-        for parameter in case[0]["fit"]["parameters"]:
-            for method, own in grouped(case, label).items():
-                means = np.array([r["fit"]["parameters"][parameter]["mean"] for r in own])
-                truths = np.array([r["truth"][parameter]["mean"] for r in own])
-                rows.append(
-                    {
-                        "case": CASES[variant],
-                        "parameter": parameter,
-                        "method": method,
-                        "truth": float(truths.mean()),
-                        "true_std": float(np.mean([r["truth"][parameter]["std"] for r in own])),
-                        "mean": float(means.mean()),
-                        "std": float(np.mean([drawn_std(r, parameter) for r in own])),
-                        "largest_error_percent": float(100 * np.max(np.abs(means / truths - 1))),
-                        "mse": float(np.mean([r["fit"]["mse"] for r in own])),
-                        "seeds": len(own),
-                    }
-                )
-    return rows
+    """Return the rows of a block's table of methods."""
+    return recovery_rows(pick(results, block), CASES, label)
 
 
 def sweep_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
@@ -154,7 +127,7 @@ def cma_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
         {
             "optimizer": r["fit"]["optimizer"],
             "log_likelihood": r["fit"]["log_likelihood"],
-            "largest_error_percent": 100 * _largest_error(r),
+            "largest_error_percent": 100 * largest_error(r),
             "simulated_per_logged": r["fit"]["simulated_transitions"] / r["transitions"],
             "seconds": r["wall_seconds"],
         }
@@ -165,12 +138,12 @@ def cma_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
 def all_findings(results: Sequence[Result]) -> list[Finding]:
     """Return the paper's qualitative findings, and whether they hold here."""
     point = {m: pick(results, "table", variant="point", method=m) for m in ("dropo", "droid", "bayessim")}
-    error = {m: 100 * max(map(_largest_error, point[m])) for m in ("dropo", "droid")}
-    droid = max(_widest(r) for r in results if r["cell"]["method"] == "droid")
+    error = {m: 100 * max(map(largest_error, point[m])) for m in ("dropo", "droid")}
+    droid = max(widest(r) for r in results if r["cell"]["method"] == "droid")
     unmodeled = pick(results, "table", variant="unmodeled", method="dropo")
-    before, after = (float(np.mean([_widest(r) for r in group])) for group in (point["dropo"], unmodeled))
-    wide = min(_widest(r) for r in results if r["cell"]["method"] == "bayessim")
-    off = max(map(_farthest_off, pick(results, "table", variant="unmodeled", method="bayessim")))
+    before, after = (float(np.mean([widest(r) for r in group])) for group in (point["dropo"], unmodeled))
+    wide = min(widest(r) for r in results if r["cell"]["method"] == "bayessim")
+    off = max(map(farthest_off, pick(results, "table", variant="unmodeled", method="bayessim")))
     found = [
         Finding(
             "DROPO and DROID find the point dynamics",
@@ -216,18 +189,18 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
 def sections(tables: dict[str, list[dict[str, Any]]]) -> list[Section]:
     """Return the tables as people read them."""
     sizes = [
-        [r["case"], str(r["transitions"]), r["parameter"], _number(r["truth"])]
-        + [f"{_number(r[k])} [{_number(r[k + '_low'])}, {_number(r[k + '_high'])}]" for k in ("mean", "std")]
+        [r["case"], str(r["transitions"]), r["parameter"], number(r["truth"])]
+        + [f"{number(r[k])} [{number(r[k + '_low'])}, {number(r[k + '_high'])}]" for k in ("mean", "std")]
         for r in tables["size"]
     ]
     level = min((r["level"] for r in tables["size"]), default=0.0)
     bootstrap = f"mean [{100 * level:.0f} % of bootstrap]"
-    cma = [[v if isinstance(v, str) else _number(v) for v in r.values()] for r in tables["cma"]]
+    cma = [[v if isinstance(v, str) else number(v) for v in r.values()] for r in tables["cma"]]
     return [
-        _methods("Table 1: mean ± std of draws, averaged over seeds", tables["table"], _draws),
-        _methods("Table 1: largest error of a mean, of all seeds (%)", tables["table"], _error),
-        _methods("Recovery of a distribution: mean ± std of draws", tables["recovery"], _draws, "recovery.png"),
-        _methods("Recovery: largest error of a mean, of all seeds (%)", tables["recovery"], _error),
+        methods_section("Table 1: mean ± std of draws, averaged over seeds", tables["table"], draws),
+        methods_section("Table 1: largest error of a mean, of all seeds (%)", tables["table"], mean_error),
+        methods_section("Recovery of a distribution: mean ± std of draws", tables["recovery"], draws, "recovery.png"),
+        methods_section("Recovery: largest error of a mean, of all seeds (%)", tables["recovery"], mean_error),
         _sweeps("Sweeps over ε", tables["sweep"], "sweep.png"),
         _sweeps("ε against the noise", tables["noise"], "noise.png"),
         Section(
@@ -247,53 +220,8 @@ def sections(tables: dict[str, list[dict[str, Any]]]) -> list[Section]:
 def _sweeps(title: str, rows: Sequence[dict[str, Any]], figure: str) -> Section:
     head = ["case", "noise variance", "noise on", "ε stands for", "ε chosen", "ratio"]
     lines = [
-        [r["case"], _number(r["noise_variance"]), r["noise_on"] or "–", r["stands_for"], _number(r["chosen"])]
-        + [_number(r[k]) for k in ("ratio", "caused_variance", "caused_ratio")]
+        [r["case"], number(r["noise_variance"]), r["noise_on"] or "–", r["stands_for"], number(r["chosen"])]
+        + [number(r[k]) for k in ("ratio", "caused_variance", "caused_ratio")]
         for r in rows
     ]
     return Section(title, [*head, "variance it causes in the ends", "ratio"], lines, figure)
-
-
-def _methods(
-    title: str, rows: Sequence[dict[str, Any]], entry: Callable[[dict[str, Any]], str], figure: str = ""
-) -> Section:
-    """Cases and parameters down, methods across."""
-    methods = list(dict.fromkeys(r["method"] for r in rows))
-    lines = []
-    for (case, parameter), group in grouped(rows, lambda r: (r["case"], r["parameter"])).items():
-        own = {r["method"]: entry(r) for r in group}
-        truth = _spread(group[0]["truth"], group[0]["true_std"])
-        lines.append([case, parameter, truth, *(own.get(method, "–") for method in methods)])
-    return Section(title, ["case", "parameter", "truth", *methods], lines, figure)
-
-
-def _draws(row: dict[str, Any]) -> str:
-    return f"{row['mean']:.3f} ± {row['std']:.2g}"
-
-
-def _error(row: dict[str, Any]) -> str:
-    return f"{row['largest_error_percent']:.2g}"
-
-
-def _spread(mean: float, std: float) -> str:
-    return f"{mean:.3f} ± {std:.2g}" if std > 1e-9 else f"{mean:.3f}"  # rounding is no spread
-
-
-def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g}"
-
-
-def _largest_error(result: Result) -> float:
-    """Largest relative error of a mean."""
-    return max(abs(p["mean"] / result["truth"][n]["mean"] - 1) for n, p in result["fit"]["parameters"].items())
-
-
-def _farthest_off(result: Result) -> float:
-    """Largest error of a mean in standard deviations of the draws."""
-    parameters = result["fit"]["parameters"]
-    return max(abs(p["mean"] - result["truth"][n]["mean"]) / drawn_std(result, n) for n, p in parameters.items())
-
-
-def _widest(result: Result) -> float:
-    """Largest standard deviation as a share of its search box."""
-    return max(p["std"] / (p["high"] - p["low"]) for p in result["fit"]["parameters"].values())
