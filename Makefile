@@ -26,7 +26,8 @@ coverage: $(STAMP)
 	$(PYTEST) --cov --cov-report=term-missing
 
 study-reduced: $(STAMP)
-	$(BIN)/dropo reproduce hopper --reduced --out out/study-reduced
+	$(BIN)/dropo reproduce hopper --reduced --out out/study-reduced/hopper
+	$(BIN)/dropo reproduce push --reduced --out out/study-reduced/push
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --durations=20

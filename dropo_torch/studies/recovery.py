@@ -24,8 +24,9 @@ def pick(results: Iterable[Result], block: str, **wanted: Any) -> list[Result]:
 
 
 def drawn_std(result: Result, parameter: str) -> float:
-    """Return the standard deviation of a fit's draws: they end two σ from the mean."""
-    return float(DRAWN_STD * result["fit"]["parameters"][parameter]["std"])
+    """Return the standard deviation of a fit's draws: those of a normal end two σ from its mean."""
+    found = result["fit"]["parameters"][parameter]
+    return float(found["std"] * (DRAWN_STD if found.get("law", "normal") == "normal" else 1.0))
 
 
 def recovery_rows(results: Iterable[Result], cases: Mapping[str, str], label: Callable[[Result], str]) -> list[Row]:
