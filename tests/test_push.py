@@ -11,6 +11,7 @@ import torch
 from dropo_sims.push import SIM
 from dropo_sims.push.policy import START, Push, Pusher
 from dropo_sims.push.record import NOISE, SPREAD, VARIANTS, main, record
+from dropo_sims.push.task import TARGETS, PushTask
 
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
@@ -19,6 +20,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
+from dropo_torch.rl import load_task
 from dropo_torch.simulators import make_simulator
 from dropo_torch.testing import converged
 
@@ -152,3 +154,42 @@ def test_recording_refuses_what_cannot_be(tmp_path: Path, capsys: pytest.Capture
             main(arguments)
         assert stop.value.code == 2
         assert "Traceback" not in capsys.readouterr().err
+
+
+def test_the_task_knows_where_the_tip_and_the_box_are() -> None:
+    task = load_task("push")
+    assert isinstance(task, PushTask)
+    model, generator = task.model, torch.Generator().manual_seed(1)
+    states = task.initial_states(20, generator)
+    states[:, :7] += 0.3 * torch.randn(20, 7, generator=generator, dtype=torch.float64)
+    angles = torch.rand(20, generator=generator, dtype=torch.float64) * 6 - 3
+    states[:, 10], states[:, 13] = (angles / 2).cos(), (angles / 2).sin()
+    seen, data = task.observe(states), mujoco.MjData(model)
+    assert seen.shape == (20, task.num_observations)
+    for state, row, angle in zip(states.numpy(), seen.numpy(), angles.tolist(), strict=True):
+        data.qpos[:], data.qvel[:] = state[:14], state[14:]
+        mujoco.mj_forward(model, data)
+        box = data.body("box").xpos
+        np.testing.assert_allclose(row[14:16], 10 * (np.array(TARGETS[0]) - box[:2]), atol=1e-12)
+        np.testing.assert_allclose(row[16:19], 10 * (box - data.site("tip").xpos), atol=1e-12)
+        np.testing.assert_allclose(row[19:21], [np.sin(angle), np.cos(angle)], atol=1e-12)
+    np.testing.assert_array_equal(
+        task.initial_states(4, torch.Generator().manual_seed(3)),
+        task.initial_states(4, torch.Generator().manual_seed(3)),
+    )
+
+
+@pytest.mark.parametrize("target", range(len(TARGETS)))
+def test_the_reward_is_largest_with_the_box_at_the_target_and_the_arm_at_rest(target: int) -> None:
+    task = PushTask(target=target)
+    states = task.initial_states(3, torch.Generator().manual_seed(0))
+    states[0, 7:9] = torch.tensor(TARGETS[target], dtype=torch.float64)
+    states[1, 7:9] = states[0, 7:9] + torch.tensor([0.03, 0.04], dtype=torch.float64)
+    reward = task.reward(states, torch.zeros(3, 7), states)
+    np.testing.assert_allclose(task.distance(states)[:2], [0, 0.05], atol=1e-12)
+    np.testing.assert_allclose(reward[:2], [-np.log(1e-3), -0.0025 - np.log(0.0035)], rtol=1e-12)
+    assert reward[0] > reward[1] > reward[2]
+    assert (task.reward(states, torch.full((3, 7), 0.5), states) < reward).all()
+    assert not task.terminated(states).any()
+    states[:, 10:14] = torch.tensor([0.7, 0.7, 0.0, 0.0], dtype=torch.float64) / 0.98**0.5
+    assert task.terminated(states).all()

@@ -73,6 +73,10 @@ def test_a_finding_that_does_not_hold_is_told(change: dict[str, dict[str, float]
     assert [i for i, f in enumerate(all_findings(study(**change))) if not f.holds] == [fails]
 
 
+def test_adam_is_left_out_where_there_are_no_gradients() -> None:
+    assert {c.optimizer for c in all_cells(Plan(backend="mujoco"))} == {"fisher", "cma", ""}
+
+
 def test_means_outside_of_the_box_are_named() -> None:
     outside = beyond_box(result(Cell("table", "distribution", "bayessim", 4, features="mdnn"), factor=-4.0))
     assert outside[0] == "mass -2.8 with seed 4"

@@ -20,6 +20,7 @@ SIM = BundledSim(
         "com_y": {"field": "body_ipos", "name": "box", "index": 1, "bounds": [-0.032, 0.032], "unit": "m"},
     },
     log=_HERE / "log.npz",
+    task="dropo_sims.push.task:PushTask",
     study="dropo_sims.push.study:run_study",
     truth={"mass": 0.7, "friction_x": 0.8, "friction_y": 0.6, "com_x": 0.01, "com_y": -0.012},
 )
