@@ -317,6 +317,23 @@ def test_sampled_scores_see_curvature():
     np.testing.assert_allclose(sums[2:6], expected, rtol=1e-6)
 
 
+def test_influences_tell_what_the_likelihood_is_without_a_sample():
+    simulator = LinearSimulator(linear_space(), np.diag(GAINS), transform=lambda v: v + 0.1 * v.square())
+    objective = linear_objective(simulator, spread_data(25) * 1.1, epsilon=1e-2)
+    uniforms = draw_uniforms(60, 2, 0)
+    stage = SampledStage(objective.box, *AWAY, uniforms=uniforms)
+    stage.tell(objective.map(stage.points(), stage.reduction()).total)
+    influences = stage.sums[-60:] - stage.sums[-60:].mean()
+    without = np.array([
+        objective.evaluate(AWAY[0][None], AWAY[1][None], uniforms[np.arange(60) != k])[0].log_likelihood
+        for k in range(60)
+    ])  # fmt: skip
+    jackknife = 59 * (without.mean() - without)
+    assert np.corrcoef(influences, jackknife)[0, 1] > 0.98
+    assert influences.std() == pytest.approx(jackknife.std(), rel=0.1)
+    assert stage.small_gain == pytest.approx(max(0.1, 0.1 * influences.std() / 60**0.5))
+
+
 def test_fisher_information_is_that_of_the_gaussians():
     objective = mixed_objective()
     sums, _ = stage_gradient(lambda m, s: SigmaPointStage(objective.box, m, s), objective, *AWAY)

@@ -67,6 +67,11 @@ class Ascent(abc.ABC):
         """μ and σ of the candidate, ``(d,)`` each."""
         return self.candidate or (self.mean, self.std)
 
+    @property
+    def small_gain(self) -> float:
+        """The gain of a step that is as good as none, in nats."""
+        return self.SMALL_GAIN
+
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one unless it is time to stop.
 
@@ -79,9 +84,9 @@ class Ascent(abc.ABC):
             self.lost, self.log_likelihood, self.sums = lost, value, sums.numpy().copy()
             self.narrows = self.narrows and lost > 0
             self.damping = max(self.damping / 4, 1e-6)
-            self.small_gains = self.small_gains + 1 if gain < self.SMALL_GAIN and not self.narrows else 0
+            self.small_gains = self.small_gains + 1 if gain < self.small_gain and not self.narrows else 0
             if self.small_gains >= 2:
-                self.reason = f"two steps in a row gained less than {self.SMALL_GAIN:g} nat"
+                self.reason = f"two steps in a row gained less than {self.small_gain:.3g} nat"
         elif self.candidate is None:
             self.reason = "no simulation succeeded at the starting point"
         elif not self.narrows:

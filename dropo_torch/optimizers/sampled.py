@@ -32,6 +32,8 @@ class SampledStage(Ascent):
     TITLE = "Fisher scoring on samples"
     BEGUN_AT = 0.7
     SMALL_GAIN = 0.1
+    #: Share of the likelihood's own sampling error that is worth no further step, either.
+    OF_ERROR = 0.1
     MAX_ITERATIONS = 25
 
     def points(self) -> np.ndarray:
@@ -39,16 +41,27 @@ class SampledStage(Ascent):
         return self.box.draw_coordinates(self.uniforms, *map(torch.as_tensor, self.phi)).numpy()
 
     def reduction(self) -> Reduce:
-        """Return the reduction to log-likelihood, losses, scores and Fisher matrices, ``(2 + 2d + 2d²,)``."""
+        """Return the reduction to what :func:`sampled_scores` gives, ``(2 + 2d + 2d² + K,)``."""
         mean, std = self.phi
         z = torch.from_numpy((self.points() - mean) / std)
         return partial(sampled_scores, std=torch.from_numpy(std), z=z)
+
+    @property
+    def small_gain(self) -> float:
+        """The gain of a step that is as good as none: far less than other draws would change."""
+        if self.sums is None:
+            return self.SMALL_GAIN
+        influences = self.sums[-len(self.uniforms) :]
+        return max(self.SMALL_GAIN, self.OF_ERROR * float(influences.std() / len(influences) ** 0.5))
 
 
 def sampled_scores(
     features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, std: torch.Tensor, z: torch.Tensor
 ) -> torch.Tensor:
-    """Return sampled log-likelihood, losses, scores and Fisher information of (μ, log σ), ``(2 + 2d + 2d²,)``.
+    """Return sampled log-likelihood, losses, scores and Fisher information of (μ, log σ), and influences.
+
+    ``(2 + 2d + 2d² + K,)`` together. The influence of a sample is by how much the log-likelihood changes per share of
+    weight that it gains, but for what is common to all samples.
 
     Args:
         features: at the samples, ``(t, K, m)``.
@@ -76,7 +89,10 @@ def sampled_scores(
     v = z.var(0)
     fisher_mean = gram.sum(0) / torch.outer(std, std)
     fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0)
-    return torch.cat([p.flatten() for p in (value, lost, score_mean, score_log, fisher_mean, fisher_log)])
+    distance = (centred * pull).sum(-1)  # (s_k − s̄)ᵀ C⁻¹ (s_k − s̄), (t, K)
+    influence = (along[..., 0] + 0.5 * (along[..., 0].square() - distance)).sum(0)
+    parts = (value, lost, score_mean, score_log, fisher_mean, fisher_log, influence)
+    return torch.cat([p.flatten() for p in parts])
 
 
 def _regress(features: torch.Tensor, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
