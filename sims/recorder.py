@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -53,6 +54,39 @@ def transition(model: mujoco.MjModel, state: np.ndarray, action: np.ndarray, fra
     data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], action
     mujoco.mj_step(model, data, nstep=frame_skip)
     return np.concatenate([data.qpos, data.qvel])
+
+
+def drawn_within(
+    parameters: Mapping[str, Mapping[str, Any]], mean: Mapping[str, float], spread: Mapping[str, float],
+    generator: np.random.Generator,
+) -> dict[str, float]:  # fmt: skip
+    """Return parameters drawn from normals, each within its bounds; those without a spread are as they are."""
+    found = {}
+    for name, value in mean.items():
+        low, high = parameters[name]["bounds"]
+        found[name] = value
+        while spread.get(name):
+            found[name] = value + spread[name] * generator.standard_normal()
+            if low < found[name] < high:
+                break
+    return found
+
+
+def measured(
+    states: np.ndarray, quaternion: slice, noise: tuple[float, float], generator: np.random.Generator
+) -> np.ndarray:
+    """Return states ``(E, steps + 1, n)`` with noise on positions and velocities, and quaternions of length 1.
+
+    Args:
+        states: simulated.
+        quaternion: where a quaternion stands, the last of the positions.
+        noise: standard deviations of positions and of velocities.
+        generator: of the noise.
+    """
+    level = np.where(np.arange(states.shape[-1]) < quaternion.stop, *noise)
+    found = states + level * generator.standard_normal(states.shape)
+    found[..., quaternion] /= np.linalg.norm(found[..., quaternion], axis=-1, keepdims=True)
+    return found
 
 
 def check_request(variant: str, variants: Collection[str], episodes: int, steps: int, seed: int) -> None:

@@ -108,7 +108,7 @@ class FisherOptimizer(LikelihoodOptimizer):
 
     def _means_from(self, point: np.ndarray) -> MeansStage:
         """The stage of the means; where they gain little, σ has to explain what is left, and the scoring moves both."""
-        return MeansStage(self._box.low, self._box.high, point, patience=PATIENCE)
+        return MeansStage(self._box.low, self._box.high, point, robust=True, patience=PATIENCE)
 
     def _after_means(self) -> None:
         """Refit the means around the noise propagated at them until convergence, then go on to σ."""

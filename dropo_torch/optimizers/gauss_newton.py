@@ -11,7 +11,7 @@ import torch
 from scipy.stats import qmc
 
 from dropo_torch.distribution import SearchBox
-from dropo_torch.likelihood import robust_cholesky
+from dropo_torch.likelihood import STUDENT_DOF, robust_cholesky
 from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.least_squares import bounded_step
 
@@ -28,13 +28,15 @@ STARTS = 16
 
 @dataclass
 class MeansStage:
-    """Minimises Σ rᵀC⁻¹r over μ inside its box.
+    """Minimises Σ rᵀC⁻¹r over μ inside its box, or a robust sum, by which no transition counts for all others.
 
     Attributes:
         low, high: the box of μ in coordinates, ``(d,)``.
         point: the best μ so far, ``(d,)``.
         shape: transitions and columns of the log, where the residuals' own size is to tell when μ is good enough;
             by default C tells.
+        robust: whether the log-density is Student's t: beside a few transitions with an impact, which a wrong μ misses
+            by orders of magnitude, the many smooth ones that lead to the right one would not count.
         patience: iterations after which it ends, if they have not made the cost notably smaller.
         cost: ½ Σ rᵀC⁻¹r at ``point``, over the transitions that do not diverge there.
         lost: how many do; no cost outweighs one.
@@ -47,6 +49,7 @@ class MeansStage:
     high: np.ndarray
     point: np.ndarray
     shape: tuple[int, int] | None = None
+    robust: bool = False
     patience: int = MAX_ITERATIONS
     damping: float = 1e-3
     cost: float = np.inf
@@ -68,7 +71,7 @@ class MeansStage:
 
     def reduction(self) -> Reduce:
         """Return the reduction to cost, losses, normal equations and moments, ``(2 + 2d + 2d²,)``."""
-        return partial(normal_equations, steps=torch.from_numpy(self.steps))
+        return partial(normal_equations, steps=torch.from_numpy(self.steps), robust=self.robust)
 
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one.
@@ -166,9 +169,11 @@ class MeansStage:
 
 
 def normal_equations(
-    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor
+    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor, robust: bool = False
 ) -> torch.Tensor:
     """Return cost, gradient and Gauss-Newton matrix of ½ Σ rᵀC⁻¹r, and two moments for σ, ``(2 + 2d + 2d²,)``.
+
+    The robust cost is ½ (ν + m) Σ log(1 + rᵀC⁻¹r / ν), whose matrix is that of the reweighted squares.
 
     The order is cost, transitions lost, gradient, Σ (JᵀC⁻¹r)² − diag JᵀC⁻¹J, Gauss-Newton matrix, Σ (JᵀC⁻¹J)².
 
@@ -177,6 +182,7 @@ def normal_equations(
         measured: ``(t, m)``.
         covariance: ``(t, m, m)``.
         steps: ``(d,)``.
+        robust: whether the cost is the robust one.
     """
     base, moved = features[:, 0], features[:, 1:]
     alive = torch.isfinite(base).all(-1)
@@ -187,12 +193,17 @@ def normal_equations(
     factor = robust_cholesky(covariance)
     both = torch.cat([residual[..., None], jacobian.mT], -1)
     white = torch.linalg.solve_triangular(factor, both, upper=False)  # (t, m, 1 + d)
+    chi2 = white[..., 0].square().sum(-1)
+    cost = 0.5 * chi2.sum()
+    if robust:
+        freedom = STUDENT_DOF + white.shape[1]
+        cost = 0.5 * freedom * torch.log1p(chi2 / STUDENT_DOF).sum()
+        white = white * (freedom / (STUDENT_DOF + chi2)).sqrt()[:, None, None]
     r, jac = white[..., 0], white[..., 1:]
     gradient = -(jac * r[..., None]).sum((0, 1))
     flat = jac.flatten(0, 1)
     gram = jac.mT @ jac
     pulled = (jac.mT @ r[..., None])[..., 0]
     excess = (pulled.square() - torch.diagonal(gram, dim1=-2, dim2=-1)).sum(0)
-    cost = 0.5 * r.square().sum()
     parts = (cost, lost, gradient, excess, flat.T @ flat, gram.square().sum(0))
     return torch.cat([part.flatten() for part in parts])

@@ -46,8 +46,14 @@ class SigmaPointStage(Ascent):
         return partial(scores, std=torch.from_numpy(std), reach=reach, moments=moments)
 
     def tell(self, sums: torch.Tensor) -> None:
-        """Accept or reject the candidate, and propose the next one where it promises to gain anything."""
+        """Accept or reject the candidate, and propose the next one where it promises to gain anything.
+
+        Where a step is no good because the simulation bends, a shorter one is no cure.
+        """
+        best = self.sums
         super().tell(sums)
+        if self.reason is None and best is not None and self.sums is best and not self.narrows and self.bends:
+            self.reason = "the simulation bends too much for sigma points"
         if self.reason is None and self.sums is not None and not self.narrows:
             mean, std = self.phi
             move = np.concatenate([mean - self.mean, np.log(std / self.std)])
@@ -57,8 +63,12 @@ class SigmaPointStage(Ascent):
     @property
     def misleads(self) -> bool:
         """Whether sigma points are no good description of the simulation at this φ: it bends too much within it."""
-        bending = 0.0 if self.sums is None else float(self.sums[-1])
-        return self.log_likelihood > -np.inf and (bending > MUCH_BENDING or self.damping > MAX_DAMPING)
+        return self.log_likelihood > -np.inf and (self.bends or self.damping > MAX_DAMPING)
+
+    @property
+    def bends(self) -> bool:
+        """Whether curvature within the best φ counts."""
+        return self.sums is not None and float(self.sums[-1]) > MUCH_BENDING
 
     def _reach(self, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """How far the sigma points lie above and below μ: σ, less at a physical limit, ``(d,)`` each."""

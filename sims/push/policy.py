@@ -7,10 +7,12 @@ from dataclasses import dataclass
 import mujoco
 import numpy as np
 
+from ..reaching import Reach
+
 #: Joints at which the rod stands upright before the box, its tip at (0.43, 0, 0.03) m.
 START = np.array([0.0, 0.2010, 0.0, -2.6236, 0.0, 2.8247, 0.0])
-#: Proportional gain on height, heading and uprightness, 1/s; damping of the inverse, and the fastest joint, rad/s.
-GAIN, DAMPING, FASTEST = 5.0, 1e-3, 1.5
+#: Proportional gain on height, line and uprightness, 1/s, and the fastest joint, rad/s.
+GAIN, FASTEST = 5.0, 1.5
 
 
 @dataclass(frozen=True)
@@ -40,8 +42,7 @@ class Pusher:
     """
 
     def __init__(self, model: mujoco.MjModel) -> None:
-        self._model, self._data = model, mujoco.MjData(model)
-        self._tip = model.site("tip").id
+        self._reach = Reach(model, fastest=FASTEST, gain=GAIN)
 
     def start(self, push: Push) -> np.ndarray:
         """Return joint positions ``(7,)`` with the tip on the line of a push, before the box, rad."""
@@ -52,24 +53,9 @@ class Pusher:
 
     def velocities(self, qpos: np.ndarray, push: Push, time: float) -> np.ndarray:
         """Return joint velocities ``(7,)`` at joint positions ``(7,)`` and a time since the push began, rad/s."""
-        model, data = self._model, self._data
-        data.qpos[:7] = qpos
-        mujoco.mj_kinematics(model, data)
-        mujoco.mj_comPos(model, data)
-        linear, angular = np.zeros((3, model.nv)), np.zeros((3, model.nv))
-        mujoco.mj_jacSite(model, data, linear, angular, self._tip)
-        jacobian = np.concatenate([linear, angular])[:, :7]
-        inverse = jacobian.T @ np.linalg.inv(jacobian @ jacobian.T + DAMPING * np.eye(6))
-        found = inverse @ self._twist(push, time)
-        return found / max(1.0, np.abs(found).max() / FASTEST)
-
-    def _twist(self, push: Push, time: float) -> np.ndarray:
-        """The tip's velocity that is wanted: along the line, back onto it, and upright, ``(6,)``."""
-        tip, turn = self._data.site_xpos[self._tip], self._data.site_xmat[self._tip].reshape(3, 3)
+        tip = self._reach.tip(qpos)
         along, across = (np.array([np.cos(a), np.sin(a), 0.0]) for a in (push.heading, push.heading + np.pi / 2))
         off = (tip - np.array([0.46, push.side, 0.0])) @ across
         velocity = push.speed * min(1.0, time / push.ramp) * along - GAIN * off * across
         velocity[2] = GAIN * (push.height - tip[2])
-        upright = np.cross(turn[:, 2], [0.0, 0.0, -1.0])
-        ahead = np.cross(turn[:, 0], [1.0, 0.0, 0.0])
-        return np.concatenate([velocity, GAIN * (upright + ahead * [0.0, 0.0, 1.0])])
+        return self._reach.velocities(qpos, velocity)

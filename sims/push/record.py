@@ -17,7 +17,7 @@ import numpy as np
 
 from dropo_torch.parameters import ParameterSpace
 
-from ..recorder import Log, check_names, check_request, columns, run_recorder, transition
+from ..recorder import Log, check_names, check_request, columns, drawn_within, measured, run_recorder, transition
 from . import SIM
 from .policy import Push, Pusher
 
@@ -66,26 +66,13 @@ def record(
     generator = np.random.default_rng(seed)
     mean = space.named(space.nominal) | dict(truth or {})
     widths = dict(SPREAD if spread is None else spread) if variant == "distribution" else {}
-    drawn = [_drawn(mean, widths, generator) for _ in range(episodes)]
+    drawn = [drawn_within(SIM.parameters, mean, widths, generator) for _ in range(episodes)]
     parts = [_episode(space.apply(values), _push(generator), steps) for values in drawn]
     states, actions = (np.stack(part) for part in zip(*parts, strict=True))
     if variant == "noisy":
-        states = _measured(states, generator)
+        states = measured(states, QUATERNION, NOISE, generator)
     drawn_values = np.array([[values[name] for name in SIM.parameters] for values in drawn])
     return PushLog(**columns(states, actions), parameters=drawn_values)
-
-
-def _drawn(mean: Mapping[str, float], spread: Mapping[str, float], generator: np.random.Generator) -> dict[str, float]:
-    """Parameters of a push, within their bounds."""
-    found = {}
-    for name, value in mean.items():
-        low, high = SIM.parameters[name]["bounds"]
-        found[name] = value
-        while spread.get(name):
-            found[name] = value + spread[name] * generator.standard_normal()
-            if low < found[name] < high:
-                break
-    return found
 
 
 def _push(generator: np.random.Generator) -> Push:
@@ -104,14 +91,6 @@ def _episode(model: mujoco.MjModel, push: Push, steps: int) -> tuple[np.ndarray,
         actions.append(pusher.velocities(states[-1][:7], push, step * model.opt.timestep * SIM.frame_skip))
         states.append(transition(model, states[-1], actions[-1], SIM.frame_skip))
     return np.stack(states), np.stack(actions)
-
-
-def _measured(states: np.ndarray, generator: np.random.Generator) -> np.ndarray:
-    """States with noise, their quaternions of length 1."""
-    level = np.where(np.arange(states.shape[-1]) < QUATERNION.stop, *NOISE)
-    found = states + level * generator.standard_normal(states.shape)
-    found[..., QUATERNION] /= np.linalg.norm(found[..., QUATERNION], axis=-1, keepdims=True)
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -1,24 +1,28 @@
-"""What the study of pushes makes of cells whose results are known."""
+"""What the studies of arms that manipulate make of cells whose results are known."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from dropo_sims.push import SIM
-from dropo_sims.push.record import record
-from dropo_sims.push.study import REDUCED, TRUTH, Cell, Plan, _document, all_cells, identifiability, realised
-from dropo_sims.push.study_tables import all_findings, beyond_box, label, optimizer_rows, sections, write_results
+from dropo_sims.manipulation import Cell, all_cells, config_of, identifiability, realised
+from dropo_sims.manipulation_tables import all_findings, beyond_box, label, optimizer_rows, sections, write_results
+from dropo_sims.puck.study import STUDY as PUCK
+from dropo_sims.push.study import STUDY as PUSH
 
 from dropo_torch.baselines import make_search
 from dropo_torch.config import make_config
 from dropo_torch.distribution import DRAWN_STD
+from dropo_torch.models.bundled import bundled_study
 from dropo_torch.problem import make_problem
 from dropo_torch.studies.recovery import pick, recovery_rows
 
+STUDIES = {"push": PUSH, "puck": PUCK}
+each = pytest.mark.parametrize("name", STUDIES)
+TRUTH, PARAMETERS = PUSH.truth, PUSH.about.sim.parameters
 STD = 0.1
 
 
@@ -27,7 +31,7 @@ def result(cell: Cell, factor: float = 1.0, width: float = 1.0) -> dict[str, Any
     varies = cell.variant == "distribution"
     found = {}
     for name, value in TRUTH.items():
-        low, high = SIM.parameters[name]["bounds"]
+        low, high = PARAMETERS[name]["bounds"]
         found[name] = {"mean": factor * value, "std": width * STD * value / DRAWN_STD, "low": low, "high": high}
     fit = {"parameters": found, "mse": 1e-6, "optimizer": cell.optimizer, "log_likelihood": 12.34}
     return {
@@ -43,7 +47,7 @@ def study(**changes: dict[str, float]) -> list[dict[str, Any]]:
          "correlation": 0.5} for n in TRUTH
     ]  # fmt: skip
     found: list[dict[str, Any]] = []
-    for cell in all_cells(Plan(seeds=2)):
+    for cell in all_cells(replace(PUSH.plan, seeds=2)):
         usual = {"width": 1e-6} if cell.method == "droid" else {}
         change = changes.get(f"{cell.method}_{cell.variant}", usual)
         found.append(
@@ -74,7 +78,7 @@ def test_a_finding_that_does_not_hold_is_told(change: dict[str, dict[str, float]
 
 
 def test_adam_is_left_out_where_there_are_no_gradients() -> None:
-    assert {c.optimizer for c in all_cells(Plan(backend="mujoco"))} == {"fisher", "cma", ""}
+    assert {c.optimizer for c in all_cells(replace(PUSH.plan, backend="mujoco"))} == {"fisher", "cma", ""}
 
 
 def test_means_outside_of_the_box_are_named() -> None:
@@ -85,8 +89,8 @@ def test_means_outside_of_the_box_are_named() -> None:
 
 
 def test_the_page_has_every_method_and_the_papers_numbers(tmp_path: Path) -> None:
-    plan = Plan(seeds=2)
-    sentences = write_results(tmp_path, study(), asdict(plan))
+    plan = replace(PUSH.plan, seeds=2)
+    sentences = write_results(tmp_path, PUSH.about, study(), asdict(plan))
     assert all(sentence.startswith("holds: ") for sentence in sentences)
     page = (tmp_path / "tables.md").read_text()
     for words in ("dropo (fisher)", "bayessim (mdrff)", "simopt", "udr", "0.788 ± 0.11", "one box", "12.3"):
@@ -103,22 +107,37 @@ def test_widths_are_judged_only_where_something_varies() -> None:
     ]
     np.testing.assert_allclose(errors, 0, atol=1e-9)
     assert optimizer_rows(study())[0]["simulated_per_logged"] == 7
-    assert len(sections({"table": rows, "paper": [], "optimizers": [], "identify": []})) == 6
+    assert len(sections({"table": rows, "paper": [], "optimizers": [], "identify": []}, [])) == 6
 
 
-@pytest.mark.parametrize("cell", all_cells(REDUCED), ids=lambda cell: cell.name)
-def test_every_cell_has_a_config_that_is_understood(cell: Cell, tmp_path: Path) -> None:
+@each
+def test_it_is_found_by_name_and_every_size_is_one_of_its_logs(name: str) -> None:
+    study = STUDIES[name]
+    assert bundled_study(name) == study.run
+    assert set(study.truth) == set(study.about.sim.parameters)
+    assert study.about.sim.name == name
+    for plan in (study.plan, study.reduced):
+        assert plan.small_episodes <= plan.episodes
+        assert plan.horizon <= plan.steps
+    for values in study.about.published.values():
+        assert len(values) <= len(study.truth)
+
+
+@each
+@pytest.mark.parametrize("cell", all_cells(replace(PUSH.reduced, seeds=1)), ids=lambda cell: cell.name)
+def test_every_cell_has_a_config_that_is_understood(name: str, cell: Cell, tmp_path: Path) -> None:
     pytest.importorskip("sbi")
-    path = tmp_path / "log.npz"
-    log = record(variant=cell.variant, episodes=2, steps=12, truth=TRUTH)
+    study, path = STUDIES[name], tmp_path / "log.npz"
+    log = study.record(variant=cell.variant, episodes=2, steps=study.reduced.steps, truth=study.truth)
     log.save(path)
-    assert {name: value["mean"] for name, value in realised(log).items()} == pytest.approx(
-        dict(zip(TRUTH, log.parameters.mean(0), strict=True))
+    assert {n: value["mean"] for n, value in realised(log.parameters, study).items()} == pytest.approx(
+        dict(zip(study.truth, log.parameters.mean(0), strict=True))
     )
-    problem = make_problem(make_config({**_document(cell, REDUCED), "data": str(path), "backend": "mujoco"}))
-    if cell.optimizer != "adam":
+    document = config_of(cell, study, replace(study.reduced, backend="mujoco"))
+    problem = make_problem(make_config({**document, "data": str(path)}))
+    if cell.optimizer != "adam":  # which needs gradients
         make_search(problem)
     if cell.block == "identify":
-        rows = identifiability(problem)
-        assert [row["parameter"] for row in rows] == list(TRUTH)
+        rows = identifiability(problem, study)
+        assert [row["parameter"] for row in rows] == list(study.truth)
         assert all(row["standard_error"] > 0 and row["correlated_with"] != row["parameter"] for row in rows)

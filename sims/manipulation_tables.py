@@ -1,14 +1,17 @@
-"""What the cells of the study of pushes say together: tables, findings, a figure."""
+"""What the cells of a study of an arm that manipulates say together: tables, findings, a figure."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from dropo_torch.commands.folder import versions
+from dropo_torch.models.bundled import BundledSim
 from dropo_torch.report.recovery import draw_recovery, write_recovery_study
 from dropo_torch.studies.recovery import (
+    STEADY,
     Result,
     Row,
     draws,
@@ -23,21 +26,29 @@ from dropo_torch.studies.recovery import (
 )
 from dropo_torch.studies.study import Finding, Section
 
-from . import SIM
+#: Names of the columns of a study's table from the paper, mean and standard deviation of each parameter.
+Published = Mapping[str, Sequence[tuple[float, float]]]
 
-TITLE = "The paper's pushed box, in simulation"
-INTRODUCTION = (
-    "Written by dropo reproduce push. Arm, controller, pushes and logs are this project's: compare with the paper in "
-    "kind, not digit by digit."
-)
-CASES = {"point": "one box", "distribution": "box redrawn for every push"}
-#: The paper's own table: mean and standard deviation of mass, friction along x and y, center of mass along x and y.
-PAPER = {
-    "truth": ((0.7, 0.3), (0.8, 0.2), (0.8, 0.2), (0.01, 0.001), (0.01, 0.001)),
-    "DROPO": ((0.788, 0.108), (0.603, 0.033), (0.683, 0.18), (0.015, 0.001), (0.009, 0.003)),
-    "DROID": ((0.774, 3.1e-11), (0.737, 1.3e-10), (0.716, 1.2e-11), (0.014, 7.6e-11), (0.011, 2.4e-11)),
-    "BayesSim": ((0.703, 0.269), (0.894, 0.224), (0.840, 0.257), (-0.011, 0.309), (0.004, 0.234)),
-}
+
+@dataclass(frozen=True)
+class About:
+    """What the pages of a study say.
+
+    Attributes:
+        sim: the simulation.
+        title: of the page.
+        lead: what the study is.
+        cases: what the variants of its logs are called.
+        published: the paper's own table, for the first parameters of the simulation.
+    """
+
+    sim: BundledSim
+    title: str
+    lead: str
+    cases: Mapping[str, str]
+    published: Published
+
+
 #: A standard deviation below this share of the search box has collapsed to a point.
 COLLAPSED = 1e-3
 #: What identifies a distribution: its means within this share, its standard deviations within that.
@@ -55,21 +66,28 @@ def label(result: Result) -> str:
     return f"{cell['method']} ({kind})" if kind else str(cell["method"])
 
 
-def write_results(out: Path, results: Sequence[Result], plan: dict[str, Any]) -> list[str]:
+def write_results(out: Path, about: About, results: Sequence[Result], plan: dict[str, Any]) -> list[str]:
     """Write ``study.json``, ``tables.md``, ``report.html`` and the figure; return the findings as sentences."""
     tables = {
-        "table": recovery_rows(pick(results, "table"), CASES, label),
-        "paper": [{"source": name, "values": values} for name, values in PAPER.items()],
+        "table": recovery_rows(pick(results, "table"), about.cases, label),
+        "paper": [{"source": name, "values": values} for name, values in about.published.items()],
         "optimizers": optimizer_rows(results),
         "identify": pick(results, "identify")[0]["identifiability"],
     }
-    units = {name: str(p.get("unit", "")) for name, p in SIM.parameters.items()}
-    chosen = [r for r in pick(results, "table", variant="distribution", seed=0) if label(r) in _COLOURS]
+    units = {name: str(p.get("unit", "")) for name, p in about.sim.parameters.items()}
+    chosen = [varying(r) for r in pick(results, "table", variant="distribution", seed=0)]
+    figure, page = draw_recovery(chosen, label, _COLOURS, units), sections(tables, list(about.sim.parameters))
     return write_recovery_study(
-        out, title=TITLE, lead=INTRODUCTION, plan=plan, findings=all_findings(results), tables=tables,
-        sections=sections(tables), drawn={"recovery.png": draw_recovery(chosen, label, _COLOURS, units)},
-        versions=versions(),
+        out, title=about.title, lead=about.lead, plan=plan, findings=all_findings(results), tables=tables,
+        sections=page, drawn={"recovery.png": figure}, versions=versions(),
     )  # fmt: skip
+
+
+def varying(result: Result) -> Result:
+    """Return a result with the parameters that vary alone."""
+    names = [name for name, true in result["truth"].items() if true["std"] > STEADY]
+    found = result["fit"]["parameters"]
+    return {**result, "fit": {**result["fit"], "parameters": {name: found[name] for name in names}}}
 
 
 def optimizer_rows(results: Sequence[Result]) -> list[dict[str, Any]]:
@@ -97,19 +115,19 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
     outside = [offset for r in of("bayessim") for offset in beyond_box(r)]
     return [
         Finding(
-            "DROPO and DROID find one box",
+            "DROPO and DROID find one object",
             max(point.values()) < 2,
             f"largest error of a mean {point['dropo']:.2g} % and {point['droid']:.2g} %",
         ),
         Finding(
-            "DROPO recovers the means of a box that is redrawn",
+            "DROPO recovers the means of an object that is redrawn",
             max(means.values()) < MEANS,
-            "; ".join(f"{name} {100 * error:.2g} % off" for name, error in means.items()),
+            worst(means),
         ),
         Finding(
             "DROPO recovers its standard deviations",
             max(widths.values()) < WIDTHS,
-            "; ".join(f"{name} {100 * error:.2g} % off" for name, error in widths.items()),
+            worst(widths),
         ),
         Finding(
             "DROID's standard deviations collapse",
@@ -126,9 +144,15 @@ def all_findings(results: Sequence[Result]) -> list[Finding]:
 
 def errors(results: Sequence[Result], key: str) -> dict[str, float]:
     """Return the largest relative error of each parameter's drawn mean or standard deviation, of all seeds."""
-    rows = recovery_rows(results, CASES, label)
+    rows = recovery_rows(results, {"distribution": ""}, label)
     name = {"mean": "largest_error_percent", "std": "largest_std_error_percent"}[key]
-    return {row["parameter"]: row[name] / 100 for row in rows}
+    return {row["parameter"]: row[name] / 100 for row in rows if name in row}
+
+
+def worst(found: Mapping[str, float], count: int = 5) -> str:
+    """Return the largest errors in words."""
+    largest = sorted(found.items(), key=lambda item: -item[1])[:count]
+    return "; ".join(f"{name} {100 * error:.2g} % off" for name, error in largest)
 
 
 def beyond_box(result: Result) -> list[str]:
@@ -140,14 +164,14 @@ def beyond_box(result: Result) -> list[str]:
     ]
 
 
-def sections(tables: dict[str, Any]) -> list[Section]:
+def sections(tables: dict[str, Any], names: Sequence[str]) -> list[Section]:
     """Return the tables as people read them."""
     table: list[Row] = tables["table"]
     varied = [row for row in table if "largest_std_error_percent" in row]
     paper = {row["source"]: row["values"] for row in tables["paper"]}
     lines = [
         [name, *(f"{mean:.3g} ± {std:.2g}" for mean, std in (values[i] for values in paper.values()))]
-        for i, name in enumerate(SIM.parameters)
+        for i, name in enumerate(names[: min(map(len, paper.values()), default=0)])
     ]
     identified = [
         [r["parameter"], number(r["standard_error"]), f"{r['share_of_box_percent']:.2g}", r["correlated_with"]]
@@ -160,7 +184,7 @@ def sections(tables: dict[str, Any]) -> list[Section]:
     ]
     return [
         methods_section("Mean ± std of draws, averaged over seeds", table, draws, "recovery.png"),
-        Section("The same in the paper, with its arm and pushes", ["parameter", *paper], lines),
+        Section("The same in the paper, with its arm and its motions", ["parameter", *paper], lines),
         methods_section("Largest error of a mean, of all seeds (%)", table, mean_error),
         methods_section("Largest error of a standard deviation, of all seeds (%)", varied, std_error),
         Section(

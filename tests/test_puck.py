@@ -1,0 +1,71 @@
+"""The bundled arm that hits a puck: hits that are what they say, and eighteen parameters that are found."""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+import pytest
+from dropo_sims.puck import SIM
+from dropo_sims.puck.policy import FASTEST, HEIGHT, HOME, PUCK, STEP, Hit, hit_targets
+from dropo_sims.puck.record import record
+
+from dropo_torch.baselines import fit_problem
+from dropo_torch.config import make_config
+from dropo_torch.parameters import ParameterSpace
+from dropo_torch.problem import make_problem
+
+
+def model_of(**values: float) -> mujoco.MjModel:
+    space = ParameterSpace(SIM.model, SIM.parameters)
+    return space.apply(space.named(space.nominal) | values)
+
+
+@pytest.mark.parametrize(("axis", "name"), [(0, "friction_x"), (1, "friction_y")])
+def test_friction_along_an_axis_stops_what_slides_along_it(axis: int, name: str) -> None:
+    other = {"friction_x": "friction_y", "friction_y": "friction_x"}[name]
+    model = model_of(**{name: 0.3, other: 0.7})
+    data = mujoco.MjData(model)
+    data.qpos[:7], data.qpos[7], data.qvel[7 + axis], data.ctrl[:] = HOME, 1.2, 1.0, HOME
+    speeds = []
+    for _ in range(250):
+        mujoco.mj_step(model, data)
+        speeds.append(data.qvel[7 + axis])
+    slowed = (speeds[50] - speeds[200]) / (150 * model.opt.timestep)
+    assert slowed == pytest.approx(0.3 * 9.81, rel=0.06)
+
+
+def test_the_stick_strikes_along_its_line_and_returns() -> None:
+    model, hit = model_of(), Hit(heading=0.2, side=0.01, speed=0.6)
+    targets, data = hit_targets(model, hit, 750), mujoco.MjData(model)
+    assert np.abs(np.diff(targets, axis=0)).max() <= FASTEST * STEP * (1 + 1e-9)
+    np.testing.assert_allclose(targets[-1], HOME, atol=0.15)  # of many poses with this tip
+    places = []
+    for target in targets:
+        data.qpos[:7] = target
+        mujoco.mj_kinematics(model, data)
+        places.append(data.site("tip").xpos.copy())
+        assert data.site("tip").xmat[8] < -0.999
+    path = np.array(places)
+    near = path[np.abs(path[:, :2] - PUCK).max(1) < 0.06]
+    across = (near[:, :2] - PUCK) @ [-np.sin(0.2), np.cos(0.2)]
+    np.testing.assert_allclose(across, 0.01, atol=4e-3)
+    np.testing.assert_allclose(near[:, 2], HEIGHT, atol=3e-3)
+    np.testing.assert_allclose(path[-1], path[0], atol=2e-3)
+
+
+def test_a_hit_sends_the_puck_along_its_heading() -> None:
+    log = record(episodes=6, steps=400, seed=3, truth=SIM.truth)
+    states = log.observations.reshape(6, 400, 27)
+    way = states[:, -1, 7:9] - states[:, 0, 7:9]
+    assert (np.linalg.norm(way, axis=1) > 0.05).all()
+    assert (way[:, 0] > 0).all()
+    assert np.linalg.norm(states[:, -1, 21:24], axis=1).max() < 1e-2  # it has come to rest
+    assert states[:, :, 9].max() < 0.0132  # and has never left the board
+
+
+def test_puck_and_servos_are_found() -> None:
+    pytest.importorskip("warp")
+    config = make_config({"sim": "puck", "backend": "warp", "epsilon": 1e-8, "trajectories": [0]})
+    result = fit_problem(make_problem(config))
+    for name, mean in zip(SIM.parameters, result.distribution.mean, strict=True):
+        assert float(mean) == pytest.approx(SIM.truth[name], rel=1e-3), name
