@@ -62,7 +62,7 @@ class Plan:
     simopt_iterations: int = 15
     horizon: int = 30
     small_samples: int = 50
-    cma_budget: int = 1500
+    cma_budget: int = 150
     adam_steps: int = 200
     backend: Literal["mujoco", "warp"] = "warp"
 
