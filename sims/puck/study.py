@@ -26,7 +26,9 @@ STUDY = Study(
     ),
     record=record,
     truth=SIM.truth,
-    plan=Plan(seeds=3, episodes=5, steps=750, small_episodes=1, horizon=50, droid_budget=400, simulations=300, cma_budget=80),
+    plan=Plan(
+        seeds=3, episodes=5, steps=750, small_episodes=1, horizon=50, droid_budget=400, simulations=300, cma_budget=80
+    ),
     reduced=Plan(
         seeds=1, episodes=2, steps=260, samples=40, droid_budget=60, simulations=40, simopt_samples=8,
         simopt_iterations=2, horizon=10, small_episodes=1, small_samples=20, cma_budget=20, adam_steps=10,
