@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
+import torch
 from dropo_sims.puck import SIM
+from dropo_sims.puck.generator import LATENT, STEPS, load_decoder, scripted_hits, train_decoder
 from dropo_sims.puck.policy import FASTEST, HEIGHT, HOME, PUCK, STEP, Hit, hit_targets
 from dropo_sims.puck.record import record
+from dropo_sims.puck.task import TARGET, PuckTask
+from safetensors.torch import save_file
 
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
+from dropo_torch.rl import RandomizedEnv, load_task
 
 
 def model_of(**values: float) -> mujoco.MjModel:
@@ -71,3 +78,49 @@ def test_puck_and_servos_are_found() -> None:
     result = fit_problem(make_problem(config))
     for name, mean in zip(SIM.parameters, result.distribution.mean, strict=True):
         assert float(mean) == pytest.approx(SIM.truth[name], rel=1e-3), name
+
+
+def test_the_generator_makes_hits_within_the_arms_limits() -> None:
+    decoder = load_decoder()
+    corners = torch.cartesian_prod(*[torch.tensor([-2.0, 0.0, 2.0])] * LATENT)
+    motions = decoder(corners).double()
+    assert motions.shape == (27, STEPS, 7)
+    speeds = motions.diff(dim=1).abs().amax((0, 1)) / STEP
+    assert (speeds < torch.tensor([110, 110, 128, 128, 204, 184, 184]) * np.pi / 180).all()
+    model = model_of()
+    limits = torch.from_numpy(model.jnt_range[:7])
+    assert ((motions > limits[:, 0]) & (motions < limits[:, 1])).all()
+    np.testing.assert_allclose(motions[:, 0], np.tile(HOME, (27, 1)), atol=0.02)
+
+
+def test_a_generator_is_trained_from_hits(tmp_path: Path) -> None:
+    hits = scripted_hits(6, seed=1)
+    assert not torch.equal(hits, scripted_hits(6, seed=2))
+    first, error = train_decoder(hits, epochs=200, seed=4)
+    again, _ = train_decoder(hits, epochs=200, seed=4)
+    z = torch.zeros(1, LATENT)
+    torch.testing.assert_close(first(z), again(z), rtol=0, atol=0)
+    assert error < 0.01
+    save_file(first.state_dict(), str(tmp_path / "own.safetensors"))
+    torch.testing.assert_close(load_decoder(tmp_path / "own.safetensors")(z), first(z), rtol=0, atol=0)
+
+
+def test_an_action_is_a_whole_hit() -> None:
+    """An environment's step is the same as its motion's targets, one after the other."""
+    task = load_task("puck")
+    assert isinstance(task, PuckTask)
+    env = RandomizedEnv(task, 2, seed=1)
+    before = env.reset()
+    action = torch.tensor([[0.3, -1.0, 0.5], [-0.5, 0.2, 1.0]])
+    start = env.states
+    after = env.step(before.set("action", action))["next"]
+    targets, data = task.controls(action.double()), mujoco.MjData(task.model)
+    data.qpos[:], data.qvel[:] = np.split(start[1].numpy(), [14])
+    for target in targets[1].numpy():
+        data.ctrl[:] = target
+        mujoco.mj_step(task.model, data, SIM.frame_skip)
+    np.testing.assert_allclose(env.states[1], np.concatenate([data.qpos, data.qvel]), rtol=0, atol=1e-12)
+    distance = np.linalg.norm(data.qpos[7:9] - TARGET)
+    assert float(after["reward"][1]) == pytest.approx(-(distance**2) - np.log(distance + 1e-3), rel=1e-5)
+    assert after["terminated"].all()
+    assert distance < np.linalg.norm(start[1, 7:9].numpy() - TARGET)  # it has been hit

@@ -464,6 +464,8 @@ def test_tasks_that_cannot_be(name: str, message: str, tmp_path: Path) -> None:
         ("reward", lambda s, a, n: 1.0, r"reward returns a float; expected a tensor"),
         ("terminated", lambda s: s[:, 0], r"terminated returns torch.float64; expected torch.bool"),
         ("controls", lambda a: a.repeat(1, 2), r"controls returns shape \(1, 2\)"),
+        ("controls", lambda a: a[:, None].repeat(1, 2, 2), r"controls returns shape \(1, 2, 2\).*\(1, 2, 1\)"),
+        ("controls", lambda a: a[:, None].repeat(1, 3, 1), r"controls returns 3 controls in a row.*frame_skip, 2"),
         ("observe", lambda s: s / s.nowhere, r"task: cartpole fails, .*test_rl_env.py line \d+: AttributeError"),
     ],
 )

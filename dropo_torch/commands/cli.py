@@ -27,7 +27,7 @@ COMMANDS = {
     "sweep-epsilon": ("sweep", "fit at several ε and choose one by the elbow"),
     "certify": ("certify", "compare the gradients of the warp backend with MuJoCo's own differences"),
     "compare": ("compare", "fit by several optimizers and backends, side by side"),
-    "reproduce": ("reproduce", "redo a published study: hopper"),
+    "reproduce": ("reproduce", "redo a published study: hopper, push or puck"),
     "demo": ("demo", "fit the bundled Hopper's masses"),
 }  # fmt: skip
 

@@ -17,7 +17,7 @@ from dropo_torch.support.parallel import processors
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo reproduce``."""
-    parser.add_argument("study", metavar="STUDY", help="hopper or push, simulated experiments of the DROPO paper")
+    parser.add_argument("study", metavar="STUDY", help="hopper, push or puck: the DROPO paper's experiments, simulated")
     add_folder(parser)
     parser.add_argument("--reduced", action="store_true", help="short logs and few seeds: minutes instead of hours")
     parser.add_argument("--workers", type=count, metavar="N", help="fits side by side (default: one a processor)")

@@ -230,8 +230,9 @@ class Commands(RowFilters):
         self._fresh[rows] = True
 
     def __call__(self, controls: torch.Tensor) -> torch.Tensor:
-        """Return commands ``(N, skip, nu)`` as they act, of controls ``(N, nu)`` of an environment step."""
-        signals, any_fresh = controls[:, None].repeat(1, self._skip, 1), bool(self._fresh.any())
+        """Return commands ``(N, skip, nu)`` as they act, of an environment step's controls ``(N, S, nu)`` in a row."""
+        signals = controls.repeat_interleave(self._skip // controls.shape[1], 1)
+        any_fresh = bool(self._fresh.any())
         for i, f in enumerate(self._filters):
             signal, state = signals[:, :, f.column], self._states[i]
             if any_fresh:

@@ -127,11 +127,11 @@ class RandomizedEnv(EnvBase):
 
     def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
         actions = tensordict.get("action").detach().to(torch.float64)
-        controls = self.task.controls(actions)
+        controls = self.task.motion(actions)
         if not torch.isfinite(controls).all():
-            row = int((~torch.isfinite(controls)).any(1).nonzero()[0])
+            row = int((~torch.isfinite(controls)).flatten(1).any(1).nonzero()[0])
             raise InputError(f"action: {tensordict.get('action')[row].tolist()} in environment {row} is not finite")
-        signals = self._commands(controls) if self._commands or self._sensors else controls[:, None]
+        signals = self._commands(controls) if self._commands or self._sensors else controls
         path = self._stepper.step(signals).to(self.device)
         good = (path.abs() < DIVERGED).flatten(1).all(1)
         if not bool(good.all()):

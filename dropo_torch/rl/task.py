@@ -75,8 +75,17 @@ class Task(abc.ABC):
         """Return which episodes end in these states, ``(N,)`` bool."""
 
     def controls(self, actions: torch.Tensor) -> torch.Tensor:
-        """Return the model's controls ``(N, nu)`` of actions; the actions themselves by default."""
+        """Return the model's controls ``(N, nu)`` of actions; the actions themselves by default.
+
+        Where an action is a whole motion, S controls in a row, ``(N, S, nu)``, each held for ``frame_skip / S`` physics
+        steps.
+        """
         return actions
+
+    def motion(self, actions: torch.Tensor) -> torch.Tensor:
+        """Return :meth:`controls` of an environment step in a row, ``(N, S, nu)``, one where they are one."""
+        controls = self.controls(actions)
+        return controls[:, None] if controls.ndim == 2 else controls
 
     @property
     def timestep(self) -> float:
@@ -138,13 +147,27 @@ def check_task(task: Task) -> None:
         states = task.initial_states(1, torch.Generator().manual_seed(0))
         _expect(f"{where}: initial_states(1)", states, (1, width))
         states = states.to(torch.float64)
-        _expect(f"{where}: controls", task.controls(middle), (1, task.model.nu))
+        _check_controls(task, where, task.controls(middle))
         _expect(f"{where}: observe", task.observe(states), (1, task.num_observations))
         _expect(f"{where}: reward", task.reward(states, middle, states), (1,))
         ends = task.terminated(states)
         _expect(f"{where}: terminated", ends, (1,))
     if ends.dtype != torch.bool:
         raise InputError(f"{where}: terminated returns {ends.dtype}; expected torch.bool")
+
+
+def _check_controls(task: Task, where: str, given: object) -> None:
+    """Raise for controls of one environment that are neither one nor several in a row."""
+    if not isinstance(given, torch.Tensor) or given.ndim != 3:
+        _expect(f"{where}: controls", given, (1, task.model.nu))
+        return
+    count = given.shape[1]
+    _expect(f"{where}: controls", given, (1, count, task.model.nu))
+    if not count or task.frame_skip % count:
+        raise InputError(
+            f"{where}: controls returns {count} controls in a row; expected a number that divides frame_skip, "
+            f"{task.frame_skip}"
+        )
 
 
 def _check_bounds(task: Task, where: str) -> None:

@@ -41,6 +41,7 @@ SIM = BundledSim(
         **_gains("actuator_kv", "kd", KD, "N m s/rad"),
     },
     log=_HERE / "log.npz",
+    task="dropo_sims.puck.task:PuckTask",
     study="dropo_sims.puck.study:run_study",
     truth={
         "mass": 0.11,
