@@ -13,8 +13,6 @@ from dropo_torch.distribution import SearchBox
 from dropo_torch.objective import Reduce
 from dropo_torch.optimizers.least_squares import damped_step
 
-#: Damping beyond which no step is tried.
-MAX_DAMPING = 1e2
 #: Damping after a step that was no good, at least: with less, the next one would be the same.
 LEAST_RAISED = 0.05
 
@@ -51,6 +49,8 @@ class Ascent(abc.ABC):
     BEGUN_AT: ClassVar[float]
     #: Two accepted steps in a row that each gain less end the stage, in nats.
     SMALL_GAIN: ClassVar[float]
+    #: Damping beyond which no step is tried.
+    MAX_DAMPING: ClassVar[float] = 1e2
     #: Candidates after which the stage ends.
     MAX_ITERATIONS: ClassVar[int]
 
@@ -91,7 +91,7 @@ class Ascent(abc.ABC):
             self.reason = "no simulation succeeded at the starting point"
         elif not self.narrows:
             self.damping = max(8 * self.damping, LEAST_RAISED)
-            if self.damping > MAX_DAMPING:
+            if self.damping > self.MAX_DAMPING:
                 self.reason = "no step improves the likelihood"
         self.iterations += 1
         if self.iterations >= self.MAX_ITERATIONS and self.reason is None:

@@ -15,7 +15,7 @@ import torch
 from dropo_torch.distribution import truncated_interval, truncated_moments
 from dropo_torch.likelihood import gaussian_log_density, survivors
 from dropo_torch.objective import Reduce
-from dropo_torch.optimizers.ascent import MAX_DAMPING, Ascent
+from dropo_torch.optimizers.ascent import Ascent
 
 #: Curvature that counts for more than this in the likelihood calls for sampling, in nats.
 MUCH_BENDING = 1.0
@@ -63,7 +63,7 @@ class SigmaPointStage(Ascent):
     @property
     def misleads(self) -> bool:
         """Whether sigma points are no good description of the simulation at this φ: it bends too much within it."""
-        return self.log_likelihood > -np.inf and (self.bends or self.damping > MAX_DAMPING)
+        return self.log_likelihood > -np.inf and (self.bends or self.damping > self.MAX_DAMPING)
 
     @property
     def bends(self) -> bool:
