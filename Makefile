@@ -28,6 +28,7 @@ coverage: $(STAMP)
 study-reduced: $(STAMP)
 	$(BIN)/dropo reproduce hopper --reduced --out out/study-reduced/hopper
 	$(BIN)/dropo reproduce push --reduced --out out/study-reduced/push
+	$(BIN)/dropo reproduce puck --reduced --out out/study-reduced/puck
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --durations=20
