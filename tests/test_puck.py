@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 import torch
-from dropo_sims.puck import SIM
+from dropo_sims.puck import SIM, generator
 from dropo_sims.puck.generator import LATENT, STEPS, load_decoder, scripted_hits, train_decoder
 from dropo_sims.puck.policy import FASTEST, HEIGHT, HOME, PUCK, STEP, Hit, hit_targets
 from dropo_sims.puck.record import record
@@ -124,3 +124,13 @@ def test_an_action_is_a_whole_hit() -> None:
     assert float(after["reward"][1]) == pytest.approx(-(distance**2) - np.log(distance + 1e-3), rel=1e-5)
     assert after["terminated"].all()
     assert distance < np.linalg.norm(start[1, 7:9].numpy() - TARGET)  # it has been hit
+
+
+@pytest.mark.parametrize("arguments", [["--hits", "0"], ["--epochs", "-1"], ["--out", "nowhere/x.safetensors"]])
+def test_a_generator_that_cannot_be_trained_is_refused(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as stop:
+        generator.main(arguments)
+    assert stop.value.code == 2
+    assert "error: " in capsys.readouterr().err

@@ -113,6 +113,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--epochs", type=int, default=3000)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
+    if min(given.hits, given.epochs) < 1 or given.seed < 0:
+        parser.error(f"hits {given.hits}, epochs {given.epochs}, seed {given.seed}: expected 1, 1 and 0 or more")
+    if not given.out.parent.is_dir():
+        parser.error(f"--out: no folder {given.out.parent}; make it first, or name another file")
     motions = scripted_hits(given.hits, given.seed)
     print(f"{given.hits} hits of {STEPS} targets")
     decoder, error = train_decoder(motions, given.epochs, given.seed)
