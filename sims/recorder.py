@@ -12,6 +12,8 @@ import mujoco
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.models.bundled import BundledSim
+from dropo_torch.parameters import ParameterSpace
 
 
 @dataclass(frozen=True)
@@ -34,6 +36,45 @@ class Log:
         columns = ("observations", "next_observations", "actions", "terminals")
         with open(path, "wb") as stream:  # numpy would append .npz to a path without it
             np.savez_compressed(stream, **{name: getattr(self, name) for name in columns})
+
+
+@dataclass(frozen=True)
+class ObjectLog(Log):
+    """A recorded log of an arm and an object: joints, the object's position and quaternion, then velocities.
+
+    Attributes:
+        parameters: those in force in each episode, ``(E, d)``.
+    """
+
+    parameters: np.ndarray
+
+
+def record_object(
+    sim: BundledSim, episode: Callable[[mujoco.MjModel, np.random.Generator], tuple[np.ndarray, np.ndarray]], *,
+    episodes: int, seed: int, truth: Mapping[str, float] | None, spread: Mapping[str, float],
+    quaternion: slice, noise: tuple[float, float] | None,
+) -> ObjectLog:  # fmt: skip
+    """Simulate episodes with an object, each with its own parameters.
+
+    Args:
+        sim: the simulation.
+        episode: simulates one, and returns its states and actions.
+        episodes: how many.
+        seed: of parameters, episodes and noise.
+        truth: parameters by name; the model's own where absent.
+        spread: standard deviations of those that are redrawn.
+        quaternion: where the object's stands in a state.
+        noise: of the measurement, or none.
+    """
+    space, generator = ParameterSpace(sim.model, sim.parameters), np.random.default_rng(seed)
+    mean = space.named(space.nominal) | dict(truth or {})
+    drawn = [drawn_within(sim.parameters, mean, spread, generator) for _ in range(episodes)]
+    parts = [episode(space.apply(values), generator) for values in drawn]
+    states, actions = (np.stack(part) for part in zip(*parts, strict=True))
+    if noise is not None:
+        states = measured(states, quaternion, noise, generator)
+    values = np.array([[row[name] for name in sim.parameters] for row in drawn])
+    return ObjectLog(**columns(states, actions), parameters=values)
 
 
 def columns(states: np.ndarray, actions: np.ndarray) -> dict[str, np.ndarray]:

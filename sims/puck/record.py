@@ -10,14 +10,11 @@ Every episode is one hit, with a heading, a side of the puck and a speed of its 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 
 import mujoco
 import numpy as np
 
-from dropo_torch.parameters import ParameterSpace
-
-from ..recorder import Log, check_names, check_request, columns, drawn_within, measured, run_recorder, transition
+from ..recorder import ObjectLog, check_names, check_request, record_object, run_recorder, transition
 from . import SIM
 from .policy import HOME, Hit, hit_targets
 
@@ -32,21 +29,10 @@ QUATERNION = slice(10, 14)
 HEADING, SIDE, SPEEDS = 0.2, 0.008, (0.5, 1.0)
 
 
-@dataclass(frozen=True)
-class PuckLog(Log):
-    """A recorded log: the joints, the puck's position and quaternion, then velocities; positions that servos are given.
-
-    Attributes:
-        parameters: those in force at each hit, ``(E, 18)``.
-    """
-
-    parameters: np.ndarray
-
-
 def record(
     *, variant: str = "point", episodes: int = 5, steps: int = 750, seed: int = 0,
     truth: Mapping[str, float] | None = None, spread: Mapping[str, float] | None = None,
-) -> PuckLog:  # fmt: skip
+) -> ObjectLog:  # fmt: skip
     """Simulate hits and log them.
 
     Args:
@@ -62,17 +48,11 @@ def record(
     """
     check_request(variant, VARIANTS, episodes, steps, seed)
     check_names("truth", {**(truth or {}), **(spread or {})}, SIM.parameters)
-    space = ParameterSpace(SIM.model, SIM.parameters)
-    generator = np.random.default_rng(seed)
-    mean = space.named(space.nominal) | dict(truth or {})
     widths = dict(SPREAD if spread is None else spread) if variant == "distribution" else {}
-    drawn = [drawn_within(SIM.parameters, mean, widths, generator) for _ in range(episodes)]
-    parts = [_episode(space.apply(values), _hit(generator), steps) for values in drawn]
-    states, actions = (np.stack(part) for part in zip(*parts, strict=True))
-    if variant == "noisy":
-        states = measured(states, QUATERNION, NOISE, generator)
-    drawn_values = np.array([[values[name] for name in SIM.parameters] for values in drawn])
-    return PuckLog(**columns(states, actions), parameters=drawn_values)
+    return record_object(
+        SIM, lambda model, generator: _episode(model, _hit(generator), steps), episodes=episodes, seed=seed,
+        truth=truth, spread=widths, quaternion=QUATERNION, noise=NOISE if variant == "noisy" else None,
+    )  # fmt: skip
 
 
 def _hit(generator: np.random.Generator) -> Hit:
@@ -93,7 +73,7 @@ def _episode(model: mujoco.MjModel, hit: Hit, steps: int) -> tuple[np.ndarray, n
 def main(arguments: Sequence[str] | None = None) -> None:
     """Record a log from the command line."""
 
-    def recorded(variant: str, episodes: int, steps: int, seed: int, robot: bool) -> PuckLog:
+    def recorded(variant: str, episodes: int, steps: int, seed: int, robot: bool) -> ObjectLog:
         truth = SIM.truth if robot else None
         return record(variant=variant, episodes=episodes, steps=steps, seed=seed, truth=truth)
 
