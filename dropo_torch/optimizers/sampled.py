@@ -35,7 +35,6 @@ class SampledStage(Ascent):
     #: Share of the likelihood's own sampling error that is worth no further step, either.
     OF_ERROR = 0.1
     MAX_ITERATIONS = 25
-    MAX_DAMPING = 2.0  # a step of a third of the size that gains nothing, on a likelihood that is rough, is the last
 
     def points(self) -> np.ndarray:
         """Return the candidate's samples in coordinates, ``(K, d)``."""
