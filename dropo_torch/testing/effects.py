@@ -222,7 +222,7 @@ class EffectCase:
         commands.reset(rows, none)
         sensors.reset(rows, self.states, none)
         first, shown = sensors.show(self.states), []
-        for control in self.controls.unbind(1):
+        for control in self.controls.split(1, 1):
             fine = stepper.step(commands(control))
             sensors.record(fine)
             shown.append(sensors.show(fine[:, -1]))
