@@ -24,9 +24,13 @@ if TYPE_CHECKING:
 Entries = dict[str, Any]
 
 
-def _key(default: Any, description: str, **limits: Any) -> Any:
-    """A key's default, what it is, and which numbers it takes."""
-    return Field(default, description=description, **limits)
+#: What the config's keys are about, as the command line groups them.
+GROUPS = ("model and log", "fit", "policy", "machine")
+
+
+def _key(default: Any, description: str, about: str = "fit", **limits: Any) -> Any:
+    """A key's default, what it is, which of :data:`GROUPS` it is of, and which numbers it takes."""
+    return Field(default, description=description, json_schema_extra={"about": about}, **limits)
 
 
 class Config(pydantic.BaseModel):
@@ -34,23 +38,31 @@ class Config(pydantic.BaseModel):
 
     model_config = pydantic.ConfigDict(extra="forbid", frozen=True, arbitrary_types_allowed=True)
 
-    model: str | None = _key(None, "path of the MJCF, URDF or .mjb model")
-    sim: str | None = _key(None, "a bundled simulation instead of a model")
+    model: str | None = _key(None, "path of the MJCF, URDF or .mjb model", "model and log")
+    sim: str | None = _key(None, "a bundled simulation instead of a model", "model and log")
     environment: str | None = _key(
-        None, "with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter"
+        None,
+        "with backend gymnasium: an environment id, or file.py:function (module:function) of an adapter",
+        "model and log",
     )
-    data: Any = _key(None, "path of the log, a list of paths, or path and reading options")
+    data: Any = _key(None, "path of the log, a list of paths, or path and reading options", "model and log")
     trajectories: int | Annotated[list[int], Field(min_length=1)] | None = _key(
-        None, "how many of the log's episodes to use (the first ones), or which, counted from 0"
+        None, "how many of the log's episodes to use (the first ones), or which, counted from 0", "model and log"
     )
-    frame_skip: int | None = _key(None, "physics steps per logged transition", ge=1, le=1_000_000)
-    observation: list[str] | None = _key(None, "what the log's columns are, such as ['qpos[1:]', qvel]")
+    frame_skip: int | None = _key(None, "physics steps per logged transition", "model and log", ge=1, le=1_000_000)
+    observation: list[str] | None = _key(
+        None, "what the log's columns are, such as ['qpos[1:]', qvel]", "model and log"
+    )
     parameters: dict[str, Entries] | None = _key(
-        None, "name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia"
+        None, "name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia", "model and log"
     )
-    effects: list[Entries] = _key([], "physical effects that the model lacks: effect, target and its numbers")
-    own_effects: list[str] = _key([], "file.py:Class (module:Class) of effects of one's own, which join the vocabulary")
-    backend: Literal["mujoco", "warp", "gymnasium"] = _key("mujoco", "the simulator")
+    effects: list[Entries] = _key(
+        [], "physical effects that the model lacks: effect, target and its numbers", "model and log"
+    )
+    own_effects: list[str] = _key(
+        [], "file.py:Class (module:Class) of effects of one's own, which join the vocabulary", "model and log"
+    )
+    backend: Literal["mujoco", "warp", "gymnasium"] = _key("mujoco", "the simulator", "machine")
     method: Literal["dropo", "droid", "bayessim", "simopt", "udr", "laplace"] = _key(
         "dropo", "what finds the distribution"
     )
@@ -60,12 +72,14 @@ class Config(pydantic.BaseModel):
     covariance: Literal["diagonal", "full"] = _key("diagonal", "whether parameters vary together")
     epsilon: float | list[float] = _key(1e-5, "ε, variance added to every column, or one each")
     noise: float | list[float] | None = _key(
-        None, "standard deviation of the measurement, or one per column; initial states are then uncertain"
+        None,
+        "standard deviation of the measurement, or one per column; initial states are then uncertain",
+        "model and log",
     )
     samples: int = _key(100, "K, parameter vectors per transition", ge=2, le=1_000_000)
     lag: int = _key(1, "λ, logged steps per window", ge=1, le=1_000_000)
-    seed: int = _key(0, "seed of everything that is random", ge=0, lt=2**63)
-    mask: list[str | int] = _key([], "observed columns which the likelihood leaves out")
+    seed: int = _key(0, "seed of everything that is random", "machine", ge=0, lt=2**63)
+    mask: list[str | int] = _key([], "observed columns which the likelihood leaves out", "model and log")
     scaling: bool = _key(False, "divide each column by its standard deviation over the log")
     orientation: Literal["rotation_vector", "angle"] = _key(
         "rotation_vector", "how orientations are compared: as rotation vectors, or by the angle as in the paper"
@@ -74,20 +88,23 @@ class Config(pydantic.BaseModel):
     population: int | None = _key(None, "with cma: φ per generation", ge=2, le=100_000)
     common_random_numbers: bool = _key(False, "with cma: the same samples in every generation")
     adam: Entries = _key({}, "with adam: steps, batch, samples, learning_rate, refresh, clip, common_random_numbers")
-    device: str = _key("cpu", "with warp: cpu, or a GPU such as cuda:0")
+    device: str = _key("cpu", "with warp: cpu, or a GPU such as cuda:0", "machine")
     task: str | None = _key(
-        None, "what a policy learns: a bundled task, or file.py:Class (module:Class); the sim's by default"
+        None, "what a policy learns: a bundled task, or file.py:Class (module:Class); the sim's by default", "policy"
     )
-    algorithm: Literal["ppo", "sac"] | None = _key(None, "how a policy is trained: ppo (the default) or sac")
+    algorithm: Literal["ppo", "sac"] | None = _key(None, "how a policy is trained: ppo (the default) or sac", "policy")
     distribution: str | Entries | None = _key(
         None,
         "of the parameters in training: path of a fit.json, uniform, nominal, or name: value; "
         "fit.json beside the config by default, uniform where there is none",
+        "policy",
     )
-    train: Entries = _key({}, "how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md")
-    target: Entries = _key({}, "name: value, the model on which a trained policy is evaluated beside the nominal one")
-    threads: int = _key(0, "threads of the simulator, 0 for all processors", ge=0, le=4096)
-    chunk_size: int = _key(10_000, "simulations held in memory at once", ge=1, le=10**9)
+    train: Entries = _key({}, "how: steps, num_envs, hidden, learning_rate, gamma ...: docs/policies.md", "policy")
+    target: Entries = _key(
+        {}, "name: value, the model on which a trained policy is evaluated beside the nominal one", "policy"
+    )
+    threads: int = _key(0, "threads of the simulator, 0 for all processors", "machine", ge=0, le=4096)
+    chunk_size: int = _key(10_000, "simulations held in memory at once", "machine", ge=1, le=10**9)
 
     #: Folder that relative paths start from; not a key of the file.
     base: Path = Field(Path(), exclude=True)

@@ -34,6 +34,7 @@ from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, accept, add, find_gap, outcome, prepare
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed
+from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, regime
@@ -71,7 +72,7 @@ STIFFNESS = Effect("joint_stiffness", "hinge", {"stiffness": 0.2, "reference": 0
 UNEVEN = {"friction": 1.0, "waves": 6.0, "phase": 0.3}
 HYSTERESIS = Effect("hysteresis", "hinge", {"stiffness": 0.5, "yield": 0.4})
 SIZE = {"episodes": 4, "transitions": 100}
-FILES = {"gap.json", "report.html", "model.xml", "config.yaml", "gap-progress.bin"}
+FILES = {"gap.json", "report.html", "picture.png", "model.xml", "config.yaml", "gap-progress.bin"}
 
 
 @functools.cache
@@ -1389,6 +1390,23 @@ def test_scores_order_by_how_wrong_a_model_is() -> None:
     assert best.log_likelihood > worse.log_likelihood > worst.log_likelihood
     assert best.mse == pytest.approx(floor.mse, rel=0.2)
     assert best.log_likelihood == pytest.approx(floor.log_likelihood, rel=0.02)
+
+
+def test_courses_are_of_the_log_and_typical_of_its_scores() -> None:
+    scene, right = scene_of("joint_damping"), true(hidden("joint_damping"))
+    held = cut_held(scene.evidence, scene.held, right)
+    found = courses(scene.evidence, held, scene.begin, right)
+    assert [c.label for c in found] == ["rail.position", "hinge.position"]
+    for column, course in enumerate(found):
+        logged = scene.held.observations[:, column]
+        assert np.isin(course.measured[:, :-1], logged).all()
+        assert np.allclose(np.diff(course.time), scene.problem.simulator.timestep)
+        assert np.array_equal(course.time[1:, 0], course.time[:-1, -1])  # one begins where the last one ends
+        assert np.array_equal(course.before[:, 0], course.measured[:, 0])
+        before, after = (np.sqrt(np.mean((m - course.measured) ** 2)) for m in (course.before, course.after))
+        assert after < 0.2 * before
+    size = np.sqrt(np.mean([(c.before - c.measured)[:, 1:] ** 2 for c in found]))
+    assert 0.4 < size / score(scene.evidence, held, scene.begin).rollout_rmse < 2.5
 
 
 def test_open_loop_floor_is_that_of_many_draws() -> None:

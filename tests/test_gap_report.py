@@ -8,12 +8,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib import image
+from matplotlib.colors import to_rgb
 from rich.console import Console
 
 from dropo_torch.commands.gap import _show
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Ranked, Remaining, Residuals, Score, Strength
-from dropo_torch.report import gap_words, write_gap_report
+from dropo_torch.gap.result import Course, Gap, NamedEffect, Place, Ranked, Remaining, Residuals, Score, Strength
+from dropo_torch.report import gap_words, write_gap_picture, write_gap_report
+from dropo_torch.report.figures.drawing import BLUE, ORANGE
 from dropo_torch.report.figures.gap import running_median
 
 JOINTS = ("shoulder", "elbow", "wrist")
@@ -135,6 +138,31 @@ def unnamed() -> Gap:
         base, effects=(effect,), after=base.before, reduced=(412.31, 412.31), ranking=ranking,
         residuals=(force("odd"),), symbolic="force(elbow) = 0.101 · sin(3.00 · velocity(elbow))³",
     )  # fmt: skip
+
+
+def course(label: str, seed: int = 0) -> Course:
+    """Three stretches of an oscillation, which the model as given damps too little, and once blows up."""
+    time = 0.01 * np.arange(101) + np.arange(3)[:, None]
+    measured, drift = np.sin(4 * time + seed), 0.3 * (time - time[:, :1]) ** 2
+    before = measured + np.where((time > 2.5) & (seed > 0), np.nan, drift)
+    return Course(label, "rad", time, measured, before, measured + 0.01 * drift)
+
+
+def test_curves_and_picture_show_what_was_predicted(tmp_path: Path) -> None:
+    gap = replace(double(), courses=(course("elbow.position"), course("wrist.position", 1)))
+    html = page(tmp_path, gap)
+    assert html.count("as measured and as predicted") == 2
+    assert "every 2.00 s" in html
+    assert write_gap_picture(tmp_path / "picture.png", gap)
+    drawn = image.imread(tmp_path / "picture.png")
+    assert drawn.shape[:2] == (1080, 1920)
+    for colour in (ORANGE, BLUE):
+        assert (np.abs(drawn[..., :3] - to_rgb(colour)).max(-1) < 0.02).sum() > 1000
+    before = (tmp_path / "picture.png").read_bytes()
+    write_gap_picture(tmp_path / "picture.png", gap)
+    assert (tmp_path / "picture.png").read_bytes() == before
+    assert not write_gap_picture(tmp_path / "other.png", double())
+    assert not (tmp_path / "other.png").exists()
 
 
 CASES = {"single": single, "double": double, "null": null, "unnamed": unnamed}

@@ -227,7 +227,9 @@ def require_same_everywhere(names: tuple[str, ...], tmp_path: Path) -> None:
     assert "timestep" not in " ".join(written.space.names)
     rows, found = written.objective.transitions.rows, likelihood(written, values)  # those whose commands are known
     assert len(found) == len(rows) == len(windows) - written.left_out > 0
-    after = score(evidence, Held(problem.trajectories, rows, windows, 0.0, np.zeros(0)), hypothesis).log_likelihood
+    after = score(
+        evidence, Held(problem.trajectories, rows, windows, 0.0, np.zeros(0), np.zeros(0, int)), hypothesis
+    ).log_likelihood
     assert abs(found.sum() - after) <= len(found) / 100, notes
     # a training
     from dropo_torch.rl.problem import make_training

@@ -14,22 +14,63 @@ import io
 import os
 import sys
 from collections.abc import Sequence
+from typing import NamedTuple
 
 from dropo_torch.commands.options import Parser
 from dropo_torch.errors import InputError, choices, one_line
 
-#: Commands, each with its module and what it does.
-COMMANDS = {
-    "check": ("check", "examine the log before anything is fitted to it"),
-    "fit": ("fit", "fit the distribution to the log"),
-    "gap": ("gap", "find where simulation and log disagree, and name the physical effect that is missing"),
-    "train": ("train", "train a policy over the distribution"),
-    "sweep-epsilon": ("sweep", "fit at several ε and choose one by the elbow"),
-    "certify": ("certify", "compare the gradients of the warp backend with MuJoCo's own differences"),
-    "compare": ("compare", "fit by several optimizers and backends, side by side"),
-    "reproduce": ("reproduce", "redo a published study: hopper, push or puck"),
-    "demo": ("demo", "fit the bundled Hopper's masses"),
+
+class Command(NamedTuple):
+    """A command: its module, what it does, and how it is called."""
+
+    module: str
+    summary: str
+    examples: tuple[str, ...]
+
+
+#: Commands by what they are for, in the order in which one comes to need them.
+GROUPS = {
+    "begin": {
+        "demo": Command("demo", "fit the bundled Hopper's masses", ("dropo demo",)),
+        "check": Command(
+            "check", "examine the log before anything is fitted to it",
+            ("dropo check robot.yaml", "dropo check robot.yaml --out out/check"),
+        ),
+    },
+    "answers": {
+        "gap": Command(
+            "gap", "find where simulation and log disagree, and name the physical effect that is missing",
+            ("dropo gap robot.yaml --out out/gap", "dropo gap robot.yaml --out out/gap --time-limit 120"),
+        ),
+        "fit": Command(
+            "fit", "fit the distribution to the log",
+            ("dropo fit robot.yaml --out out/robot", "dropo fit out/gap/config.yaml --out out/robot --epsilon 1e-4"),
+        ),
+        "train": Command(
+            "train", "train a policy over the distribution",
+            ("dropo train robot.yaml --out out/policy --task arm.py:Reach --distribution out/robot/fit.json",),
+        ),
+    },
+    "studies": {
+        "sweep-epsilon": Command(
+            "sweep", "fit at several ε and choose one by the elbow",
+            ("dropo sweep-epsilon robot.yaml --out out/sweep",),
+        ),
+        "compare": Command(
+            "compare", "fit by several optimizers and backends, side by side",
+            ("dropo compare robot.yaml --out out/compare",),
+        ),
+        "certify": Command(
+            "certify", "compare the gradients of the warp backend with MuJoCo's own differences",
+            ("dropo certify robot.yaml --out out/certify",),
+        ),
+        "reproduce": Command(
+            "reproduce", "redo a published study: hopper, push or puck",
+            ("dropo reproduce hopper --out out/hopper", "dropo reproduce push --reduced --out out/push"),
+        ),
+    },
 }  # fmt: skip
+COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -94,20 +135,36 @@ def _dispatch(given: list[str]) -> int:
 
 def _parser(called: str) -> argparse.ArgumentParser:
     """The parser of the command that is called; of the others it knows the names."""
-    purpose = "Fit a distribution over a simulator's parameters to a log of the real robot."
-    parser = Parser(prog="dropo", description=purpose, allow_abbrev=False)
+    parser = Parser(
+        prog="dropo", usage="dropo COMMAND ...", description=_OVERVIEW.format("\n\n".join(map(_group, GROUPS))),
+        allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter,
+    )  # fmt: skip
     parser.add_argument("--version", action="store_true", help="show the version and exit")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser)
-    for name, (module, summary) in COMMANDS.items():
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser, help=argparse.SUPPRESS)
+    for name, (module, summary, examples) in COMMANDS.items():
+        shown = "\n".join(f"  {line}" for line in examples)
         command = commands.add_parser(
-            name, help=summary, description=summary[0].upper() + summary[1:] + ".", allow_abbrev=False,
-            formatter_class=argparse.RawDescriptionHelpFormatter,
+            name, description=f"{summary[0].upper()}{summary[1:]}.\n\nexamples:\n{shown}", allow_abbrev=False,
+            formatter_class=argparse.RawDescriptionHelpFormatter, prog=f"dropo {name}",
         )  # fmt: skip
         if name == called:
             verb = importlib.import_module(f"dropo_torch.commands.{module}")
             verb.add_arguments(command)
             command.set_defaults(run=verb.run)
     return parser
+
+
+_OVERVIEW = """\
+Where do simulator and robot disagree, what does the model lack, and over which parameters should a policy be trained?
+
+{}
+
+Begin with `dropo demo`, which needs no robot. `dropo COMMAND --help` shows how each is used."""
+
+
+def _group(name: str) -> str:
+    """The commands of a group, a line each."""
+    return "\n".join([f"{name}:", *(f"  {command:<15}{GROUPS[name][command].summary}" for command in GROUPS[name])])
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo compare``."""
-    add_config(parser)
+    add_config(parser, "fit")
     parser.add_argument("--methods", metavar="fisher-warp,...", help="optimizer-backend pairs, all by default")
     parser.add_argument("--seeds", type=count, metavar="N", default=3, help="seeds of each (default 3)")
 

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo fit``."""
-    add_config(parser)
+    add_config(parser, "fit")
     add_log(parser, "the history")
     add_force(parser)
 

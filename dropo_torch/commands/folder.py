@@ -22,8 +22,8 @@ _MARKS = (
 )  # fmt: skip
 #: What runs write; an earlier run's are moved aside together.
 _RESULTS = (
-    *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "distribution.yaml",
-    "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "tensorboard",
+    *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "gap-progress-rare.bin",
+    "distribution.yaml", "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "picture.png", "tensorboard",
 )  # fmt: skip
 _PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")
 

@@ -38,11 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
-    """Run ``dropo gap``, which writes ``gap.json``, ``report.html``, and the model and config with what was missing."""
+    """Run ``dropo gap``, which writes ``gap.json``, a report, a picture, and the model and config with what it found."""
     from dropo_torch.gap import add, find_gap, prepare
     from dropo_torch.gap.remaining import Remaining
     from dropo_torch.problem import logged_data, make_problem
-    from dropo_torch.report import write_gap_report
+    from dropo_torch.report import write_gap_picture, write_gap_report
 
     config, out = load_config(given.config, overrides), given.out
     written = out / "config.yaml"
@@ -65,6 +65,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     gap = replace(gap, notes=(*gap.notes, *notes))
     write_json(out / "gap.json", gap.document())
     about = {"title": f"What {config.sim or config.model or 'model'} lacks", **provenance(config)}
+    write_gap_picture(out / "picture.png", gap)
     write_gap_report(out / "report.html", gap, model_note=" ".join(notes), has_config=written.exists(), **about)
     _show(gap, out, console)
 

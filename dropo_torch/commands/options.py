@@ -5,9 +5,12 @@ from __future__ import annotations
 import argparse
 import math
 from pathlib import Path
-from typing import NoReturn
+from typing import TYPE_CHECKING, NoReturn
 
 from dropo_torch.errors import InputError
+
+if TYPE_CHECKING:
+    from dropo_torch.config import Config
 
 
 class Parser(argparse.ArgumentParser):
@@ -19,21 +22,36 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; usage: {usage}")
 
 
-def add_config(parser: argparse.ArgumentParser, *, out_required: bool = True) -> None:
-    """Add the config, the folder of the results, and to the help every key of the config, as each is an option."""
-    from dropo_torch.config import Config
+def add_config(parser: argparse.ArgumentParser, *about: str, out_required: bool = True) -> None:
+    """Add the config, the folder of the results, and to the help the keys of the config that matter to the command.
+
+    Args:
+        parser: of the command.
+        about: which groups of keys these are, besides those of model and log and of the machine.
+        out_required: whether there must be a folder.
+    """
+    from dropo_torch.config import GROUPS, Config
 
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file")
     if out_required:
         add_folder(parser)
     else:
         parser.add_argument("--out", type=_folder, metavar="DIR", help="folder of the results")
-    lines = ["every key of the config is an option too (--epsilon 1e-4, --parameters.mass.bounds '[1, 2]'):"]
-    for name, entry in Config.model_fields.items():
-        if name != "base":
-            default = "" if entry.default in (None, [], {}) else f" (default {entry.default})"
-            lines.append(f"  --{name:<22} {entry.description}{default}")
+    lines = ["each key of the config is an option too, such as --epsilon 1e-4 or --parameters.mass.bounds '[1, 2]':"]
+    for group in GROUPS:
+        if group in ("model and log", "machine", *about):
+            lines += ["", f"{group}:", *_keys(Config, group)]
     parser.epilog = "\n".join(lines)
+
+
+def _keys(config: type[Config], group: str) -> list[str]:
+    """A line for each key of a group, with its default."""
+    return [
+        f"  --{name:<22} {entry.description}"
+        + ("" if entry.default in (None, [], {}) else f" (default {entry.default})")
+        for name, entry in config.model_fields.items()
+        if isinstance(entry.json_schema_extra, dict) and entry.json_schema_extra["about"] == group
+    ]
 
 
 def add_folder(parser: argparse.ArgumentParser, default: Path | None = None) -> None:

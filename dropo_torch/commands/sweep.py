@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo sweep-epsilon``."""
-    add_config(parser)
+    add_config(parser, "fit")
     parser.add_argument("--epsilons", type=_numbers, metavar="1e-6,1e-5,...", help="the values to try")
     parser.add_argument(
         "--noisy-starts", action="store_true",

@@ -31,7 +31,7 @@ POINTS = 1000
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of ``dropo train``."""
-    add_config(parser)
+    add_config(parser, "policy")
     add_log(parser, "the learning curves")
     add_force(parser)
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Quantity, Setting
+from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
@@ -108,6 +109,7 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         reduced=(alone.cost.reduced, rest.cost.reduced),
         ranking=_ranking(naming.attempts),
         residuals=residual_pictures(setting, before, after, 2 if naming.gap else 0),
+        courses=courses(evidence, held, base, best),
         cannot_judge=tuple(p.key for p in naming.first.silent),
         rollout_seconds=held.seconds,
         window=evidence.windows.length,
@@ -155,6 +157,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
         declared={n: (given, alone, given) for n, (given, alone, _) in gap.declared.items()},
         reduced=(chi2[0], chi2[1]),
         residuals=_force_pictures(setting, view),
+        courses=(),
         simulated_transitions=scene.twin.simulated_transitions,
         refused="",
         symbolic="",

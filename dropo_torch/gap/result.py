@@ -125,6 +125,25 @@ class Residuals:
 
 
 @dataclass(frozen=True)
+class Course:
+    """A position over successive stretches of unseen data, each predicted in open loop from where the log is then.
+
+    Attributes:
+        label, unit: of the position.
+        time: seconds since the episode began, ``(S, L + 1)``.
+        measured: as logged, ``(S, L + 1)``.
+        before, after: as predicted without and with the effects, ``(S, L + 1)``; NaN where a simulation diverged.
+    """
+
+    label: str
+    unit: str
+    time: np.ndarray
+    measured: np.ndarray
+    before: np.ndarray
+    after: np.ndarray
+
+
+@dataclass(frozen=True)
 class Remaining:
     """What named effects leave, where it is more than noise.
 
@@ -178,6 +197,7 @@ class Gap:
         reduced: χ² per degree of freedom before and after.
         ranking: candidates that were tried, best first.
         residuals: pictures of what is missing.
+        courses: positions on held-out data, as measured and as predicted; empty where predictions did not decide.
         cannot_judge: candidates that change nothing on this log.
         rollout_seconds: length of an open-loop prediction.
         window: logged steps of the windows on which hypotheses were compared.
@@ -209,6 +229,7 @@ class Gap:
     reduced: tuple[float, float]
     ranking: tuple[Ranked, ...] = ()
     residuals: tuple[Residuals, ...] = ()
+    courses: tuple[Course, ...] = ()
     cannot_judge: tuple[tuple[str, str | None], ...] = ()
     rollout_seconds: float = 0.0
     window: int = 0

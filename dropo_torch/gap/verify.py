@@ -47,6 +47,7 @@ class Held:
         rollouts: open-loop stretches.
         seconds: length of a stretch.
         floor: open-loop error of each feature that noise alone makes under the hypothesis they were cut for, ``(m,)``.
+        since: logged step of each episode before which nothing is cut, ``(E,)``.
     """
 
     log: Trajectories
@@ -54,6 +55,7 @@ class Held:
     rollouts: Windows
     seconds: float
     floor: np.ndarray
+    since: np.ndarray
 
 
 def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
@@ -88,7 +90,7 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
         windows = cut_windows(log, observation, length, stride=max(1, length // 3), since=since)
         windows = spread(windows, MOST_ROLLOUTS if wanted else MOST)
         floor = rollout_floor(evidence.on(windows), hypothesis) if len(windows) else np.zeros(evidence.chart.size)
-        return Held(log, rows, windows, length * timestep, floor)
+        return Held(log, rows, windows, length * timestep, floor, since)
 
     found = None
     for wanted in SECONDS:

@@ -10,8 +10,8 @@ import numpy as np
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.gap.result import Gap, Ranked, Residuals
 from dropo_torch.report import gap_words as words
-from dropo_torch.report.figures.drawing import BLUE, ORANGE
-from dropo_torch.report.figures.gap import force_frame, force_panel, score_panel
+from dropo_torch.report.figures.drawing import BLUE, CLOUD, ORANGE
+from dropo_torch.report.figures.gap import course_panel, force_frame, force_panel, score_panel
 from dropo_torch.report.formatting import duration, nats, percent, whole
 from dropo_torch.report.page import Frame, write_page
 
@@ -56,6 +56,10 @@ def write_gap_report(
         "where": gap.where[:MAX_PLACES],
         "more_places": len(gap.where) - MAX_PLACES,
         "residuals": [(r.title, _residual(r, bool(named))) for r in gap.residuals[:MAX_RESIDUALS]],
+        "blue": BLUE,
+        "orange": ORANGE,
+        "cloud": CLOUD,
+        "courses": [(c.label, course_panel(c, named=bool(named))) for c in gap.courses],
         "more_residuals": len(gap.residuals) - MAX_RESIDUALS,
         **_ranking(gap),
         "folder": folder.name if folder.is_absolute() else folder.as_posix(),

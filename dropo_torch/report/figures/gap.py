@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dropo_torch.gap.result import Course
 from dropo_torch.report.figures import drawing
 from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GREY, INK, ORANGE
 from dropo_torch.report.formatting import number, score
@@ -17,6 +18,8 @@ MAX_DOTS = 700
 LEAST_POINTS = 8
 #: An axis of log-likelihoods is no narrower: smaller differences are chance.
 LEAST_NATS = 20.0
+#: Axes of a course reach this share of the measured range beyond it; what is predicted farther off is cut.
+BEYOND = 0.75
 _COLOURS = {"your model": ORANGE, "before": ORANGE, "after": BLUE, "noise floor": GREY}
 
 
@@ -92,6 +95,43 @@ def force_frame(variable: np.ndarray, *forces: np.ndarray) -> tuple[float, float
     x_low, x_high = _range(variable, 0.0025)
     y_low, y_high = _range(np.concatenate(forces) if forces else np.zeros(0), 0.005)
     return x_low, x_high, min(y_low, 0.0), max(y_high, 0.0)
+
+
+def course_panel(course: Course, *, named: bool) -> Any:
+    """Draw a position on unseen data: as measured, and as predicted by the model as given and with the effects."""
+    figure, axes = drawing.new_panel(420, 190, f"{course.label} as measured and as predicted", (56, 38, 12, 8))
+    draw_course(axes, course, named=named)
+    axes.set(xlabel="time (s)", ylabel=f"{drawing.shorten(course.label)}{f' ({course.unit})' if course.unit else ''}")
+    axes.yaxis.set_label_coords(-44 / 352, 0.5)
+    return figure
+
+
+def draw_course(axes: Any, course: Course, *, named: bool, width: float = 1.0) -> None:
+    """Draw a course's lines on axes, whose limits suit what was measured and the prediction with the effects.
+
+    Args:
+        axes: where.
+        course: the position.
+        named: whether there are effects.
+        width: factor of the lines' widths.
+    """
+    keep = np.unique(np.linspace(0, course.time.shape[1] - 1, drawing.MAX_POINTS).astype(int))
+    low, high = float(course.measured.min()), float(course.measured.max())
+    pad = BEYOND * (high - low) or 0.5
+    frame, lines = (low - pad, high + pad), [(course.before, ORANGE, 1.5)]
+    lines += [(course.after, BLUE, 1.8)] if named else []
+    shown = np.concatenate([course.measured, *(line for line, *_ in lines)])
+    shown = shown[np.isfinite(shown)].clip(*frame)
+    margin = 0.06 * float(np.ptp(shown)) or 0.5
+    for time in course.time[1:, 0]:
+        axes.axvline(time, color=FAINT, linewidth=0.7 * width, zorder=0.5)
+    for time, measured in zip(course.time, course.measured, strict=True):
+        axes.plot(time[keep], measured[keep], color=CLOUD, linewidth=4.5 * width, solid_capstyle="round")
+    for line, colour, size in lines:
+        for time, predicted in zip(course.time, line, strict=True):
+            axes.plot(time[keep], predicted[keep], color=colour, linewidth=size * width)
+    axes.set(xlim=(course.time.min(), course.time.max()), ylim=(shown.min() - margin, shown.max() + margin))
+    drawing.few_ticks(axes, 6, 5)
 
 
 def running_median(x: np.ndarray, y: np.ndarray, most: int = 40) -> tuple[np.ndarray, np.ndarray]:

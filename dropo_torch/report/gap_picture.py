@@ -1,0 +1,85 @@
+"""What a model lacks, on one picture: the answer, and unseen data as measured and as predicted."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.gap.result import Course, Gap
+from dropo_torch.report import gap_words as words
+from dropo_torch.report.figures.drawing import BLUE, CLOUD, GREY, INK, ORANGE, new_axes, new_figure
+from dropo_torch.report.figures.gap import draw_course
+from dropo_torch.support.files import write_atomically
+
+#: Size in points; dots per inch of 72 points.
+WIDTH, HEIGHT, DPI = 1152, 648, 120
+#: Items of the answer, and courses, that have room.
+MOST_ITEMS, MOST_COURSES = 4, 2
+
+
+def write_gap_picture(path: str | Path, gap: Gap) -> bool:
+    """Write the answer as a picture in PNG, whole or not at all; return whether there is something to draw.
+
+    Args:
+        path: the file.
+        gap: the result. One whose answer is by forces at the joints has no predictions to draw.
+    """
+    if not gap.courses:
+        return False
+    figure = new_figure(WIDTH, HEIGHT)
+    figure.patch.set(visible=True, facecolor="white")
+    bottom = _say(figure, gap)
+    _draw(figure, gap, bottom)
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=DPI, metadata={"Software": None})
+    write_atomically(Path(path), stream.getvalue())
+    return True
+
+
+def _say(figure: Any, gap: Gap) -> float:
+    """Write the answer, and return the height in points that is left below it."""
+    headline, items = words.answer(gap)
+    given = [f"–  {item}" for item in items[:MOST_ITEMS]]
+    given += [f"–  and {len(items) - MOST_ITEMS} more"] if len(items) > MOST_ITEMS else []
+    lines = [(line, 23, "bold", INK) for line in textwrap.wrap(headline, 74)]
+    lines += [
+        (line, 17, "normal", INK) for item in given for line in textwrap.wrap(item, 112, subsequent_indent="    ")
+    ]
+    lines += [(line, 15, "normal", GREY) for line in textwrap.wrap(words.change(gap), 125)]
+    height = HEIGHT - 30.0
+    for text, size, weight, colour in lines:
+        height -= (1.45 if size > 15 else 1.7) * size
+        figure.text(48 / WIDTH, height / HEIGHT, text, size=size, weight=weight, color=colour, va="bottom")
+    return height - 24
+
+
+def _draw(figure: Any, gap: Gap, height: float) -> None:
+    """Draw the courses side by side below, with a legend."""
+    named = any(words.is_named(e) for e in gap.effects)
+    shown = sorted(gap.courses, key=_gained, reverse=True)[:MOST_COURSES]
+    wide = WIDTH / len(shown)
+    for i, course in enumerate(shown):
+        axes = new_axes(figure, (wide * i + 84, 62, WIDTH - wide * (i + 1) + 24, HEIGHT - height + 26))
+        draw_course(axes, course, named=named, width=1.5)
+        axes.tick_params(labelsize=13)
+        axes.set_xlabel("time in unseen data (s)", size=14)
+        axes.set_ylabel(f"{course.label}{f' ({course.unit})' if course.unit else ''}", size=14)
+    legend = [("measured", CLOUD), ("model as given" if named else "your model", ORANGE)]
+    legend += [("with what was missing", BLUE)] if named else []
+    place = 84.0
+    for text, colour in legend:
+        figure.text(place / WIDTH, (height - 12) / HEIGHT, text, size=15, weight="bold", color=colour, va="center")
+        place += 9.2 * len(text) + 30
+
+
+def _gained(course: Course) -> float:
+    """By how much effects improve the prediction of a position, in units of how much it moves."""
+    before, after = (
+        float(np.sqrt(np.nanmean((line - course.measured) ** 2))) if np.isfinite(line).any() else 0.0
+        for line in (course.before, course.after)
+    )
+    return (before - after) / (float(np.ptp(course.measured)) or 1.0)
