@@ -38,7 +38,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
-    """Run ``dropo gap``, which writes ``gap.json``, a report, a picture, and the model and config with what it found."""
+    """Run ``dropo gap``, which writes ``gap.json``, report, picture, and the model and config with what it found."""
     from dropo_torch.gap import add, find_gap, prepare
     from dropo_torch.gap.remaining import Remaining
     from dropo_torch.problem import logged_data, make_problem
