@@ -1,6 +1,6 @@
 """A crane whose model lacks two things, and a log of it for ``dropo gap``.
 
-python examples/crane.py --out out/crane             # writes crane.xml, log.npz and crane.yaml
+python examples/crane.py --out out/crane             # writes crane.xml, log.npz, the same as log.csv, and crane.yaml
 dropo gap out/crane/crane.yaml --out out/crane/gap
 """
 
@@ -69,6 +69,18 @@ def record(seed: int = 0) -> dict[str, np.ndarray]:
     return {name: np.concatenate(arrays) for name, arrays in parts.items()}
 
 
+def write_csv(path: Path, log: dict[str, np.ndarray]) -> None:
+    """Write a log as a recorder would: a row for every instant, episodes ten seconds apart."""
+    rows = []
+    for episode, end in enumerate(np.flatnonzero(log["terminals"])):
+        own = slice(end + 1 - STEPS, end + 1)
+        states = np.concatenate([log["observations"][own], log["next_observations"][end : end + 1]])
+        commands = np.append(log["actions"][own], log["actions"][end])
+        rows.append(np.column_stack([10 * episode + 0.02 * np.arange(STEPS + 1), states, commands]))
+    header = "time,rail_position,rope_angle,rail_velocity,rope_velocity,drive_cmd"
+    np.savetxt(path, np.concatenate(rows), "%.8g", delimiter=",", header=header, comments="")
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--out", type=Path, default=Path("out/crane"), help="folder of model, log and config")
@@ -76,7 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     out.mkdir(parents=True, exist_ok=True)
     (out / "crane.xml").write_text(MODEL)
     (out / "crane.yaml").write_text(CONFIG)
-    np.savez(out / "log.npz", **record())
+    log = record()
+    np.savez(out / "log.npz", **log)
+    write_csv(out / "log.csv", log)
     print(f"{out / 'crane.yaml'}")
 
 

@@ -93,6 +93,11 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
         for f in gap.forces:
             forces.add_row(f.joint, f.unit, f"{f.before:.3g}", f"{f.after:.3g}")
         console.print(forces)
+    if gap.declared:
+        values = Table("parameter of the config", "model as given", "fitted alone", "fitted with the effects")
+        for name, fitted in gap.declared.items():
+            values.add_row(name, *(f"{value:.4g}" for value in fitted))
+        console.print(values)
     for line in filter(None, (gap.next_experiment, *gap.notes)):
         console.print(line)
     console.print(

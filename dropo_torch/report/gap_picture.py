@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +19,8 @@ from dropo_torch.support.files import write_atomically
 
 #: Size in points; dots per inch of 72 points.
 WIDTH, HEIGHT, DPI = 1152, 648, 120
-#: Items of the answer, and courses, that have room.
-MOST_ITEMS, MOST_COURSES = 4, 2
+#: Lines of the answer's items, and courses, that have room.
+MOST_LINES, MOST_COURSES = 6, 2
 
 
 def write_gap_picture(path: str | Path, gap: Gap) -> bool:
@@ -42,19 +44,28 @@ def write_gap_picture(path: str | Path, gap: Gap) -> bool:
 
 def _say(figure: Any, gap: Gap) -> float:
     """Write the answer, and return the height in points that is left below it."""
-    headline, items = words.answer(gap)
-    given = [f"–  {item}" for item in items[:MOST_ITEMS]]
-    given += [f"–  and {len(items) - MOST_ITEMS} more"] if len(items) > MOST_ITEMS else []
+    headline, items = words.answer(replace(gap, remaining=None, own_step=None))
+    said = [words.change(gap)]
+    said += [] if gap.remaining is None else [f"They do not explain everything: {words.left(gap.remaining)}."]
     lines = [(line, 23, "bold", INK) for line in textwrap.wrap(headline, 74)]
-    lines += [
-        (line, 17, "normal", INK) for item in given for line in textwrap.wrap(item, 112, subsequent_indent="    ")
-    ]
-    lines += [(line, 15, "normal", GREY) for line in textwrap.wrap(words.change(gap), 125)]
+    lines += [(line, 15, "normal", INK) for line in _listed(items)]
+    lines += [(line, 13, "normal", GREY) for text in said for line in textwrap.wrap(text, 146)]
     height = HEIGHT - 30.0
     for text, size, weight, colour in lines:
-        height -= (1.45 if size > 15 else 1.7) * size
+        height -= 1.5 * size
         figure.text(48 / WIDTH, height / HEIGHT, text, size=size, weight=weight, color=colour, va="bottom")
     return height - 24
+
+
+def _listed(items: Sequence[str]) -> list[str]:
+    """The lines of as many items as have room."""
+    lines: list[str] = []
+    for shown, item in enumerate(items):
+        own = textwrap.wrap(f"–  {item}", 126, subsequent_indent="    ")
+        if len(lines) + len(own) > MOST_LINES:
+            return [*lines, f"–  and {len(items) - shown} more"]
+        lines += own
+    return lines
 
 
 def _draw(figure: Any, gap: Gap, height: float) -> None:
