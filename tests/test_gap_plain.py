@@ -19,6 +19,9 @@ from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
+from dropo_torch.gap.accept import undone
+from dropo_torch.gap.cancel import cancelling
+from dropo_torch.gap.family import needed, not_needed
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.locate import regressors
 from dropo_torch.gap.log import cut_windows, spread
@@ -61,6 +64,19 @@ PENDULUM = """
       <joint name="b" axis="0 1 0" damping=".02"/><geom type="capsule" size=".02" fromto="0 0 0 0 0 -.25" mass=".6"/>
     </body>
   </body></worldbody>
+</mujoco>"""
+SPINNING = """
+<mujoco><option timestep="0.002"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody><body>
+    <joint name="shoulder" axis="0 1 0" damping=".3"/>
+    <geom type="capsule" size=".03" fromto="0 0 0 .3 0 0" mass="1.5"/>
+    <body pos=".3 0 0">
+      <joint name="elbow" axis="0 1 0" damping=".1"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .25 0 0" mass=".8"/></body>
+  </body></worldbody>
+  <actuator><motor name="shoulder_motor" joint="shoulder" gear="12"/>
+    <motor name="elbow_motor" joint="elbow" gear="4"/></actuator>
 </mujoco>"""
 NOISE = {"position": 1e-4, "velocity": 1e-3}
 Change = Callable[[mujoco.MjModel], None]
@@ -200,6 +216,37 @@ def test_friction_of_a_thousandth_of_the_forces_is_foreseen() -> None:
     assert first.ranked[0].key == ("joint_friction", "rail")
     assert first.ranked[0].placed.values[0] == pytest.approx(1.0, rel=0.1)
     assert first.ranked[0].chi2 < 1.2 * first.degrees
+
+
+def test_friction_and_an_offset_that_undo_each_other_are_dropped_together() -> None:
+    """Of a joint that turns one way only, both may be anything; derivatives where it sets off hold on to either."""
+
+    def turn(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
+        waves = [0.3 * np.sin(f * time[:, None] + phases[:2]) for f in (2.0, 5.0, 11.0)]
+        return sum(waves) - np.array([3.0, 0.3])
+
+    def rub(model: mujoco.MjModel) -> None:
+        model.dof_frictionloss[1] = 0.4
+        model.dof_damping[1] += 0.1
+
+    scene = scene_of(SPINNING, rub, turn, shape=(3, 300), begin=lambda data, rng: None)
+    assert np.percentile(scene.train.observations[:, 2], 99) < 0
+    ground = Ground(scene.evidence, tuple(VOCABULARY.values()))
+    true = [Placed(VOCABULARY["joint_friction"], "elbow", (0.4,)), Placed(VOCABULARY["joint_damping"], "elbow", (0.1,))]
+    pair = [
+        Placed(VOCABULARY["joint_friction"], "shoulder", (5.0,)),
+        Placed(VOCABULARY["actuator_bias"], "shoulder_motor", (-5 / 12,)),
+    ]
+    whole = ground.refit(Hypothesis((), (*true, *pair)))
+    most = whole.cost.excess + 4 * whole.cost.sigma
+    assert cancelling(scene.setting, whole) == [(2, 3)]
+    assert not_needed(ground, whole, most) == []
+    state = start(ground, scene.begin)
+    fewer, least = undone(ground, replace(state, current=whole), whole), needed(ground, whole)
+    assert least is not None
+    for fitted in (*fewer, least):
+        assert [p.key for p in fitted.hypothesis.placed] == [p.key for p in true]
+    assert undone(ground, state, least) == []
 
 
 def test_the_noise_of_masked_columns_is_no_smaller() -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
+from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
@@ -291,13 +292,25 @@ def everywhere(ground: Ground, state: State) -> State:
 
 
 def prune(ground: Ground, state: State) -> State:
-    """Drop effects that are not needed, the least needed first."""
+    """Drop effects that are not needed, the least needed first; then two that only undo each other."""
     current = state.current
     while current.hypothesis.placed:
         count = len(current.hypothesis.placed)
         without = [ground.refit(current.hypothesis.without(i)) if count > 1 else state.base for i in range(count)]
         idle = [r for r in without if not is_needed(ground, state, current, r)]
+        idle = idle or undone(ground, state, current)
         if not idle:
             break
         current = min(idle, key=lambda r: r.cost.excess)
     return replace(state, current=current)
+
+
+def undone(ground: Ground, state: State, current: Refit) -> list[Refit]:
+    """Return the hypothesis without two effects that undo each other, if both together are not needed."""
+    for pair in cancelling(ground.setting, current):
+        first, second = sorted(pair)
+        rest = current.hypothesis.without(second).without(first)
+        fewer = ground.refit(rest) if rest.placed else state.base
+        if not is_needed(ground, state, current, fewer):
+            return [fewer]
+    return []

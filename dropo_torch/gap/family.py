@@ -17,6 +17,7 @@ from dropo_torch.effects.actuator import driven_joint
 from dropo_torch.effects.base import Effect, Placed, Setting, object_number
 from dropo_torch.effects.joint import JointFrictionSlope
 from dropo_torch.gap.accept import SOFT, extend, with_soft_friction
+from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
@@ -79,7 +80,8 @@ def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
     """Return the base family with the members that are needed, if several are at several joints."""
     whole = needed(ground, fitted_family(ground, begin))
     for refined in (with_soft_friction, with_slopes, with_soft_friction):
-        whole = None if whole is None else refined(ground, whole)
+        finer = None if whole is None else refined(ground, whole)
+        whole = finer if finer is None or finer is whole else needed(ground, finer)  # it may do what others made up for
     whole = None if whole is None else without_steps(ground, whole)
     if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
         return None
@@ -147,13 +149,26 @@ def needed(ground: Ground, whole: Refit) -> Refit | None:
         idle = not_needed(ground, whole, most)
         idle = idle[: int(min(len(idle), tried))]
         if not idle:
-            return whole
+            undone = _without_what_cancels(ground, whole, most)
+            if undone is whole:
+                return whole
+            whole = undone
+            continue
         fewer = _without(ground, whole, idle)
         if fewer.cost.excess <= most:
             whole, tried = fewer, math.inf
         else:  # by the derivatives it would not have mattered: half as many, the least needed
             tried = len(idle) // 2
     return whole if math.isfinite(most) else None
+
+
+def _without_what_cancels(ground: Ground, whole: Refit, most: float) -> Refit:
+    """Return a fitted family without the first two members that undo each other, if any can go; else the same."""
+    for pair in cancelling(ground.setting, whole):
+        fewer = _without(ground, whole, [whole.hypothesis.placed[i] for i in pair])
+        if fewer.cost.excess <= most:
+            return fewer
+    return whole
 
 
 def without_steps(ground: Ground, whole: Refit) -> Refit:
