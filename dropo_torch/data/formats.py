@@ -6,6 +6,10 @@ folder, ``*_observations.npy``     the same with ``*_nextobservations``, ``*_act
 ``.h5``, ``.hdf5``                 data sets in the layout of D4RL, or any others by a column map
 ``.csv``, ``.tsv``, ``.parquet``   by a column map
 ``.mat``                           MATLAB variables (all versions), by a column map
+``.feather``, ``.arrow``           as Parquet
+``.bag``, ``.mcap``, ``.db3``      ROS bags, as a ROS 2 bag's folder: fields of messages by a column map
+LeRobot's folder                   states and actions, or what a column map picks
+``mujoco.sysid``'s ``.npz``        time series, by a column map
 ``minari:ID``, a Minari folder     a local Minari dataset
 =================================  ===============================================================
 
@@ -28,6 +32,9 @@ from typing import IO, TYPE_CHECKING, Any
 
 import numpy as np
 
+from dropo_torch.data.bags import is_bag, open_bag
+from dropo_torch.data.lerobot import is_lerobot, open_lerobot
+from dropo_torch.data.sysid import is_sysid, sysid_table
 from dropo_torch.data.tables import Table
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.child import read_in_child
@@ -52,7 +59,7 @@ def open_npz(path: Path, _: str | None) -> list[Table]:
                 _check_npy(stream, f"{path}: {name}")
             return np.asarray(archive[name])
 
-    return [Table(str(path), names, read)]
+    return [sysid_table(str(path), names, read) if is_sysid(names) else Table(str(path), names, read)]
 
 
 def open_npy(path: Path, _: str | None) -> list[Table]:
@@ -102,7 +109,7 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
     other = next((mark for mark in ";\t," if mark != separator and mark in only), None)
     if len(frame.columns) == 1 and other is not None:
         raise InputError(f"{path}: its one column is {only!r}; separator: {other!r} may be what is meant")
-    return [_frame(path, frame)]
+    return [frame_table(str(path), frame)]
 
 
 def open_parquet(path: Path, _: str | None) -> list[Table]:
@@ -114,8 +121,19 @@ def open_parquet(path: Path, _: str | None) -> list[Table]:
         with parquet.ParquetFile(path) as file:
             check_size(file.metadata.num_rows * file.metadata.num_columns, 8, path)
         frame = pd.read_parquet(path, engine="pyarrow")
-    named = any(name is not None for name in frame.index.names)
-    return [_frame(path, frame.reset_index() if named else frame)]
+    return [frame_table(str(path), frame)]
+
+
+def open_feather(path: Path, _: str | None) -> list[Table]:
+    """A data frame with its index, in Arrow's file format."""
+    with extra("formats", str(path)):
+        import pandas as pd
+        from pyarrow import dataset
+    with reading(path, "Feather"):
+        file = dataset.dataset(path, format="feather")
+        check_size(file.count_rows() * len(file.schema), 8, path)
+        frame = pd.read_feather(path)
+    return [frame_table(str(path), frame)]
 
 
 def open_hdf5(path: Path, group: str | None) -> list[Table]:
@@ -187,39 +205,54 @@ class Format:
 
     name: str
     suffixes: tuple[str, ...]
-    open: Callable[[Path, str | None], list[Table]]
+    open: Callable[[Path, Any], list[Table]]
     option: str | None = None
 
 
 NPY = Format("NumPy", ("_observations.npy",), open_npy)
+ROS = Format("ROS bag", (".bag", ".mcap", ".db3"), open_bag, option="stamps")
 FORMATS = (
     Format("NumPy archive", (".npz",), open_npz),
     NPY,
     Format("text", (".csv", ".tsv", ".txt"), open_text, option="separator"),
     Format("Parquet", (".parquet", ".pq"), open_parquet),
+    Format("Feather", (".feather", ".arrow"), open_feather),
     Format("HDF5", (".h5", ".hdf5"), open_hdf5, option="group"),
     Format("MATLAB", (".mat",), open_mat),
+    ROS,
 )
+#: Folders, by what tells them.
+FOLDERS = ((is_bag, ROS), (is_lerobot, Format("LeRobot", (), open_lerobot)), (Path.is_dir, NPY))
 
 
-def open_tables(path: Path, *, group: str | None = None, separator: str | None = None) -> list[Table]:
+def open_tables(
+    path: Path, *, group: str | None = None, separator: str | None = None, stamps: Mapping[str, str] | None = None
+) -> list[Table]:
     """Return the logs in a file or folder: one, or one for each HDF5 group that ``group`` matches.
 
     Args:
-        path: a file of one of the :data:`FORMATS`, or a folder with one ``*_observations.npy``.
+        path: a file of one of the :data:`FORMATS`, or one of the :data:`FOLDERS`.
         group: pattern of the HDF5 groups that hold an episode each, such as ``data/demo_*``.
         separator: what separates the columns of a text file; a comma by default, a tab in ``.tsv``.
+        stamps: of a bag: topics that do not take the time of their headers, and whence they take it.
 
     Raises:
         InputError: a file that is missing, unreadable or of an unknown kind.
     """
     if not path.exists():
         raise InputError(missing_file(path))
-    kind = NPY if path.is_dir() else next((f for f in FORMATS if path.name.lower().endswith(f.suffixes)), None)
-    if kind is None:
+    if path.is_dir():
+        kind = next(folder for tells, folder in FOLDERS if tells(path))
+    else:
         known = ", ".join(suffix for f in FORMATS for suffix in f.suffixes)
-        raise InputError(f"{path}: unknown kind of log; expected {known}, a folder of .npy files or a Minari dataset")
-    given = {"group": group, "separator": separator}
+        found = next((f for f in FORMATS if path.name.lower().endswith(f.suffixes)), None)
+        if found is None:
+            raise InputError(
+                f"{path}: unknown kind of log; expected {known}, a folder of .npy files, a ROS 2 bag, a LeRobot or a "
+                "Minari dataset"
+            )
+        kind = found
+    given = {"group": group, "separator": separator, "stamps": stamps}
     for option, value in given.items():
         if value is not None and option != kind.option:
             owner = next(f for f in FORMATS if f.option == option)
@@ -227,6 +260,14 @@ def open_tables(path: Path, *, group: str | None = None, separator: str | None =
                 f"{path}: {option} is an option of {owner.name} files ({', '.join(owner.suffixes)}); leave it out here"
             )
     return kind.open(path, given[kind.option] if kind.option else None)
+
+
+def frame_table(source: str, frame: pd.DataFrame) -> Table:
+    """Return the columns of a data frame, and of its index where that has names."""
+    if any(name is not None for name in frame.index.names):
+        frame = frame.reset_index()
+    columns = {str(name): i for i, name in enumerate(frame.columns)}
+    return Table(source, tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
 
 
 def missing_file(path: Path) -> str:
@@ -272,11 +313,6 @@ def _mat73(table: Table) -> Table:
         return array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
 
     return Table(table.source, tuple(names), read)
-
-
-def _frame(path: Path, frame: pd.DataFrame) -> Table:
-    columns = {str(name): i for i, name in enumerate(frame.columns)}
-    return Table(str(path), tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
 
 
 def _only_log(folder: Path) -> Path:

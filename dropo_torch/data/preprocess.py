@@ -52,7 +52,8 @@ class Preprocess:
             ``velocities``.
         velocities: signals that measure velocities, taken as the last columns; by default the velocities
             are derivatives of the positions. ``()`` for none.
-        quaternions: groups of four of the positions that are a unit quaternion (w, x, y, z). Its derived
+        quaternions: groups of four of the positions that are a unit quaternion (w, x, y, z); by default those that
+            the log itself says, as bags do. Its derived
             velocity is the angular velocity in the body's frame, as in MuJoCo.
         actions: ``hold``: the command in force at the step's start; ``mean``: the mean of the commands in
             force during it; ``position`` or ``velocity``: what was measured at its end, which is what a
@@ -169,7 +170,7 @@ def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
             f"{recording.source}: preprocess: actions: {options.actions} infers the actions from the motion, but the "
             f"log's actions are {', '.join(recording.action_names)}; leave one of both out"
         )
-    if options.max_gap is None:
+    if options.max_gap is None and not recording.sparse:
         where = f"{recording.source}: preprocess without max_gap"
         check_values(recording.observations, recording.observation_names, where)
         check_values(recording.actions, recording.action_names, where)
@@ -249,13 +250,13 @@ def _lag(part: Recording, reference: str, name: str, max_delay: float) -> float:
     return estimate_delay(first.spline(grid), second.spline(grid), dt, max_delay=max_delay, source=source)
 
 
-def _samples(part: Recording, name: str, delay: float = 0.0) -> _Samples:
+def _samples(part: Recording, name: str, delay: float = 0.0, least: int = 2) -> _Samples:
     """A signal's samples at the times of what they measure; NaN counts as none."""
     assert part.time is not None
     values = part.signal(name)
     present = ~np.isnan(values)
-    if present.sum() < 2:
-        raise InputError(f"{part.source}: {name} has {present.sum()} samples; at least two are needed")
+    if present.sum() < least:
+        raise InputError(f"{part.source}: {name} has {present.sum()} samples; at least {least} are needed")
     return _Samples(time=part.time[present] - part.time[0] - delay, values=values[present])
 
 
@@ -273,7 +274,8 @@ class _Episode:
         positions = self._resolve(
             "positions", [n for n in names if n not in velocities] if given is None else given, names
         )
-        quaternions = [self._resolve("quaternions", group, positions) for group in self.options.quaternions]
+        groups = self.options.quaternions or [g for g in self.part.quaternions if set(g) <= set(positions)]
+        quaternions = [self._resolve("quaternions", group, positions) for group in groups]
         signals = {name: _samples(self.part, name, self.delays.get(name, 0.0)) for name in positions + velocities}
         for group in quaternions:
             signals |= self._continuous(group, signals)
@@ -360,6 +362,8 @@ class _Episode:
         trim = 1 / options.cutoff if options.cutoff is not None and options.trim is None else options.trim or 0.0
         early = [self.delays.get(name, 0.0) for name in self.part.action_names]
         low = max([s.time[0] + trim for s in signals] + [-delay for delay in early] + [options.start or 0.0])
+        if self.part.sparse:  # as every signal, commands begin with their first sample
+            low = max([low, *(self._command(name).time[0] for name in self.part.action_names)])
         stop = np.inf if options.stop is None else options.stop
         high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early] + [stop])
         steps = int(np.floor((high - low) / options.dt + _EDGE)) if high > low else 0
@@ -370,9 +374,13 @@ class _Episode:
             )
         return low + options.dt * np.arange(steps + 1)
 
+    def _command(self, name: str) -> _Samples:
+        """The samples of a command; of a stream, a single one holds from then on."""
+        return _samples(self.part, name, self.delays.get(name, 0.0), least=1 if self.part.sparse else 2)
+
     def _commands(self, name: str, begin: np.ndarray) -> np.ndarray:
         """A command in the steps that begin at the given times, ``(T,)``: in force then, or the mean of each step."""
-        samples, dt = _samples(self.part, name, self.delays.get(name, 0.0)), self.options.dt
+        samples, dt = self._command(name), self.options.dt
         if samples.time[0] > begin[0] + _EDGE * dt:
             raise InputError(
                 f"{self.part.source}: {name} has no sample before {samples.time[0]:.6g} s; use start from there on"

@@ -17,16 +17,20 @@ import numpy as np
 
 from dropo_torch.data.corrections import Corrections, break_rows, corrected
 from dropo_torch.data.formats import missing_file, open_tables
+from dropo_torch.data.memory import in_memory
 from dropo_torch.data.minari import PREFIX, read_minari
 from dropo_torch.data.preprocess import Preprocess, preprocess
 from dropo_torch.data.recording import TOLERANCE, Recording
-from dropo_torch.data.tables import ColumnMap, Table, missing, parse_columns
+from dropo_torch.data.tables import Choice, ColumnMap, Table, missing, parse_columns
 from dropo_torch.data.trajectory import Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.extras import extra
 from dropo_torch.support.given import check_keys, number, reading, user_path
 
-Source = str | Path | Mapping[str, Any] | Sequence["Source"]
+#: A path, options with one, what is in memory (a data frame, arrays, a time series), or several of these.
+Source = str | Path | Mapping[str, Any] | Sequence["Source"] | Any
+#: Options that mean nothing for a log whose signals have time stamps of their own.
+_OF_ROWS = ("next_observations", "time", "dt", "episode", "terminals", "shift", "breaks")
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,9 @@ class ReadOptions:
     unwrap: Sequence[str] | None = None
     shift: int = 0
     breaks: Sequence[int] | None = None
+    pause: float | None = None
+    joints: Sequence[str] | None = None
+    stamps: Mapping[str, str] | None = None
 
     @property
     def corrections(self) -> Corrections:
@@ -56,7 +63,7 @@ class ReadOptions:
 
     def __post_init__(self) -> None:
         Corrections.of(self.scale, self.unwrap, self.shift)
-        for name in ("dt", "tolerance"):
+        for name in ("dt", "tolerance", "pause"):
             value = getattr(self, name)
             if value is not None:
                 object.__setattr__(self, name, number(value, f"data: {name}", above=0))
@@ -64,6 +71,8 @@ class ReadOptions:
             value = getattr(self, name)
             if value is not None and not isinstance(value, str):
                 raise InputError(f"data: {name} is {value!r}; expected text")
+        if isinstance(self.joints, str) or not isinstance(self.joints or [], Sequence):
+            raise InputError(f"data: joints is {self.joints!r}; expected a list of names")
         if isinstance(self.preprocess, Mapping):
             object.__setattr__(self, "preprocess", Preprocess.from_mapping(self.preprocess))
         elif self.preprocess is not None and not isinstance(self.preprocess, Preprocess):
@@ -88,12 +97,16 @@ def read_trajectories(
     unwrap: Sequence[str] | None = None,
     shift: int = 0,
     breaks: Sequence[int] | None = None,
+    pause: float | None = None,
+    joints: Sequence[str] | None = None,
+    stamps: Mapping[str, str] | None = None,
     base: str | Path | None = None,
 ) -> Trajectories:
     """Read one or more logs.
 
     Args:
-        source: a path, a pattern such as ``logs/*.csv``, ``minari:ID``, a mapping with ``path`` and any
+        source: a path, a pattern such as ``logs/*.csv``, ``minari:ID``, a pandas ``DataFrame``, a dictionary of
+            arrays, a time series or trajectory of ``mujoco.sysid``, a mapping with ``path`` (any of these) and any
             of the options below (which then count for it), or a list of those, joined in its order.
         observations: the columns observed; by default the array ``observations``.
         next_observations: the columns observed after the transition. By default the array
@@ -114,6 +127,9 @@ def read_trajectories(
         unwrap: angles in rad that wrap at ±π or at 2π, which become continuous in each episode.
         shift: rows by which the commands stand too late; each row takes the command of so many rows further on.
         breaks: rows, counted from 0, at which an episode begins, for a log that does not say.
+        pause: seconds without a measurement after which an episode begins.
+        joints: of signals whose columns are joints, those that are meant, in the model's order.
+        stamps: of a bag: topic → ``received`` or a clock's topic, whence it takes its time instead of from headers.
         base: folder from which relative paths start, by default the current one.
 
     Raises:
@@ -121,7 +137,7 @@ def read_trajectories(
     """
     options = ReadOptions(
         observations, next_observations, actions, time, episode, terminals, dt, tolerance, group, separator, preprocess,
-        scale, unwrap, shift, breaks,
+        scale, unwrap, shift, breaks, pause, joints, stamps,
     )  # fmt: skip
     return concatenate(_read(source, options, Path(base or ".")))
 
@@ -136,17 +152,25 @@ def read_recording(
     terminals: ColumnMap | None = None,
     dt: float | None = None,
     separator: str | None = None,
+    joints: Sequence[str] | None = None,
+    stamps: Mapping[str, str] | None = None,
 ) -> Recording:
     """Read one log as samples in time; the arguments are those of :func:`read_trajectories`.
 
     Raises:
         InputError: a file, name or value that cannot be used; its one line says which.
     """
-    options = ReadOptions(observations, None, actions, time, episode, terminals, dt)
-    return _recording(open_tables(Path(path), separator=separator)[0], options)
+    options = ReadOptions(observations, None, actions, time, episode, terminals, dt, joints=joints)
+    return _recording(open_tables(Path(path), separator=separator, stamps=stamps)[0], options)
 
 
 def _read(source: Source, options: ReadOptions, base: Path) -> list[Trajectories]:
+    table = in_memory(source)
+    if table is not None:
+        for name in ("group", "separator", "stamps"):
+            if getattr(options, name) is not None:
+                raise InputError(f"{table.source}: {name} is an option of files; leave it out here")
+        return [_read_table(table, options)]
     if isinstance(source, Mapping):
         if "path" not in source:
             raise InputError(f"data: there is no key 'path'{choices('path', source)}")
@@ -179,7 +203,7 @@ def _read_path(path: Path, options: ReadOptions) -> list[Trajectories]:
             return [_read_minari(folder, options)]
     if not path.exists() and not path.suffix and "-v" in path.name:
         raise InputError(f"{missing_file(path)}; a local Minari dataset is written minari:{path.name}")
-    tables = open_tables(path, group=options.group, separator=options.separator)
+    tables = open_tables(path, group=options.group, separator=options.separator, stamps=options.stamps)
     return [_read_table(table, options) for table in tables]
 
 
@@ -195,6 +219,11 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
     if following is None and options.observations is None and "next_observations" in table.names:
         following = "next_observations"
     rows = _recording(table, options)
+    if rows.sparse:
+        raise InputError(
+            f"{rows.source}: {rows.names[0]} and other signals have time stamps of their own; preprocess: {{dt: SECONDS}} "
+            "puts them on one grid"
+        )
     if following is None:
         return corrected(rows, None, options.corrections)[0].trajectories(tolerance=options.tolerance)
     found, next_names = table.matrix(following, "next_observations", len(rows))
@@ -215,23 +244,64 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
 
 
 def _recording(table: Table, options: ReadOptions) -> Recording:
-    observations, names = table.matrix(_wanted(table, options.observations, "observations"), "observations")
+    wanted = _wanted(table, options.observations, "observations")
+    infers = isinstance(options.preprocess, Preprocess) and options.preprocess.infers_actions
+    commands = [] if infers and options.actions is None else _wanted(table, options.actions, "actions")
+    table = _chosen(table, wanted, commands, options)
+    observations, names = table.matrix(wanted, "observations")
     if not names:
         raise InputError(f"{table.source}: observations: the list is empty; name at least one column")
     if len(observations) == 0:
         raise InputError(f"{table.source}: the log has no row; at least two samples are needed")
-    infers = isinstance(options.preprocess, Preprocess) and options.preprocess.infers_actions
-    wanted = [] if infers and options.actions is None else _wanted(table, options.actions, "actions")
-    actions, action_names = table.matrix(wanted, "actions", len(observations))
+    actions, action_names = table.matrix(commands, "actions", len(observations))
     episodes = _episodes(table, options, len(observations))
+    time = _time(table, options, episodes)
+    if options.pause is not None:
+        episodes = _paused(episodes, time, ~np.isnan(observations).all(axis=1), options.pause, table.source)
     return Recording(
-        observations, actions, _time(table, options, episodes), episodes, names, action_names, source=table.source
-    )
+        observations, actions, time, episodes, names, action_names, source=table.source, sparse=table.sparse,
+        quaternions=tuple(table.orientations(wanted, "observations")),
+    )  # fmt: skip
+
+
+def _chosen(table: Table, observations: ColumnMap, actions: ColumnMap, options: ReadOptions) -> Table:
+    """The table with what is read of it, where that must be known."""
+    joints = tuple(str(name) for name in options.joints or ())
+    if table.choose is None:
+        if joints and not table.keyed:
+            raise InputError(f"{table.source}: joints: no signal of this log has columns with names; leave it out")
+        return replace(table, joints=joints)
+    for name in _OF_ROWS:
+        if getattr(options, name):
+            raise InputError(
+                f"{table.source}: {name} has no meaning here, as every signal has time stamps of its own; leave it out"
+            )
+    maps = {"observations": observations, "actions": actions}
+    signals = [s for what, given in maps.items() for s in parse_columns(given, f"{table.source}: {what}")]
+    for signal in signals:
+        if signal.transpose or isinstance(signal.scale, str):
+            raise InputError(f"{table.source}: {signal.signal}: scale is a number here, and there is no transpose")
+    missing_allowed = isinstance(options.preprocess, Preprocess) and options.preprocess.max_gap is not None
+    return table.choose(Choice(tuple(s.signal for s in signals), joints, missing_allowed))
+
+
+def _paused(
+    episodes: np.ndarray, time: np.ndarray | None, measured: np.ndarray, pause: float, source: str
+) -> np.ndarray:
+    """The episode of each row, where one begins after a pause, too; ``measured`` says which rows have a measurement."""
+    if time is None:
+        raise InputError(f"{source}: pause needs time stamps; name their column with time")
+    rows = np.flatnonzero(measured)
+    begins = np.zeros(len(episodes), dtype=np.int64)
+    begins[rows[1:][np.diff(time[rows]) > pause]] = 1
+    return episodes + np.cumsum(begins)
 
 
 def _wanted(table: Table, columns: ColumnMap | None, default: str) -> ColumnMap:
     if columns is not None:
         return columns
+    if default in table.defaults:
+        return table.defaults[default]
     if default in table.names:
         return default
     empty = " ([] for a system without)" if default == "actions" else ""
@@ -247,7 +317,8 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
     flags = options.terminals
     if flags is None:
         flags = [name for name in ("terminals", "timeouts") if name in table.names]
-        if not flags and options.observations is None and options.episode is None and options.group is None:
+        told = options.observations is not None or options.group is not None or table.choose is not None
+        if not flags and not told and _episode_column(table, options) is None:
             raise InputError(
                 f"{table.source}: there is no 'terminals'; say where episodes end with terminals: NAME "
                 f"(or terminals: [] if all of it is one episode){choices('terminals', table.names)}"
@@ -261,27 +332,35 @@ def _episodes(table: Table, options: ReadOptions, rows: int) -> np.ndarray:
             "expected true/false or 0/1"
         )
     start[1:] |= values[:-1].any(axis=1)
-    if options.episode is not None:
-        label = table.array(options.episode, "episode").reshape(-1)
-        table.check_rows(options.episode, len(label), rows)
+    column = _episode_column(table, options)
+    if column is not None:
+        label = table.array(column, "episode").reshape(-1)
+        table.check_rows(column, len(label), rows)
         empty = np.flatnonzero(missing(label))
         if empty.size:
-            raise InputError(f"{table.source}: {options.episode} has no value at row {empty[0]} (counted from 0)")
+            raise InputError(f"{table.source}: {column} has no value at row {empty[0]} (counted from 0)")
         start[1:] |= label[1:] != label[:-1]
     start[break_rows(options.breaks, rows, table.source)] = True
     return np.cumsum(start)
 
 
+def _episode_column(table: Table, options: ReadOptions) -> str | None:
+    return table.defaults.get("episode") if options.episode is None else options.episode
+
+
 def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarray | None:
     """Time stamps in seconds since the log's first, ``(rows,)``."""
-    if options.time is None:
+    column = options.time
+    if column is None and options.dt is None:
+        column = table.defaults.get("time")
+    if column is None:
         if options.dt is None:
             return None
         first = np.searchsorted(episodes, episodes)
         return (np.arange(len(episodes)) - first) * options.dt
     if options.dt is not None:
         raise InputError(f"{table.source}: both time and dt are given; dt is for a log without time stamps")
-    signals = parse_columns(options.time, f"{table.source}: time")
+    signals = parse_columns(column, f"{table.source}: time")
     if len(signals) == 1 and signals[0].signal in table.names:
         stamps = table.array(signals[0].signal, "time")
         if _are_dates(stamps):
@@ -290,7 +369,7 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
             with reading(f"{table.source}: {signals[0].signal}", "dates such as 2024-05-01T12:00:00.125"):
                 dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
             return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
-    values, names = table.matrix(options.time, "time", len(episodes))
+    values, names = table.matrix(column, "time", len(episodes))
     if len(names) != 1:
         raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
     return values[:, 0]
@@ -320,6 +399,9 @@ def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
         "unwrap",
         "shift",
         "breaks",
+        "pause",
+        "joints",
+        "stamps",
     ):
         if getattr(options, name):
             source = f"{PREFIX}{dataset}" if isinstance(dataset, str) else dataset

@@ -31,6 +31,8 @@ class Recording:
         action_names: a name for each column of ``actions``.
         source: where it came from, for messages.
         rows: row of the file of each sample, ``(N,)``; by default all from 0 on.
+        sparse: whether signals have time stamps of their own, so that NaN says only that another has a sample there.
+        quaternions: names of four observations each that are a unit quaternion (w, x, y, z).
 
     Raises:
         InputError: shapes that do not fit, an infinite value, a name that stands twice, time stamps
@@ -45,6 +47,8 @@ class Recording:
     action_names: tuple[str, ...]
     source: str = "recording"
     rows: np.ndarray | None = None
+    sparse: bool = False
+    quaternions: tuple[tuple[str, ...], ...] = ()
 
     def __post_init__(self) -> None:
         rows = len(self.observations)

@@ -5,6 +5,7 @@ A column map is what a config writes after ``observations``, ``actions`` or ``ti
 ============================================  ===================================================
 ``q``                                         the column or variable ``q``, every column of a matrix
 ``q[2]``, ``q[0:3]``                          one column, a slice of the columns of a matrix
+``q[elbow]``, ``q[elbow, wrist]``             columns by their names, where the file has them
 ``{signal: vir, scale: 35.15, name: force}``  ``scale · signal + offset``, renamed
 ============================================  ===================================================
 
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -28,6 +29,7 @@ from dropo_torch.support.extras import extra
 from dropo_torch.support.given import check_keys, number
 
 ColumnMap = str | int | Mapping[str, Any] | Sequence[Any]
+Index = slice | tuple[str, ...]
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,21 @@ class Signal:
 
 
 @dataclass(frozen=True)
+class Choice:
+    """What is read of a log whose signals have time stamps of their own.
+
+    Attributes:
+        entries: what column maps name, with indices.
+        joints: the joints that are meant where an entry names none.
+        missing_allowed: whether NaN counts as no sample.
+    """
+
+    entries: tuple[str, ...]
+    joints: tuple[str, ...] = ()
+    missing_allowed: bool = False
+
+
+@dataclass(frozen=True)
 class Table:
     """The named arrays of one log, read when asked for.
 
@@ -57,11 +74,25 @@ class Table:
         source: the file, for messages.
         names: the columns or variables that there are.
         read: gives the array of a name, of whatever dtype the file holds.
+        labels: the names of a matrix' columns, where the file has them.
+        joints: of the matrices whose columns are joints, the columns that are meant where an entry names none.
+        keyed: those matrices.
+        defaults: what is meant by ``observations``, ``actions``, ``time`` or ``episode`` where the config does not say.
+        quaternions: first columns of the unit quaternions in a matrix.
+        sparse: whether NaN says only that another signal has a sample there.
+        choose: reads what some entries name, of a log whose signals have time stamps of their own.
     """
 
     source: str
     names: tuple[str, ...]
     read: Callable[[str], np.ndarray]
+    labels: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    joints: tuple[str, ...] = ()
+    keyed: frozenset[str] = frozenset()
+    defaults: Mapping[str, str] = field(default_factory=dict)
+    quaternions: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
+    sparse: bool = False
+    choose: Callable[[Choice], Table] | None = None
 
     def matrix(self, columns: ColumnMap, what: str, rows: int | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the float64 matrix ``(N, k)`` that a column map picks, and the ``k`` names.
@@ -114,29 +145,50 @@ class Table:
             raise InputError(f"{self.source}: {what}: {name} has shape {values.shape}; expected (samples, columns)")
         if signal.transpose:
             values = values.T
-        width = values.shape[1]
-        labels = column_names(signal.name or name, width)
-        if index is not None:
+        stem = signal.name or name
+        labels, picked = self._picked(name, stem, index, values.shape[1], f"{self.source}: {what}: {signal.signal}")
+        if index is not None and signal.name and len(picked) == 1:
+            labels = [signal.name]
+        return self._scale(signal, what) * values[:, picked] + signal.offset, labels
+
+    def _picked(
+        self, name: str, stem: str, index: Index | None, width: int, where: str
+    ) -> tuple[list[str], Sequence[int]]:
+        """The chosen columns of a matrix of some width, by their names and numbers."""
+        known = self.labels.get(name)
+        labels = column_names(stem, width) if known is None else [f"{stem}[{label}]" for label in known]
+        if index is None and name in self.keyed and self.joints:
+            index = self.joints
+        if index is None:
+            return labels, range(width)
+        if isinstance(index, tuple):
+            if known is None:
+                raise InputError(f"{where}: the columns of {name} have no names; choose by number, as in {name}[0]")
+            picked = [column for wanted in index for column in pick(wanted, known, where)]
+        else:
             low, high = index.start or 0, width if index.stop is None else index.stop
             inside = -width <= low < width and -width <= high <= width
-            picked = np.arange(width)[index if inside else slice(0)]
-            if picked.size == 0:
-                raise InputError(f"{self.source}: {what}: {signal.signal} is outside {name}, which has {width} columns")
-            values, labels = values[:, picked], [labels[i] for i in picked]
-            if signal.name and len(labels) == 1:
-                labels = [signal.name]
-        return self._scale(signal, what) * values + signal.offset, labels
+            picked = list(range(width)[index if inside else slice(0)])
+            if not picked:
+                raise InputError(f"{where} is outside {name}, which has {width} columns")
+        return [labels[i] for i in picked], picked
 
-    def _locate(self, text: str) -> tuple[str, slice | None]:
+    def orientations(self, columns: ColumnMap, what: str) -> list[tuple[str, ...]]:
+        """Return the names that :meth:`matrix` gives the columns of each unit quaternion that it picks whole."""
+        found = []
+        for signal in parse_columns(columns, f"{self.source}: {what}"):
+            name, index = self._locate(signal.signal)
+            if name in self.quaternions:
+                width = len(self.labels[name])
+                labels, picked = self._picked(name, signal.name or name, index, width, self.source)
+                named = dict(zip(picked, labels, strict=True))
+                groups = [range(first, first + 4) for first in self.quaternions[name]]
+                found += [tuple(named[c] for c in group) for group in groups if named.keys() >= set(group)]
+        return found
+
+    def _locate(self, text: str) -> tuple[str, Index | None]:
         """The array that an entry names and, where it has an index, its columns."""
-        match = re.fullmatch(r"(.+)\[(-?\d+|-?\d*:-?\d*)\]", text)
-        if text in self.names or match is None:
-            return text, None
-        if ":" in match[2]:
-            low, high = (int(bound) if bound else None for bound in match[2].split(":"))
-            return match[1], slice(low, high)
-        column = int(match[2])
-        return match[1], slice(column, column + 1 or None)
+        return (text, None) if text in self.names else split_index(text)
 
     def _scale(self, signal: Signal, what: str) -> float:
         if not isinstance(signal.scale, str):
@@ -147,6 +199,32 @@ class Table:
                 f"{self.source}: {what}: scale {signal.scale!r} has shape {factor.shape}; expected a scalar"
             )
         return float(factor.reshape(()))
+
+
+def split_index(text: str) -> tuple[str, Index | None]:
+    """Return the name and the index of an entry ``name[index]``: a slice of its columns, or their names."""
+    match = re.fullmatch(r"(.+?)\[([^\[\]]+)\]", text)
+    if match is None:
+        return text, None
+    name, inside = match[1], match[2].strip()
+    if re.fullmatch(r"-?\d+", inside):
+        return name, slice(int(inside), int(inside) + 1 or None)
+    if re.fullmatch(r"-?\d*:-?\d*", inside):
+        low, high = (int(bound) if bound else None for bound in inside.split(":"))
+        return name, slice(low, high)
+    return name, tuple(part.strip() for part in inside.split(","))
+
+
+def pick(wanted: str, labels: Sequence[str], where: str) -> list[int]:
+    """Return the columns of a name; that of a group such as ``hand`` stands for ``hand.x``, ``hand.y``, ... too.
+
+    Raises:
+        InputError: a name that no column has.
+    """
+    found = [i for i, label in enumerate(labels) if label == wanted or label.startswith(f"{wanted}.")]
+    if not found:
+        raise InputError(f"{where}: there is no {wanted!r}{choices(wanted, labels)}")
+    return found
 
 
 def parse_columns(columns: ColumnMap, where: str) -> tuple[Signal, ...]:
