@@ -2,16 +2,22 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
+import shutil
 import warnings
 from pathlib import Path
 
 import h5py
+import mujoco
 import numpy as np
 import pandas as pd
+import pyarrow as pa
 import pytest
 import scipy.io
+import torch
+from pyarrow import feather, parquet
 
 from dropo_torch.data.readers import read_recording, read_trajectories
 from dropo_torch.data.recording import Recording
@@ -111,6 +117,47 @@ def write_parquet_of_lists(folder: Path):
     table["t"] = pd.Timestamp("2024-05-01", tz="Europe/Rome") + pd.to_timedelta(TIME, unit="s")
     table.to_parquet(folder / "log.parquet")
     return folder / "log.parquet", {**COLUMNS, "observations": "state"}
+
+
+def write_feather(folder: Path):
+    frame().set_index(["episode", "t"]).to_feather(folder / "log.feather")
+    return folder / "log.feather", COLUMNS
+
+
+def write_arrow_of_lists(folder: Path):
+    feather.write_feather(pa.table({"q": list(OBSERVATIONS), "u": ACTIONS[:, 0], "k": EPISODE}), folder / "log.arrow")
+    return folder / "log.arrow", {"observations": "q", "actions": "u", "episode": "k", "dt": DT}
+
+
+#: What LeRobot says of its datasets, in degrees and with the elbow's speed before its angle.
+FEATURES = {
+    "observation.state": {"dtype": "float32", "shape": [2], "names": ["elbow.vel", "elbow.pos"]},
+    "action": {"dtype": "float32", "shape": [1], "names": {"motors": ["elbow"]}},
+    "observation.images.front": {"dtype": "video", "shape": [48, 64, 3], "names": ["height", "width", "channels"]},
+    **{name: {"dtype": "float32", "shape": [1], "names": None} for name in ("timestamp",)},
+    **{name: {"dtype": "int64", "shape": [1], "names": None} for name in ("frame_index", "episode_index", "index")},
+}
+
+
+def write_lerobot(folder: Path):
+    """Two files of a dataset, in the order of neither name nor time."""
+    (folder / "meta").mkdir()
+    about = {"codebase_version": "v3.0", "fps": round(1 / DT), "total_frames": SAMPLES, "total_episodes": 2}
+    (folder / "meta" / "info.json").write_text(json.dumps({**about, "features": FEATURES}))
+    columns = {
+        "observation.state": list(np.rad2deg(OBSERVATIONS[:, ::-1])),
+        "action": list(np.rad2deg(ACTIONS)),
+        "timestamp": TIME.astype(np.float32),
+        "episode_index": EPISODE // 8,
+        "index": np.arange(SAMPLES),
+    }
+    for number, rows in enumerate((slice(3, None), slice(0, 3))):
+        chunk = folder / "data" / f"chunk-00{number}"
+        chunk.mkdir(parents=True)
+        parquet.write_table(pa.table({k: v[rows] for k, v in columns.items()}), chunk / "file-000.parquet")
+    degree = float(np.pi / 180)
+    chosen = "observation.state[elbow.pos, elbow.vel]"
+    return folder, {"observations": chosen, "scale": {"observation.state": degree, "action": degree}}
 
 
 def write_d4rl(folder: Path):
@@ -501,3 +548,153 @@ def test_published_hopper_log():
     log = read_trajectories(folder)
     assert log.observations.shape == (10000, 11)
     assert log.num_episodes == 20
+
+
+# --- LeRobot, mujoco.sysid, and what is in memory ---
+
+
+def test_a_lerobot_dataset_says_what_is_what(tmp_path):
+    """Without options: its states, its actions, its time and its episodes."""
+    folder, _ = write_lerobot(tmp_path)
+    log = read_trajectories(folder)
+    np.testing.assert_allclose(log.observations, np.rad2deg(OBSERVATIONS[START, ::-1]))
+    assert log.num_episodes == 2
+    assert log.dt == pytest.approx(DT, rel=1e-5)
+    assert log.origin.observation_names == ("observation.state[elbow.vel]", "observation.state[elbow.pos]")
+    both = {"observations": "observation.state", "preprocess": {"dt": DT / 2}, "joints": ["elbow.pos"]}
+    np.testing.assert_allclose(read_trajectories(folder, **both, actions=[]).observations[::2, 0],
+                               np.rad2deg(OBSERVATIONS[START, 0]), atol=1e-4)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (
+            lambda f: (f / "data" / "chunk-001" / "file-000.parquet").unlink(),
+            "total_frames: 7, and .* have 4",
+        ),
+        (lambda f: shutil.rmtree(f / "data"), "there are no data/chunk-"),
+        (lambda f: (f / "meta" / "info.json").write_text("{}"), "cannot be read as a LeRobot dataset's description"),
+        (
+            lambda f: (f / "meta" / "info.json").write_text('{"features": {"x": {}}}'),
+            "say which columns",
+        ),
+        (lambda f: (f / "data" / "chunk-000" / "file-000.parquet").write_text("version https://git-lfs"), "Parquet"),
+    ],
+)
+def test_a_lerobot_dataset_that_is_not_whole(tmp_path, damage, message):
+    folder, _ = write_lerobot(tmp_path)
+    damage(folder)
+    with pytest.raises(InputError, match=message):
+        read_trajectories(folder)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"joints": ["wrist"]}, r"observation.state: there is no 'wrist' \(there are: elbow.vel, elbow.pos\)"),
+        ({"observations": "observation.state[knee]"}, "there is no 'knee'"),
+        ({"observations": "observation.images.front"}, "there is no 'observation.images.front'"),
+        ({"stamps": {"/a": "received"}}, "stamps is an option of ROS bag files"),
+    ],
+)
+def test_what_a_lerobot_dataset_has_not(tmp_path, options, message):
+    with pytest.raises(InputError, match=message):
+        read_trajectories(write_lerobot(tmp_path)[0], **options)
+
+
+SERIES_XML = """
+<mujoco>
+  <worldbody><body><joint name="elbow" axis="0 1 0"/><geom size=".1" mass="1"/></body></worldbody>
+  <actuator><motor name="motor" joint="elbow"/></actuator>
+  <sensor><jointpos name="angle" joint="elbow"/><jointvel name="speed" joint="elbow"/></sensor>
+</mujoco>"""
+
+
+def trajectory(times=TIME[:4], late=0.0):
+    """The first episode as mujoco.sysid has it."""
+    from mujoco.sysid._src import (
+        timeseries as sysid,  # which the package shows only where all of its extra is installed
+    )
+    from mujoco.sysid._src.trajectory import SystemTrajectory
+
+    model = mujoco.MjModel.from_xml_string(SERIES_XML)
+    control = sysid.TimeSeries.from_control_names(times + late, ACTIONS[:4], model)
+    seen = sysid.TimeSeries.from_names(times, OBSERVATIONS[:4], model)
+    qpos, qvel, _, _ = sysid.TimeSeries.compute_all_state_mappings(model)
+    state = sysid.TimeSeries(times, np.column_stack([times, OBSERVATIONS[:4]]), qpos | qvel)
+    return SystemTrajectory(model, control, seen, np.zeros(3), state)
+
+
+SYSID = (
+    {"observations": ["angle", "speed"], "actions": "motor_ctrl"},
+    {"observations": "sensordata"},
+    {"observations": "sensordata[angle, speed]", "actions": "control[motor_ctrl]"},
+    {"observations": ["state.elbow_qpos", "state[elbow_qvel]"]},
+)
+
+
+@pytest.mark.parametrize("options", SYSID)
+def test_a_trajectory_of_mujoco_sysid_from_memory_and_disk(tmp_path, options):
+    given = trajectory()
+    given.save_to_disk(tmp_path / "log.npz")
+    for source in (given, tmp_path / "log.npz"):
+        log = read_trajectories(source, **options)
+        np.testing.assert_allclose(log.observations, OBSERVATIONS[:3])
+        np.testing.assert_allclose(log.actions, ACTIONS[:3])
+        assert log.dt == pytest.approx(DT)
+
+
+def test_time_series_of_mujoco_sysid(tmp_path):
+    series = trajectory().sensordata
+    series.save_to_disk(tmp_path / "log.npz")
+    for source in (series, tmp_path / "log.npz"):
+        log = read_trajectories(source, observations=["speed", "data[angle]"], actions=[])
+        np.testing.assert_allclose(log.observations, OBSERVATIONS[:3, ::-1])
+    with pytest.raises(InputError, match=r"TimeSeries: there is no signal 'angel'; did you mean 'angle'"):
+        read_trajectories(series, observations="angel", actions=[])
+
+
+def test_series_with_other_stamps_need_preprocessing():
+    late = trajectory(late=0.01)
+    with pytest.raises(InputError, match="stamps of their own"):
+        read_trajectories(late, observations="sensordata")
+    log = read_trajectories(late, observations="angle", preprocess={"dt": DT})
+    np.testing.assert_allclose(log.actions, ACTIONS[:2], atol=1e-12)
+
+
+def test_frames_and_arrays_in_memory():
+    check(read_trajectories(frame(), **COLUMNS))
+    check(read_trajectories(frame().set_index(["episode", "t"]), **COLUMNS))
+    check(read_trajectories({"path": frame(), **COLUMNS}))
+    check(read_trajectories(arrays(following=True), dt=DT))
+    columns = {name: series.to_numpy() for name, series in frame().items()}
+    check(read_trajectories(columns, **COLUMNS))
+    check(read_trajectories({"q": torch.tensor(OBSERVATIONS), "u": list(ACTIONS[:, 0]), "k": EPISODE},
+                            observations="q", actions="u", episode="k", dt=DT))  # fmt: skip
+    halves = [frame()[label == EPISODE] for label in (7, 9)]
+    check(read_trajectories(halves, **{**COLUMNS, "episode": None}))
+
+
+@pytest.mark.parametrize(
+    ("source", "options", "message"),
+    [
+        ({"q": OBSERVATIONS}, {"observations": "p", "actions": []}, r"arrays: .* there is no 'p' \(there are: q\)"),
+        ({"q": OBSERVATIONS, "u": ACTIONS[1:]}, {"observations": "q", "actions": "u"}, "actions has 6 rows"),
+        ({"q": OBSERVATIONS}, {"separator": ",", "observations": "q"}, "arrays: separator is an option of files"),
+        ({"q": [1, 2, 3]}, {}, "no key 'path'"),
+        (frame(), {"observations": "angle"}, "data frame: there is no 'actions'"),
+        (frame(), {"observations": ["q"], "actions": [], "joints": ["q"]}, "joints: no signal of this log"),
+        (3.5, {}, r"3\.5 given; expected a path"),
+    ],
+)  # fmt: skip
+def test_what_is_in_memory_must_fit(source, options, message):
+    with pytest.raises(InputError, match=message):
+        read_trajectories(source, **options)
+
+
+def test_a_pause_ends_an_episode_of_a_table(tmp_path):
+    table = frame(t=TIME + np.where(EPISODE == 9, 1.0, 0.0)).drop(columns="episode")
+    check(read_trajectories(table, observations=["q", "dq"], actions="u", time="t", pause=0.2))
+    with pytest.raises(InputError, match="pause needs time stamps"):
+        read_trajectories(table, observations=["q", "dq"], actions="u", pause=0.2)

@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -99,9 +99,10 @@ def open_bag(path: Path, stamps: Any) -> list[Table]:
             name: Topic(str(info.msgtype), _fields(types, info.msgtype), info.msgcount)
             for name, info in reader.topics.items()
         }
-    bag = Bag(path, topics, _checked_stamps(path, topics, stamps))
+    bag = Bag(path, topics, {})
     if not any(topic.messages for topic in topics.values()):
         raise InputError(f"{path}: the bag is empty: no topic has messages ({bag.listed})")
+    bag = replace(bag, stamps=_checked_stamps(path, topics, stamps))
     names = [f"{name}.{below}" for name, topic in topics.items() if topic.messages for below in topic.fields]
     return [Table(str(path), tuple(names), _unread, choose=partial(choose, bag))]
 

@@ -95,7 +95,7 @@ def _labels(feature: Mapping[str, Any]) -> tuple[str, ...]:
         names = next(iter(names.values()))
     if not isinstance(names, list) or not isinstance(shape, list) or len(shape) != 1 or len(names) != shape[0]:
         return ()
-    return tuple(str(name) for name in names) if len(set(map(str, names))) == len(names) > 1 else ()
+    return tuple(map(str, names)) if len(set(map(str, names))) == len(names) else ()
 
 
 def _check_complete(folder: Path, info: Mapping[str, Any], data: _Data) -> None:

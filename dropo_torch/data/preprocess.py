@@ -334,7 +334,7 @@ class _Episode:
         if steps[longest] > most:
             raise InputError(
                 f"{self.part.source}: {name} has no sample for {steps[longest]:.4g} s from {samples.time[longest]:.6g} "
-                f"s on, and at most {most:.4g} s are interpolated; raise max_gap, or make two episodes of it"
+                f"s on, and at most {most:.4g} s are interpolated; raise max_gap, or begin an episode there with pause"
             )
 
     def _filtered(self, name: str, samples: _Samples, cutoff: float) -> _Samples:

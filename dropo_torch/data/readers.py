@@ -221,7 +221,7 @@ def _read_table(table: Table, options: ReadOptions) -> Trajectories:
     rows = _recording(table, options)
     if rows.sparse:
         raise InputError(
-            f"{rows.source}: {rows.names[0]} and other signals have time stamps of their own; preprocess: {{dt: SECONDS}} "
+            f"{rows.source}: {rows.names[0]} and other signals have stamps of their own; preprocess: {{dt: SECONDS}} "
             "puts them on one grid"
         )
     if following is None:

@@ -57,9 +57,8 @@ def sysid_table(source: str, names: Iterable[str], read: Callable[[str], np.ndar
     for part in found:
         stem = f"{part}_" if part else ""
         mapping = str(read(f"{stem}signal_mapping")) if f"{stem}signal_mapping" in names else "{}"
-        arrays = (numbers(read(f"{stem}{name}"), f"{source}: {stem}{name}") for name in ("times", "data"))
-        below = "state." if part == "state" else ""
-        matrices |= _signals(f"{source}: {stem}data", part or "data", below, *arrays, mapping)
+        times, data = (numbers(read(f"{stem}{name}"), f"{source}: {stem}{name}") for name in ("times", "data"))
+        matrices |= _signals(f"{source}: {stem}data", part or "data", times, data, mapping)
     defaults = {"actions": "control"} if "control" in matrices else {}
     return Table(source, tuple(matrices), _unread, defaults=defaults, choose=partial(_choose, source, matrices))
 
@@ -82,7 +81,7 @@ def _choose(source: str, matrices: Mapping[str, Matrix], choice: Choice) -> Tabl
     return aligned(source, kept, joints=choice.joints)
 
 
-def _signals(where: str, name: str, below: str, times: np.ndarray, data: np.ndarray, mapping: str) -> dict[str, Matrix]:
+def _signals(where: str, name: str, times: np.ndarray, data: np.ndarray, mapping: str) -> dict[str, Matrix]:
     """The signals of a series, and all of it under one name."""
     if times.ndim != 1 or data.ndim != 2 or len(times) != len(data) or not (np.diff(times) > 0).all():
         raise InputError(
@@ -98,6 +97,7 @@ def _signals(where: str, name: str, below: str, times: np.ndarray, data: np.ndar
                 raise InputError(f"{where}: {signal} is column {column}, but there are {len(labels)}")
             labels[column + offset] = signal if len(columns) == 1 else f"{signal}.{number}"
     streams = {label: Stream(times, data[:, i]) for i, label in enumerate(labels)}
+    below = "state." if name == "state" else ""
     of = {
         f"{below}{signal}": Matrix({labels[c + offset]: streams[labels[c + offset]] for c in columns})
         for signal, columns in indices.items()
