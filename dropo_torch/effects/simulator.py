@@ -30,7 +30,7 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.base import Numbers, Simulator
 from dropo_torch.simulators.hidden import filter_memory
 
 #: Shares of the search box of which one after the other is asked whether most of the log knows its commands.
@@ -114,11 +114,11 @@ class EffectSimulator(Simulator):
         late = self._sensors.look_back(parameters)
         self._late = min(math.ceil(late / timestep - 1e-9), LONGEST_HISTORY) if late < math.inf else LONGEST_HISTORY
 
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def simulate(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
         return self._run(states, controls, values, last=True)[:, :, 0]
 
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
         return self._run(states, controls, values, last=False)
 
@@ -131,7 +131,7 @@ class EffectSimulator(Simulator):
                 "window, and its own"
             )
 
-    def _run(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, *, last: bool) -> torch.Tensor:
+    def _run(self, states: Numbers, controls: Numbers, values: Numbers, *, last: bool) -> torch.Tensor:
         start, control, vectors = self.arrays(states, controls, values)
         lag = control.shape[1] - self.history
         out = np.empty((len(start), len(vectors), 1 if last else lag, self.num_states))

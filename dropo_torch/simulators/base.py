@@ -6,6 +6,7 @@ import abc
 from typing import ClassVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 
 from dropo_torch.errors import InputError
@@ -13,6 +14,9 @@ from dropo_torch.parameters import ParameterSpace
 
 #: MuJoCo's own bound on a state it still calls stable (mjMAXVAL).
 DIVERGED = 1e10
+
+#: What a simulator takes: a tensor, or anything that NumPy makes an array of.
+Numbers = torch.Tensor | npt.ArrayLike
 
 
 class Simulator(abc.ABC):
@@ -44,8 +48,10 @@ class Simulator(abc.ABC):
     timestep: float | None
     notes: tuple[str, ...] = ()
 
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def simulate(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after ``lag`` transitions, the last of :meth:`rollout`.
+
+        Arguments are tensors, arrays or lists; the result is a tensor.
 
         Args:
             states: initial states, ``(T, num_states)``, float64.
@@ -55,22 +61,42 @@ class Simulator(abc.ABC):
 
         Returns:
             ``(T, K, num_states)``, float64. A simulation that diverges is NaN throughout.
+
+        Raises:
+            InputError: shapes that do not fit, or gradients asked of a simulator that has none.
         """
         return self.rollout(states, controls, values)[:, :, -1]
 
     @abc.abstractmethod
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each of the ``lag`` transitions, ``(T, K, lag, num_states)``.
 
         The arguments are those of :meth:`simulate`, whose result is the last of these.
         """
 
-    def arrays(
-        self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the arguments as float64 arrays, once :meth:`check_arguments` finds that they fit."""
-        self.check_arguments(states, controls, values)
-        start, control, vectors = (x.detach().cpu().double().numpy() for x in (states, controls, values))
+    def arrays(self, states: Numbers, controls: Numbers, values: Numbers) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the arguments as float64 arrays; see :meth:`tensors`."""
+        start, control, vectors = (x.detach().cpu().double().numpy() for x in self.tensors(states, controls, values))
+        return start, control, vectors
+
+    def tensors(
+        self, states: Numbers, controls: Numbers, values: Numbers
+    ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        """Return the arguments as tensors, once :meth:`check_arguments` finds that they fit.
+
+        Raises:
+            InputError: what is no number, shapes that do not fit, or gradients asked of a simulator that has none.
+        """
+        given = {"states": states, "controls": controls, "values": values}
+        start, control, vectors = (_tensor(name, numbers) for name, numbers in given.items())
+        self.check_arguments(start, control, vectors)
+        asked = torch.is_grad_enabled() and not self.differentiable
+        for name, tensor in zip(given, (start, control, vectors), strict=True):
+            if asked and tensor.requires_grad:
+                raise InputError(
+                    f"{name}: gradients are asked (requires_grad), but backend {self.name} has none; {self.remedy}, or "
+                    f"give {name}.detach()"
+                )
         return start, control, vectors
 
     def check_arguments(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> None:
@@ -88,3 +114,13 @@ class Simulator(abc.ABC):
         if controls.shape[1] <= self.history:
             before = f"{self.history} before each transition, and " if self.history else ""
             raise InputError(f"controls: {controls.shape[1]} logged steps given; expected {before}lag 1 or more")
+
+
+def _tensor(name: str, numbers: Numbers) -> torch.Tensor:
+    """A tensor of what was given, on the CPU and in float64 unless it was one."""
+    if isinstance(numbers, torch.Tensor):
+        return numbers
+    try:
+        return torch.tensor(np.asarray(numbers, dtype=np.float64))
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{name}: {error}; expected numbers in an array or a tensor") from None

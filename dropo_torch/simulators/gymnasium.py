@@ -13,7 +13,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, write_field
-from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
 from dropo_torch.simulators.hidden import filters_of, prescribed_bodies
 from dropo_torch.support.usercode import user_code
 
@@ -181,7 +181,7 @@ class GymnasiumSimulator(Simulator):
         step = self._adapter.timestep
         self.timestep = None if step is None else step * frame_skip
 
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
         start, control, vectors = self.arrays(states, controls, values)
         out = np.empty((len(start), len(vectors), control.shape[1], self.num_states))

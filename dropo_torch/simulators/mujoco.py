@@ -13,7 +13,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import load_model, quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
-from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
 from dropo_torch.simulators.hidden import POSE, filters_of, prescribed_bodies
 
 
@@ -73,15 +73,15 @@ class MujocoSimulator(Simulator):
         self._tiled: tuple[np.ndarray, int] | None = None  # the values that the batch's fields hold, and their repeats
         self._constants: mujoco.batch.Batch | None = None
 
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def simulate(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
         return self._run(states, controls, values, slice(-1, None))[:, :, 0]
 
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
         return self._run(states, controls, values, slice(None))
 
-    def _run(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor, kept: slice) -> torch.Tensor:
+    def _run(self, states: Numbers, controls: Numbers, values: Numbers, kept: slice) -> torch.Tensor:
         start, control, vectors = self.arrays(states, controls, values)
         num_t, num_k, lag = len(start), len(vectors), control.shape[1] - self.history
         out = np.empty((num_t, num_k, len(range(lag)[kept]), self.num_states))

@@ -12,7 +12,7 @@ from dropo_torch.data.observation import generic_observation
 from dropo_torch.data.trajectory import Transitions
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators.base import Simulator
+from dropo_torch.simulators.base import Numbers, Simulator
 
 
 class LinearSimulator(Simulator):
@@ -52,13 +52,13 @@ class LinearSimulator(Simulator):
         self.transform = transform
         self.calls = 0
 
-    def simulate(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def simulate(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after ``lag`` transitions; see :meth:`Simulator.simulate`."""
         return self.rollout(states, controls, values)[:, :, -1]
 
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
-        self.check_arguments(states, controls, values)
+        states, controls, values = self.tensors(states, controls, values)
         self.calls += 1
         drift = _apply(self.effect, self.transform(values))
         now = states[:, None].expand(-1, len(values), -1)

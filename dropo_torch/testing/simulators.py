@@ -220,6 +220,13 @@ def _arguments_that_do_not_fit_are_refused(case: SimulatorCase) -> None:
         raise Broken(f"a result for {what}", "an InputError; see Simulator.check_arguments")
 
 
+def _arrays_are_taken_as_tensors_are(case: SimulatorCase) -> None:
+    given = (case.states, case.controls, case.values)
+    for what, convert in (("arrays", lambda x: x.numpy()), ("lists", lambda x: x.tolist())):
+        found = case.simulator.simulate(*map(convert, given))
+        require_same(found.detach(), case.result, f"a result for {what}", "that for tensors")
+
+
 def _the_same_arguments_give_the_same_result(case: SimulatorCase) -> None:
     simulator, states, controls, values = case.simulator, case.states, case.controls, case.values
     expected = case.result
@@ -368,6 +375,12 @@ def _gradients_are_those_of_central_differences(case: SimulatorCase) -> None:
     simulator = case.simulator
     if not simulator.differentiable:
         require(simulator.remedy, "no remedy", "words on what to do where gradients are needed")
+        try:
+            simulator.simulate(case.states, case.controls, case.values.clone().requires_grad_(True))
+        except InputError:
+            pass
+        else:
+            raise Broken("a result without gradients where they are asked", "an InputError; see Simulator.tensors")
         raise NotApplicable("the simulator is not differentiable")
     weights = torch.from_numpy(np.random.default_rng(1).normal(size=tuple(case.states.shape)))
     arguments = [case.states, case.controls, case.values[:1]]
@@ -439,6 +452,7 @@ LAWS = (
     _results_have_their_shape_and_are_float64,
     _empty_batches_give_empty_results,
     _arguments_that_do_not_fit_are_refused,
+    _arrays_are_taken_as_tensors_are,
     _the_same_arguments_give_the_same_result,
     _a_result_belongs_to_the_caller,
     _order_and_size_of_the_batch_do_not_matter,

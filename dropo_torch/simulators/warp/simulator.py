@@ -12,7 +12,7 @@ import warp as wp
 
 from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
-from dropo_torch.simulators.base import DIVERGED, Simulator
+from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
 from dropo_torch.simulators.hidden import POSE, prescribed_bodies
 from dropo_torch.simulators.warp.engine import Batch, Engine, Simulate
 from dropo_torch.simulators.warp.filters import FilterStarts
@@ -75,12 +75,12 @@ class WarpSimulator(Simulator):
         )
         self._device = wp.device_to_torch(device)
 
-    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+    def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition ``(T, K, lag, nq + nv)``, differentiable in all three arguments.
 
         A quaternion in ``states`` need not be normalised; those returned are. See :meth:`Simulator.rollout`.
         """
-        self.check_arguments(states, controls, values)
+        states, controls, values = self.tensors(states, controls, values)
         origin = states.device
         shape = (len(states), len(values), controls.shape[1] - self.history, self.num_states)
         if 0 in shape[:2]:
