@@ -124,7 +124,16 @@ def log_of(config: Config, model: mujoco.MjModel | None, tolerance: float = TOLE
             raise InputError("data: preprocess needs dt, the seconds of one transition (or frame_skip, and a model)")
         step = float(model.opt.timestep) * config.frame_skip
         source = {**source, "preprocess": {"dt": step, **source["preprocess"]}}
-    log, wanted = read_trajectories(source, base=config.base, tolerance=tolerance), config.trajectories
+    return used(config, read_trajectories(source, base=config.base, tolerance=tolerance))
+
+
+def used(config: Config, log: Trajectories) -> Trajectories:
+    """Return the episodes of a log that a config uses.
+
+    Raises:
+        InputError: episodes that the log does not have.
+    """
+    wanted = config.trajectories
     if isinstance(wanted, int):
         if not 1 <= wanted <= log.num_episodes:
             raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")

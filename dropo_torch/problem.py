@@ -19,7 +19,16 @@ from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator, first_known
 from dropo_torch.errors import InputError
-from dropo_torch.logged import SLOWEST, TIME_TOLERANCE, LoggedData, completed, frame_skip_of, is_registered, log_of
+from dropo_torch.logged import (
+    SLOWEST,
+    TIME_TOLERANCE,
+    LoggedData,
+    completed,
+    frame_skip_of,
+    is_registered,
+    log_of,
+    used,
+)
 from dropo_torch.models.load import load_model
 from dropo_torch.objective import Objective
 from dropo_torch.parameters import ParameterSpace
@@ -72,11 +81,12 @@ def logged_data(problem: Problem) -> LoggedData:
     )  # fmt: skip
 
 
-def make_problem(config: Config, *, general: bool = False) -> Problem:
+def make_problem(config: Config, *, log: Trajectories | None = None, general: bool = False) -> Problem:
     """Read, build and check everything that a config names.
 
     Args:
         config: the config.
+        log: the log, such as one read from memory, in place of the config's ``data``.
         general: as the search for missing effects needs it: free bodies are compiled so that their mass and its centre
             may change in any way, and a config may name no parameters.
 
@@ -91,7 +101,7 @@ def make_problem(config: Config, *, general: bool = False) -> Problem:
         model_path = config.path(str(config.model))
         space = _space(load_model(model_path, general=general or config.moves_centres), config, general)
         source = space.model
-    trajectories = log_of(config, space.model)
+    trajectories = log_of(config, space.model) if log is None else used(config, log)
     frame_skip = frame_skip_of(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
     effects, since = None, None

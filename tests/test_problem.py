@@ -13,6 +13,7 @@ import torch
 from arm import DT, PARAMETERS, XML, Folder, record
 
 from dropo_torch.config import load_config
+from dropo_torch.data.readers import read_trajectories
 from dropo_torch.errors import InputError
 from dropo_torch.problem import Problem, make_problem
 
@@ -141,3 +142,15 @@ def test_a_run_is_identified_by_config_model_log_and_adapter(folder: Folder, pro
 def test_a_problem_reads_a_log_of_any_folder(folder: Folder, problem: Callable[..., Problem], tmp_path: Path) -> None:
     np.savez(tmp_path / "elsewhere.npz", **record())
     assert len(problem(data=str(tmp_path / "elsewhere.npz")).trajectories) == 60
+
+
+def test_a_log_in_memory_stands_for_the_configs(folder: Folder) -> None:
+    """The same log from a file and from memory is the same problem; episodes are chosen of either."""
+    made = record()
+    arrays = {name: made[name] for name in ("observations", "next_observations", "actions", "terminals")}
+    config = load_config(folder.config())
+    from_file, from_memory = make_problem(config), make_problem(config, log=read_trajectories(arrays))
+    assert from_memory.fingerprint == from_file.fingerprint
+    assert len(from_memory.objective) == len(from_file.objective)
+    without = load_config(folder.config(data=None, trajectories=1))
+    assert make_problem(without, log=read_trajectories(arrays)).trajectories.num_episodes == 1

@@ -186,3 +186,12 @@ def test_a_zero_quaternion_at_either_end_is_refused_with_its_row(what: str, lag:
     log = Trajectories(**arrays, actions=np.zeros((6, 0)), terminals=np.zeros(6, dtype=bool))
     with pytest.raises(InputError, match=rf"row 3 of {what} has a zero quaternion in root\.position\[qw\]"):
         make_transitions(log, parse_observation(model, None), lag=lag)
+
+
+def test_a_log_is_shown_in_one_line():
+    shown = repr(numbered_log([3, 2], dt=0.02, source="log.npz"))
+    assert shown == (
+        "<Trajectories of log.npz: 5 transitions, 2 episodes, 2 observed columns, 1 action column, every 0.02 s>"
+    )
+    assert "1 transition, 1 episode" in repr(numbered_log([1]))
+    assert "no time stamps" in repr(numbered_log([1]))

@@ -111,6 +111,14 @@ class Trajectories:
         """Return the number of transitions T."""
         return len(self.observations)
 
+    def __repr__(self) -> str:
+        """Return one line: where the log came from, and how much there is of what."""
+        widths = {"observed columns": self.observations.shape[1], "action columns": self.actions.shape[1]}
+        amounts = {"transitions": len(self), "episodes": self.num_episodes, **widths}
+        counted = ", ".join(f"{n} {what.removesuffix('s') if n == 1 else what}" for what, n in amounts.items())
+        step = "no time stamps" if self.dt is None else f"every {self.dt:.6g} s"
+        return f"<Trajectories of {self.source}: {counted}, {step}>"
+
     @property
     def num_episodes(self) -> int:
         """Number of episodes."""
