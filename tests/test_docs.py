@@ -15,6 +15,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import bags
 import h5py
 import mujoco
 import numpy as np
@@ -150,12 +151,45 @@ def write_logs(folder: Path, time: np.ndarray, states: np.ndarray, controls: np.
     frame.to_csv(folder / "log.csv", index=False)
     lists = {"stamp": time, "q": list(states[:, :2]), "dq": list(states[:, 2:]), "u": list(controls)}
     pd.DataFrame(lists).to_parquet(folder / "log.parquet")
+    pd.DataFrame(lists).to_feather(folder / "log.feather")
+    write_bags(folder, time, states, controls)
+    write_lerobot(folder, time, states, controls)
+    sysid = {"control_times": time, "control_data": controls, "sensordata_times": time, "sensordata_data": states}
+    np.savez(folder / "trajectory.npz", **sysid)
     variables = {"t": time, "q": states[:, :2].T, "dq": states[:, 2:].T, "log": {"u": controls}}
     scipy.io.savemat(folder / "log.mat", variables)
     velocity = np.cumsum(0.01 * np.append(0, controls[:-1, 0]) / 2)
     position = np.cumsum(0.01 * velocity)
     cart = {"stamp": time, "x": position, "v": velocity, "force": controls[:, 0]}
     pd.DataFrame(cart).to_csv(folder / "cart.csv", index=False)
+
+
+def write_bags(folder: Path, time: np.ndarray, states: np.ndarray, controls: np.ndarray) -> None:
+    """The log as an MCAP file and as a folder, with joints in the order of the alphabet."""
+    m, names, state = bags.Messages(), ["elbow", "shoulder"], "control_msgs/msg/JointTrajectoryControllerState"
+    sent = []
+    for t, row, u in zip(time, states, controls, strict=True):
+        at = bags.START + t
+        measured = m.joint_state(at, names, row[[1, 0]], row[[3, 2]])
+        sent.append(("/joint_states", "sensor_msgs/msg/JointState", at + 0.002, measured))
+        sent.append(("/servo_controller/commands", "std_msgs/msg/Float64MultiArray", at, m.numbers(u)))
+        sent.append(("/trajectory_controller/state", state, at, m.controller(at, names, u[::-1])))
+    bags.write(folder / "bag", sent).rename(folder / "run.mcap")
+    bags.write(folder / "bag_folder", sent, kind="folder")
+
+
+def write_lerobot(folder: Path, time: np.ndarray, states: np.ndarray, controls: np.ndarray) -> None:
+    """The log as a dataset in degrees, of positions only."""
+    names = {"names": ["shoulder.pos", "elbow.pos"], "dtype": "float32", "shape": [2]}
+    plain = {"dtype": "float32", "shape": [1], "names": None}
+    features = {"observation.state": names, "action": names, "timestamp": plain, "episode_index": plain}
+    (folder / "lerobot_dataset" / "meta").mkdir(parents=True)
+    info = {"codebase_version": "v3.0", "fps": 100, "total_frames": len(time), "features": features}
+    (folder / "lerobot_dataset" / "meta" / "info.json").write_text(json.dumps(info))
+    (folder / "lerobot_dataset" / "data" / "chunk-000").mkdir(parents=True)
+    columns = {"observation.state": list(np.rad2deg(states[:, :2])), "action": list(np.rad2deg(controls))}
+    columns |= {"timestamp": time, "episode_index": 0 * time, "index": np.arange(len(time))}
+    pd.DataFrame(columns).to_parquet(folder / "lerobot_dataset" / "data" / "chunk-000" / "file-000.parquet")
 
 
 def write_minari(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
