@@ -167,6 +167,20 @@ class WrongGradient(Sound):
         return super().rollout(states, controls, values + 0.01 * (values.detach() - values))
 
 
+class Silent(Sound):
+    """It says that it has no gradients, but lets them be asked."""
+
+    differentiable: ClassVar[bool] = False
+
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return super().rollout(*(x.detach() for x in (states, controls, values)))
+
+
+class TensorsOnly(Sound):
+    def rollout(self, states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        return super().rollout(states.clone(), controls, values)
+
+
 def off_by_little(states: torch.Tensor, controls: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
     return Sound().rollout(states, controls, values) + 1e-6
 
@@ -195,6 +209,8 @@ BROKEN_SIMULATORS: list[tuple[str, LinearSimulator, dict[str, Any]]] = [
     ("states are those of the reference", Sound(), {"reference": off_by_little}),
     ("states are those of the reference", Sound(), {"reference": off_by_little, "tolerance": Tolerance(states=1e-8)}),
     ("gradients are those of central differences", WrongGradient(), {}),
+    ("gradients are those of central differences", Silent(), {}),
+    ("arrays are taken as tensors are", TensorsOnly(), {}),
 ]
 
 

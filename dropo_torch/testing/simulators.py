@@ -223,7 +223,10 @@ def _arguments_that_do_not_fit_are_refused(case: SimulatorCase) -> None:
 def _arrays_are_taken_as_tensors_are(case: SimulatorCase) -> None:
     given = (case.states, case.controls, case.values)
     for what, convert in (("arrays", lambda x: x.numpy()), ("lists", lambda x: x.tolist())):
-        found = case.simulator.simulate(*map(convert, given))
+        try:
+            found = case.simulator.simulate(*map(convert, given))
+        except Exception as error:
+            raise Broken(f"{type(error).__name__} for {what}", "a result; see Simulator.tensors") from None
         require_same(found.detach(), case.result, f"a result for {what}", "that for tensors")
 
 
@@ -452,7 +455,6 @@ LAWS = (
     _results_have_their_shape_and_are_float64,
     _empty_batches_give_empty_results,
     _arguments_that_do_not_fit_are_refused,
-    _arrays_are_taken_as_tensors_are,
     _the_same_arguments_give_the_same_result,
     _a_result_belongs_to_the_caller,
     _order_and_size_of_the_batch_do_not_matter,
@@ -464,4 +466,5 @@ LAWS = (
     _every_parameter_acts,
     _states_are_those_of_the_reference,
     _gradients_are_those_of_central_differences,
+    _arrays_are_taken_as_tensors_are,
 )
