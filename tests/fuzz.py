@@ -31,9 +31,11 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import bags
 import mujoco
 import numpy as np
 import scipy.io
+import test_bags
 import test_readers
 import torch
 import yaml
@@ -228,6 +230,18 @@ def write_compressed_mat(folder: Path) -> tuple[Path, dict[str, Any]]:
     return folder / "log.mat", {"observations": "log.state", "actions": "u", "time": "t", "episode": "k"}
 
 
+def bag_writer(kind: str) -> Callable[[Path], tuple[Path, dict[str, Any]]]:
+    """What writes a bag of a third of a second."""
+
+    def write(folder: Path) -> tuple[Path, dict[str, Any]]:
+        made = bags.Messages(kind)
+        sent = [*test_bags.joint_states(made), *test_bags.commands(made)]
+        early = [one for one in sent if one[2] < bags.START + 0.3]
+        return bags.write(folder / "run", early, kind=kind), test_bags.ASKED
+
+    return write
+
+
 def write_big_npz(folder: Path) -> tuple[Path, dict[str, Any]]:
     np.savez_compressed(folder / "log.npz", **test_readers.arrays(following=True))
     return folder / "log.npz", {}
@@ -294,6 +308,7 @@ def targets(folder: Path) -> dict[str, Target]:
         log_target("mat4", write_mat4, fresh("mat4"), share=0.3),
         log_target("compressed_mat", write_compressed_mat, fresh("cmat"), share=0.3),
         log_target("npz_compressed", write_big_npz, fresh("znpz"), share=0.5),
+        *(log_target(f"ros_{kind}", bag_writer(kind), fresh(f"ros_{kind}"), share=0.3) for kind in bags.KINDS),
     ]
     inner = fresh("inner")
     buffer = io.BytesIO()

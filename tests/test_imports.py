@@ -235,6 +235,7 @@ MISSING = {
     "csv": ("pandas", {"data": "log.csv"}, "fit", "log.csv needs pandas"),
     "parquet": ("pyarrow", {"data": "log.parquet"}, "fit", "log.parquet needs pyarrow"),
     "hdf5": ("h5py", {"data": "log.h5"}, "fit", "log.h5 needs h5py"),
+    "ros": ("rosbags", {"data": "log.mcap"}, "fit", "log.mcap needs rosbags"),
 }  # fmt: skip
 
 
@@ -246,7 +247,7 @@ def test_a_missing_extra_is_told_in_one_line(
     folder = Folder(tmp_path)
     config = folder.config()
     config.write_text(yaml.safe_dump({**yaml.safe_load(config.read_text()), **changes}))
-    for kind in ("csv", "parquet", "h5"):
+    for kind in ("csv", "parquet", "h5", "mcap"):
         (tmp_path / f"log.{kind}").touch()
     verb, *options = command.split()
     arguments = [verb, str(config), "--out", str(tmp_path / "out"), *options]
