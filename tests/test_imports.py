@@ -94,7 +94,7 @@ LAYERS = (
     "logged",
     "effects",
     "problem",
-    "baselines", "gap", "rl",
+    "baselines", "gap", "rl", "view",
     "studies",
     "report",
     "commands", "__main__",

@@ -112,6 +112,7 @@ def _write(out: Path, config: Config, logged: LoggedData, findings: Sequence[Fin
         "transitions": len(log),
         "episodes": log.num_episodes,
         "seconds": seconds,
+        "config": config.portable(),
     })  # fmt: skip
     write_check_report(
         out / "report.html", findings, transitions=len(log), episodes=log.num_episodes, seconds=seconds,

@@ -46,6 +46,10 @@ GROUPS = {
             "fit", "fit the distribution to the log",
             ("dropo fit robot.yaml --out out/robot", "dropo fit out/gap/config.yaml --out out/robot --epsilon 1e-4"),
         ),
+        "view": Command(
+            "view", "show measured and simulated motion side by side",
+            ("dropo view out/robot", "dropo view out/gap --episode 2 --start 4 --seconds 3"),
+        ),
         "train": Command(
             "train", "train a policy over the distribution",
             ("dropo train robot.yaml --out out/policy --task arm.py:Reach --distribution out/robot/fit.json",),

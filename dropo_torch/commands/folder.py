@@ -25,6 +25,8 @@ _RESULTS = (
     *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "gap-progress-rare.bin",
     "distribution.yaml", "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "picture.png", "tensorboard",
 )  # fmt: skip
+#: What ``dropo view`` writes beside a run's results, and goes with them.
+_VIEWS = ("view.html", "view.mp4")
 _PACKAGES = ("dropo_torch", "torch", "mujoco", "warp-lang", "numpy", "scipy", "cma", "gymnasium")
 
 
@@ -89,7 +91,8 @@ def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:
     number = next(i for i in range(1, 10_000) if not (out / f"previous-{i}").exists())
     aside = out / f"previous-{number}"
     aside.mkdir()
-    for name in reversed(present):  # the marks last: what is cut short here is still known as a run
+    beside = [name for name in _VIEWS if (out / name).exists()]
+    for name in (*beside, *reversed(present)):  # the marks last: what is cut short here is still known as a run
         shutil.move(str(out / name), aside / name)
 
 

@@ -63,7 +63,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         gap = find_gap(problem, report=progress.show, scene=scene, **options)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
-    write_json(out / "gap.json", gap.document())
+    write_json(out / "gap.json", gap.document() | {"config": config.portable()})
     about = {"title": f"What {config.sim or config.model or 'model'} lacks", **provenance(config)}
     write_gap_picture(out / "picture.png", gap)
     write_gap_report(out / "report.html", gap, model_note=" ".join(notes), has_config=written.exists(), **about)

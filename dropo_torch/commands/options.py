@@ -36,7 +36,7 @@ def add_config(parser: argparse.ArgumentParser, *about: str, out_required: bool 
     if out_required:
         add_folder(parser)
     else:
-        parser.add_argument("--out", type=_folder, metavar="DIR", help="folder of the results")
+        add_out(parser, "folder of the results")
     lines = ["each key of the config is an option too, such as --epsilon 1e-4 or --parameters.mass.bounds '[1, 2]':"]
     for group in GROUPS:
         if group in ("model and log", "machine", *about):
@@ -52,6 +52,11 @@ def _keys(config: type[Config], group: str) -> list[str]:
         for name, entry in config.model_fields.items()
         if isinstance(entry.json_schema_extra, dict) and entry.json_schema_extra["about"] == group
     ]
+
+
+def add_out(parser: argparse.ArgumentParser, purpose: str) -> None:
+    """Add a folder that need not be given."""
+    parser.add_argument("--out", type=_folder, metavar="DIR", help=purpose)
 
 
 def add_folder(parser: argparse.ArgumentParser, default: Path | None = None) -> None:

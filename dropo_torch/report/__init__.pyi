@@ -6,3 +6,4 @@ from .gap import write_gap_report as write_gap_report
 from .gap_picture import write_gap_picture as write_gap_picture
 from .study import write_study_report as write_study_report
 from .sweep import write_sweep_report as write_sweep_report
+from .view import write_view_page as write_view_page

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import copy
-import os
-import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
@@ -15,17 +12,12 @@ import torch
 
 from dropo_torch.rl.env import RandomizedEnv
 from dropo_torch.rl.policy import Policy
+from dropo_torch.support.offscreen import REMEDY, draw_offscreen
 
 #: Pictures of a row.
 COLUMNS = 8
 #: Seconds between the pictures of the second row.
 INTERVAL = 0.08
-#: Seconds after which drawing is given up.
-PATIENCE = 120.0
-REMEDY = (
-    "No pictures: OpenGL cannot draw without a display here; install EGL (Debian, Ubuntu: apt install libegl1 "
-    "libgl1-mesa-dri) or OSMesa (apt install libosmesa6) and set MUJOCO_GL=egl or MUJOCO_GL=osmesa."
-)
 
 
 @torch.no_grad()
@@ -54,25 +46,13 @@ def chosen_frames(count: int, timestep: float) -> list[int]:
 def draw(model: mujoco.MjModel, states: np.ndarray) -> tuple[bytes | None, str]:
     """Return a PNG of states ``(F, nq + nv)``, :data:`COLUMNS` a row, and a note where there is none.
 
-    ``MUJOCO_GL`` decides what draws; where it is not set, a display, EGL and OSMesa are tried.
+    What draws is as :func:`~dropo_torch.support.offscreen.draw_offscreen` has it.
     """
     with tempfile.TemporaryDirectory() as folder:
         paths = [str(Path(folder) / name) for name in ("model.mjb", "states.npy", "strip.png")]
         mujoco.mj_saveModel(copy.copy(model), paths[0])
         np.save(paths[1], states)
-        command = [sys.executable, "-P", str(Path(__file__).with_name("render.py")), *paths, str(COLUMNS)]
-        for backend in _backends():
-            environment = {**os.environ, **({"MUJOCO_GL": backend} if backend else {})}
-            try:
-                subprocess.run(command, env=environment, capture_output=True, timeout=PATIENCE, check=True)
-                return Path(paths[2]).read_bytes(), ""
-            except (OSError, subprocess.SubprocessError):
-                continue
-    return None, REMEDY
-
-
-def _backends() -> list[str]:
-    """Values of ``MUJOCO_GL`` to try; empty for the one that is set, or the system's own."""
-    if os.environ.get("MUJOCO_GL") or not sys.platform.startswith("linux"):
-        return [""]
-    return [*([""] if os.environ.get("DISPLAY") else []), "egl", "osmesa"]
+        program = Path(__file__).with_name("render.py")
+        if draw_offscreen(program, [*paths, str(COLUMNS)]):
+            return Path(paths[2]).read_bytes(), ""
+    return None, f"No pictures: {REMEDY}"

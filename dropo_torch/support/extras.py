@@ -17,6 +17,7 @@ EXTRAS = {
     "ros": ("rosbags",),
     "rl": ("torchrl", "tensordict", "gymnasium"),
     "tensorboard": ("tensorboard",),
+    "view": ("imageio", "av"),
     "warp": ("warp",),
 }
 
