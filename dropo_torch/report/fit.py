@@ -18,7 +18,7 @@ from dropo_torch.report import words
 from dropo_torch.report.figures import fit as figures
 from dropo_torch.report.figures.drawing import BLUE, FAINT, PALETTE, Axis
 from dropo_torch.report.formatting import duration, nats, number, plain, plural, rms
-from dropo_torch.report.page import Frame, write_page
+from dropo_torch.report.page import Frame, folder_of, write_page
 
 #: What stands at the top of the page, by verdict.
 TAGS = {"explained": "✓ Explained", "not_explained": "! Not fully explained", "hopeless": "✗ Hopeless"}
@@ -73,6 +73,7 @@ def write_fit_report(
         **_convergence(fit),
         **_identifiability(fit, diagnostics),
         "facts": _facts(fit, diagnostics),
+        "folder": folder_of(path),
     }
     write_page(path, "fit.html", content, frame)
 

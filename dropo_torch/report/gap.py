@@ -13,7 +13,7 @@ from dropo_torch.report import gap_words as words
 from dropo_torch.report.figures.drawing import BLUE, CLOUD, ORANGE
 from dropo_torch.report.figures.gap import course_panel, force_frame, force_panel, score_panel
 from dropo_torch.report.formatting import duration, nats, percent, whole
-from dropo_torch.report.page import Frame, write_page
+from dropo_torch.report.page import Frame, folder_of, write_page
 
 #: Rounds of the search that the ranking shows, and candidates in each.
 MAX_ROUNDS = 3
@@ -40,7 +40,6 @@ def write_gap_report(
     """
     named = [e for e in gap.effects if words.is_named(e)]
     headline, items = words.answer(gap)
-    folder = Path(path).parent  # as a command takes it; of one elsewhere on the machine, but its name
     content = {
         "title": "What the model lacks",
         "gap": gap,
@@ -62,7 +61,7 @@ def write_gap_report(
         "courses": [(c.label, course_panel(c, named=bool(named))) for c in gap.courses],
         "more_residuals": len(gap.residuals) - MAX_RESIDUALS,
         **_ranking(gap),
-        "folder": folder.name if folder.is_absolute() else folder.as_posix(),
+        "folder": folder_of(path),
         "facts": _facts(gap, bool(named)),
     }
     write_page(path, "gap.html", content, frame)

@@ -1,7 +1,7 @@
 """The frame of every report: a template filled with its content, in one HTML file.
 
 A page is a function ``write_..._report`` in a module of its own, which puts the content together, a template beside it,
-and a module of :mod:`~dropo_torch.report.figures`. Pages need no network and no scripts.
+and a module of :mod:`~dropo_torch.report.figures`. Pages need no network; no page but that of a view has a script.
 """
 
 from __future__ import annotations
@@ -52,6 +52,12 @@ def write_page(path: str | Path, template: str, content: Mapping[str, Any], fram
         {"facts": (), "config": None, "versions": None, **content, **frame}
     )
     write_atomically(Path(path), page.encode())
+
+
+def folder_of(path: str | Path) -> str:
+    """Return the folder of a page as a command takes it; of one elsewhere on the machine, but its name."""
+    folder = Path(path).parent
+    return folder.name if folder.is_absolute() else folder.as_posix()
 
 
 def config_yaml(config: Mapping[str, Any]) -> str:

@@ -135,7 +135,8 @@
   const shortened = (value) => {
     if (!isFinite(value)) return "diverged";
     const size = Math.abs(value);
-    return (size < 0.05 ? "0" : size < 100 ? value.toFixed(1) : value.toPrecision(3).replace(/e\+/, "e")).replace("-", "−");
+    const text = size < 0.05 ? "0" : size < 100 ? value.toFixed(1) : size < 1e5 ? value.toFixed(0) : value.toExponential(0).replace("+", "");
+    return text.replace("-", "−");
   };
   const strip = (figure, column) => {
     const count = labels.length;

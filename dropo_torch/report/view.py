@@ -22,7 +22,7 @@ COLOURS = {1: ((BLUE, "#004a75"),), 2: ((ORANGE, "#8c3d00"), (BLUE, "#004a75"))}
 #: Simulations as subjects of sentences.
 NAMES = {
     "before": "the model before", "after": "the model with what it lacked", "fitted": "the fitted model",
-    "the model's own values": "the model with its own values",
+    "the model's own values": "the model with its own values", "the model as it is": "the model",
 }  # fmt: skip
 #: Pictures under the scene, and the least and largest height of one relative to its width.
 STILLS = 6
@@ -84,7 +84,7 @@ def _drawing(view: View) -> dict[str, Any]:
         scene = make_scene(models[-1])
         logged = poses(models[-1], scene, view.logged, view.controls)
         frames = [logged, *(poses(m, scene, t.states, view.controls) for m, t in zip(models, view.takes, strict=True))]
-        camera = aim(scene, logged)
+        camera = aim(scene, *frames)
     robots = [
         {"name": name, "fill": fill, "edge": edge, "alpha": alpha, "poses": packed(pose)}
         for name, (fill, edge, alpha), pose in zip(names, looks, frames, strict=True)
@@ -130,9 +130,8 @@ def _size(value: float) -> str:
 
 
 def _named(take: Take) -> str:
-    return {"before": "the model before", "after": "the model after", "fitted": "the fitted model"}.get(
-        take.name, take.name
-    )
+    """A simulation as the subject of a sentence."""
+    return NAMES.get(take.name, take.name)
 
 
 def _worst(view: View) -> int:

@@ -62,7 +62,7 @@ class Pane:
         """Add a robot in one colour; its links as capsules, where it has no geoms."""
         first, moving = scene.ngeom, int(mujoco.mjtCatBit.mjCAT_DYNAMIC)
         mujoco.mjv_addGeoms(self._model, data, self._options, mujoco.MjvPerturb(), moving, scene)
-        for body, start, end, radius in self._given["shapes"]:
+        for body, start, end, radius in self._given["rods"]:
             begin, finish = np.stack([start, end]) @ data.xmat[body].reshape(3, 3).T + data.xpos[body]
             _connect(scene, mujoco.mjtGeom.mjGEOM_CAPSULE, begin, finish, radius, colour)
         _paint(scene, first, colour)
@@ -118,7 +118,7 @@ def main(arguments: list[str]) -> None:
         given: dict[str, Any] = dict(file)
     names, texts = given["names"].tolist(), given["texts"].tolist()
     given["colours"] = [tuple(colour) for colour in given["colours"]]
-    given["shapes"] = [(int(s[0]), s[1:4], s[4:7], float(s[7])) for s in given["shapes"]]
+    given["rods"] = [(int(s[0]), s[1:4], s[4:7], float(s[7])) for s in given["rods"]]
     models = [mujoco.MjModel.from_binary_path(f"{source}.{i}.mjb") for i in range(len(names))]
     panes = [Pane(model, given, i) for i, model in enumerate(models)]
     with iio.imopen(video, "w", plugin="pyav") as out:

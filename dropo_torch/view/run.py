@@ -21,6 +21,8 @@ from dropo_torch.support.given import read_text
 
 #: Files by which a folder is known to hold something to see.
 RUNS = ("fit.json", "gap.json", "check.json")
+#: What a model with its own parameters is called.
+AS_IT_IS = "the model as it is"
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,8 +112,10 @@ def _gap(folder: Path, overrides: Mapping[str, Any]) -> Run:
     document = _document(folder / "gap.json")
     problem, declared = _recorded(folder, document, "gap.json", overrides), document.get("declared") or {}
     alone = {name: entry["alone"] for name, entry in declared.items()}
-    candidates = [Candidate("before", problem, _values(problem, alone))]
-    if (folder / "config.yaml").is_file():
+    has_names = (folder / "config.yaml").is_file()
+    name = "before" if has_names else "fitted" if alone else AS_IT_IS
+    candidates = [Candidate(name, problem, _values(problem, alone))]
+    if has_names:
         amended = _problem(load_config(folder / "config.yaml", overrides))
         found = {name: entry["with_effects"] for name, entry in declared.items()}
         candidates.append(Candidate("after", amended, _values(amended, found)))
@@ -125,7 +129,7 @@ def _check(folder: Path, overrides: Mapping[str, Any]) -> Run:
 
 
 def _as_given(problem: Problem, title: str, folder: Path | None) -> Run:
-    candidates = (Candidate("the model as it is", problem, _values(problem, {})),)
+    candidates = (Candidate(AS_IT_IS, problem, _values(problem, {})),)
     return Run(title, candidates, None, _given_noise(problem), folder)
 
 

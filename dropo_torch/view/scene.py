@@ -7,6 +7,7 @@ geom by the same few lines.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import mujoco
@@ -28,8 +29,10 @@ FLAT = 0.02
 ELEVATION, TURN = -18.0, 25.0
 #: How far a robot may travel, relative to its own size, before the camera follows it.
 TRAVEL = 1.5
+#: How far from the logged robot simulated ones are seen, relative to what is seen without them.
+REACH = 2.0
 #: Lines of a floor, and share of the picture that is left free around the robot.
-LINES, MARGIN = 40, 0.12
+LINES, MARGIN = 24, 0.12
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,13 +57,13 @@ class Scene:
     Attributes:
         shapes: of moving and of fixed bodies.
         bodies: the moving bodies, ``(B,)``.
-        links: whether shapes stand for bodies and joints, since the model has no geoms that move.
+        rods: those of the shapes that are no geoms: they show bodies and joints where geoms do not.
         hidden: whether geoms of the groups that a viewer hides are shown, since no others move.
     """
 
     shapes: tuple[Shape, ...]
     bodies: np.ndarray
-    links: bool
+    rods: tuple[Shape, ...]
     hidden: bool
 
 
@@ -90,10 +93,8 @@ def make_scene(model: mujoco.MjModel) -> Scene:
     if hidden:
         visible = np.ones(model.ngeom, dtype=bool)
     shapes = [Shape(int(model.geom_bodyid[g]), *geom_points(model, g)) for g in np.flatnonzero(visible).tolist()]
-    links = not moves.any()
-    if links:
-        shapes += link_shapes(model, bodies)
-    return Scene(tuple(s for s in shapes if len(s.points)), bodies, links, hidden)
+    rods = arms(model, shapes) if moves.any() else link_shapes(model, bodies)
+    return Scene((*(s for s in shapes if len(s.points)), *rods), bodies, tuple(rods), hidden)
 
 
 def moving_bodies(model: mujoco.MjModel) -> np.ndarray:
@@ -158,6 +159,19 @@ def link_shapes(model: mujoco.MjModel, bodies: np.ndarray) -> list[Shape]:
     return found
 
 
+def arms(model: mujoco.MjModel, shapes: Sequence[Shape]) -> list[Shape]:
+    """Return thin links from hinges to what they carry where geoms do not reach them, such as a pendulum's bob."""
+    radius, found = 0.5 * THIN * max(float(model.stat.extent), 1e-3), []
+    for joint in np.flatnonzero(model.jnt_type == int(mujoco.mjtJoint.mjJNT_HINGE)):
+        body, anchor = int(model.jnt_bodyid[joint]), model.jnt_pos[joint]
+        own = [s for s in shapes if s.body == body]
+        gap = min((float(np.linalg.norm(s.points - anchor, axis=1).min()) - s.radius for s in own), default=0.0)
+        inside = any((s.points.min(0) <= anchor).all() and (anchor <= s.points.max(0)).all() for s in own)
+        if gap > radius and not inside:
+            found.append(Shape(body, np.stack([anchor, np.mean([s.points.mean(0) for s in own], axis=0)]), radius))
+    return found
+
+
 def poses(model: mujoco.MjModel, scene: Scene, states: np.ndarray, controls: np.ndarray) -> np.ndarray:
     """Return positions and quaternions (w, x, y, z) of the moving bodies, ``(F, B, 7)``, by forward kinematics.
 
@@ -203,36 +217,36 @@ def turned(quaternions: np.ndarray, points: np.ndarray) -> np.ndarray:
     return points + w * twice + np.cross(v, twice)
 
 
-def aim(scene: Scene, frames: np.ndarray) -> Camera:
+def aim(scene: Scene, logged: np.ndarray, *simulated: np.ndarray) -> Camera:
     """Return a camera that sees a motion from where it shows most: across its plane, where it has one.
 
-    It follows a robot that travels farther than it is large.
+    It follows a robot that travels farther than it is large. Simulated robots are seen, too, unless they go far astray.
 
     Args:
         scene: the shapes.
-        frames: poses of the moving bodies, ``(F, B, 7)``, all finite.
+        logged: poses of the moving bodies, ``(F, B, 7)``, all finite.
+        simulated: other poses of them, NaN where they diverged.
     """
-    chosen = np.unique(np.linspace(0, len(frames) - 1, SAMPLES).astype(int))
-    points = placed_points(scene, frames[chosen])
+    count = len(logged)
+    chosen = np.unique(np.linspace(0, count - 1, SAMPLES).astype(int))
+    points = placed_points(scene, logged[chosen])
     if not points.size:
-        return Camera(90.0, ELEVATION, np.zeros((len(frames), 3)), 1.0, 1.0)
+        return Camera(90.0, ELEVATION, np.zeros((count, 3)), 1.0, 1.0)
     azimuth, elevation = direction(points)
-    right, up = axes_of(azimuth, elevation)
+    sides = np.stack(axes_of(azimuth, elevation))
     radius = max((s.radius for s in scene.shapes if s.body in scene.bodies), default=0.0)
-    low, high = points.min(1), points.max(1)
-    middle = 0.5 * (low + high)
-    sides = np.stack([right, up])
-    seen = points @ sides.T
-    own = np.ptp(seen, axis=1).max(0) + 2 * radius
-    path = (middle - middle.mean(0)) @ sides.T
-    if (np.ptp(path, axis=0) <= TRAVEL * own.max()).all():
-        centre = 0.5 * (low.min(0) + high.max(0))
-        spread = np.ptp(seen.reshape(-1, 2), axis=0) + 2 * radius
-        centres = np.tile(centre, (len(frames), 1))
-    else:
-        centres = np.stack([np.interp(np.arange(len(frames)), chosen, middle[:, axis]) for axis in range(3)], 1)
-        spread = own
-    width, height = (1 + 2 * MARGIN) * np.maximum(spread, 0.25 * spread.max())
+    middle = 0.5 * (points.min(1) + points.max(1))
+    size = float(np.ptp(points @ sides.T, axis=1).max()) + 2 * radius
+    follows = bool((np.ptp(middle, axis=0) > TRAVEL * size).any())
+    middle = middle if follows else np.tile(0.5 * (points.min((0, 1)) + points.max((0, 1))), (len(chosen), 1))
+    others = [placed_points(scene, poses[chosen]) for poses in simulated]
+    seen = (np.concatenate([points, *others], 1) - middle[:, None]) @ sides.T
+    reach = REACH * max(size, float(np.abs(seen[:, : points.shape[1]]).max()))
+    seen = seen[(np.abs(seen) <= reach).all(-1)]
+    low, high = seen.min(0) - radius, seen.max(0) + radius
+    middle = middle + 0.5 * (low + high) @ sides
+    centres = np.stack([np.interp(np.arange(count), chosen, middle[:, axis]) for axis in range(3)], 1)
+    width, height = (1 + 2 * MARGIN) * np.maximum(high - low, 0.25 * (high - low).max())
     return Camera(azimuth, elevation, centres, float(width), float(height))
 
 

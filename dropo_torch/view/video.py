@@ -78,7 +78,8 @@ def _drawing(view: View, models: list[mujoco.MjModel]) -> dict[str, Any]:
     """All that the program draws, as arrays."""
     model, (shown, speed) = models[-1], video_frames(view.times)
     scene, logged, controls = make_scene(model), view.logged[shown], view.controls[shown]
-    camera = aim(scene, poses(model, scene, logged, controls))
+    simulated = [poses(m, scene, t.states[shown], controls) for m, t in zip(models, view.takes, strict=True)]
+    camera = aim(scene, poses(model, scene, logged, controls), *simulated)
     data, mocap = mujoco.MjData(model), []
     for state, control in zip(logged, controls, strict=True):
         set_state(model, data, state, control)
@@ -95,13 +96,13 @@ def _drawing(view: View, models: list[mujoco.MjModel]) -> dict[str, Any]:
         "names": np.array([take.name for take in view.takes]),
         "colours": np.array(COLOURS[-len(view.takes) :]), "lines": np.array(lines).reshape(-1, 2, 3),
         "texts": np.array([f"{view.times[f]:.2f} s{slower}" for f in shown]),
-        "rate": RATE, "links": scene.links, "hidden": scene.hidden, "shapes": _links(scene),
+        "rate": RATE, "hidden": scene.hidden, "rods": _rods(scene),
     }  # fmt: skip
 
 
-def _links(scene: Scene) -> np.ndarray:
-    """Links as rows of body, two ends and radius, ``(L, 8)``; none where geoms are drawn."""
-    shapes = [s for s in scene.shapes if scene.links and s.body in scene.bodies]
-    return np.array(
-        [[s.body, *s.points[0], *(s.points[-1] + 1e-6 * (len(s.points) == 1)), s.radius] for s in shapes]
-    ).reshape(-1, 8)
+def _rods(scene: Scene) -> np.ndarray:
+    """Rows of body, two ends and radius, ``(L, 8)``; a ball's ends lie next to each other."""
+    rows = [
+        [s.body, *s.points[0], *(s.points[-1] + (1e-6 if len(s.points) == 1 else 0.0)), s.radius] for s in scene.rods
+    ]
+    return np.array(rows).reshape(-1, 8)
