@@ -15,8 +15,11 @@ import numpy as np
 from PIL import Image, ImageDraw
 
 WIDTH, HEIGHT = 640, 480
-#: Colours of the logged robot, of what is fixed, of lines on the floor, and of where there is nothing.
-GHOST, FIXED, LINE, NOTHING = (0.12, 0.16, 0.20, 0.45), (0.93, 0.94, 0.95, 1.0), (0.78, 0.81, 0.84, 1.0), 250
+#: Colours of the logged robot, of what is fixed, of lines on the floor, and of the wall behind all.
+GHOST, FIXED = (0.12, 0.16, 0.20, 0.45), (0.93, 0.94, 0.95, 1.0)
+LINE, WALL = (0.72, 0.76, 0.80, 1.0), (1.0, 1.0, 1.0, 1.0)
+#: Distance of the wall from what is looked at, relative to the camera's, and its width.
+FAR, WIDE = 8.0, 200.0
 #: How much larger the logged robot is drawn, so that surfaces at one place do not flicker.
 LARGER = 1.02
 FLAGS = ("SHADOW", "REFLECTION", "SKYBOX", "FOG", "HAZE")
@@ -29,6 +32,9 @@ class Pane:
         model.vis.global_.offwidth = max(model.vis.global_.offwidth, WIDTH)
         model.vis.global_.offheight = max(model.vis.global_.offheight, HEIGHT)
         model.vis.quality.offsamples = 2
+        model.light_active[:], model.vis.headlight.active = 0, 1  # of the same brightness in every model
+        model.vis.headlight.ambient[:], model.vis.headlight.diffuse[:] = 0.45, 0.55
+        model.vis.map.zfar = 4 * FAR * self._distance(model, given) / model.stat.extent
         self._model, self._given = model, given
         self._qpos, self._colour = given[f"qpos{number}"], given["colours"][number]
         self._simulated, self._logged = mujoco.MjData(model), mujoco.MjData(model)
@@ -45,8 +51,10 @@ class Pane:
         shown = ((self._simulated, self._qpos[frame], self._colour),) if finite else ()
         self._renderer.update_scene(self._logged, self._camera(frame), self._options)
         scene.ngeom, fixed = 0, int(mujoco.mjtCatBit.mjCAT_STATIC)
+        self._add_wall(scene, frame)
+        first = scene.ngeom
         mujoco.mjv_addGeoms(self._model, self._logged, self._options, mujoco.MjvPerturb(), fixed, scene)
-        _paint(scene, 0, FIXED)
+        _paint(scene, first, FIXED)
         for start, end in given["lines"]:
             _connect(scene, mujoco.mjtGeom.mjGEOM_LINE, start, end, 1.0, LINE)
         for data, qpos, colour in (*shown, (self._logged, given["logged"][frame], GHOST)):
@@ -54,9 +62,7 @@ class Pane:
             self._add(scene, data, colour)
         for flag in FLAGS:
             scene.flags[getattr(mujoco.mjtRndFlag, f"mjRND_{flag}")] = 0
-        picture = self._renderer.render().copy()
-        picture[(picture == 0).all(-1)] = NOTHING
-        return picture
+        return self._renderer.render().copy()
 
     def _add(self, scene: mujoco.MjvScene, data: mujoco.MjData, colour: tuple[float, ...]) -> None:
         """Add a robot in one colour; its links as capsules, where it has no geoms."""
@@ -76,8 +82,27 @@ class Pane:
         camera = mujoco.MjvCamera()
         camera.lookat[:] = self._given["centres"][frame]
         camera.azimuth, camera.elevation = self._given["direction"]
-        camera.distance = float(self._given["size"]) / np.tan(np.radians(self._model.vis.global_.fovy) / 2)
+        camera.distance = self._distance(self._model, self._given)
         return camera
+
+    @staticmethod
+    def _distance(model: mujoco.MjModel, given: dict[str, Any]) -> float:
+        """Distance of the camera from what it looks at."""
+        return float(given["size"]) / float(np.tan(np.radians(model.vis.global_.fovy) / 2))
+
+    def _add_wall(self, scene: mujoco.MjvScene, frame: int) -> None:
+        """Add a white wall far behind what is looked at: what is translucent would be black before nothing."""
+        azimuth, elevation = np.radians(self._given["direction"])
+        ahead = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
+        distance = self._distance(self._model, self._given)
+        wide, turn, frame_of = WIDE * distance, np.empty(4), np.empty(9)
+        mujoco.mju_quatZ2Vec(turn, ahead)
+        mujoco.mju_quat2Mat(frame_of, turn)
+        place = self._given["centres"][frame] + FAR * distance * ahead
+        geom, size = scene.geoms[scene.ngeom], np.array([wide, wide, 0.01 * distance])
+        mujoco.mjv_initGeom(geom, mujoco.mjtGeom.mjGEOM_BOX, size, place, frame_of, np.array(WALL, dtype=np.float32))
+        geom.emission, geom.specular = 1.0, 0.0
+        scene.ngeom += 1
 
 
 def _connect(
@@ -96,7 +121,8 @@ def _paint(scene: mujoco.MjvScene, first: int, colour: tuple[float, ...]) -> Non
     """Give the geoms from one on a colour, and the logged robot's a little more size."""
     for geom in scene.geoms[first : scene.ngeom]:
         geom.rgba[:], geom.matid = colour, -1
-        geom.emission, geom.specular, geom.reflectance = 0.15, 0.1, 0.0
+        is_floor = geom.type in (mujoco.mjtGeom.mjGEOM_PLANE, mujoco.mjtGeom.mjGEOM_HFIELD)
+        geom.emission, geom.specular, geom.reflectance = 0.9 if is_floor else 0.15, 0.1, 0.0
         if colour is GHOST and geom.type != mujoco.mjtGeom.mjGEOM_MESH:
             geom.size[:] *= LARGER
 
