@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.report.figures.drawing import BLUE, ORANGE
-from dropo_torch.report.formatting import joined, number, short, whole
+from dropo_torch.report.formatting import joined, short, whole
 from dropo_torch.report.page import Frame, write_page
 from dropo_torch.view.replay import Take, View
 from dropo_torch.view.scene import Camera, Scene, aim, floor_lines, make_scene, poses
@@ -191,4 +191,4 @@ def _facts(view: View) -> list[tuple[str, str]]:
 
 
 def _seconds(value: float) -> str:
-    return f"{number(round(float(value), 4)).rstrip('0').rstrip('.') if value else '0'} s"
+    return f"{short(float(value))} s"
