@@ -64,6 +64,8 @@ WHOLE = {
     "test_recorders.py": ("",),
     "test_rl_train.py": ("",),
     "test_sweep.py": ("test_the_noise_of_every_measurement_is_found",),
+    "test_view.py": ("test_a_video_has_a_pane_for_each_simulation",
+                     "test_in_a_browser_time_moves_by_keys_and_cursors_with_it"),
     "test_warp_backend.py": ("test_the_library_does_not_need_warp",),
     "test_warp_collide.py": ("test_geoms_touch_where_mujoco_says",),
     "test_warp_conformance.py": ("test_contacts", "test_gymnasium_models", "test_hopper_through_four_substeps"),

@@ -207,6 +207,30 @@ def test_poses_are_those_of_mujoco(name: str, tmp_path: Path) -> None:
     assert text.count('data-column="') == len(view.labels)
 
 
+def test_prescribed_bodies_are_where_the_log_has_them() -> None:
+    """The pose of a hand that pushes stands in the log after the commands, and with it what it carries."""
+    model = compiled(
+        """<mujoco><worldbody>
+        <body name="hand" mocap="true"><geom size=".1"/><body name="finger" pos="0 0 .2">
+          <joint name="bend" axis="0 1 0"/><geom size=".05" mass=".1"/></body></body>
+        </worldbody><actuator><motor joint="bend"/></actuator></mujoco>"""
+    )
+    rng = np.random.default_rng(0)
+    pose = rng.normal(size=(4, 7))
+    pose[:, 3:] /= np.linalg.norm(pose[:, 3:], axis=1, keepdims=True)
+    found = poses(model, make_scene(model), np.zeros((4, 2)), np.concatenate([np.zeros((4, 1)), pose], 1))
+    np.testing.assert_allclose(found[:, 0], pose, atol=1e-12)
+    np.testing.assert_allclose(found[:, 1, :3], pose[:, :3] + turned(pose[:, 3:], np.array([0, 0, 0.2])), atol=1e-12)
+
+
+def test_a_stretch_begins_where_the_commands_that_act_are_known(tmp_path: Path) -> None:
+    """A delay of 60 ms acts on commands from before the log in its first three rows of 20 ms."""
+    delay = {"effect": "actuator_delay", "target": "pull", "delay": 0.06}
+    view = make_view(read_run(logged(tmp_path, CART_XML, effects=[delay])))
+    assert view.stretch.first == 3
+    assert view.times[0] == pytest.approx(0.06)
+
+
 GEOMS = {
     "sphere": ('type="sphere" size=".2"', lambda d: 0.2),
     "capsule": ('type="capsule" size=".1 .3"', lambda d: 0.1 + 0.3 * abs(d[2])),

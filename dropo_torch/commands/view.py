@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "run_folder", type=Path, metavar="RUN",
         help="folder of a finished dropo fit, gap or check; or a config, whose model is then taken as it is",
     )  # fmt: skip
-    add_out(parser, "folder of the page and the video (RUN)")
+    add_out(parser, "folder of the page and the video (RUN itself)")
     parser.add_argument("--episode", type=_index, default=0, metavar="N", help="which of the log's, counted from 0 (0)")
     parser.add_argument(
         "--start", type=_start, default=0.0, metavar="S", help="seconds since the episode's start to begin at (0)"
