@@ -363,20 +363,29 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
     signals = parse_columns(column, f"{table.source}: time")
     if len(signals) == 1 and signals[0].signal in table.names:
         stamps = table.array(signals[0].signal, "time")
-        if _are_dates(stamps):
-            import pandas as pd
-
-            with reading(f"{table.source}: {signals[0].signal}", "dates such as 2024-05-01T12:00:00.125"):
-                dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
-            return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
+        if are_dates(stamps):
+            return dates_in_seconds(stamps, f"{table.source}: {signals[0].signal}")
     values, names = table.matrix(column, "time", len(episodes))
     if len(names) != 1:
         raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
     return values[:, 0]
 
 
-def _are_dates(stamps: np.ndarray) -> bool:
-    """Whether a column holds dates, or text that does not start with a number."""
+def dates_in_seconds(stamps: np.ndarray, where: str) -> np.ndarray:
+    """Return dates ``(N,)`` as seconds since the first.
+
+    Raises:
+        InputError: something that is no date.
+    """
+    import pandas as pd
+
+    with reading(where, "dates such as 2024-05-01T12:00:00.125"):
+        dates = pd.to_datetime(pd.Series(stamps), format="ISO8601", utc=True)
+    return np.asarray((dates - dates.iloc[0]) / pd.Timedelta(seconds=1), dtype=np.float64)
+
+
+def are_dates(stamps: np.ndarray) -> bool:
+    """Return whether a column holds dates, or text that does not start with a number."""
     if stamps.ndim != 1 or stamps.dtype.kind in "biuf":
         return False
     with extra("formats", "a column that holds no plain numbers"):

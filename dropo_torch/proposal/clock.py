@@ -1,0 +1,163 @@
+"""When the rows of a log were taken: its time column and unit, its rate, and where it begins anew."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from dropo_torch.data.readers import are_dates, dates_in_seconds
+from dropo_torch.proposal.columns import Column, Columns
+from dropo_torch.proposal.words import time_unit
+
+#: Units of time stamps, the likeliest first, and seconds between rows that a robot's log may have.
+UNITS = (1.0, 1e-3, 1e-9, 1e-6)
+FASTEST, SLOWEST = 1.5e-4, 0.6
+#: Steps between stamps beyond which another episode begins.
+GAP = 12.0
+#: Relative deviation of a spacing up to which stamps count as even.
+EVEN = 0.05
+
+
+@dataclass(frozen=True)
+class Clock:
+    """When the rows were taken.
+
+    Attributes:
+        column: the time column, or ``None``.
+        unit: seconds of its unit.
+        dt: seconds between rows, the median; ``None`` where nothing says it.
+        even: whether spacings differ by no more than a reader takes.
+        jitter: standard deviation of the spacings, gaps aside, relative to ``dt``.
+        episode: a column that tells episodes apart, or ``None``.
+        terminals: columns of flags that end episodes.
+        breaks: rows at which stamps begin anew or leave a gap, where no column says so.
+        why: how unit and episodes were found, in words.
+    """
+
+    column: Column | None
+    unit: float
+    dt: float | None
+    even: bool
+    jitter: float
+    episode: Column | None
+    terminals: tuple[Column, ...]
+    breaks: tuple[int, ...]
+    why: tuple[str, ...]
+
+    def starts(self, rows: int, parts: Sequence[int]) -> np.ndarray:
+        """Return at which rows an episode begins, ``(N,)`` bool."""
+        start = np.zeros(rows, dtype=bool)
+        start[list(parts)] = True
+        start[list(self.breaks)] = True
+        if self.episode is not None:
+            start[1:] |= self.episode.labels[1:] != self.episode.labels[:-1]
+        for flag in self.terminals:
+            start[1:] |= flag.values[:-1] == 1
+        return start
+
+
+def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Clock:
+    """Return the clock of a log.
+
+    Args:
+        columns: the log.
+        timestep: the model's, seconds.
+        dt: seconds between rows, where they are given.
+    """
+    episode, flags = _episode(columns), _flags(columns)
+    given = dt is not None
+    empty = Clock(None, 1.0, dt, True, 0.0, episode, () if episode else flags, (), ())
+    known = empty.starts(len(columns), columns.parts)
+    column = None if given else _time_column(columns, known)
+    if column is None:
+        why = f"rows are {dt:g} s apart, as given" if given else "the log has no time stamps"
+        return Clock(None, 1.0, dt, True, 0.0, episode, empty.terminals, (), (why,))
+    stamps = _stamps(column)
+    spacing = np.diff(stamps)
+    usual = spacing[(spacing > 0) & ~known[1:]]
+    median = float(np.median(usual)) if usual.size else 1.0
+    unit, told = _unit_of(column, median, timestep)
+    breaks = tuple((np.flatnonzero(((spacing < 0) | (spacing > GAP * median)) & ~known[1:]) + 1).tolist())
+    within = usual[usual <= GAP * median] / median
+    even = bool((np.abs(within - 1) <= EVEN).all())
+    why = [f"time stamps of {column.entry} {told}"]
+    if breaks:
+        why.append(f"they begin anew, or leave a gap, at {len(breaks)} rows: an episode begins there")
+    jitter = float(np.std(within[within < 2])) if within.size else 0.0
+    return Clock(
+        column, unit, float(within.mean()) * median * unit if even else median * unit, even, jitter, episode,
+        empty.terminals, breaks, tuple(why),
+    )  # fmt: skip
+
+
+def _stamps(column: Column) -> np.ndarray:
+    """A time column's stamps, ``(N,)``, in its own unit; dates in seconds."""
+    return column.values if column.values.size else dates_in_seconds(column.labels, column.entry)
+
+
+def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
+    """The column of time stamps: by its name, or as the only one that rises evenly."""
+    named = [c for c in columns.columns if c.words.role == "time" and _rises(c, known)]
+    if named:
+        return max(named, key=lambda c: _steps(_stamps(c)))
+    rising = [c for c in columns.numeric if not c.words.role and _rises(c, known) and _evenly(c.values, known)]
+    return rising[0] if len(rising) == 1 else None
+
+
+def _rises(column: Column, known: np.ndarray) -> bool:
+    if not column.values.size:
+        return are_dates(column.labels)
+    spacing = np.diff(column.values)[~known[1:]]
+    return bool(spacing.size and np.isfinite(spacing).all() and (spacing > 0).mean() > 0.9)
+
+
+def _evenly(values: np.ndarray, known: np.ndarray) -> bool:
+    spacing = np.diff(values)[~known[1:]]
+    whole = bool((values == np.round(values)).all() and np.median(spacing) == 1)  # that is a number of the row
+    return not whole and bool((np.abs(spacing / np.median(spacing) - 1) < 0.5).mean() > 0.95)
+
+
+def _steps(stamps: np.ndarray) -> int:
+    """Different values of a column: of seconds and nanoseconds the finer ones tell the time."""
+    return len(np.unique(stamps[:1000]))
+
+
+def _unit_of(column: Column, median: float, timestep: float) -> tuple[float, str]:
+    """Seconds of the unit of time stamps, and how it is known."""
+    if not column.values.size:
+        return 1.0, "are dates"
+    named = time_unit(column.entry)
+    likely = [u for u in UNITS if FASTEST <= median * u <= SLOWEST]
+    whole = [u for u in likely if _is_whole(median * u / timestep)]
+    if named is not None and (not likely or named in likely):
+        return named, f"are in {_name(named)}, as its name says"
+    if not likely:
+        return 1.0, "are taken as seconds"
+    unit = (whole or likely)[0]
+    return unit, f"are in {_name(unit)}: rows are then {median * unit:.4g} s apart"
+
+
+def _is_whole(ratio: float) -> bool:
+    return round(ratio) >= 1 and abs(ratio - round(ratio)) < 0.02 * ratio
+
+
+def _name(unit: float) -> str:
+    return {1.0: "seconds", 1e-3: "milliseconds", 1e-6: "microseconds", 1e-9: "nanoseconds"}[unit]
+
+
+def _episode(columns: Columns) -> Column | None:
+    """A column that keeps its value for long and is called an episode's."""
+    for c in columns.columns:
+        if c.words.role != "episode" or len(c.labels) < 2:
+            continue
+        changes = int((c.labels[1:] != c.labels[:-1]).sum())
+        if 1 <= changes <= len(c.labels) / 5:
+            return c
+    return None
+
+
+def _flags(columns: Columns) -> tuple[Column, ...]:
+    found = [c for c in columns.numeric if c.words.role == "flag" and np.isin(c.values, (0, 1)).all()]
+    return tuple(c for c in found if c.values.any())

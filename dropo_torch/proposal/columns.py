@@ -1,0 +1,194 @@
+"""A log as named columns of numbers, before anybody has said what they are."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.data.formats import open_tables
+from dropo_torch.data.tables import Table, missing, numbers
+from dropo_torch.errors import InputError
+from dropo_torch.proposal.words import Words, read_name
+
+#: Columns of a matrix beyond which it is a picture or a cloud of points, and no state.
+WIDEST = 200
+#: Arrays that hold what is observed, and commanded, of a whole robot.
+STATES = ("observations", "observation", "obs", "state", "states")
+ACTIONS = ("actions", "action", "ctrl", "control", "controls", "u", "commands")
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a log.
+
+    Attributes:
+        entry: what a config calls it, such as ``q1`` or ``position[2]``.
+        array: the array that it belongs to.
+        index: its place in that array, or ``None`` where the array is this column alone.
+        values: its numbers, ``(N,)``, NaN where there is none; empty where it holds text.
+        labels: what it holds as it stands, ``(N,)``.
+        transposed: whether the array holds a sample in each column.
+        words: what its name says.
+    """
+
+    entry: str
+    array: str
+    index: int | None
+    values: np.ndarray
+    labels: np.ndarray
+    transposed: bool
+    words: Words
+
+    @property
+    def moves(self) -> bool:
+        """Whether it holds numbers that change."""
+        finite = self.values[np.isfinite(self.values)]
+        return bool(finite.size and np.ptp(finite) > 0)
+
+    def as_map(self, scale: float = 1.0) -> str | dict[str, Any]:
+        """Return it as an entry of a column map, in units of the model."""
+        options = ({"scale": scale} if scale != 1.0 else {}) | ({"transpose": True} if self.transposed else {})
+        return {"signal": self.entry, **options} if options else self.entry
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of a log.
+
+    Attributes:
+        path: the file or folder.
+        source: it, for messages.
+        columns: its columns, in the file's order.
+        parts: first row of each part that the file itself keeps apart, such as HDF5 groups.
+        group: pattern of these, as a config has it.
+        separator: of a text file, where it is no comma.
+    """
+
+    path: Path
+    source: str
+    columns: tuple[Column, ...]
+    parts: tuple[int, ...] = (0,)
+    group: str | None = None
+    separator: str | None = None
+
+    def __len__(self) -> int:
+        """Return the number of rows."""
+        return len(self.columns[0].labels) if self.columns else 0
+
+    @property
+    def numeric(self) -> tuple[Column, ...]:
+        """Columns of numbers."""
+        return tuple(c for c in self.columns if c.values.size)
+
+    def named(self, entry: str) -> Column | None:
+        """Return the column of an entry, or ``None``."""
+        return next((c for c in self.columns if c.entry == entry), None)
+
+    def matrix(self, names: tuple[str, ...]) -> tuple[Column, ...]:
+        """Return the columns of the first array of one of these names, by the last part of its path."""
+        for name in names:
+            found = tuple(c for c in self.columns if re.split(r"[./]", c.array.lower())[-1] == name)
+            if len(found) > 1 or (found and found[0].index is not None):
+                return found
+        return ()
+
+
+def read_columns(path: str | Path) -> Columns:
+    """Read all columns of a log.
+
+    Raises:
+        InputError: a file that cannot be read, or in which nothing has a row a sample.
+    """
+    path, separator = Path(path), None
+    try:
+        tables = open_tables(path)
+    except InputError as error:
+        if "separator" not in str(error):
+            raise
+        separator = next(mark for mark in (";", "\t", ",") if repr(mark) in str(error))
+        tables = open_tables(path, separator=separator)
+    group = _group(tables[0].names)
+    if group is not None:
+        tables = open_tables(path, group=group)
+    parts = [_of_table(table) for table in tables]
+    names = [c.entry for c in parts[0] if all(any(c.entry == d.entry for d in other) for other in parts[1:])]
+    starts = np.cumsum([0, *(len(p[0].labels) if p else 0 for p in parts)])[:-1]
+    joined = [_joined([next(c for c in p if c.entry == name) for p in parts]) for name in names]
+    if not joined:
+        raise InputError(f"{path}: nothing in it has a number a sample; expected columns of positions and commands")
+    return Columns(path, str(path), tuple(joined), tuple(int(s) for s in starts), group, separator)
+
+
+def _of_table(table: Table) -> list[Column]:
+    """The columns of a table that have as many rows as most have."""
+    arrays = {}
+    for name in table.names:
+        try:
+            array = np.asarray(table.read(name))
+        except InputError:
+            continue  # what a column map could not take either
+        if array.ndim in (1, 2) and array.size > 1:
+            arrays[name] = array
+    counts = Counter(n for a in arrays.values() for n in {max(a.shape) if a.ndim == 2 else len(a)})
+    if not counts:
+        return []
+    rows = max(counts, key=lambda n: (counts[n], n))
+    return [column for name, array in arrays.items() for column in _of_array(name, array, rows)]
+
+
+def _of_array(name: str, array: np.ndarray, rows: int) -> list[Column]:
+    if array.ndim == 2 and array.shape[0] != rows and array.shape[1] == rows:
+        return [] if len(array) > WIDEST else _of_matrix(name, array.T, transposed=True)
+    if len(array) != rows:
+        return []
+    if array.ndim == 2:
+        return [] if array.shape[1] > WIDEST else _of_matrix(name, array, transposed=False)
+    try:
+        values = numbers(array, name)
+    except InputError:
+        return [Column(name, name, None, np.empty(0), array, False, read_name(name))]
+    if values.ndim == 2:
+        return [] if values.shape[1] > WIDEST else _of_matrix(name, values, transposed=False)
+    if array.dtype.kind == "O" and missing(array).all():
+        return []
+    return [Column(name, name, None, values, array, False, read_name(name))]
+
+
+def _of_matrix(name: str, matrix: np.ndarray, *, transposed: bool) -> list[Column]:
+    try:
+        values = matrix.astype(np.float64)
+    except (TypeError, ValueError):
+        return []
+    if values.shape[1] == 1 and not transposed:
+        return [Column(name, name, None, values[:, 0], values[:, 0], False, read_name(name))]
+    entries = [f"{name}[{i}]" for i in range(values.shape[1])]
+    return [
+        Column(entry, name, i, values[:, i], values[:, i], transposed, read_name(entry))
+        for i, entry in enumerate(entries)
+    ]
+
+
+def _joined(parts: list[Column]) -> Column:
+    if len(parts) == 1:
+        return parts[0]
+    return replace(
+        parts[0], values=np.concatenate([p.values for p in parts]), labels=np.concatenate([p.labels for p in parts])
+    )
+
+
+def _group(names: tuple[str, ...]) -> str | None:
+    """Pattern of numbered groups that hold the same data sets, such as ``data/demo_*``; ``None`` for none."""
+    found: dict[str, dict[str, set[str]]] = {}
+    for name in names:
+        match = re.fullmatch(r"((?:[^/]+/)*[^/\d]*)(\d+)/(.+)", name)
+        if match:
+            found.setdefault(match[1], {}).setdefault(match[2], set()).add(match[3])
+    for stem, groups in found.items():
+        if len(groups) > 1 and set.intersection(*groups.values()):
+            return f"{stem}*"
+    return None

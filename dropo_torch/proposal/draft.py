@@ -1,0 +1,256 @@
+"""From matched columns to the keys of a config that read the log: ``data``, ``frame_skip``, ``observation``."""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dropo_torch.config import make_config
+from dropo_torch.data.examination import Finding
+from dropo_torch.logged import LoggedData, read_log
+from dropo_torch.proposal.clock import GAP, Clock
+from dropo_torch.proposal.columns import Columns
+from dropo_torch.proposal.matching import Match, Matching
+from dropo_torch.proposal.places import Place
+
+#: Relative deviation up to which rows are a whole number of the model's steps apart.
+WHOLE = 1e-3
+#: Findings of an examination whose cures are taken; others are told.
+CURED = (
+    "degrees", "units", "sign", "order", "wraps", "quaternion_order", "joined", "frame_skip", "delay", "dropouts",
+    "jitter", "next_observations",
+)  # fmt: skip
+#: Examinations at most: each may find what the one before hid.
+ROUNDS = 8
+#: A power that noise does not have: times that of the highest quarter of frequencies.
+ABOVE_NOISE = 12.0
+#: Share of what a row adds to a position that its noise may make before it is filtered, and a filter's margin.
+NOISY, MARGIN = 0.02, 1.6
+
+
+@dataclass(frozen=True)
+class Draft:
+    """The part of a config that reads the log.
+
+    Attributes:
+        document: its keys.
+        logged: the log as it reads it.
+        findings: what an examination still finds.
+        notes: what was done and why, in words.
+    """
+
+    document: dict[str, Any]
+    logged: LoggedData
+    findings: tuple[Finding, ...]
+    notes: tuple[str, ...]
+
+
+def make_draft(
+    model: str, data: str, columns: Columns, matching: Matching, places: Sequence[Place], clock: Clock,
+    timestep: float, base: Path,
+) -> Draft:
+    """Return the keys that read a log, corrected by what its examination surely finds.
+
+    Args:
+        model, data: paths as the config has them.
+        columns, matching, clock: the log, what its columns are and when its rows were taken.
+        places: of the model.
+        timestep: the model's, seconds.
+        base: folder of the config.
+
+    Raises:
+        InputError: a log that cannot be read so.
+    """
+    document, notes = _document(model, data, columns, matching, places, clock, timestep, derived=False)
+    logged, findings, cured = _cured(document, base)
+    if any(f.name == "angular_frame" for f in findings):
+        document, notes = _document(model, data, columns, matching, places, clock, timestep, derived=True)
+        notes += ["angular velocities are in the world's frame: all velocities are derived"]
+        logged, findings, cured = _cured(document, base)
+    return Draft(document, logged, findings, (*notes, *cured))
+
+
+def _document(
+    model: str, data: str, columns: Columns, matching: Matching, places: Sequence[Place], clock: Clock,
+    timestep: float, *, derived: bool,
+) -> tuple[dict[str, Any], list[str]]:
+    dt = clock.dt
+    assert dt is not None
+    notes: list[str] = []
+    positions, velocities = list(matching.of("position")), list(matching.of("velocity"))
+    lacking = [p for p in matching.lacks("velocity") if p.partner == "" or matching.at(p.partner)]
+    derived = derived or bool(lacking)
+    skip = max(1, round(dt / timestep))
+    whole = abs(dt / timestep - skip) <= WHOLE * skip
+    missing = any(np.isnan(m.column.values).any() for m in matching.matches)
+    resampled = derived or not clock.even or not whole or missing
+    source: dict[str, Any] = {"path": data}
+    source |= {} if columns.group is None else {"group": columns.group}
+    source |= {} if columns.separator is None else {"separator": columns.separator}
+    if clock.column is None:
+        source["dt"] = float(f"{dt:.6g}")
+    else:
+        unit = clock.unit
+        source["time"] = clock.column.entry if unit == 1.0 else {"signal": clock.column.entry, "scale": unit}
+    if clock.episode is not None:
+        source["episode"] = clock.episode.entry
+    elif clock.terminals:
+        source["terminals"] = [c.entry for c in clock.terminals]
+    if clock.breaks:
+        source["breaks"] = list(clock.breaks)
+    if derived:
+        velocities = []
+        names = ", ".join(dict.fromkeys(p.label for p in lacking))
+        notes += [f"velocities are derived from positions: {names} not logged"] if names else []
+    source["observations"] = [m.column.as_map(m.scale) for m in positions + velocities]
+    commands = matching.of("command")
+    follows = not commands and bool(matching.lacks("command"))
+    if not follows:
+        source["actions"] = [m.column.as_map(m.scale) for m in commands]
+    if resampled or follows:
+        source["preprocess"], more = _preprocess(
+            columns, matching, clock, positions, velocities, skip * timestep, follows=follows
+        )
+        notes += more
+        notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
+        notes += [] if clock.even else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
+    entries = [m.place.entry for m in positions + velocities]
+    if derived:
+        entries += _rates(positions, places)
+    return {"model": model, "data": source, "frame_skip": skip, "observation": entries}, notes
+
+
+def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:
+    """Entries of the velocities that preprocessing derives, in its order."""
+    found: list[str] = []
+    for m in positions:
+        if m.place.measure != "quaternion":
+            found += [p.entry for p in places if p.kind == "velocity" and p.partner == m.place.label]
+        elif m.place.axis == "w":
+            found += [p.entry for p in places if p.kind == "velocity" and p.joint == m.place.joint and p.angular]
+    return found
+
+
+def _preprocess(
+    columns: Columns, matching: Matching, clock: Clock, positions: Sequence[Match], velocities: Sequence[Match],
+    step: float, *, follows: bool,
+) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
+    """Options that resample a log, and what they are for."""
+    options: dict[str, Any] = {"dt": float(f"{step:.9g}")}
+    notes: list[str] = []
+    if velocities:
+        options["velocities"] = [m.column.entry for m in velocities]
+    groups: dict[int, list[str]] = {}
+    for m in positions:
+        if m.place.measure == "quaternion":
+            groups.setdefault(m.place.joint, []).append(m.column.entry)
+    if groups:
+        options["quaternions"] = list(groups.values())
+    if not velocities and (cutoff := filter_frequency(positions, clock, len(columns), columns.parts)) is not None:
+        options["cutoff"] = cutoff
+        notes.append(f"positions are noisy: a filter at {cutoff:g} Hz, above which the log shows noise alone")
+    dt = clock.dt or step
+    longest = _longest(clock, len(columns), columns.parts)
+    if any(np.isnan(m.column.values).any() for m in matching.matches) or longest > 2.4 * max(dt, step):
+        options["max_gap"] = float(f"{min(max(1.05 * longest, 2.5 * dt), GAP * dt):.4g}")
+    if follows:
+        options["actions"] = "position"
+        joints = {m.place.partner for m in matching.of("command")} | {p.partner for p in matching.lacks("command")}
+        options["controlled"] = [m.column.entry for m in positions if m.place.label in joints]
+        notes.append("commands were not logged: servos are taken to have been told what was measured a row later")
+    return options, notes
+
+
+def _longest(clock: Clock, rows: int, parts: Sequence[int]) -> float:
+    """Longest time between rows inside episodes, seconds."""
+    if clock.column is None or not clock.column.values.size:
+        return clock.dt or 0.0
+    spacing = np.diff(clock.column.values)[~clock.starts(rows, parts)[1:]]
+    return float(spacing.max(initial=0.0)) * clock.unit
+
+
+def filter_frequency(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int]) -> float | None:
+    """Return the frequency above which positions show noise alone, Hz; ``None`` where noise does not matter."""
+    from scipy import signal
+
+    starts = np.append(np.flatnonzero(clock.starts(rows, parts)), rows)
+    longest = int(np.argmax(np.diff(starts)))
+    part, highest, dt = slice(starts[longest], starts[longest + 1]), 0.0, clock.dt
+    assert dt is not None
+    is_noisy = False
+    for m in positions:
+        values = m.values[part]
+        values = values[np.isfinite(values)]
+        if len(values) < 64 or not np.ptp(values):
+            continue
+        noise = float(np.std(np.diff(values, 4))) / math.sqrt(70)
+        is_noisy |= noise > NOISY * float(np.std(np.diff(values)))
+        length = min(len(values), 512)
+        frequency, power = signal.welch(np.diff(values), 1 / dt, nperseg=length, detrend="linear")
+        power = power / np.maximum(4 * np.sin(np.pi * frequency * dt) ** 2, 1e-12)  # that of the positions
+        floor = float(np.median(power[-len(power) // 4 :]))
+        above = np.flatnonzero(power[1:] > ABOVE_NOISE * floor) + 1
+        highest = max(highest, float(frequency[above.max()]) if above.size else 0.0)
+    cutoff = MARGIN * max(highest, 4 / (dt * rows))
+    if not is_noisy or cutoff > 0.4 / dt:
+        return None
+    return float(f"{cutoff:.2g}")
+
+
+# --- what an examination cures ---
+
+
+def _cured(document: dict[str, Any], base: Path) -> tuple[LoggedData, tuple[Finding, ...], list[str]]:
+    """Correct the keys, in place, by what the examination of the log surely finds; return what it finds then."""
+    notes: list[str] = []
+    done: set[tuple] = set()
+    for _ in range(ROUNDS):
+        logged = read_log(make_config(document, base=base), uneven=True)
+        findings = logged.examined()
+        new = [f for f in findings if f.sure and f.cure and f.name in CURED and (f.name, f.where) not in done]
+        if not new:
+            break
+        for finding in new[:1]:
+            done.add((finding.name, finding.where))
+            merge_cure(document, finding.cure)
+            notes.append(f"{finding.name}: {finding.what}")
+    return logged, findings, notes
+
+
+def merge_cure(document: dict[str, Any], cure: Mapping[str, Any]) -> None:
+    """Add the keys that cure a finding to those of a config, in place: factors multiply, lists grow."""
+    for key, value in cure.items():
+        if key == "data":
+            for option, given in value.items():
+                _MERGE.get(option, _replace)(document["data"], option, copy.deepcopy(given))
+        else:
+            document[key] = copy.deepcopy(value)
+
+
+def _replace(data: dict[str, Any], option: str, given: Any) -> None:
+    data[option] = given
+
+
+def _multiply(data: dict[str, Any], option: str, given: Mapping[str, float]) -> None:
+    own = data.setdefault(option, {})
+    for name, factor in given.items():
+        own[name] = own.get(name, 1.0) * factor
+
+
+def _extend(data: dict[str, Any], option: str, given: Sequence[Any]) -> None:
+    data[option] = sorted({*data.get(option, ()), *given})
+
+
+def _update(data: dict[str, Any], option: str, given: Mapping[str, Any]) -> None:
+    data[option] = {**data.get(option, {}), **given}
+
+
+_MERGE: dict[str, Callable[[dict[str, Any], str, Any], None]] = {
+    "scale": _multiply, "unwrap": _extend, "breaks": _extend, "preprocess": _update,
+}  # fmt: skip

@@ -1,0 +1,177 @@
+"""What a log tells of candidates: its noise, the length of windows that suits it, and Fisher information."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from dropo_torch.config import Config
+from dropo_torch.data.trajectory import make_transitions
+from dropo_torch.distribution import SearchBox
+from dropo_torch.effects.base import Setting
+from dropo_torch.effects.engine import Variant
+from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.noise import free_forces
+from dropo_torch.gap.scene import short_windows
+from dropo_torch.gap.twin import Twin
+from dropo_torch.objective import Objective
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.proposal.candidates import Candidate
+
+#: Noise, and ε beside it, relative to a column's standard deviation and to its noise.
+FLOOR, BESIDE = 1e-6, 0.3
+#: Windows that are looked at, in logged steps, and seconds that they may take.
+LAGS, LONGEST = (1, 2, 4, 8, 16, 32), 1.0
+#: Microseconds of simulation for one length of windows, about, and logged steps at least and at most.
+BUDGET, FEWEST, MOST = 4e6, 150, 3000
+#: Step of the differences, as a share of a candidate's bounds.
+STEP = 1e-4
+#: Standard errors, in sizes of candidates, below which more does not count when the length of windows is chosen.
+FINE = 0.005
+#: Nats for each direction that a longer window must gain.
+GAIN = 0.15
+
+Report = Callable[[str, float], None]
+
+
+@dataclass(frozen=True)
+class Noise:
+    """The noise of a log.
+
+    Attributes:
+        columns: standard deviation of each observed column, ``(n,)``.
+        setting: the model, and the sizes of the log.
+    """
+
+    columns: np.ndarray
+    setting: Setting
+
+
+@dataclass(frozen=True)
+class Information:
+    """What a log tells of candidates, to first order around the model's values.
+
+    Attributes:
+        gram: Fisher information in the candidates' sizes, ``(d, d)``.
+        lag: logged steps of a window.
+        windows: of the log.
+    """
+
+    gram: np.ndarray
+    lag: int
+    windows: int
+
+
+def measure_noise(problem: Problem) -> Noise:
+    """Return the noise of a log, by short windows in which forces are free: what no missing effect explains.
+
+    Raises:
+        InputError: a log too short for that.
+    """
+    log = replace(problem.trajectories, dt=problem.trajectories.dt or problem.simulator.timestep)
+    setting = make_setting(problem, log)
+    twin = Twin(setting, problem.space, num_threads=problem.config.threads)
+    found = free_forces(twin, short_windows(setting, log), Variant(()))
+    spread = problem.observation.observed(log.observations).std(0)
+    columns = np.array(problem.objective._every_feature.column_noise(found.noise))
+    return Noise(np.maximum(columns, FLOOR * np.where(spread > 0, spread, 1.0)), setting)
+
+
+def noise_keys(problem: Problem, noise: np.ndarray) -> dict[str, Any]:
+    """Return the keys ``noise`` and ``epsilon`` of a config: ε is small beside the noise."""
+    listed = [float(f"{x:.3g}") for x in noise]
+    features = problem.objective.features.feature_noise(np.array(listed))
+    epsilon = [float(f"{max((BESIDE * x) ** 2, 1e-18):.2g}") for x in features]
+    return {"noise": listed, "epsilon": epsilon}
+
+
+def information_of(
+    config: Config, candidates: Sequence[Candidate], *, lags: Sequence[int] | None = None, report: Report | None = None
+) -> Information:
+    """Return what a log tells of candidates, by windows of the length that tells most.
+
+    Args:
+        config: with the log, ``noise`` and ``epsilon``.
+        candidates: the candidates.
+        lags: lengths of windows to choose from, in logged steps.
+        report: is told the stage and its share.
+    """
+    document = config.document() | {"parameters": {c.name: c.spec for c in candidates}, "lag": 1}
+    problem = make_problem(Config(**document, base=config.base))
+    cost = _microseconds(problem) * problem.simulator.frame_skip * (len(candidates) + 1)
+    steps = int(np.clip(BUDGET / cost, FEWEST, MOST))
+    longest = int(np.bincount(problem.trajectories.episodes).max())
+    step = problem.simulator.timestep or 1.0
+    tried = [n for n in lags or LAGS if n == 1 or lags or (n * 4 <= longest and n * step <= LONGEST)]
+    best: Information | None = None
+    for number, lag in enumerate(tried):
+        if report is not None:
+            report(f"Fisher information of windows of {lag} rows", number / len(tried))
+        found = _at_lag(problem, candidates, lag, steps)
+        if best is None or _worth(found.gram) > _worth(best.gram) + GAIN * _rank(found.gram):
+            best = found
+    assert best is not None
+    return best
+
+
+def _worth(gram: np.ndarray) -> float:
+    """Nats that are learnt, beside a prior of the candidates' sizes; what is known finely enough does not count more."""
+    values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
+    return float(-0.5 * np.log(1 / (1 + values) + FINE**2).sum())
+
+
+def _rank(gram: np.ndarray) -> int:
+    return int((np.linalg.eigvalsh(gram) > 1).sum())
+
+
+def _microseconds(problem: Problem) -> float:
+    """Of a physics step, about."""
+    model = problem.space.model
+    assert model is not None
+    return float((3 + 0.15 * model.nv**2) * (1.0 if model.ngeom < 2 else 2.0))
+
+
+def _at_lag(problem: Problem, candidates: Sequence[Candidate], lag: int, steps: int) -> Information:
+    """Fisher information by windows of one length."""
+    every = make_transitions(
+        problem.trajectories, problem.observation, lag=lag, history=problem.simulator.history, since=problem.since
+    )
+    wanted = max(8, steps // lag)
+    rows = np.unique(np.linspace(0, len(every) - 1, wanted).astype(int))
+    objective = problem.objective.on(every.select(rows))
+    jacobian, covariance = sensitivities(objective)
+    scaled = jacobian * torch.tensor([c.size for c in candidates], dtype=torch.float64)[None, :, None]
+    pulled = torch.linalg.solve(covariance, scaled.mT)
+    each = torch.nan_to_num(scaled @ pulled)
+    usual = each.diagonal(dim1=1, dim2=2).sum(1)
+    kept = usual <= 100 * usual[usual > 0].median() if bool((usual > 0).any()) else usual >= 0
+    gram = each[kept].sum(0) * (len(every) / max(int(kept.sum()), 1))
+    return Information(gram.numpy(), lag, len(every))
+
+
+def sensitivities(objective: Objective) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return the derivatives of the features in the parameters ``(T, d, m)``, and the features' covariance.
+
+    They are taken at the model's values, by differences into the search box.
+    """
+    box, space = objective.box, objective.simulator.parameters
+    start = nominal_point(objective)
+    step = STEP * box.width * np.where(start + STEP * box.width > box.high, -1.0, 1.0)
+    points = np.concatenate([start[None], start + np.diag(step)])
+    run = objective.evaluator
+    features = [run.after(block, torch.from_numpy(box.values(points))) for block in run.blocks(len(points))]
+    simulated = torch.cat(features)
+    jacobian = torch.nan_to_num((simulated[:, 1:] - simulated[:, :1]) / torch.from_numpy(step)[:, None])
+    initial = objective.initial_noise(start, None, widen=False)
+    assert len(space) == len(step)
+    return jacobian, objective.base_covariance(slice(None), initial)
+
+
+def nominal_point(objective: Objective) -> np.ndarray:
+    """Return the model's own values in coordinates, within the search box, ``(d,)``."""
+    space, box = objective.simulator.parameters, SearchBox.of(objective.simulator.parameters)
+    return np.clip(np.nan_to_num(space.nominal, nan=1.0), box.low, box.high)

@@ -1,0 +1,438 @@
+"""Which column of a log is which number of a model: by names, by order, and by what the numbers do."""
+
+from __future__ import annotations
+
+import difflib
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns
+from dropo_torch.proposal.places import Place
+from dropo_torch.proposal.words import Words
+
+Sureness = Literal["sure", "likely", "guess"]
+
+#: Score below which a column is not taken for a place, and above which its name leaves no doubt.
+LEAST, SURE = 0.3, 0.75
+#: Shares of motion that a velocity must explain to be its position's, and to be so whatever it is called.
+LIKE, SAME = 0.5, 0.9
+#: Factors between a sensor's unit and the model's; the second kind are those of lengths.
+ANGLES = {1.0: "rad", math.pi / 180: "degrees", math.pi / 30: "rpm"}
+LENGTHS = {1.0: "m", 1e-3: "mm", 1e-2: "cm"}
+#: Rows over which motion is compared with velocities: noise of positions drowns it over one.
+SPANS = (1, 4, 16)
+#: Relative distance from a factor within which a unit is named.
+UNIT = 0.3
+
+
+@dataclass(frozen=True)
+class Match:
+    """A column that is a number of the model.
+
+    Attributes:
+        place: the number.
+        column: the column.
+        scale: by which its values are multiplied.
+        sureness: how sure that is.
+        why: by what it was found, in words.
+    """
+
+    place: Place
+    column: Column
+    scale: float
+    sureness: Sureness
+    why: str
+
+    @property
+    def values(self) -> np.ndarray:
+        """The values in the model's unit, ``(N,)``."""
+        return self.scale * self.column.values
+
+
+@dataclass(frozen=True)
+class Matching:
+    """The columns that were found, and the places that have none.
+
+    Attributes:
+        matches: what was matched, in the model's order: positions, velocities, commands.
+        missing: places without a column.
+        unused: columns of numbers that move and are none of the model's.
+    """
+
+    matches: tuple[Match, ...]
+    missing: tuple[Place, ...]
+    unused: tuple[Column, ...]
+
+    def of(self, kind: str) -> tuple[Match, ...]:
+        """Return the matches of a kind, in the model's order."""
+        return tuple(m for m in self.matches if m.place.kind == kind)
+
+    def at(self, label: str) -> Match | None:
+        """Return the match of a place, or ``None``."""
+        return next((m for m in self.matches if m.place.label == label), None)
+
+    def lacks(self, kind: str) -> tuple[Place, ...]:
+        """Return the places of a kind that have no column."""
+        return tuple(p for p in self.missing if p.kind == kind)
+
+
+def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray, taken: Sequence[Column]) -> Matching:
+    """Return which column is which place, in units as names and ranges tell them.
+
+    Args:
+        columns: the log.
+        places: of the model.
+        starts: rows at which an episode begins, ``(N,)`` bool.
+        taken: columns that are something else, such as the time.
+    """
+    whole = _whole_state(columns, places, starts)
+    free = [c for c in columns.numeric if c not in taken and not any(m.column is c for m in whole)]
+    found = {m.place.label: m for m in whole}
+    for kind in ("position", "velocity", "command"):
+        wanted = [p for p in places if p.kind == kind and p.label not in found]
+        if kind == "command":
+            own = _whole_action(columns, wanted)
+            found |= {m.place.label: m for m in own}
+            wanted = [p for p in wanted if p.label not in found]
+        fits = _assigned(wanted, [c for c in free if not _is_taken(c, found)], found, starts)
+        found |= {m.place.label: m for m in fits}
+    found |= {m.place.label: m for m in _in_order(places, free, found)}
+    matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
+    used = [m.column for m in matches] + list(taken)
+    unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used))
+    return Matching(matches, tuple(p for p in places if p.label not in found), unused)
+
+
+def _is_taken(column: Column, found: dict[str, Match]) -> bool:
+    return any(m.column is column for m in found.values())
+
+
+# --- arrays of a whole robot ---
+
+
+def _whole_state(columns: Columns, places: Sequence[Place], starts: np.ndarray) -> list[Match]:
+    """Matches of an array that holds the state, in the order in which its velocities are its positions' best."""
+    array = columns.matrix(STATES)
+    positions, velocities = ([p for p in places if p.kind == kind] for kind in ("position", "velocity"))
+    orders = []
+    for skipped in range(1 + sum(p.optional for p in positions[:2])):
+        some = positions[skipped:]
+        orders += [some + velocities, velocities + some, some]
+        if len(some) == len(velocities):
+            orders.append([p for pair in zip(some, velocities, strict=True) for p in pair])
+    orders = [o for o in orders if len(o) == len(array)]
+    if not orders:
+        return []
+    best = max(orders, key=lambda order: _likeness(order, array, starts))
+    sureness: Sureness = "likely" if len(orders) > 1 or velocities[0] in best else "guess"
+    why = f"its place in {array[0].array}" + (", as its velocities fit" if velocities[0] in best else "")
+    return [Match(p, c, 1.0, sureness, why) for p, c in zip(best, array, strict=True)]
+
+
+def _likeness(order: Sequence[Place], array: Sequence[Column], starts: np.ndarray) -> float:
+    held = {p.label: c.values for p, c in zip(order, array, strict=True)}
+    shares = [
+        motion(held[p.partner], held[p.label], starts)[0] for p in order if p.partner in held and p.kind == "velocity"
+    ]
+    return float(np.mean(shares)) if shares else 0.0
+
+
+def _whole_action(columns: Columns, wanted: Sequence[Place]) -> list[Match]:
+    array = columns.matrix(ACTIONS)
+    if not wanted or len(array) != len(wanted):
+        return []
+    return [Match(p, c, 1.0, "likely", f"its place in {c.array}") for p, c in zip(wanted, array, strict=True)]
+
+
+# --- one column after the other ---
+
+
+def _assigned(
+    wanted: Sequence[Place], free: Sequence[Column], found: dict[str, Match], starts: np.ndarray
+) -> list[Match]:
+    """The best assignment of columns to places of a kind, by names and motion."""
+    free = [c for c in free if _may_be(c, wanted)] if wanted else []
+    if not free:
+        return []
+    words = {c.entry: w for c, w in zip(free, _with_axes(free), strict=True)}
+    ranks = _ranks(free, words, wanted)
+    scalar = {p.label: i for i, p in enumerate(p for p in wanted if not p.axis)}
+    names = np.array([[_name(words[c.entry], p, ranks.get(c.entry), scalar.get(p.label)) for c in free] for p in wanted])
+    scores = names.copy()
+    shares = np.zeros_like(scores)
+    for i, p in enumerate(wanted):
+        partner = found.get(p.partner) if p.kind == "velocity" else None
+        for j, c in enumerate(free):
+            if partner is not None and names[i, j] > -1:
+                shares[i, j] = motion(partner.values, c.values, starts)[0]
+                scores[i, j] += 0.8 * shares[i, j]
+            scores[i, j] += _role_bonus(words[c.entry], p) + 1e-6 * (len(free) - j)
+    rows, columns = linear_sum_assignment(np.where(scores < -1, -10.0, scores), maximize=True)
+    matches = []
+    for i, j in zip(rows, columns, strict=True):
+        named = names[i, j] >= LEAST
+        same = shares[i, j] > SAME and words[free[j].entry].role in ("velocity", "")
+        if (named or (same and names[i, j] > -1)) and scores[i, j] >= LEAST:
+            matches.append(_matched(wanted[i], free[j], float(names[i, j]), float(shares[i, j])))
+    return matches
+
+
+def _matched(place: Place, column: Column, name: float, share: float) -> Match:
+    by = "its name" if name >= SURE else "its number" if name >= LEAST else "its motion"
+    sureness: Sureness = "sure" if name >= SURE or (name >= LEAST and share > LIKE) else "likely"
+    why = by + (f" and motion (r² {share:.2f})" if share > LIKE and name >= LEAST else "")
+    return Match(place, column, 1.0, sureness, why)
+
+
+def _may_be(column: Column, wanted: Sequence[Place]) -> bool:
+    """Whether a column's role allows it to be one of the places."""
+    role, kind = column.words.role, wanted[0].kind
+    if kind == "position":
+        return role in ("position", "")
+    if kind == "velocity":
+        return role in ("velocity", "")
+    return role in ("command", "effort", "")
+
+
+def _role_bonus(words: Words, place: Place) -> float:
+    """What a role that the name says is worth beside one that it leaves open."""
+    if place.kind == "command":
+        return 0.2 if words.role == "command" and words.commanded == place.takes else 0.1 * (words.role == "command")
+    return 0.1 * (words.role == place.kind)
+
+
+def _name(words: Words, place: Place, rank: int | None, own: int | None) -> float:
+    """How well a column's name fits a place, up to 1; -2 where it speaks against it.
+
+    Args:
+        words: what the name says.
+        place: the place.
+        rank: of the column among those that differ by their number, where there is one for each place.
+        own: the place's.
+    """
+    if place.kind == "command" and not _commands(words, place):
+        return -2.0
+    known, others = set(place.words), set(place.words) | set(place.aliases)
+    said = set(words.objects)
+    if place.axis:
+        fits = words.axis == place.axis and words.quaternion == (place.measure == "quaternion")
+        if not fits or (place.kind == "velocity" and words.angular != place.angular):
+            return -2.0
+        return 0.9 if said & others else 0.6 if not said else 0.2
+    if words.quaternion or (words.angular and words.axis):
+        return -2.0
+    numbered = None
+    if words.numbers and rank is not None:
+        numbered = rank == own
+    elif words.numbers and place.numbers:
+        numbered = words.numbers[-1] == place.numbers[-1]
+    if numbered is False:
+        return -2.0
+    score = _likeness_of_words(said, known, others, words.axis)
+    if not words.role and score < SURE:  # a bare name must be the joint's
+        return 0.0
+    if not numbered:
+        return score
+    if place.numbers or score > 0:
+        return min(1.0, 0.6 + 0.4 * score) if not said or score > 0 or not known else 0.4
+    return 0.5 if not said or not known else 0.35
+
+
+def _likeness_of_words(said: set[str], known: set[str], others: set[str], axis: str) -> float:
+    """How alike the words of a column and of a joint are, up to 1."""
+    if said and known:
+        if "".join(sorted(said)) == "".join(sorted(known)) or said == known:
+            return 1.0
+        share = len(said & known) / max(len(said), len(known))
+        near = difflib.SequenceMatcher(None, "".join(sorted(said)), "".join(sorted(known))).ratio()
+        if share or near > 0.75:
+            return max(0.4 + 0.6 * share if share else 0.0, near if near > 0.75 else 0.0)
+    if said and said & others:
+        return 0.8
+    if axis and not said and axis in others | {w[-1] for w in known if len(w) > 2 and w[:-1] == "root"}:
+        return 0.7
+    return 0.0
+
+
+def _commands(words: Words, place: Place) -> bool:
+    """Whether a column may be what an actuator takes."""
+    if words.role == "effort":
+        return place.takes == "effort"
+    if words.role != "command":
+        return False
+    return words.commanded in ("", place.takes)
+
+
+def _with_axes(columns: Sequence[Column]) -> list[Words]:
+    """The words of columns, with the axes that numbers stand for in groups of three and four."""
+    groups: dict[tuple, list[int]] = {}
+    for i, c in enumerate(columns):
+        w = c.words
+        if w.numbers and not w.axis and (w.objects or w.quaternion or w.angular):
+            groups.setdefault((w.role, w.objects, w.quaternion, w.angular, w.numbers[:-1]), []).append(i)
+    found = [c.words for c in columns]
+    for (_, _, quaternion, _, _), members in groups.items():
+        letters = "wxyz" if quaternion else "xyz"
+        if len(members) == len(letters):
+            ordered = sorted(members, key=lambda i: columns[i].words.numbers[-1])
+            for i, letter in zip(ordered, letters, strict=True):
+                found[i] = replace(found[i], axis=letter)
+    return found
+
+
+def _ranks(columns: Sequence[Column], words: dict[str, Words], wanted: Sequence[Place]) -> dict[str, int]:
+    """The place that a column's number names, among those of one coordinate, where there is a column for each.
+
+    Columns that differ by their number only are counted from whatever the first has, unless the model's numbers are
+    theirs.
+    """
+    numbers = [p.numbers[-1] if p.numbers else None for p in wanted if not p.axis]
+    groups: dict[tuple, list[Column]] = {}
+    for c in columns:
+        w = words[c.entry]
+        if w.numbers and not w.axis:
+            groups.setdefault((w.role, w.objects, w.commanded, w.numbers[:-1]), []).append(c)
+    found: dict[str, int] = {}
+    for members in groups.values():
+        if len(members) != len(numbers):
+            continue
+        own = {words[c.entry].numbers[-1]: c.entry for c in members}
+        same = set(own) == set(numbers)
+        order = [numbers.index(n) if same else i for i, n in enumerate(sorted(own))]
+        found |= {own[n]: place for n, place in zip(sorted(own), order, strict=True)}
+    return found
+
+
+def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
+    """Places that nothing told apart, in the order of as many columns without a name."""
+    wanted = [p for p in places if p.label not in found and p.kind == "position" and not p.optional]
+    nameless = [c for c in free if not _is_taken(c, found) and c.words.role in ("", "position") and c.moves]
+    if not wanted or len(wanted) != len(nameless):
+        return []
+    return [Match(p, c, 1.0, "guess", "the order of columns") for p, c in zip(wanted, nameless, strict=True)]
+
+
+# --- motion and units ---
+
+
+def motion(position: np.ndarray, velocity: np.ndarray, starts: np.ndarray) -> tuple[float, float]:
+    """Return which share of a position's changes a velocity explains, and its factor: seconds a row times its unit."""
+    best = (0.0, math.nan)
+    total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
+    runs = np.cumsum(starts)
+    for span in SPANS:
+        if len(position) < 4 * span + 8:
+            continue
+        with np.errstate(all="ignore"):
+            change, told = position[span:] - position[:-span], total[span:] - total[:-span]
+            good = (runs[span:] == runs[:-span]) & np.isfinite(change) & np.isfinite(told)
+            change, told = change[good], told[good]
+            if len(change) < 8 or not told.any() or not change.any():
+                continue
+            kept = np.abs(change) <= np.quantile(np.abs(change), 0.995)  # without turns and joints of episodes
+            change, told = change[kept], told[kept]
+            size = float(told @ told)
+            if size == 0 or not change.any():
+                continue
+            slope = float(change @ told) / size
+            share = 1 - float(((change - slope * told) ** 2).sum()) / float(change @ change)
+        if share > best[0]:
+            best = (share, slope)
+    return best
+
+
+def with_unit(match: Match, found: dict[str, Match]) -> Match:
+    """Return a match with its unit, by its name, by its joint's range, or by the joint's own unit for a target."""
+    place, column = match.place, match.column
+    if place.measure == "quaternion":
+        return match
+    named = column.words.scale
+    if place.kind == "command" and place.takes != "position":
+        return match if named in (None, 1.0) or place.takes == "effort" and named != 1e-3 else _scaled(match, named)
+    if named is not None:
+        return _scaled(match, named)
+    if place.kind == "position":
+        return _scaled(match, _by_range(place, column.values))
+    if place.kind == "command":
+        partner = found.get(place.partner)
+        if partner is not None:
+            own = with_unit(partner, found).scale
+            return _scaled(match, own if _alike(column.values, partner.column.values) else 1.0)
+    return match
+
+
+def _scaled(match: Match, scale: float | None) -> Match:
+    return match if scale is None else replace(match, scale=scale)
+
+
+def _alike(command: np.ndarray, position: np.ndarray) -> bool:
+    """Whether a target has the size of what was measured."""
+    sizes = [float(np.nanquantile(np.abs(x), 0.95)) for x in (command, position)]
+    return sizes[1] > 0 and 1 / 6 < sizes[0] / sizes[1] < 6
+
+
+def _by_range(place: Place, values: np.ndarray) -> float:
+    """The unit in which a position lies within its joint's range; 1 where nothing speaks for another."""
+    if place.limits is None:
+        return 1.0
+    low, high = place.limits
+    margin = 0.2 * (high - low)
+    finite = values[np.isfinite(values)]
+
+    def inside(scale: float) -> float:
+        return float(((scale * finite >= low - margin) & (scale * finite <= high + margin)).mean())
+
+    others = [s for s in (ANGLES if place.measure == "angle" else LENGTHS) if s != 1.0 and s != math.pi / 30]
+    if inside(1.0) > 0.8:
+        return 1.0
+    return next((s for s in others if inside(s) > 0.95), 1.0)
+
+
+def with_velocity_units(matching: Matching, starts: np.ndarray, dt: float) -> Matching:
+    """Return a matching in which velocities have the unit in which they are their positions' derivatives."""
+    found = []
+    for m in matching.matches:
+        partner = matching.at(m.place.partner) if m.place.kind == "velocity" else None
+        if partner is not None and m.column.words.scale is None:
+            share, slope = motion(partner.values, m.column.values, starts)
+            if share > LIKE and (unit := nearest_unit(slope / dt, m.place)) is not None:
+                m = replace(m, scale=unit)
+        found.append(m)
+    return replace(matching, matches=tuple(found))
+
+
+def nearest_unit(factor: float, place: Place) -> float | None:
+    """Return the unit's factor nearest to one that was measured, with its sign; ``None`` where none is near."""
+    known = ANGLES if place.measure == "angle" else LENGTHS
+    size = abs(factor)
+    near = min(known, key=lambda s: abs(math.log(max(size, 1e-300) / s)))
+    return math.copysign(near, factor) if abs(size / near - 1) < UNIT else None
+
+
+def rows_apart(matching: Matching, starts: np.ndarray) -> list[float]:
+    """Return the seconds between rows that each velocity makes of its position's changes, in the model's units."""
+    found = []
+    for m in matching.of("velocity"):
+        partner = matching.at(m.place.partner)
+        if partner is not None:
+            share, slope = motion(partner.values, m.values, starts)
+            if share > LIKE:
+                found.append(abs(slope))
+    return found
+
+
+def unit_name(scale: float, place: Place) -> str:
+    """Return the unit of a column's values, for people."""
+    known = ANGLES if place.measure == "angle" else LENGTHS
+    if place.measure == "quaternion":
+        return "–"
+    if place.kind == "command" and place.takes == "effort":
+        return ("N·m" if place.measure == "angle" else "N") if scale == 1.0 else f"{scale:g} × SI"
+    near = next((name for factor, name in known.items() if math.isclose(abs(scale), factor)), f"{abs(scale):g} × SI")
+    per = "/s" if (place.kind == "velocity" or place.takes == "velocity" and place.kind == "command") else ""
+    return near + ("" if near == "rpm" else per) + (", reversed" if scale < 0 else "")

@@ -1,0 +1,160 @@
+"""What a model wants columns for: positions and velocities of its joints, and commands of its actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import mujoco
+import numpy as np
+
+from dropo_torch.data.observation import joint_name
+from dropo_torch.parameters import object_names
+from dropo_torch.proposal.words import object_words
+
+Kind = Literal["position", "velocity", "command"]
+#: Kinds of a place by what is measured there: an angle, a length, a component of a quaternion.
+Measure = Literal["angle", "length", "quaternion"]
+
+
+@dataclass(frozen=True)
+class Place:
+    """One number of a state or a command.
+
+    Attributes:
+        label: what it is called, such as ``shoulder.position``.
+        kind: position, velocity or command.
+        measure: what is measured there.
+        entry: its entry of a config's ``observation``; empty for a command.
+        number: its column in ``[qpos, qvel]``, or its actuator.
+        joint: the joint's number, -1 for none.
+        words, numbers: by which the object is known.
+        aliases: words by which it may be known besides: its body's, its axis.
+        axis: of a joint with several coordinates: ``x``, ``y``, ``z`` or ``w``.
+        angular: whether it turns about that axis.
+        limits: of a position or a command, or ``None``.
+        takes: of a command, what it is: ``position``, ``velocity`` or ``effort``.
+        optional: whether a log may lack it, as nothing depends on it.
+        partner: of a velocity, the place of its position, by label; of a command, that of its joint.
+    """
+
+    label: str
+    kind: Kind
+    measure: Measure
+    entry: str
+    number: int
+    joint: int
+    words: tuple[str, ...]
+    numbers: tuple[int, ...]
+    aliases: tuple[str, ...] = ()
+    axis: str = ""
+    angular: bool = False
+    limits: tuple[float, float] | None = None
+    takes: Literal["position", "velocity", "effort"] = "effort"
+    optional: bool = False
+    partner: str = ""
+
+
+def places_of(model: mujoco.MjModel) -> tuple[Place, ...]:
+    """Return all places of a model: positions, velocities and commands, each in the model's order."""
+    positions: list[Place] = []
+    velocities: list[Place] = []
+    for j in range(model.njnt):
+        own, rates = _of_joint(model, j)
+        positions += own
+        velocities += rates
+    return (*positions, *velocities, *_commands(model))
+
+
+def _of_joint(model: mujoco.MjModel, j: int) -> tuple[list[Place], list[Place]]:
+    kind, name = int(model.jnt_type[j]), joint_name(model, j)
+    first, dof = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
+    body = model.body(int(model.jnt_bodyid[j])).name
+    words, numbers = object_words(name)
+    aliases = object_words(body)[0]
+    common = {"joint": j, "words": words, "numbers": numbers}
+    if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+        turns = kind == mujoco.mjtJoint.mjJNT_HINGE
+        axis = "xyz"[int(np.argmax(np.abs(model.jnt_axis[j])))]
+        turned = {"x": "roll", "y": "pitch", "z": "yaw"}
+        limits = tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else None
+        rest = {
+            **common, "measure": "angle" if turns else "length", "limits": limits,
+            "aliases": (*aliases, turned[axis] if turns else axis),
+        }  # fmt: skip
+        free = not turns and _moves_nothing(model, j)
+        position = Place(f"{name}.position", "position", entry=f"{name}.position", number=first, optional=free, **rest)
+        velocity = Place(
+            f"{name}.velocity", "velocity", entry=f"{name}.velocity", number=dof, partner=position.label, **rest
+        )
+        return [position], [velocity]
+    common["aliases"] = aliases
+    own: list[Place] = []
+    rates: list[Place] = []
+    if kind == mujoco.mjtJoint.mjJNT_FREE:
+        for i, axis in enumerate("xyz"):
+            label = f"{name}.position[{axis}]"
+            own.append(Place(label, "position", "length", f"qpos[{first + i}]", first + i, axis=axis, **common))
+            rates.append(Place(
+                f"{name}.velocity[v{axis}]", "velocity", "length", f"qvel[{dof - model.nq + i}]", dof + i, axis=axis,
+                partner=label, **common,
+            ))  # fmt: skip
+    skip = len(own)
+    for i, axis in enumerate("wxyz"):
+        label = f"{name}.position[q{axis}]"
+        own.append(Place(
+            label, "position", "quaternion", f"qpos[{first + skip + i}]", first + skip + i, axis=axis, **common
+        ))  # fmt: skip
+    for i, axis in enumerate("xyz"):
+        rates.append(Place(
+            f"{name}.velocity[w{axis}]", "velocity", "angle", f"qvel[{dof - model.nq + skip + i}]", dof + skip + i,
+            axis=axis, angular=True, **common,
+        ))  # fmt: skip
+    return own, rates
+
+
+def _moves_nothing(model: mujoco.MjModel, j: int) -> bool:
+    """Whether a slide joint only moves all of the robot along a level direction of the world."""
+    body = int(model.jnt_bodyid[j])
+    if int(model.body_parentid[body]) != 0 or model.jnt_stiffness[j] != 0 or model.jnt_limited[j]:
+        return False
+    gravity = np.asarray(model.opt.gravity)
+    down = abs(float(model.jnt_axis[j] @ gravity)) > 1e-6 * max(float(np.linalg.norm(gravity)), 1e-9)
+    driven = any(
+        model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j
+        and model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_NONE
+        for a in range(model.nu)
+    )  # fmt: skip
+    return not down and not driven
+
+
+def _commands(model: mujoco.MjModel) -> list[Place]:
+    found = []
+    for a, name in enumerate(object_names(model, "actuator")):
+        by_joint = model.actuator_trntype[a] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        joint = int(model.actuator_trnid[a, 0]) if by_joint else -1
+        words, numbers = object_words(name)
+        aliases: tuple[str, ...] = ()
+        turns = True
+        if joint >= 0:
+            others, more = object_words(joint_name(model, joint))
+            aliases, numbers = others, numbers or more
+            turns = int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE
+        limits = tuple(model.actuator_ctrlrange[a].tolist()) if model.actuator_ctrllimited[a] else None
+        partner = f"{joint_name(model, joint)}.position" if joint >= 0 else ""
+        found.append(Place(
+            name, "command", "angle" if turns else "length", "", a, joint, words, numbers, aliases, limits=limits,
+            takes=command_kind(model, a), partner=partner,
+        ))  # fmt: skip
+    return found
+
+
+def command_kind(model: mujoco.MjModel, a: int) -> Literal["position", "velocity", "effort"]:
+    """Return what an actuator takes as its command."""
+    if model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
+        gain = model.actuator_gainprm[a, 0]
+        if model.actuator_biasprm[a, 1] != 0 and np.isclose(model.actuator_biasprm[a, 1], -gain):
+            return "position"
+        if model.actuator_biasprm[a, 1] == 0 and model.actuator_biasprm[a, 2] != 0:
+            return "velocity"
+    return "effort"

@@ -1,0 +1,278 @@
+"""From a model and a log, and nothing else, to a config that runs: what ``dropo init`` does."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
+
+import mujoco
+import numpy as np
+
+from dropo_torch.config import Config, make_config
+from dropo_torch.data.examination import Finding
+from dropo_torch.errors import InputError, choices
+from dropo_torch.models.load import load_model
+from dropo_torch.problem import make_problem
+from dropo_torch.proposal.candidates import Candidate, all_candidates
+from dropo_torch.proposal.choice import Choice, choose
+from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
+from dropo_torch.proposal.columns import Columns, read_columns
+from dropo_torch.proposal.draft import Draft, make_draft
+from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
+from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
+from dropo_torch.proposal.motors import drivable, motor_spec, write_with_motors
+from dropo_torch.proposal.places import Place, places_of
+from dropo_torch.proposal.text import config_text
+from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
+
+#: Told of the stage, and of its share.
+Report = Callable[[str, float], None]
+
+
+class Review(Protocol):
+    """Somebody who looks at each step of a proposal, and may correct it."""
+
+    def columns(self, columns: Columns, matching: Matching, places: Sequence[Place]) -> Matching:
+        """Return which column is which number of the model."""
+
+    def clock(self, clock: Clock) -> Clock:
+        """Return when the rows were taken."""
+
+    def parameters(self, choice: Choice) -> Sequence[str] | None:
+        """Return the names of the parameters to fit; ``None`` for those that were chosen."""
+
+
+@dataclass(frozen=True)
+class Proposal:
+    """A config for a model and a log, and why it is as it is.
+
+    Attributes:
+        document: the config's keys; paths are relative to ``base``.
+        base: folder of the config.
+        matching: which column is which number of the model.
+        clock: when the rows were taken.
+        draft: how the log is read, and what its examination still finds.
+        noise: standard deviation of each observed column, ``(n,)``.
+        choice: what is fitted of all physical candidates, and why.
+        windows: of the log, of the chosen length.
+        rate: how the rate was found, in a sentence.
+        window: why windows have their length, in a sentence.
+    """
+
+    document: dict[str, Any]
+    base: Path
+    matching: Matching
+    clock: Clock
+    draft: Draft
+    noise: np.ndarray
+    choice: Choice
+    windows: int
+    rate: str
+    window: str
+
+    @property
+    def config(self) -> Config:
+        """The config."""
+        return make_config(self.document, base=self.base)
+
+    @property
+    def text(self) -> str:
+        """The config as commented YAML."""
+        return config_text(self)
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The observed columns."""
+        return self.draft.logged.observation.labels
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units."""
+        return self.draft.logged.observation.units
+
+    @property
+    def findings(self) -> tuple[Finding, ...]:
+        """What an examination still finds in the log."""
+        return self.draft.findings
+
+
+def propose_config(
+    model: str | Path,
+    log: str | Path,
+    *,
+    out: str | Path = "robot.yaml",
+    dt: float | None = None,
+    seed: int = 0,
+    threads: int = 0,
+    review: Review | None = None,
+    report: Report | None = None,
+) -> Proposal:
+    """Return a config for a robot's model and log: columns, units, rate, episodes, noise and parameters.
+
+    Nothing is written, except ``…_motors.xml`` beside ``out`` where the log has forces for a model without actuators.
+
+    Args:
+        model: an MJCF or URDF.
+        log: a log of any format that the package reads.
+        out: the config to be written, from whose folder paths are told.
+        dt: seconds between rows, for a log that does not say.
+        seed: of the config.
+        threads: of the simulator, 0 for all processors.
+        review: looks at each step and may correct it.
+        report: is told the stage and its share.
+
+    Raises:
+        InputError: a position that no column is, commands that no column is, a rate that nothing tells; and whatever a
+            model or log is refused for.
+    """
+    tell = report or (lambda stage, share: None)
+    path, base = Path(model), Path(out).resolve().parent
+    tell("reading the model and the log", 0.0)
+    compiled, columns = load_model(path), read_columns(log)
+    if len(prescribed_bodies(compiled)):
+        raise InputError(
+            f"model: {prescribed_names(compiled)}: mocap bodies act in this model, and their poses belong to the "
+            "actions; write the config by hand (docs/data.md)"
+        )
+    compiled, path, commanded = _with_motors(compiled, path, columns, Path(out))
+    places, step = places_of(compiled), float(compiled.opt.timestep)
+    clock = find_clock(columns, step, dt)
+    matching, clock = _matched(columns, places, clock, step, commanded)
+    if review is not None:
+        matching, clock = review.columns(columns, matching, places), review.clock(clock)
+    _check(matching, columns, compiled, clock)
+    if path != Path(model):
+        driven = [m.place.label for m in matching.of("command")]
+        write_with_motors(Path(model), driven, path)
+        keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
+        places = tuple(p for p in places if p.label in keep)
+        matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
+    tell("examining the log", 0.1)
+    draft = make_draft(_relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base)
+    document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
+    tell("estimating the noise", 0.2)
+    noise, candidates, document = _with_noise(document, base)
+    found = information_of(make_config(document, base=base), candidates, report=tell)
+    choice = choose(candidates, found.gram)
+    if review is not None and (names := review.parameters(choice)) is not None:
+        choice = choose(candidates, found.gram, names)
+    if not choice.chosen:
+        raise InputError(f"{log}: the log tells none of the model's {len(candidates)} physical parameters; log a motion")
+    document |= {"lag": found.lag, "parameters": {t.candidate.name: t.candidate.spec for t in choice.chosen}}
+    return Proposal(
+        document, base, matching, clock, draft, noise.columns, choice, found.windows, _rate(clock, document, step),
+        _window(found, document["frame_skip"] * step),
+    )  # fmt: skip
+
+
+def _relative(path: Path, base: Path) -> str:
+    """A path as the config has it: from its folder, or absolute where that is on another drive."""
+    try:
+        return Path(os.path.relpath(path.resolve(), base)).as_posix()
+    except ValueError:
+        return str(path.resolve())
+
+
+def _with_motors(
+    model: mujoco.MjModel, path: Path, columns: Columns, out: Path
+) -> tuple[mujoco.MjModel, Path, bool]:
+    """The model with motors at all joints where it has no actuators and the log has forces; where it will stand."""
+    forces = [c for c in columns.numeric if c.words.role in ("effort", "command") and c.moves]
+    joints = drivable(model)
+    if model.nu or not forces or not joints or path.suffix == ".mjb":
+        return model, path, bool(model.nu)
+    return motor_spec(path, joints).compile(), out.resolve().parent / f"{path.stem}_motors.xml", False
+
+
+def _matched(
+    columns: Columns, places: Sequence[Place], clock: Clock, timestep: float, commanded: bool
+) -> tuple[Matching, Clock]:
+    """Columns and their units, with the clock's unit as velocities show it."""
+    starts = clock.starts(len(columns), columns.parts)
+    taken = [c for c in (clock.column, clock.episode, *clock.terminals) if c is not None]
+    matching = match_columns(columns, places, starts, taken)
+    clock = _checked_clock(clock, matching, starts, timestep)
+    if clock.dt is not None:
+        matching = with_velocity_units(matching, starts, clock.dt)
+    return matching, clock
+
+
+def _checked_clock(clock: Clock, matching: Matching, starts: np.ndarray, timestep: float) -> Clock:
+    """The clock with the unit, or the rate, that velocities make of positions, where its name does not tell it."""
+    seconds = rows_apart(matching, starts)
+    if not seconds:
+        return clock
+    usual = float(np.median(seconds))
+    if clock.dt is None:
+        whole = round(usual / timestep)
+        near = whole >= 1 and abs(usual / timestep - whole) < 0.03 * whole
+        dt = whole * timestep if near else usual
+        return replace(clock, dt=dt, why=(*clock.why, f"velocities and positions say that rows are {dt:.4g} s apart"))
+    if clock.column is None or not clock.column.values.size:
+        return clock
+    for power in (1e3, 1e-3, 1e6, 1e-6, 1e9, 1e-9):
+        dt = clock.dt * power
+        if abs(usual / dt - 1) < 0.25 and FASTEST <= dt <= SLOWEST and not _explained(usual / clock.dt, matching):
+            why = f"velocities and positions say that rows are {dt:.4g} s apart"
+            return replace(clock, unit=clock.unit * power, dt=dt, why=(*clock.why, why))
+    return clock
+
+
+def _explained(factor: float, matching: Matching) -> bool:
+    """Whether a unit of the velocities would do as well as another one of the stamps."""
+    return any(nearest_unit(factor, m.place) is not None for m in matching.of("velocity")[:1])
+
+
+def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: Clock) -> None:
+    """Refuse a log that lacks what is needed, naming what there is instead."""
+    free = [c.entry for c in matching.unused]
+    lacking = [p for p in matching.lacks("position") if not p.optional]
+    lacking += [
+        p for p in matching.lacks("velocity")
+        if any(o.optional and o.label == p.partner for o in matching.lacks("position"))
+    ]  # fmt: skip
+    if lacking:
+        names = ", ".join(p.label for p in lacking[:6]) + (", ..." if len(lacking) > 6 else "")
+        known = choices(lacking[0].label.partition(".")[0], free or [c.entry for c in columns.columns])
+        raise InputError(f"{columns.source}: no column is {names}; rename one, or use --interactive{known}")
+    absent = matching.lacks("command")
+    told = matching.of("command")
+    if absent and (told or any(p.takes != "position" for p in absent)):
+        names = ", ".join(p.label for p in absent[:6]) + (", ..." if len(absent) > 6 else "")
+        kind = {"position": "targets", "velocity": "target velocities", "effort": "commanded forces"}[absent[0].takes]
+        raise InputError(
+            f"{columns.source}: no column is the command of {names} ({kind}); rename one, or use --interactive"
+            + choices(absent[0].label, free or [c.entry for c in columns.columns])
+        )
+    if clock.dt is None:
+        raise InputError(
+            f"{columns.source}: nothing says how far rows are apart: neither time stamps nor velocities; give "
+            "--dt SECONDS" + choices("time", free)
+        )
+
+
+def _with_noise(document: dict[str, Any], base: Path) -> tuple[Noise, tuple[Candidate, ...], dict[str, Any]]:
+    """The noise, the candidates as the log sizes them, and the config's keys with the noise."""
+    problem = make_problem(make_config(document, base=base), general=True)
+    noise = measure_noise(problem)
+    states = problem.observation.states(problem.trajectories.observations, problem.trajectories.unseen)
+    candidates = all_candidates(noise.setting, states)
+    return noise, candidates, document | noise_keys(problem, noise.columns)
+
+
+def _rate(clock: Clock, document: dict[str, Any], timestep: float) -> str:
+    seconds = document["frame_skip"] * timestep
+    told = "; ".join(clock.why)
+    return f"{told[:1].upper()}{told[1:]}. A row is {document['frame_skip']} steps of {timestep:g} s, {seconds:.4g} s."
+
+
+def _window(found: Information, step: float) -> str:
+    if found.lag == 1:
+        return f"Every row is predicted from the one before: longer windows would tell no more ({found.windows} windows)."
+    return (
+        f"Windows of {found.lag} rows ({found.lag * step:.3g} s), {found.windows} of them: over one row, noise hides "
+        "what parameters do."
+    )

@@ -1,0 +1,195 @@
+"""What a column's name says: its role, its unit, and which object and number it speaks of."""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+from typing import Literal
+
+Role = Literal["position", "velocity", "acceleration", "effort", "command", "time", "episode", "flag", "other", ""]
+
+#: Words of names, by what they make of a column.
+_ROLES: dict[Role, frozenset[str]] = {
+    "position": frozenset("q qpos pos position positions angle angles theta th phi enc encoder pose p".split()),
+    "velocity": frozenset(
+        "dq qd qdot qvel vel velocity velocities speed speeds omega dot rate v twist gyro angvel linvel".split()
+    ),
+    "acceleration": frozenset("ddq qdd qddot acc accel acceleration qacc".split()),
+    "effort": frozenset("tau torque torques effort efforts force forces moment current load frc".split()),
+    "command": frozenset(
+        "cmd cmds command commands commanded u ctrl control controls action actions act input inputs target targets "
+        "des desired ref reference setpoint setp goal sp pwm".split()
+    ),
+    "time": frozenset("t time times timestamp timestamps stamp clock sec secs seconds".split()),
+    "episode": frozenset("episode episodes ep run trial traj trajectory demo rollout segment take experiment".split()),
+    "flag": frozenset("done dones terminal terminals terminated truncated timeout timeouts reset".split()),
+    "other": frozenset(
+        "temp temperature voltage volt volts error err status mode battery seq frame id std var cov reward rewards "
+        "next".split()
+    ),
+}  # fmt: skip
+#: Words of commands that are positions to be reached.
+_TARGETS = frozenset("target targets des desired ref reference setpoint setp goal sp".split())
+#: Words of units → what the value is multiplied by to be SI.
+UNITS: dict[str, float] = {
+    "deg": math.pi / 180, "degs": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180,
+    "dps": math.pi / 180, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0, "radian": 1.0, "radians": 1.0, "mm": 1e-3,
+    "mmps": 1e-3, "cm": 1e-2, "meter": 1.0, "meters": 1.0, "nm": 1.0, "newton": 1.0, "mnm": 1e-3,
+}  # fmt: skip
+#: Units that count only as a name's last word: they are letters with other meanings, too.
+_LAST = {"m": 1.0, "s": 1.0, "n": 1.0, "mps": 1.0}
+#: Units of time stamps → seconds.
+TIME_UNITS = {
+    "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "millis": 1e-3,
+    "milliseconds": 1e-3, "us": 1e-6, "usec": 1e-6, "micros": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
+    "nanos": 1e-9, "nanoseconds": 1e-9, "nanosec": 1e-9,
+}  # fmt: skip
+#: Words that tell nothing.
+_EMPTY = frozenset(
+    "joint joints jnt state states data sensor sensors robot measured meas actual value values body link obs "
+    "observation observations header log signal base hinge slide slider motor servo of the".split()
+)
+#: Words of quaternions, and of linear and angular velocities.
+_QUATERNION = frozenset("quat quaternion orientation rot rotation ori".split())
+_ANGULAR = frozenset("angular ang gyro omega angvel".split())
+_LINEAR = frozenset("linear lin linvel".split())
+_AXES = ("x", "y", "z")
+
+
+@dataclass(frozen=True)
+class Words:
+    """What a name says.
+
+    Attributes:
+        role: what kind of column it is; empty where the name does not say.
+        scale: factor of its unit to SI; ``None`` where the name has none.
+        objects: words that name an object.
+        numbers: numbers in the name, in order.
+        axis: ``x``, ``y``, ``z``, or ``w`` of a quaternion; empty for none.
+        quaternion: whether it is a quaternion's component.
+        angular: whether it is an angular velocity about an axis.
+        commanded: of a command, the role of what it commands: ``position``, ``velocity``, ``effort``, or empty.
+    """
+
+    role: Role = ""
+    scale: float | None = None
+    objects: tuple[str, ...] = ()
+    numbers: tuple[int, ...] = ()
+    axis: str = ""
+    quaternion: bool = False
+    angular: bool = False
+    commanded: Role = ""
+
+
+def split(name: str) -> list[str]:
+    """Return the words and numbers of a name in small letters: at marks, capitals and digits."""
+    spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
+    return re.findall(r"[a-z]+|\d+", spaced.lower())
+
+
+def object_words(name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
+    """Return the words and the numbers by which a model's object is known."""
+    parts = split(name)
+    kept = tuple(w for w in parts if not w.isdigit() and w not in _EMPTY)
+    return kept, tuple(int(w) for w in parts if w.isdigit())
+
+
+def read_name(name: str) -> Words:
+    """Return what a column's name says."""
+    every = split(name)
+    words, numbers = [w for w in every if not w.isdigit()], tuple(int(w) for w in every if w.isdigit())
+    words, scale = _unit(words)
+    axis, quaternion, angular = "", False, False
+    roles: list[Role] = []
+    objects: list[str] = []
+    commanded: Role = ""
+    for word in words:
+        short = _short(word)
+        if short is not None:
+            kind, letter = short
+            axis = letter
+            quaternion |= kind == "quaternion"
+            angular |= kind == "angular"
+            roles.append("velocity" if kind in ("velocity", "angular") else "position")
+            continue
+        role = _role(word)
+        if role:
+            roles.append(role)
+            commanded = "position" if word in _TARGETS and not commanded else commanded
+            angular |= word in _ANGULAR
+        elif word in _AXES or (word == "w" and (quaternion or set(words) & _QUATERNION)):
+            axis = word
+        elif word in _QUATERNION:
+            quaternion = True
+        elif word in _ANGULAR or word in _LINEAR:
+            angular |= word in _ANGULAR
+        elif word not in _EMPTY:
+            objects.append(word)
+    if not angular and axis and "velocity" in roles and set(words) & _ANGULAR:
+        angular = True
+    role, commanded = _decided(roles, commanded)
+    if quaternion and role in ("", "other"):
+        role = "position"
+    return Words(role, scale, tuple(objects), numbers, axis, quaternion and not angular, angular, commanded)
+
+
+def time_unit(name: str) -> float | None:
+    """Return the unit of time stamps that a name tells, in seconds; ``None`` where it tells none."""
+    for word in reversed([w for w in split(name) if not w.isdigit()]):
+        if word in TIME_UNITS and (word not in ("sec", "secs", "seconds") or len(split(name)) > 1):
+            return TIME_UNITS[word]
+    return None
+
+
+def _decided(roles: list[Role], commanded: Role) -> tuple[Role, Role]:
+    """The role among several, the strongest first; and of what a command is one."""
+    for role in ("time", "episode", "flag"):
+        if roles == [role]:
+            return role, ""
+    if "command" in roles:
+        rest: list[Role] = [r for r in ("effort", "velocity", "position") if r in roles]
+        return "command", rest[0] if rest else commanded
+    order: tuple[Role, ...] = (
+        "other", "acceleration", "velocity", "effort", "position", "time", "episode", "flag"
+    )  # fmt: skip
+    return next((r for r in order if r in roles), ""), ""
+
+
+def _role(word: str) -> Role:
+    for role, known in _ROLES.items():
+        if word in known:
+            return role
+    if len(word) > 3 and word.endswith("dot"):
+        return "velocity"
+    if word.startswith("d") and (word[1:] in _ROLES["position"] or word[1:] in _AXES):
+        return "velocity"
+    return ""
+
+
+def _short(word: str) -> tuple[str, str] | None:
+    """What ``qw``, ``vx``, ``wz`` and ``px`` mean: kind and axis; ``None`` for other words."""
+    kinds = {"q": "quaternion", "v": "velocity", "w": "angular", "p": "position", "d": "velocity"}
+    if len(word) == 2 and word[0] in kinds and (word[1] in _AXES or word == "qw"):
+        return kinds[word[0]], word[1]
+    if len(word) == 4 and word[1:] == "dot" and word[0] in _AXES:
+        return "velocity", word[0]
+    return None
+
+
+def _unit(words: list[str]) -> tuple[list[str], float | None]:
+    """The words without their unit, and its factor."""
+    rest = list(words)
+    per_time = len(rest) > 1 and rest[-1] == "s" and (rest[-2] in UNITS or rest[-2] in _LAST)
+    if per_time:
+        rest.pop()
+    if len(rest) > 1 or per_time:
+        last = rest[-1]
+        if last in UNITS:
+            return rest[:-1], UNITS[last]
+        if last in _LAST and len(rest) > 1:
+            return rest[:-1], _LAST[last]
+    for i, word in enumerate(rest):
+        if word in UNITS and len(rest) > 1:
+            return rest[:i] + rest[i + 1 :], UNITS[word]
+    return rest, None
