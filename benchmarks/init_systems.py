@@ -57,7 +57,7 @@ class System:
     command: Callable[[float, int, np.random.Generator], Sequence[float]]
     columns: Callable[[Samples], Mapping[str, np.ndarray]]
     every: int
-    seconds: float = 20.0
+    seconds: float = 12.0
     episodes: int = 1
     noise: tuple[float, float] = (1e-3, 1e-2)
     start: Callable[[mujoco.MjModel, mujoco.MjData, np.random.Generator], None] | None = None
@@ -104,7 +104,6 @@ def record(system: System, seed: int) -> Samples:
         data = mujoco.MjData(model)
         if system.start is not None:
             system.start(model, data, rng)
-        drawn = np.random.default_rng([seed, episode, 7])
         memory = np.random.default_rng([seed, episode, 8])
         for row in range(int(system.seconds / step / system.every)):
             if model.nu:
@@ -112,7 +111,6 @@ def record(system: System, seed: int) -> Samples:
             rows.append((row * system.every * step, data.qpos.copy(), data.qvel.copy(), data.ctrl.copy(), episode))
             for _ in range(system.every):
                 mujoco.mj_step(model, data)
-        del drawn
     t, q, v, u, e = (np.array(x) for x in zip(*rows, strict=True))
     q = q + system.noise[0] * rng.standard_normal(q.shape)
     for j in np.flatnonzero(np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_BALL))):
@@ -470,7 +468,7 @@ SYSTEMS: dict[str, System] = {
                    "bridgeX_speed_mm_s": 1000 * s["v"][:, 0], "trolleyY_speed_mm_s": 1000 * s["v"][:, 1],
                    "swayX_rate": s["v"][:, 2], "swayY_rate": s["v"][:, 3], "bridge_cmd": s["u"][:, 0],
                    "trolley_cmd": s["u"][:, 1]},
-        every=4, seconds=30,
+        every=4, seconds=20,
     ),
     "pusher": System(
         PUSHER, {"body_mass": {"box": 0.8}, "geom_friction": {"table": 0.3, "box": 0.3}}, _pushes,
@@ -496,7 +494,7 @@ SYSTEMS: dict[str, System] = {
                    **{f"base_w{a}": s["v"][:, 3 + i] for i, a in enumerate("xyz")},
                    **{f"velocity.{i}": s["v"][:, 6 + i] for i in range(8)},
                    **{f"cmd.{i}": s["u"][:, i] for i in range(8)}},
-        every=5, seconds=10, noise=(3e-4, 5e-3),
+        every=5, seconds=6, noise=(3e-4, 5e-3),
     ),
     "hopper": System(
         HOPPER, {"body_mass": {"torso": 3.0, "thigh": 4.6, "leg": 2.4, "foot": 5.8}}, _hop,
@@ -616,13 +614,14 @@ def markdown(found: Sequence[Outcome]) -> str:
     ]
     for o in found:
         lines.append(
-            f"| {o.system} | {o.seed} | {o.checked} | {o.fitted} | {o.verdict} | {o.candidates} | {o.chosen} | {o.held} "
-            f"| {o.single_held} of {o.single} | {o.lag} | {o.seconds:.1f} s | {o.fit_seconds:.1f} s |"
+            f"| {o.system} | {o.seed} | {o.checked} | {o.fitted} | {o.verdict} | {o.candidates} | {o.chosen} "
+            f"| {o.held} | {o.single_held} of {o.single} | {o.lag} | {o.seconds:.1f} s | {o.fit_seconds:.1f} s |"
         )
     total, held = sum(o.chosen for o in found), sum(o.held for o in found)
     single, inside = sum(o.single for o in found), sum(o.single_held for o in found)
-    lines += ["", f"In their 90 % intervals: {held} of {total} ({100 * held / max(total, 1):.0f} %), of those told one by "
-              f"one {inside} of {single} ({100 * inside / max(single, 1):.0f} %).", ""]  # fmt: skip
+    share, alone = 100 * held / max(total, 1), 100 * inside / max(single, 1)
+    one = f"of those told one by one {inside} of {single} ({alone:.0f} %)"
+    lines += ["", f"In their 90 % intervals: {held} of {total} ({share:.0f} %), {one}.", ""]
     for o in found:
         lines.append(f"- {o.system} {o.seed}: {o.summary}")
         lines += [f"  - outside: {text}" for text in o.outside]

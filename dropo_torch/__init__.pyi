@@ -32,6 +32,8 @@ from .parameters import Parameter as Parameter
 from .parameters import ParameterSpace as ParameterSpace
 from .problem import Problem as Problem
 from .problem import make_problem as make_problem
+from .proposal import Proposal as Proposal
+from .proposal import propose_config as propose_config
 from .rl.policy import load_policy as load_policy
 from .simulators import Simulator as Simulator
 from .simulators import make_simulator as make_simulator

@@ -55,10 +55,10 @@ def test_nothing_heavy_is_loaded_before_it_is_needed(code: str) -> None:
 
 PUBLIC = {
     "Config", "Diagnostics", "Distribution", "Effect", "Fit", "FitSettings", "InputError", "Objective", "Observation",
-    "Parameter", "ParameterSpace", "Placed", "Preprocess", "Problem", "Quantity", "Recording", "Simulator",
+    "Parameter", "ParameterSpace", "Placed", "Preprocess", "Problem", "Proposal", "Quantity", "Recording", "Simulator",
     "Trajectories", "Transitions", "baselines", "diagnose", "export_model", "fit", "fit_problem", "gap", "load_config",
     "load_policy", "log_likelihood", "make_config", "make_problem", "make_simulator", "make_transitions",
-    "parse_observation", "preprocess", "read_recording", "read_trajectories",
+    "parse_observation", "preprocess", "propose_config", "read_recording", "read_trajectories",
 }  # fmt: skip
 
 
@@ -95,7 +95,7 @@ LAYERS = (
     "effects",
     "problem",
     "baselines", "gap", "rl", "view",
-    "studies",
+    "proposal", "studies",
     "report",
     "commands", "__main__",
     "testing",

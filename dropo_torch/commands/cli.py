@@ -32,6 +32,10 @@ class Command(NamedTuple):
 GROUPS = {
     "begin": {
         "demo": Command("demo", "fit the bundled Hopper's masses", ("dropo demo",)),
+        "init": Command(
+            "init", "write a config for a model and a log",
+            ("dropo init robot.xml log.csv", "dropo init arm.urdf run.parquet --out arm.yaml --interactive"),
+        ),
         "check": Command(
             "check", "examine the log before anything is fitted to it",
             ("dropo check robot.yaml", "dropo check robot.yaml --out out/check"),

@@ -14,9 +14,7 @@ from dropo_torch.effects.base import Setting
 from dropo_torch.parameters import object_names
 from dropo_torch.proposal.places import command_kind
 
-Kind = Literal[
-    "mass", "damping", "friction", "armature", "stiffness", "gain", "contact", "softness", "centre", "gear"
-]
+Kind = Literal["mass", "damping", "friction", "armature", "stiffness", "gain", "contact", "softness", "centre", "gear"]
 
 #: A joint's friction, damping and rotor inertia that count, as a share of its typical force, force by speed, inertia.
 TYPICAL = 0.1
@@ -161,8 +159,8 @@ def _joints(setting: Setting) -> list[Candidate]:
         rate = "N·m·s/rad" if turns else "N·s/m"
         for what, field, own, typical, unit, why in (
             ("damping", "dof_damping", model.dof_damping[dofs[0]], force / speed, rate, "efforts by speeds"),
-            ("friction", "dof_frictionloss", model.dof_frictionloss[dofs[0]], force, "N·m" if turns else "N", "efforts"),
-            ("armature", "dof_armature", model.dof_armature[dofs[0]], inertia, "kg·m²" if turns else "kg", "inertias"),
+            ("friction", "dof_frictionloss", model.dof_frictionloss[dofs[0]], force, ("N", "N·m")[turns], "efforts"),
+            ("armature", "dof_armature", model.dof_armature[dofs[0]], inertia, ("kg", "kg·m²")[turns], "inertias"),
         ):  # fmt: skip
             if what == "armature" and kind == mujoco.mjtJoint.mjJNT_BALL:
                 continue

@@ -16,7 +16,7 @@ State = Literal["chosen", "stands for", "confounded", "unseen"]
 TOLD = 0.25
 #: How readily a candidate is left out: what models have right more often goes first.
 READINESS: dict[Kind, float] = {
-    "mass": 1.0, "damping": 0.8, "friction": 0.7, "armature": 1.0, "stiffness": 1.0, "gain": 1.2, "contact": 0.8,
+    "mass": 1.0, "damping": 0.8, "friction": 0.7, "armature": 1.1, "stiffness": 1.0, "gain": 1.2, "contact": 0.8,
     "softness": 2.0, "centre": 3.0, "gear": 6.0,
 }  # fmt: skip
 #: Share of a candidate's effect that the chosen ones make up for, from which on they are confused with it.
@@ -25,6 +25,8 @@ EXPLAINED = 0.9
 WEIGHT, NAMED = 0.1, 4
 #: How far off, in its size, a confounded candidate is thought to be at most.
 OFF = 0.3
+#: Standard error, in sizes, beyond which one is as bad as another: readiness alone then says what goes.
+LOST = 1.0
 #: What is not told at all counts as known to so many sizes.
 PRIOR = 30.0
 
@@ -157,7 +159,7 @@ def _eliminated(gram: np.ndarray, ready: np.ndarray, kept: list[int]) -> list[in
         errors = _errors(gram, kept)
         if (errors <= TOLD).all():
             break
-        worst = int(np.argmax(np.where(errors > TOLD, errors * ready[kept], -1.0)))
+        worst = int(np.argmax(np.where(errors > TOLD, np.minimum(errors, LOST) * ready[kept], -1.0)))
         kept = kept[:worst] + kept[worst + 1 :]
     return kept
 
@@ -177,8 +179,10 @@ def _confused(gram: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> dic
     if not kept:
         return found
     part = gram[np.ix_(kept, kept)]
+    scale = np.sqrt(np.diag(part))
+    inverse = np.linalg.pinv(part / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
     for i in left:
-        weights = np.linalg.solve(part + 1e-12 * np.trace(part) * np.eye(len(kept)), gram[kept, i])
+        weights = inverse @ gram[kept, i]
         explained = float(weights @ part @ weights) / float(gram[i, i])
         if explained > EXPLAINED:
             found[i] = {k: float(w) for k, w in zip(kept, weights, strict=True) if abs(w) > WEIGHT}

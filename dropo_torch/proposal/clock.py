@@ -72,8 +72,8 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     known = empty.starts(len(columns), columns.parts)
     column = None if given else _time_column(columns, known)
     if column is None:
-        why = f"rows are {dt:g} s apart, as given" if given else "the log has no time stamps"
-        return Clock(None, 1.0, dt, True, 0.0, episode, empty.terminals, (), (why,))
+        said = f"rows are {dt:g} s apart, as given" if given else "the log has no time stamps"
+        return Clock(None, 1.0, dt, True, 0.0, episode, empty.terminals, (), (said,))
     stamps = _stamps(column)
     spacing = np.diff(stamps)
     usual = spacing[(spacing > 0) & ~known[1:]]

@@ -43,17 +43,25 @@ class Draft:
         logged: the log as it reads it.
         findings: what an examination still finds.
         notes: what was done and why, in words.
+        smooth: the filter of noisy positions whose velocities are derived, or ``None``.
     """
 
     document: dict[str, Any]
     logged: LoggedData
     findings: tuple[Finding, ...]
     notes: tuple[str, ...]
+    smooth: Filter | None = None
 
 
 def make_draft(
-    model: str, data: str, columns: Columns, matching: Matching, places: Sequence[Place], clock: Clock,
-    timestep: float, base: Path,
+    model: str,
+    data: str,
+    columns: Columns,
+    matching: Matching,
+    places: Sequence[Place],
+    clock: Clock,
+    timestep: float,
+    base: Path,
 ) -> Draft:
     """Return the keys that read a log, corrected by what its examination surely finds.
 
@@ -67,19 +75,26 @@ def make_draft(
     Raises:
         InputError: a log that cannot be read so.
     """
-    document, notes = _document(model, data, columns, matching, places, clock, timestep, derived=False)
+    document, notes, smooth = _document(model, data, columns, matching, places, clock, timestep, derived=False)
     logged, findings, cured = _cured(document, base)
     if any(f.name == "angular_frame" for f in findings):
-        document, notes = _document(model, data, columns, matching, places, clock, timestep, derived=True)
+        document, notes, smooth = _document(model, data, columns, matching, places, clock, timestep, derived=True)
         notes += ["angular velocities are in the world's frame: all velocities are derived"]
         logged, findings, cured = _cured(document, base)
-    return Draft(document, logged, findings, (*notes, *cured))
+    return Draft(document, logged, findings, (*notes, *cured), smooth)
 
 
 def _document(
-    model: str, data: str, columns: Columns, matching: Matching, places: Sequence[Place], clock: Clock,
-    timestep: float, *, derived: bool,
-) -> tuple[dict[str, Any], list[str]]:
+    model: str,
+    data: str,
+    columns: Columns,
+    matching: Matching,
+    places: Sequence[Place],
+    clock: Clock,
+    timestep: float,
+    *,
+    derived: bool,
+) -> tuple[dict[str, Any], list[str], Filter | None]:
     dt = clock.dt
     assert dt is not None
     notes: list[str] = []
@@ -89,6 +104,7 @@ def _document(
     skip = max(1, round(dt / timestep))
     whole = abs(dt / timestep - skip) <= WHOLE * skip
     missing = any(np.isnan(m.column.values).any() for m in matching.matches)
+    smooth: Filter | None = None
     resampled = derived or not clock.even or not whole or missing
     source: dict[str, Any] = {"path": data}
     source |= {} if columns.group is None else {"group": columns.group}
@@ -114,7 +130,7 @@ def _document(
     if not follows:
         source["actions"] = [m.column.as_map(m.scale) for m in commands]
     if resampled or follows:
-        source["preprocess"], more = _preprocess(
+        source["preprocess"], more, smooth = _preprocess(
             columns, matching, clock, positions, velocities, skip * timestep, follows=follows
         )
         notes += more
@@ -123,7 +139,7 @@ def _document(
     entries = [m.place.entry for m in positions + velocities]
     if derived:
         entries += _rates(positions, places)
-    return {"model": model, "data": source, "frame_skip": skip, "observation": entries}, notes
+    return {"model": model, "data": source, "frame_skip": skip, "observation": entries}, notes, smooth
 
 
 def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:
@@ -140,8 +156,8 @@ def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:
 def _preprocess(
     columns: Columns, matching: Matching, clock: Clock, positions: Sequence[Match], velocities: Sequence[Match],
     step: float, *, follows: bool,
-) -> tuple[dict[str, Any], list[str]]:  # fmt: skip
-    """Options that resample a log, and what they are for."""
+) -> tuple[dict[str, Any], list[str], Filter | None]:  # fmt: skip
+    """Options that resample a log, what they are for, and the filter among them."""
     options: dict[str, Any] = {"dt": float(f"{step:.9g}")}
     notes: list[str] = []
     if velocities:
@@ -152,9 +168,10 @@ def _preprocess(
             groups.setdefault(m.place.joint, []).append(m.column.entry)
     if groups:
         options["quaternions"] = list(groups.values())
-    if not velocities and (cutoff := filter_frequency(positions, clock, len(columns), columns.parts)) is not None:
-        options["cutoff"] = cutoff
-        notes.append(f"positions are noisy: a filter at {cutoff:g} Hz, above which the log shows noise alone")
+    smooth = None if velocities else make_filter(positions, clock, len(columns), columns.parts)
+    if smooth is not None:
+        options["cutoff"] = smooth.cutoff
+        notes.append(f"positions are noisy: a filter at {smooth.cutoff:g} Hz, above which the log shows noise alone")
     dt = clock.dt or step
     longest = _longest(clock, len(columns), columns.parts)
     if any(np.isnan(m.column.values).any() for m in matching.matches) or longest > 2.4 * max(dt, step):
@@ -164,7 +181,7 @@ def _preprocess(
         joints = {m.place.partner for m in matching.of("command")} | {p.partner for p in matching.lacks("command")}
         options["controlled"] = [m.column.entry for m in positions if m.place.label in joints]
         notes.append("commands were not logged: servos are taken to have been told what was measured a row later")
-    return options, notes
+    return options, notes, smooth
 
 
 def _longest(clock: Clock, rows: int, parts: Sequence[int]) -> float:
@@ -175,15 +192,33 @@ def _longest(clock: Clock, rows: int, parts: Sequence[int]) -> float:
     return float(spacing.max(initial=0.0)) * clock.unit
 
 
-def filter_frequency(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int]) -> float | None:
-    """Return the frequency above which positions show noise alone, Hz; ``None`` where noise does not matter."""
+@dataclass(frozen=True)
+class Filter:
+    """A low-pass filter that takes the noise off positions, and what it leaves.
+
+    Attributes:
+        cutoff: its frequency, Hz.
+        density: of the noise of each position, by its place's label: its unit squared by Hz.
+    """
+
+    cutoff: float
+    density: dict[str, float]
+
+    def noise(self, label: str, *, of_rate: bool) -> float:
+        """Return the standard deviation that the filter leaves of a position's noise, or of its derivative's."""
+        power = self.density.get(label, 0.0) * self.cutoff
+        return math.sqrt(power * ((2 * math.pi * self.cutoff) ** 2 / 3 if of_rate else 1.0))
+
+
+def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int]) -> Filter | None:
+    """Return the filter above whose frequency positions show noise alone; ``None`` where noise does not matter."""
     from scipy import signal
 
     starts = np.append(np.flatnonzero(clock.starts(rows, parts)), rows)
     longest = int(np.argmax(np.diff(starts)))
     part, highest, dt = slice(starts[longest], starts[longest + 1]), 0.0, clock.dt
     assert dt is not None
-    is_noisy = False
+    is_noisy, density = False, {}
     for m in positions:
         values = m.values[part]
         values = values[np.isfinite(values)]
@@ -194,13 +229,11 @@ def filter_frequency(positions: Sequence[Match], clock: Clock, rows: int, parts:
         length = min(len(values), 512)
         frequency, power = signal.welch(np.diff(values), 1 / dt, nperseg=length, detrend="linear")
         power = power / np.maximum(4 * np.sin(np.pi * frequency * dt) ** 2, 1e-12)  # that of the positions
-        floor = float(np.median(power[-len(power) // 4 :]))
-        above = np.flatnonzero(power[1:] > ABOVE_NOISE * floor) + 1
+        density[m.place.label] = float(np.median(power[-len(power) // 4 :]))
+        above = np.flatnonzero(power[1:] > ABOVE_NOISE * density[m.place.label]) + 1
         highest = max(highest, float(frequency[above.max()]) if above.size else 0.0)
-    cutoff = MARGIN * max(highest, 4 / (dt * rows))
-    if not is_noisy or cutoff > 0.4 / dt:
-        return None
-    return float(f"{cutoff:.2g}")
+    cutoff = float(f"{MARGIN * max(highest, 4 / (dt * rows)):.2g}")
+    return Filter(cutoff, density) if is_noisy and cutoff <= 0.4 / dt else None
 
 
 # --- what an examination cures ---

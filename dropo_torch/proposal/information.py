@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from dropo_torch.config import Config
+from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import make_transitions
 from dropo_torch.distribution import SearchBox
 from dropo_torch.effects.base import Setting
@@ -18,16 +19,18 @@ from dropo_torch.gap.log import make_setting
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.twin import Twin
+from dropo_torch.initial_noise import NOISE_DRAWS
 from dropo_torch.objective import Objective
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.proposal.candidates import Candidate
+from dropo_torch.proposal.draft import Filter
 
 #: Noise, and ε beside it, relative to a column's standard deviation and to its noise.
 FLOOR, BESIDE = 1e-6, 0.3
 #: Windows that are looked at, in logged steps, and seconds that they may take.
 LAGS, LONGEST = (1, 2, 4, 8, 16, 32), 1.0
 #: Microseconds of simulation for one length of windows, about, and logged steps at least and at most.
-BUDGET, FEWEST, MOST = 4e6, 150, 3000
+BUDGET, FEWEST, MOST = 3e6, 150, 3000
 #: Step of the differences, as a share of a candidate's bounds.
 STEP = 1e-4
 #: Standard errors, in sizes of candidates, below which more does not count when the length of windows is chosen.
@@ -66,8 +69,10 @@ class Information:
     windows: int
 
 
-def measure_noise(problem: Problem) -> Noise:
+def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
     """Return the noise of a log, by short windows in which forces are free: what no missing effect explains.
+
+    Of filtered positions, short windows show next to nothing: what the filter leaves counts.
 
     Raises:
         InputError: a log too short for that.
@@ -77,8 +82,16 @@ def measure_noise(problem: Problem) -> Noise:
     twin = Twin(setting, problem.space, num_threads=problem.config.threads)
     found = free_forces(twin, short_windows(setting, log), Variant(()))
     spread = problem.observation.observed(log.observations).std(0)
-    columns = np.array(problem.objective._every_feature.column_noise(found.noise))
+    columns = Features.of(problem.observation).column_noise(found.noise)
+    if smooth is not None:
+        columns = np.maximum(columns, [_left(smooth, label) for label in problem.observation.labels])
     return Noise(np.maximum(columns, FLOOR * np.where(spread > 0, spread, 1.0)), setting)
+
+
+def _left(smooth: Filter, label: str) -> float:
+    """The noise that a filter leaves of an observed column."""
+    of_rate = ".velocity" in label
+    return smooth.noise(label.replace(".velocity[v", ".position[").replace(".velocity", ".position"), of_rate=of_rate)
 
 
 def noise_keys(problem: Problem, noise: np.ndarray) -> dict[str, Any]:
@@ -90,23 +103,25 @@ def noise_keys(problem: Problem, noise: np.ndarray) -> dict[str, Any]:
 
 
 def information_of(
-    config: Config, candidates: Sequence[Candidate], *, lags: Sequence[int] | None = None, report: Report | None = None
+    config: Config, candidates: Sequence[Candidate], *, least: int = 1, report: Report | None = None
 ) -> Information:
     """Return what a log tells of candidates, by windows of the length that tells most.
 
     Args:
         config: with the log, ``noise`` and ``epsilon``.
         candidates: the candidates.
-        lags: lengths of windows to choose from, in logged steps.
+        least: shortest length of windows, in logged steps.
         report: is told the stage and its share.
     """
     document = config.document() | {"parameters": {c.name: c.spec for c in candidates}, "lag": 1}
     problem = make_problem(Config(**document, base=config.base))
-    cost = _microseconds(problem) * problem.simulator.frame_skip * (len(candidates) + 1)
+    simulations = len(candidates) + 2 + 2 * NOISE_DRAWS * problem.observation.size
+    cost = _microseconds(problem) * problem.simulator.frame_skip * simulations
     steps = int(np.clip(BUDGET / cost, FEWEST, MOST))
     longest = int(np.bincount(problem.trajectories.episodes).max())
     step = problem.simulator.timestep or 1.0
-    tried = [n for n in lags or LAGS if n == 1 or lags or (n * 4 <= longest and n * step <= LONGEST)]
+    tried = [n for n in LAGS if n > least and n * 4 <= longest and n * step <= LONGEST]
+    tried = [min(least, max(1, longest // 2)), *tried]
     best: Information | None = None
     for number, lag in enumerate(tried):
         if report is not None:
@@ -119,7 +134,7 @@ def information_of(
 
 
 def _worth(gram: np.ndarray) -> float:
-    """Nats that are learnt, beside a prior of the candidates' sizes; what is known finely enough does not count more."""
+    """Nats that are learnt beside a prior of the candidates' sizes, up to what is known finely enough."""
     values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
     return float(-0.5 * np.log(1 / (1 + values) + FINE**2).sum())
 

@@ -162,7 +162,9 @@ def _assigned(
     words = {c.entry: w for c, w in zip(free, _with_axes(free), strict=True)}
     ranks = _ranks(free, words, wanted)
     scalar = {p.label: i for i, p in enumerate(p for p in wanted if not p.axis)}
-    names = np.array([[_name(words[c.entry], p, ranks.get(c.entry), scalar.get(p.label)) for c in free] for p in wanted])
+    names = np.array(
+        [[_name(words[c.entry], p, ranks.get(c.entry), scalar.get(p.label)) for c in free] for p in wanted]
+    )
     scores = names.copy()
     shares = np.zeros_like(scores)
     for i, p in enumerate(wanted):
@@ -178,15 +180,17 @@ def _assigned(
         named = names[i, j] >= LEAST
         same = shares[i, j] > SAME and words[free[j].entry].role in ("velocity", "")
         if (named or (same and names[i, j] > -1)) and scores[i, j] >= LEAST:
-            matches.append(_matched(wanted[i], free[j], float(names[i, j]), float(shares[i, j])))
+            told = words[free[j].entry]
+            matches.append(_matched(wanted[i], free[j], told, float(names[i, j]), float(shares[i, j])))
     return matches
 
 
-def _matched(place: Place, column: Column, name: float, share: float) -> Match:
-    by = "its name" if name >= SURE else "its number" if name >= LEAST else "its motion"
+def _matched(place: Place, column: Column, words: Words, name: float, share: float) -> Match:
+    """A match, with what it was found by."""
+    spoken = "its name" if words.objects or words.axis else "its number" if words.numbers else "its kind"
+    by = spoken if name >= LEAST else "its motion"
     sureness: Sureness = "sure" if name >= SURE or (name >= LEAST and share > LIKE) else "likely"
-    why = by + (f" and motion (r² {share:.2f})" if share > LIKE and name >= LEAST else "")
-    return Match(place, column, 1.0, sureness, why)
+    return Match(place, column, 1.0, sureness, by + (f" and motion (r² {share:.2f})" if share > LIKE else ""))
 
 
 def _may_be(column: Column, wanted: Sequence[Place]) -> bool:
@@ -226,6 +230,11 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
         return 0.9 if said & others else 0.6 if not said else 0.2
     if words.quaternion or (words.angular and words.axis):
         return -2.0
+    axes = known & set("xyz")
+    if axes and words.axis:
+        if words.axis not in axes:
+            return -2.0
+        said |= {words.axis}
     numbered = None
     if words.numbers and rank is not None:
         numbered = rank == own
@@ -234,8 +243,10 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
     if numbered is False:
         return -2.0
     score = _likeness_of_words(said, known, others, words.axis)
-    if not words.role and score < SURE:  # a bare name must be the joint's
+    if not words.role and score < SURE and (said or not words.axis):  # a bare name must be the joint's
         return 0.0
+    if not said and not numbered and score == 0.0 and not words.axis:
+        return 0.4 if words.turns and place.measure == "angle" else 0.0 if words.turns else LEAST
     if not numbered:
         return score
     if place.numbers or score > 0:
@@ -353,7 +364,7 @@ def with_unit(match: Match, found: dict[str, Match]) -> Match:
         return match
     named = column.words.scale
     if place.kind == "command" and place.takes != "position":
-        return match if named in (None, 1.0) or place.takes == "effort" and named != 1e-3 else _scaled(match, named)
+        return match if named in (None, 1.0) or (place.takes == "effort" and named != 1e-3) else _scaled(match, named)
     if named is not None:
         return _scaled(match, named)
     if place.kind == "position":
@@ -434,5 +445,5 @@ def unit_name(scale: float, place: Place) -> str:
     if place.kind == "command" and place.takes == "effort":
         return ("N·m" if place.measure == "angle" else "N") if scale == 1.0 else f"{scale:g} × SI"
     near = next((name for factor, name in known.items() if math.isclose(abs(scale), factor)), f"{abs(scale):g} × SI")
-    per = "/s" if (place.kind == "velocity" or place.takes == "velocity" and place.kind == "command") else ""
+    per = "/s" if (place.kind == "velocity" or (place.takes == "velocity" and place.kind == "command")) else ""
     return near + ("" if near == "rpm" else per) + (", reversed" if scale < 0 else "")

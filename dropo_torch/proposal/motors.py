@@ -23,7 +23,7 @@ def motor_spec(path: Path, joints: Sequence[str]) -> mujoco.MjSpec:
 def drivable(model: mujoco.MjModel) -> list[str]:
     """Return the joints of a model that a motor can drive by name."""
     kinds = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
-    return [joint_name(model, j) for j in range(model.njnt) if model.jnt_type[j] in kinds and model.joint(j).name]
+    return [joint_name(model, j) for j in range(model.njnt) if int(model.jnt_type[j]) in kinds and model.joint(j).name]
 
 
 def write_with_motors(path: Path, joints: Sequence[str], out: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import mujoco
@@ -67,50 +67,48 @@ def places_of(model: mujoco.MjModel) -> tuple[Place, ...]:
 
 
 def _of_joint(model: mujoco.MjModel, j: int) -> tuple[list[Place], list[Place]]:
+    """The positions and velocities of a joint."""
     kind, name = int(model.jnt_type[j]), joint_name(model, j)
-    first, dof = int(model.jnt_qposadr[j]), model.nq + int(model.jnt_dofadr[j])
-    body = model.body(int(model.jnt_bodyid[j])).name
+    first, dof = int(model.jnt_qposadr[j]), int(model.jnt_dofadr[j])
     words, numbers = object_words(name)
-    aliases = object_words(body)[0]
-    common = {"joint": j, "words": words, "numbers": numbers}
+    aliases = object_words(model.body(int(model.jnt_bodyid[j])).name)[0]
     if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
         turns = kind == mujoco.mjtJoint.mjJNT_HINGE
         axis = "xyz"[int(np.argmax(np.abs(model.jnt_axis[j])))]
-        turned = {"x": "roll", "y": "pitch", "z": "yaw"}
-        limits = tuple(model.jnt_range[j].tolist()) if model.jnt_limited[j] else None
-        rest = {
-            **common, "measure": "angle" if turns else "length", "limits": limits,
-            "aliases": (*aliases, turned[axis] if turns else axis),
-        }  # fmt: skip
-        free = not turns and _moves_nothing(model, j)
-        position = Place(f"{name}.position", "position", entry=f"{name}.position", number=first, optional=free, **rest)
-        velocity = Place(
-            f"{name}.velocity", "velocity", entry=f"{name}.velocity", number=dof, partner=position.label, **rest
-        )
+        low, high = model.jnt_range[j].tolist()
+        position = Place(
+            f"{name}.position", "position", "angle" if turns else "length", f"{name}.position", first, j, words,
+            numbers, aliases=(*aliases, {"x": "roll", "y": "pitch", "z": "yaw"}[axis] if turns else axis),
+            limits=(low, high) if model.jnt_limited[j] else None, optional=not turns and _moves_nothing(model, j),
+        )  # fmt: skip
+        label = f"{name}.velocity"
+        velocity = replace(
+            position, label=label, kind="velocity", entry=label, number=model.nq + dof, optional=False,
+            partner=position.label,
+        )  # fmt: skip
         return [position], [velocity]
-    common["aliases"] = aliases
+
+    def component(rest: str, measure: Measure, axis: str, column: int, *, moving: bool) -> Place:
+        kind: Kind = "velocity" if moving else "position"
+        entry = f"qvel[{column}]" if moving else f"qpos[{column}]"
+        number = column + (model.nq if moving else 0)
+        return Place(f"{name}.{rest}", kind, measure, entry, number, j, words, numbers, aliases, axis)
+
     own: list[Place] = []
     rates: list[Place] = []
-    if kind == mujoco.mjtJoint.mjJNT_FREE:
-        for i, axis in enumerate("xyz"):
-            label = f"{name}.position[{axis}]"
-            own.append(Place(label, "position", "length", f"qpos[{first + i}]", first + i, axis=axis, **common))
-            rates.append(Place(
-                f"{name}.velocity[v{axis}]", "velocity", "length", f"qvel[{dof - model.nq + i}]", dof + i, axis=axis,
-                partner=label, **common,
-            ))  # fmt: skip
+    for i, axis in enumerate("xyz" if kind == mujoco.mjtJoint.mjJNT_FREE else ""):
+        own.append(component(f"position[{axis}]", "length", axis, first + i, moving=False))
+        rate = component(f"velocity[v{axis}]", "length", axis, dof + i, moving=True)
+        rates.append(replace(rate, partner=own[-1].label))
     skip = len(own)
-    for i, axis in enumerate("wxyz"):
-        label = f"{name}.position[q{axis}]"
-        own.append(Place(
-            label, "position", "quaternion", f"qpos[{first + skip + i}]", first + skip + i, axis=axis, **common
-        ))  # fmt: skip
-    for i, axis in enumerate("xyz"):
-        rates.append(Place(
-            f"{name}.velocity[w{axis}]", "velocity", "angle", f"qvel[{dof - model.nq + skip + i}]", dof + skip + i,
-            axis=axis, angular=True, **common,
-        ))  # fmt: skip
-    return own, rates
+    own += [
+        component(f"position[q{axis}]", "quaternion", axis, first + skip + i, moving=False)
+        for i, axis in enumerate("wxyz")
+    ]
+    turning = [
+        component(f"velocity[w{axis}]", "angle", axis, dof + skip + i, moving=True) for i, axis in enumerate("xyz")
+    ]
+    return own, [*rates, *(replace(p, angular=True) for p in turning)]
 
 
 def _moves_nothing(model: mujoco.MjModel, j: int) -> bool:
@@ -121,8 +119,8 @@ def _moves_nothing(model: mujoco.MjModel, j: int) -> bool:
     gravity = np.asarray(model.opt.gravity)
     down = abs(float(model.jnt_axis[j] @ gravity)) > 1e-6 * max(float(np.linalg.norm(gravity)), 1e-9)
     driven = any(
-        model.actuator_trntype[a] == mujoco.mjtTrn.mjTRN_JOINT and model.actuator_trnid[a, 0] == j
-        and model.actuator_biastype[a] != mujoco.mjtBias.mjBIAS_NONE
+        int(model.actuator_trntype[a]) == mujoco.mjtTrn.mjTRN_JOINT and int(model.actuator_trnid[a, 0]) == j
+        and int(model.actuator_biastype[a]) != mujoco.mjtBias.mjBIAS_NONE
         for a in range(model.nu)
     )  # fmt: skip
     return not down and not driven
@@ -131,7 +129,7 @@ def _moves_nothing(model: mujoco.MjModel, j: int) -> bool:
 def _commands(model: mujoco.MjModel) -> list[Place]:
     found = []
     for a, name in enumerate(object_names(model, "actuator")):
-        by_joint = model.actuator_trntype[a] in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+        by_joint = int(model.actuator_trntype[a]) in (mujoco.mjtTrn.mjTRN_JOINT, mujoco.mjtTrn.mjTRN_JOINTINPARENT)
         joint = int(model.actuator_trnid[a, 0]) if by_joint else -1
         words, numbers = object_words(name)
         aliases: tuple[str, ...] = ()
@@ -151,7 +149,7 @@ def _commands(model: mujoco.MjModel) -> list[Place]:
 
 def command_kind(model: mujoco.MjModel, a: int) -> Literal["position", "velocity", "effort"]:
     """Return what an actuator takes as its command."""
-    if model.actuator_biastype[a] == mujoco.mjtBias.mjBIAS_AFFINE:
+    if int(model.actuator_biastype[a]) == mujoco.mjtBias.mjBIAS_AFFINE:
         gain = model.actuator_gainprm[a, 0]
         if model.actuator_biasprm[a, 1] != 0 and np.isclose(model.actuator_biasprm[a, 1], -gain):
             return "position"

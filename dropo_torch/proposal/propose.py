@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -151,16 +152,21 @@ def propose_config(
         places = tuple(p for p in places if p.label in keep)
         matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
     tell("examining the log", 0.1)
-    draft = make_draft(_relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base)
+    draft = make_draft(
+        _relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base
+    )
     document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
     tell("estimating the noise", 0.2)
-    noise, candidates, document = _with_noise(document, base)
-    found = information_of(make_config(document, base=base), candidates, report=tell)
+    noise, candidates, document = _with_noise(document, draft, base)
+    least = 1 if draft.smooth is None else math.ceil(0.5 / (draft.smooth.cutoff * document["frame_skip"] * step))
+    found = information_of(make_config(document, base=base), candidates, least=least, report=tell)
     choice = choose(candidates, found.gram)
     if review is not None and (names := review.parameters(choice)) is not None:
         choice = choose(candidates, found.gram, names)
     if not choice.chosen:
-        raise InputError(f"{log}: the log tells none of the model's {len(candidates)} physical parameters; log a motion")
+        raise InputError(
+            f"{log}: the log tells none of the model's {len(candidates)} physical parameters; log a motion"
+        )
     document |= {"lag": found.lag, "parameters": {t.candidate.name: t.candidate.spec for t in choice.chosen}}
     return Proposal(
         document, base, matching, clock, draft, noise.columns, choice, found.windows, _rate(clock, document, step),
@@ -176,9 +182,7 @@ def _relative(path: Path, base: Path) -> str:
         return str(path.resolve())
 
 
-def _with_motors(
-    model: mujoco.MjModel, path: Path, columns: Columns, out: Path
-) -> tuple[mujoco.MjModel, Path, bool]:
+def _with_motors(model: mujoco.MjModel, path: Path, columns: Columns, out: Path) -> tuple[mujoco.MjModel, Path, bool]:
     """The model with motors at all joints where it has no actuators and the log has forces; where it will stand."""
     forces = [c for c in columns.numeric if c.words.role in ("effort", "command") and c.moves]
     joints = drivable(model)
@@ -254,10 +258,12 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
         )
 
 
-def _with_noise(document: dict[str, Any], base: Path) -> tuple[Noise, tuple[Candidate, ...], dict[str, Any]]:
+def _with_noise(
+    document: dict[str, Any], draft: Draft, base: Path
+) -> tuple[Noise, tuple[Candidate, ...], dict[str, Any]]:
     """The noise, the candidates as the log sizes them, and the config's keys with the noise."""
     problem = make_problem(make_config(document, base=base), general=True)
-    noise = measure_noise(problem)
+    noise = measure_noise(problem, draft.smooth)
     states = problem.observation.states(problem.trajectories.observations, problem.trajectories.unseen)
     candidates = all_candidates(noise.setting, states)
     return noise, candidates, document | noise_keys(problem, noise.columns)
@@ -271,7 +277,9 @@ def _rate(clock: Clock, document: dict[str, Any], timestep: float) -> str:
 
 def _window(found: Information, step: float) -> str:
     if found.lag == 1:
-        return f"Every row is predicted from the one before: longer windows would tell no more ({found.windows} windows)."
+        return (
+            f"Every row is predicted from the one before: longer windows would tell no more ({found.windows} windows)."
+        )
     return (
         f"Windows of {found.lag} rows ({found.lag * step:.3g} s), {found.windows} of them: over one row, noise hides "
         "what parameters do."

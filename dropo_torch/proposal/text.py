@@ -81,7 +81,7 @@ def _columns(proposal: Proposal) -> Sequence[str]:
 
 
 def _parameter(told: Told) -> list[str]:
-    note = f"expected error {_percent(told)}; {told.candidate.why}"
+    note = f"expected error {error_text(told)}; {told.candidate.why}"
     if told.with_:
         note += f"; stands for {', '.join(name for name, _ in told.with_)} too"
     entry = yaml.safe_dump(
@@ -96,10 +96,11 @@ def _left(told: Told) -> str:
         return f"{c.name}: hardly moves anything in this log"
     if told.with_:
         return f"{c.name}: {', '.join(name for name, _ in told.with_)} make up for it"
-    return f"{c.name}: not told apart from the others (expected error {_percent(told)})"
+    return f"{c.name}: not told apart from the others (expected error {error_text(told)})"
 
 
-def _percent(told: Told) -> str:
+def error_text(told: Told) -> str:
+    """Return the error to expect of a parameter: in percent of the model's value, or in its unit where that is 0."""
     if told.candidate.nominal and told.candidate.kind != "centre":
         return f"{100 * told.percent:.2g} %"
     return f"{told.error:.2g} {told.candidate.unit}".rstrip()

@@ -9,28 +9,36 @@ from typing import Literal
 
 Role = Literal["position", "velocity", "acceleration", "effort", "command", "time", "episode", "flag", "other", ""]
 
+
+def _set(words: str) -> frozenset[str]:
+    return frozenset(words.split())
+
+
 #: Words of names, by what they make of a column.
 _ROLES: dict[Role, frozenset[str]] = {
-    "position": frozenset("q qpos pos position positions angle angles theta th phi enc encoder pose p".split()),
-    "velocity": frozenset(
-        "dq qd qdot qvel vel velocity velocities speed speeds omega dot rate v twist gyro angvel linvel".split()
+    "position": _set(
+        "q qpos pos position positions angle angles theta th phi psi alpha beta enc encoder pose p"
     ),
-    "acceleration": frozenset("ddq qdd qddot acc accel acceleration qacc".split()),
-    "effort": frozenset("tau torque torques effort efforts force forces moment current load frc".split()),
-    "command": frozenset(
-        "cmd cmds command commands commanded u ctrl control controls action actions act input inputs target targets "
-        "des desired ref reference setpoint setp goal sp pwm".split()
+    "velocity": _set(
+        "dq qd qdot qvel vel velocity velocities speed speeds omega dot rate v twist gyro angvel linvel"
     ),
-    "time": frozenset("t time times timestamp timestamps stamp clock sec secs seconds".split()),
-    "episode": frozenset("episode episodes ep run trial traj trajectory demo rollout segment take experiment".split()),
-    "flag": frozenset("done dones terminal terminals terminated truncated timeout timeouts reset".split()),
-    "other": frozenset(
-        "temp temperature voltage volt volts error err status mode battery seq frame id std var cov reward rewards "
-        "next".split()
+    "acceleration": _set("ddq qdd qddot acc accel acceleration qacc"),
+    "effort": _set("tau torque torques effort efforts force forces moment current load frc"),
+    "command": _set(
+        "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
+        "target targets des desired ref reference setpoint setp goal sp pwm"
+    ),
+    "time": _set("t time times timestamp timestamps stamp clock sec secs seconds"),
+    "episode": _set(
+        "episode episodes ep run trial traj trajectory demo rollout segment take experiment"
+    ),
+    "flag": _set("done dones terminal terminals terminated truncated timeout timeouts reset"),
+    "other": _set(
+        "temp temperature voltage volt volts error err status mode battery seq frame id std var cov reward rewards next"
     ),
 }  # fmt: skip
 #: Words of commands that are positions to be reached.
-_TARGETS = frozenset("target targets des desired ref reference setpoint setp goal sp".split())
+_TARGETS = _set("target targets des desired ref reference setpoint setp goal sp")
 #: Words of units → what the value is multiplied by to be SI.
 UNITS: dict[str, float] = {
     "deg": math.pi / 180, "degs": math.pi / 180, "degree": math.pi / 180, "degrees": math.pi / 180,
@@ -45,15 +53,17 @@ TIME_UNITS = {
     "milliseconds": 1e-3, "us": 1e-6, "usec": 1e-6, "micros": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
     "nanos": 1e-9, "nanoseconds": 1e-9, "nanosec": 1e-9,
 }  # fmt: skip
+#: Words of angles.
+_TURNS = _set("angle angles theta th phi psi alpha beta thetadot phidot dtheta dphi")
 #: Words that tell nothing.
-_EMPTY = frozenset(
+_EMPTY = _set(
     "joint joints jnt state states data sensor sensors robot measured meas actual value values body link obs "
-    "observation observations header log signal base hinge slide slider motor servo of the".split()
+    "observation observations header log signal motor servo of the"
 )
 #: Words of quaternions, and of linear and angular velocities.
-_QUATERNION = frozenset("quat quaternion orientation rot rotation ori".split())
-_ANGULAR = frozenset("angular ang gyro omega angvel".split())
-_LINEAR = frozenset("linear lin linvel".split())
+_QUATERNION = _set("quat quaternion orientation rot rotation ori")
+_ANGULAR = _set("angular ang gyro omega angvel")
+_LINEAR = _set("linear lin linvel")
 _AXES = ("x", "y", "z")
 
 
@@ -70,6 +80,7 @@ class Words:
         quaternion: whether it is a quaternion's component.
         angular: whether it is an angular velocity about an axis.
         commanded: of a command, the role of what it commands: ``position``, ``velocity``, ``effort``, or empty.
+        turns: whether it is called an angle.
     """
 
     role: Role = ""
@@ -80,6 +91,7 @@ class Words:
     quaternion: bool = False
     angular: bool = False
     commanded: Role = ""
+    turns: bool = False
 
 
 def split(name: str) -> list[str]:
@@ -131,7 +143,8 @@ def read_name(name: str) -> Words:
     role, commanded = _decided(roles, commanded)
     if quaternion and role in ("", "other"):
         role = "position"
-    return Words(role, scale, tuple(objects), numbers, axis, quaternion and not angular, angular, commanded)
+    turns = bool(set(words) & _TURNS)
+    return Words(role, scale, tuple(objects), numbers, axis, quaternion and not angular, angular, commanded, turns)
 
 
 def time_unit(name: str) -> float | None:
