@@ -98,6 +98,8 @@ def parameters_table(choice: Choice) -> Table:
     from dropo_torch.proposal.text import error_text
 
     table = Table("parameter", "model's own", "error to expect", "bounds", "stands for, too")
+    for column in table.columns:
+        column.overflow = "fold"
     for t in choice.chosen:
         c = t.candidate
         low, high = c.spec["bounds"]

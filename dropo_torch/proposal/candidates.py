@@ -191,7 +191,7 @@ def _actuators(model: mujoco.MjModel) -> list[Candidate]:
             gains += [("kv", "actuator_kv", float(-model.actuator_biasprm[a, 2]))]
         for what, field, own in gains:
             if own > 0:
-                spec = {"field": field, "name": name, "bounds": [rounded(0.5 * own), rounded(2 * own)]}
+                spec: dict[str, Any] = {"field": field, "name": name, "bounds": [rounded(0.5 * own), rounded(2 * own)]}
                 found.append(Candidate(f"{word}_{what}", "gain", spec, own, own, "half to double the model's"))
         if takes == "effort" and abs(model.actuator_gear[a, 0]) not in (0.0, 1.0):  # 1: commands are forces
             spec = {"field": "actuator_gear", "name": name, "bounds": [0.7, 1.4], "relative": True}

@@ -97,7 +97,7 @@ class Choice:
         """How many candidates are told, in a sentence."""
         single = sum(t.state == "chosen" for t in self.told)
         unseen = sum(t.state == "unseen" for t in self.told)
-        parts = [f"{single} of {len(self.told)} are identifiable one by one"]
+        parts = [f"{single} {'is' if single == 1 else 'are'} identifiable one by one"]
         for g in self.groups:
             count = len(g.directions)
             parts.append(f"{len(g.names)} only as {count} combination{'' if count == 1 else 's'}")

@@ -120,6 +120,9 @@ def _document(
         source["terminals"] = [c.entry for c in clock.terminals]
     if clock.breaks:
         source["breaks"] = list(clock.breaks)
+    if not resampled and (whole_arrays := _standard(columns, matching)) is not None:
+        source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
+        return {"model": model, "data": source, "frame_skip": skip, "observation": whole_arrays}, notes, None
     if derived:
         velocities = []
         names = ", ".join(dict.fromkeys(p.label for p in lacking))
@@ -140,6 +143,22 @@ def _document(
     if derived:
         entries += _rates(positions, places)
     return {"model": model, "data": source, "frame_skip": skip, "observation": entries}, notes, smooth
+
+
+def _standard(columns: Columns, matching: Matching) -> list[str] | None:
+    """What the columns of ``observations`` are, where a log's own arrays are read as they are; ``None`` elsewhere.
+
+    That is where it has ``next_observations``, which need not be those of the next row.
+    """
+    names = {c.array for c in columns.columns}
+    actions = [m.column.entry for m in matching.of("command")]
+    arrays = {m.column.array for m in matching.matches if m.place.kind != "command"}
+    plain = all(m.scale == 1.0 for m in matching.matches)
+    own = [c.entry for c in columns.columns if c.array == "actions"]
+    if "next_observations" not in names or arrays != {"observations"} or own != actions or not plain:
+        return None
+    held = {m.column.entry: m.place.entry for m in matching.matches}
+    return [held.get(c.entry, "skip") for c in columns.columns if c.array == "observations"]
 
 
 def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:

@@ -95,7 +95,8 @@ def _left(told: Told) -> str:
     if told.state == "unseen":
         return f"{c.name}: hardly moves anything in this log"
     if told.with_:
-        return f"{c.name}: {', '.join(name for name, _ in told.with_)} make up for it"
+        verb = "makes" if len(told.with_) == 1 else "make"
+        return f"{c.name}: {', '.join(name for name, _ in told.with_)} {verb} up for it"
     return f"{c.name}: not told apart from the others (expected error {error_text(told)})"
 
 

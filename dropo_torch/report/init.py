@@ -89,7 +89,8 @@ def _parameter(told: Told) -> dict[str, Any]:
     return {
         "name": c.name, "where": _where(told), "own": plain(c.nominal), "unit": c.unit, "low": plain(low),
         "high": plain(high), "why": c.why, "state": STATES[told.state], "good": told.state == "chosen",
-        "error": f"{score(100 * told.percent)} %" if relative else f"{score(told.error)} {c.unit}".rstrip(),
+        "error": "not told" if told.error > c.size else f"{score(100 * told.percent)} %" if relative
+        else f"{score(told.error)} {c.unit}".rstrip(),
         "share": min(1.0, told.error / c.size / (3 * TOLD)), "hot": told.error > 0.1 * c.size,
         "with_": [(name, plain(float(f"{weight:.2g}"))) for name, weight in told.with_],
     }  # fmt: skip

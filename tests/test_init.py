@@ -1,0 +1,336 @@
+"""A config from a model and a log alone: names, units, rates and episodes that people use, and what a log can tell."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+import dropo_torch as dropo
+from dropo_torch.commands.cli import main
+from dropo_torch.proposal.candidates import Candidate, decides
+from dropo_torch.proposal.choice import choose
+from dropo_torch.proposal.clock import find_clock
+from dropo_torch.proposal.columns import read_columns
+from dropo_torch.proposal.matching import motion
+from dropo_torch.proposal.words import read_name
+
+DEG = 180 / math.pi
+
+CARTPOLE = """
+<mujoco>
+  <option timestep="0.005"/>
+  <worldbody>
+    <body name="cart">
+      <joint name="slider" type="slide" axis="1 0 0"/>
+      <geom type="box" size=".1 .05 .05" mass="1"/>
+      <body name="pole">
+        <joint name="hinge" type="hinge" axis="0 1 0"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -.6" size=".02" mass=".25"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor name="push" joint="slider"/></actuator>
+</mujoco>"""
+
+URDF = """<robot name="two"><link name="world_link"/>
+<joint name="arm_joint1" type="revolute"><parent link="world_link"/><child link="link1"/><axis xyz="0 1 0"/>
+  <limit lower="-3" upper="3" effort="10" velocity="5"/></joint>
+<link name="link1"><inertial><origin xyz=".1 0 0"/><mass value="1"/>
+  <inertia ixx=".01" iyy=".02" izz=".02" ixy="0" ixz="0" iyz="0"/></inertial></link>
+<joint name="arm_joint2" type="revolute"><parent link="link1"/><child link="link2"/><origin xyz=".3 0 0"/>
+  <axis xyz="0 1 0"/><limit lower="-3" upper="3" effort="10" velocity="5"/></joint>
+<link name="link2"><inertial><origin xyz=".1 0 0"/><mass value=".5"/>
+  <inertia ixx=".004" iyy=".008" izz=".008" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>"""
+
+
+def recorded(
+    model: mujoco.MjModel, seconds: float, every: int, command: Callable[[float], Sequence[float]], *,
+    start: Sequence[float] = (), noise: tuple[float, float] = (1e-3, 5e-3), seed: int = 0,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:  # fmt: skip
+    """Times, noisy positions and velocities, and commands of a run, one row each ``every`` steps."""
+    data, rows, rng = mujoco.MjData(model), [], np.random.default_rng(seed)
+    data.qpos[: len(start)] = start
+    for step in range(int(seconds / model.opt.timestep / every)):
+        data.ctrl[:] = command(step * every * model.opt.timestep)
+        rows.append((data.time, data.qpos.copy(), data.qvel.copy(), data.ctrl.copy()))
+        mujoco.mj_step(model, data, every)
+    t, q, v, u = (np.array(x) for x in zip(*rows, strict=True))
+    return t, q + noise[0] * rng.standard_normal(q.shape), v + noise[1] * rng.standard_normal(v.shape), u
+
+
+def cartpole(friction: float = 0.25) -> mujoco.MjModel:
+    model = mujoco.MjModel.from_xml_string(CARTPOLE)
+    model.body("cart").mass[0], model.joint("slider").damping[0] = 1.3, 0.5
+    model.joint("slider").frictionloss[0] = friction
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+    return model
+
+
+def push(t: float) -> list[float]:
+    return [4 * math.sin(2 * t) + 3 * math.sin(5.3 * t)]
+
+
+@pytest.fixture(scope="module")
+def log() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    return recorded(cartpole(), 8, 4, push)
+
+
+def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, name: str = "robot.xml") -> list[str]:
+    """Write a model and a log, and return their paths."""
+    (folder / name).write_text(xml)
+    pd.DataFrame(frame).to_csv(folder / "log.csv", index=False, float_format="%.9g")
+    return [str(folder / name), str(folder / "log.csv")]
+
+
+# --- names ---
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "scale", "objects", "numbers"),
+    [
+        ("q_shoulder", "position", None, ("shoulder",), ()),
+        ("shoulder_pos", "position", None, ("shoulder",), ()),
+        ("dq1", "velocity", None, (), (1,)),
+        ("tau_1", "effort", None, (), (1,)),
+        ("cmd", "command", None, (), ()),
+        ("position.0", "position", None, (), (0,)),
+        ("joint_states.position[2]", "position", None, (), (2,)),
+        ("j3_vel_deg_s", "velocity", 1 / DEG, ("j",), (3,)),
+        ("trolleyY_mm", "", 1e-3, ("trolley",), ()),
+        ("theta_dot", "velocity", None, (), ()),
+        ("shoulderVelocity", "velocity", None, ("shoulder",), ()),
+        ("t_ms", "time", None, ("ms",), ()),
+        ("run", "episode", None, (), ()),
+        ("motor_temp_2", "other", None, (), (2,)),
+        ("elbow_acceleration", "acceleration", None, ("elbow",), ()),
+    ],
+)
+def test_names_say_what_people_mean(
+    name: str, role: str, scale: float | None, objects: tuple[str, ...], numbers: tuple[int, ...]
+) -> None:
+    words = read_name(name)
+    assert (words.role, words.objects, words.numbers) == (role, objects, numbers)
+    assert words.scale == (pytest.approx(scale) if scale else None)
+
+
+@pytest.mark.parametrize(
+    ("name", "axis", "quaternion", "angular"),
+    [("box_qw", "w", True, False), ("vx", "x", False, False), ("base_wz", "z", False, True),
+     ("box_quat_y", "y", True, False), ("imu.angular_velocity.x", "x", False, True)],
+)  # fmt: skip
+def test_names_of_poses(name: str, axis: str, quaternion: bool, angular: bool) -> None:
+    words = read_name(name)
+    assert (words.axis, words.quaternion, words.angular) == (axis, quaternion, angular)
+
+
+# --- rates and episodes ---
+
+
+@pytest.mark.parametrize(("name", "unit"), [("t", 1.0), ("time", 1e-3), ("stamp", 1e-9), ("t_us", 1e-6)])
+def test_the_unit_of_time_stamps_is_found(name: str, unit: float, tmp_path: Path) -> None:
+    stamps = 0.02 * np.arange(50)
+    pd.DataFrame({name: stamps / unit, "q": np.sin(stamps)}).to_csv(tmp_path / "log.csv", index=False)
+    clock = find_clock(read_columns(tmp_path / "log.csv"), 0.005)
+    assert (clock.unit, clock.dt) == (unit, pytest.approx(0.02))
+
+
+def test_episodes_begin_where_a_column_changes_or_time_begins_anew(tmp_path: Path) -> None:
+    t = np.tile(0.02 * np.arange(30), 3)
+    frame = pd.DataFrame({"t": t, "trial": np.repeat([4, 5, 6], 30), "q": np.sin(t)})
+    for columns, episode, breaks in ((frame, "trial", ()), (frame.drop(columns="trial"), None, (30, 60))):
+        columns.to_csv(tmp_path / "log.csv", index=False)
+        clock = find_clock(read_columns(tmp_path / "log.csv"), 0.005)
+        assert (clock.episode.entry if clock.episode else None, clock.breaks) == (episode, breaks)
+        assert np.flatnonzero(clock.starts(90, (0,))).tolist() == [0, 30, 60]
+
+
+def test_a_velocity_is_told_from_others_by_motion() -> None:
+    t = 0.01 * np.arange(400)
+    rng = np.random.default_rng(0)
+    q, v = np.sin(3 * t) + 1e-2 * rng.standard_normal(400), 3 * np.cos(3 * t)
+    share, seconds = motion(q, v, np.arange(400) == 0)
+    assert share > 0.9
+    assert seconds == pytest.approx(0.01, rel=0.03)
+    assert motion(q, np.sin(3 * t), np.arange(400) == 0)[0] < 0.2
+
+
+# --- the largest set that is told apart ---
+
+
+def candidate(name: str, kind: str = "mass") -> Candidate:
+    return Candidate(name, kind, {"field": "body_mass", "name": name, "bounds": [0.5, 2.0]}, 1.0, 1.0, "")  # type: ignore[arg-type]
+
+
+def gram_of(*columns: Sequence[float]) -> np.ndarray:
+    matrix = np.array(columns).T
+    return matrix.T @ matrix
+
+
+def test_of_two_that_are_tied_the_one_that_models_have_right_goes() -> None:
+    gram = gram_of([100, 0, 0], [0, 80, 0], [99.99, 0, 0.2], [0, 0, 0.01])
+    found = choose([candidate("a"), candidate("b"), candidate("gear", "gear"), candidate("none")], gram)
+    states = {t.candidate.name: t.state for t in found.told}
+    assert states == {"a": "stands for", "b": "chosen", "gear": "confounded", "none": "unseen"}
+    (group,) = found.groups
+    assert set(group.names) == {"a", "gear"}
+    assert len(group.directions) == 1
+    tied = next(t for t in found.told if t.candidate.name == "gear")
+    assert tied.with_ == (("a", pytest.approx(1.0, rel=1e-2)),)
+
+
+def test_nothing_is_left_out_that_is_told() -> None:
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        matrix = rng.standard_normal((40, 8)) * 10 ** rng.uniform(-1.5, 1.5, 8)
+        matrix[:, 7] = matrix[:, 6] * 3 + 0.02 * matrix[:, 5]
+        gram = matrix.T @ matrix
+        found = choose([candidate(f"p{i}") for i in range(8)], gram)
+        assert all(t.error <= 0.25 for t in found.chosen)
+        assert not [t for t in found.told if not t.is_in and t.error < 0.1]
+
+
+def test_friction_is_decided_as_mujoco_decides_it() -> None:
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><geom size='.1' friction='.5'/><geom size='.1' friction='.8'/>"
+        "<geom size='.1' friction='.5'/><geom size='.1' friction='.1' priority='1'/></worldbody></mujoco>"
+    )
+    assert decides(model, 0, 1) == [1]
+    assert decides(model, 0, 2) == [0, 2]
+    assert decides(model, 1, 3) == [3]
+
+
+# --- whole proposals ---
+
+
+def test_a_proposed_config_is_checked_and_fitted_as_it_is(
+    tmp_path: Path, log: tuple[np.ndarray, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    t, q, v, u = log
+    files = written(tmp_path, {
+        "speed_theta": DEG * v[:, 1], "x_mm": 1000 * q[:, 0], "stamp": 1000 * t, "force_cmd": u[:, 0],
+        "theta_deg": DEG * q[:, 1], "x_dot": v[:, 0],
+    })  # fmt: skip
+    path = tmp_path / "robot.yaml"
+    assert main(["init", *files, "--out", str(path)]) == 0
+    output, _ = capfd.readouterr()
+    document = yaml.safe_load(path.read_text())
+    assert document["frame_skip"] == 4
+    assert document["data"]["time"] == {"signal": "stamp", "scale": 0.001}
+    assert document["data"]["observations"][0] == {"signal": "x_mm", "scale": 0.001}
+    assert document["observation"] == ["slider.position", "hinge.position", "slider.velocity", "hinge.velocity"]
+    assert document["noise"] == pytest.approx([1e-3, 1e-3, 5e-3, 5e-3], rel=0.25)
+    assert {"cart_mass", "pole_mass", "slider_damping", "slider_friction"} <= set(document["parameters"])
+    page = path.with_suffix(".html").read_text()
+    for words in ("cart_mass", "slider_friction", "x_mm", "told apart from all others"):
+        assert words in page
+    assert "identifiable" in output
+    assert main(["check", str(path)]) == 0
+    assert main(["fit", str(path), "--out", str(tmp_path / "fit"), "--samples", "20"]) == 0
+    fit = json.loads((tmp_path / "fit" / "fit.json").read_text())
+    assert fit["verdict"] == "explained"
+    truth = {"cart_mass": 1.3, "pole_mass": 0.25, "slider_damping": 0.5, "slider_friction": 0.25}
+    for name, value in truth.items():
+        error = fit["standard_errors"][name]["mean"]
+        assert abs(fit["parameters"][name]["mean"] - value) < 3 * error, name
+        assert error < 0.1 * value
+    assert main(["init", *files, "--out", str(path)]) == 2  # nothing of the user's is replaced
+
+
+def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
+    tmp_path: Path, log: tuple[np.ndarray, ...]
+) -> None:
+    t, q, _, u = log
+    late = t + 2e-3 * np.random.default_rng(3).uniform(-1, 1, len(t))
+    model, data = written(tmp_path, {"time": late, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]})
+    found = dropo.propose_config(model, data, out=tmp_path / "robot.yaml")
+    options = found.document["data"]["preprocess"]
+    assert options["dt"] == pytest.approx(0.02)
+    assert "velocities" not in options
+    assert found.document["observation"] == ["slider.position", "hinge.position", "slider.velocity", "hinge.velocity"]
+    assert not [f for f in found.findings if f.sure]
+    assert dropo.make_problem(found.config).trajectories.observations.shape[1] == 4
+
+
+def test_a_urdf_without_actuators_gets_motors_for_the_efforts_of_a_log(tmp_path: Path) -> None:
+    spec = mujoco.MjSpec.from_string(URDF)
+    for joint in ("arm_joint1", "arm_joint2"):
+        spec.add_actuator(name=joint, target=joint, trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    model = spec.compile()
+    t, q, v, u = recorded(model, 4, 5, lambda s: [3 * math.sin(4 * s), math.sin(7 * s)])
+    frame = {"stamp": t} | {
+        f"{what}[{i}]": values[:, i] for what, values in (("position", q), ("velocity", v), ("effort", u))
+        for i in range(2)
+    }  # fmt: skip
+    robot, data = written(tmp_path, frame, URDF, "robot.urdf")
+    found = dropo.propose_config(robot, data, out=tmp_path / "robot.yaml")
+    assert found.document["model"] == "robot_motors.xml"
+    assert [m.column.entry for m in found.matching.of("command")] == ["effort[0]", "effort[1]"]
+    assert dropo.make_problem(found.config).space.names
+
+
+def test_a_passive_motion_tells_ratios_only(tmp_path: Path) -> None:
+    xml = CARTPOLE.replace('<joint name="slider" type="slide" axis="1 0 0"/>', "").partition("<actuator>")[0]
+    xml += "</mujoco>"
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.joint("hinge").damping[0] = 0.004
+    t, q, v, _ = recorded(model, 6, 4, lambda s: [], start=[1.2])
+    robot, data = written(tmp_path, {"t": t, "hinge": q[:, 0], "hinge_rate": v[:, 0]}, xml)
+    found = dropo.propose_config(robot, data, out=tmp_path / "robot.yaml")
+    states = {told.candidate.name: told.state for told in found.choice.told}
+    assert states["hinge_damping"] in ("chosen", "stands for")
+    assert "chosen" not in (states["pole_mass"], states["pole_centre_z"]) or found.choice.groups
+    assert states["pole_centre_y"] == "unseen"
+
+
+@pytest.mark.parametrize(
+    ("renamed", "words"),
+    [
+        ({"theta": ""}, ("no column is hinge.position", "theta_dot")),
+        ({"force_cmd": "light"}, ("command of push", "light")),
+        ({"time": "row", "x_dot": "", "theta_dot": ""}, ("--dt SECONDS",)),
+    ],
+)
+def test_what_a_log_lacks_is_named_with_what_it_has(
+    renamed: dict[str, str], words: tuple[str, ...], tmp_path: Path, log: tuple[np.ndarray, ...],
+    capfd: pytest.CaptureFixture[str],
+) -> None:  # fmt: skip
+    t, q, v, u = log
+    frame = {
+        "time": t, "x": q[:, 0], "theta": q[:, 1], "x_dot": v[:, 0], "theta_dot": v[:, 1], "force_cmd": u[:, 0]
+    }  # fmt: skip
+    if "time" in renamed:
+        frame["time"] = np.arange(len(t))
+    named = {renamed.get(name, name): values for name, values in frame.items()}
+    files = written(tmp_path, {name: values for name, values in named.items() if name})
+    assert main(["init", *files, "--out", str(tmp_path / "robot.yaml")]) == 2
+    _, error = capfd.readouterr()
+    assert error.count("\n") == 1
+    assert all(word in error for word in words), error
+    assert not (tmp_path / "robot.yaml").exists()
+
+
+def test_an_interactive_run_takes_corrections(
+    tmp_path: Path, log: tuple[np.ndarray, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from rich.prompt import FloatPrompt, Prompt
+
+    t, q, v, u = log
+    files = written(tmp_path, {
+        "time": t, "x": q[:, 0], "colour": q[:, 1], "x_dot": v[:, 0], "theta_dot": v[:, 1], "force_cmd": u[:, 0]
+    })  # fmt: skip
+    answers = iter(["hinge.position", "colour", "", "-pole_centre_x"])
+    monkeypatch.setattr(Prompt, "ask", lambda *_, **__: next(answers))
+    monkeypatch.setattr(FloatPrompt, "ask", lambda *_, default, **__: default)
+    path = tmp_path / "robot.yaml"
+    assert main(["init", *files, "--out", str(path), "--interactive"]) == 0
+    document = yaml.safe_load(path.read_text())
+    assert document["data"]["observations"][1] == "colour"
+    assert "pole_centre_x" not in document["parameters"]
