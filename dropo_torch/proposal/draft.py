@@ -31,7 +31,7 @@ ROUNDS = 8
 #: A power that noise does not have: times that of the highest quarter of frequencies.
 ABOVE_NOISE = 12.0
 #: Share of what a row adds to a position that its noise may make before it is filtered, and a filter's margin.
-NOISY, MARGIN = 0.02, 1.6
+NOISY, MARGIN = 0.02, 3.0
 
 
 @dataclass(frozen=True)
@@ -245,7 +245,7 @@ def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequ
             continue
         noise = float(np.std(np.diff(values, 4))) / math.sqrt(70)
         is_noisy |= noise > NOISY * float(np.std(np.diff(values)))
-        length = min(len(values), 512)
+        length = min(len(values) - 1, 512)
         frequency, power = signal.welch(np.diff(values), 1 / dt, nperseg=length, detrend="linear")
         power = power / np.maximum(4 * np.sin(np.pi * frequency * dt) ** 2, 1e-12)  # that of the positions
         density[m.place.label] = float(np.median(power[-len(power) // 4 :]))

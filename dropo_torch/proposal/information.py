@@ -30,7 +30,7 @@ FLOOR, BESIDE = 1e-6, 0.3
 #: Windows that are looked at, in logged steps, and seconds that they may take.
 LAGS, LONGEST = (1, 2, 4, 8, 16, 32), 1.0
 #: Microseconds of simulation for one length of windows, about, and logged steps at least and at most.
-BUDGET, FEWEST, MOST = 3e6, 150, 3000
+BUDGET, FEWEST, MOST = 1e6, 150, 3000
 #: Step of the differences, as a share of a candidate's bounds.
 STEP = 1e-4
 #: Standard errors, in sizes of candidates, below which more does not count when the length of windows is chosen.
