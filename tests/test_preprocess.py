@@ -233,6 +233,29 @@ def test_delay_of_the_reference_counts_for_what_is_aligned_with_it():
     assert signal_delays(rec, options) == {"q": 0.005, "late": pytest.approx(0.025, abs=2e-5)}
 
 
+def test_all_signals_of_a_clock_have_the_delay_of_those_that_are_aligned():
+    wave = lambda t: np.sin(2 * np.pi * t) + np.sin(7 * t)  # noqa: E731
+    late = lambda values: {"marker": wave(TIME - 0.0123), "object": values}  # noqa: E731
+    for values in (np.full(len(TIME), 0.3), np.cos(5 * (TIME - 0.0123))):  # one that rests has no delay of its own
+        rec = recording(TIME, {"tip": 3 * wave(TIME), **late(values)})
+        options = Preprocess(dt=0.01, align=["marker"], reference="tip", same_clock=["object"], delays={"tip": 0.002})
+        found = signal_delays(rec, options)
+        assert found["object"] == found["marker"] == pytest.approx(0.0143, abs=2e-5)
+        assert found["tip"] == 0.002
+    out = preprocess(rec, options)
+    at = 0.01 * np.arange(len(out))
+    np.testing.assert_allclose(out.observations[:, 2], np.cos(5 * (at + 0.002)), atol=2e-4)
+
+
+def test_several_signals_of_a_clock_have_one_delay_between_theirs():
+    wave = lambda t: np.sin(2 * np.pi * t) + np.sin(7 * t)  # noqa: E731
+    rec = recording(TIME, {"tip": wave(TIME), "x": wave(TIME - 0.010), "y": wave(TIME - 0.014), "z": 0 * TIME})
+    options = Preprocess(dt=0.01, align=["x", "y"], reference="tip")
+    apart, together = signal_delays(rec, options), signal_delays(rec, replace(options, same_clock=["z"]))
+    assert apart == {"x": pytest.approx(0.010, abs=2e-5), "y": pytest.approx(0.014, abs=2e-5)}
+    assert together == dict.fromkeys("xyz", pytest.approx(0.012, abs=2e-5))
+
+
 def test_delayed_command_is_taken_earlier():
     step = (TIME >= 0.5 - 1e-9).astype(float)
     out = preprocess(recording(TIME, {"q": SINE}, {"u": step}), Preprocess(dt=0.02, delays={"u": 0.1}))
@@ -299,6 +322,8 @@ def test_quaternion_between_samples_has_unit_length():
         ({"dt": 0.01, "start": 2, "stop": 1}, r"stop is 1 s and start 2 s"),
         ({"dt": 0.01, "actions": "holdd"}, r"unknown kind 'holdd'; did you mean 'hold'"),
         ({"dt": 0.01, "align": ["q"]}, r"align and reference go together"),
+        ({"dt": 0.01, "same_clock": ["q"]}, r"same_clock needs align"),
+        ({"dt": 0.01, "same_clock": "q"}, r"same_clock is 'q'; expected a list of signals"),
         ({"dt": 0.01, "controlled": ["q"]}, r"controlled has no meaning with actions: hold"),
         ({"dt": 0.01, "positions": "q"}, r"positions is 'q'; expected a list of signals"),
         ({"dt": 0.01, "delays": {"q": "x"}}, r"delays: q is 'x'; expected a finite number"),
@@ -327,6 +352,8 @@ def test_yaml_writes_1e_3_as_text():
         ({"align": ["x"], "reference": "q"}, r"align: there is no signal 'x'"),
         ({"align": ["u"], "reference": "x"}, r"there is no signal 'x'"),
         ({"align": ["u"], "reference": "q", "delays": {"u": 1}}, r"u stands in both align and delays"),
+        ({"align": ["u"], "reference": "q", "same_clock": ["x"]}, r"same_clock: there is no signal 'x'"),
+        ({"align": ["u"], "reference": "q", "same_clock": ["q"]}, r"q stands in both same_clock and reference"),
         ({"actions": "position"}, r"infers the actions from the motion, but the log's actions are u"),
         ({"quaternions": [["q", "q", "q", "q"]]}, r"expected four different signals"),
     ],

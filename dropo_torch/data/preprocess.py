@@ -5,7 +5,7 @@ simulator takes as action. Following Tiboni et al. (2023), every measured signal
 time grid, ``dt`` being the simulator's step times ``frame_skip``, by an Akima spline, whose derivative is
 the velocity; commands are held between their stamps. In this order:
 
-1. known delays are taken off the time stamps, unknown ones estimated by cross-correlation first;
+1. known delays are taken off the time stamps, unknown ones, of signals or clocks, estimated by cross-correlation first;
 2. a zero-phase Butterworth low-pass filter takes the encoder noise off, which differentiation amplifies;
 3. the splines are evaluated on the grid, between ``start`` and ``stop``;
 4. the commands in force are looked up, averaged over the step, or inferred from the motion.
@@ -62,6 +62,7 @@ class Preprocess:
         delays: signal → seconds by which it is stamped later than what it measures.
         align: signals whose delay against ``reference`` is estimated.
         reference: the signal that those are compared with.
+        same_clock: signals stamped by the clock of those in ``align``: all of these then have one delay, the mean.
         max_delay: largest delay, either way, that is considered, in seconds.
         max_gap: longest time without a sample in seconds that is interpolated; with it, NaN counts as no
             sample. By default a value must be finite and the longest gap is 2.5 steps or sampling intervals,
@@ -85,6 +86,7 @@ class Preprocess:
     delays: Mapping[str, float] = field(default_factory=dict)
     align: Sequence[str] = ()
     reference: str | None = None
+    same_clock: Sequence[str] = ()
     max_delay: float = 0.1
     max_gap: float | None = None
 
@@ -99,7 +101,7 @@ class Preprocess:
             value, bound = getattr(self, name), "least" if name in ("start", "stop", "trim") else "above"
             if value is not None or name in ("dt", "max_delay"):
                 checked[name] = number(value, f"preprocess: {name}", **{bound: 0})
-        for name in ("positions", "velocities", "controlled", "align"):
+        for name in ("positions", "velocities", "controlled", "align", "same_clock"):
             checked[name] = _names(getattr(self, name), name)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -115,6 +117,8 @@ class Preprocess:
             raise InputError(
                 "preprocess: align and reference go together: signals to align, and the signal to align with"
             )
+        if self.same_clock and not self.align:
+            raise InputError("preprocess: same_clock needs align: signals by which that clock is compared with another")
         if self.controlled and not self.infers_actions:
             raise InputError(f"preprocess: controlled has no meaning with actions: {self.actions}; leave it out")
 
@@ -188,19 +192,26 @@ def signal_delays(recording: Recording, options: Preprocess) -> dict[str, float]
     Raises:
         InputError: a name that is not there, a signal that does not correlate with the reference.
     """
-    names = recording.names
+    names, where = recording.names, f"{recording.source}: preprocess"
     delays: dict[str, float] = {}
     for name, delay in options.delays.items():
-        delays |= dict.fromkeys(resolve_names([name], names, f"{recording.source}: preprocess: delays"), delay)
+        delays |= dict.fromkeys(resolve_names([name], names, f"{where}: delays"), delay)
     if options.reference is None:
         return delays
     known = delays.get(options.reference, 0.0)
-    for name in resolve_names(options.align, names, f"{recording.source}: preprocess: align"):
-        if name in delays:
-            raise InputError(f"{recording.source}: preprocess: {name} stands in both align and delays; leave one out")
-        found = [_lag(part, options.reference, name, options.max_delay) for part in recording.split()]
-        delays[name] = known + float(np.median(found))
-    return delays
+    align = resolve_names(options.align, names, f"{where}: align")
+    alike = resolve_names(options.same_clock, names, f"{where}: same_clock")
+    found: dict[str, float] = {}
+    for name in (*align, *alike):
+        if name in delays or name == options.reference:
+            keys = "align" if name in align else "same_clock", "delays" if name in delays else "reference"
+            raise InputError(f"{where}: {name} stands in both {' and '.join(keys)}; leave one out")
+    for name in align:
+        lags = [_lag(part, options.reference, name, options.max_delay) for part in recording.split()]
+        found[name] = known + float(np.median(lags))
+    if alike:
+        found = dict.fromkeys([*align, *alike], float(np.mean(list(found.values()))))
+    return delays | found
 
 
 def estimate_delay(
