@@ -6,7 +6,7 @@ import argparse
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import mujoco
 import numpy as np
@@ -30,6 +30,11 @@ class Log:
     next_observations: np.ndarray
     actions: np.ndarray
     terminals: np.ndarray
+
+    @property
+    def size(self) -> str:
+        """How much it is, in words."""
+        return f"{len(self.actions)} transitions"
 
     def save(self, path: str | Path) -> None:
         """Write the log as ``.npz``, and nothing that a robot does not log."""
@@ -145,8 +150,19 @@ def check_names(key: str, given: Iterable[str], known: Collection[str]) -> None:
             raise InputError(f"{key}: unknown name {name!r}" + choices(name, known))
 
 
+class Saved(Protocol):
+    """What a recorder makes."""
+
+    @property
+    def size(self) -> str:
+        """How much it is, in words."""
+
+    def save(self, path: str | Path) -> None:
+        """Write it."""
+
+
 def run_recorder(
-    record: Callable[[str, int, int, int, bool], Log], arguments: Sequence[str] | None, *, what: str,
+    record: Callable[[str, int, int, int, bool], Saved], arguments: Sequence[str] | None, *, what: str,
     variants: Sequence[str], episodes: int, steps: int,
 ) -> None:  # fmt: skip
     """Record a log from the command line.
@@ -171,4 +187,4 @@ def run_recorder(
         log.save(given.path)
     except (InputError, OSError) as error:
         parser.error(str(error))
-    print(f"{len(log.actions)} transitions in {given.path}")
+    print(f"{log.size} in {given.path}")

@@ -2,19 +2,27 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import mujoco
 import numpy as np
 import pytest
 import torch
 from dropo_sims.push import SIM
+from dropo_sims.push.guided import InstrumentLog, record_guided
 from dropo_sims.push.policy import START, Push, Pusher
+from dropo_sims.push.record import main
 from dropo_sims.push.task import TARGETS, PushTask
 
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
+from dropo_torch.data.preprocess import Preprocess, signal_delays
+from dropo_torch.data.readers import read_recording, read_trajectories
+from dropo_torch.errors import InputError
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
 from dropo_torch.rl import load_task
+from dropo_torch.simulators import make_simulator
 
 
 def model_of(**values: float) -> mujoco.MjModel:
@@ -98,3 +106,67 @@ def test_the_reward_is_largest_with_the_box_at_the_target_and_the_arm_at_rest(ta
     assert not task.terminated(states).any()
     states[:, 10:14] = torch.tensor([0.7, 0.7, 0.0, 0.0], dtype=torch.float64) / 0.98**0.5
     assert task.terminated(states).all()
+
+
+#: How docs/manipulation.md reads a guided log.
+PREPROCESS = {
+    "dt": 0.01, "cutoff": 20, "max_gap": 0.05, "start": 0.5, "stop": 3.5, "positions": ["q", "box"],
+    "quaternions": [[f"box[{i}]" for i in range(3, 7)]], "align": ["hand[0]"], "reference": "tip[0]",
+    "same_clock": ["box"], "actions": "velocity", "controlled": ["q"],
+}  # fmt: skip
+COLUMNS = {"time": "stamp", "terminals": [], "observations": ["q", "tip", "box", "hand"]}
+
+
+@pytest.fixture(scope="module")
+def guided(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, InstrumentLog]:
+    path, log = tmp_path_factory.mktemp("guided") / "log.npz", record_guided(steps=300, seed=3, truth=SIM.truth)
+    log.save(path)
+    return path, log
+
+
+def test_a_guided_log_holds_what_instruments_tell(guided: tuple[Path, InstrumentLog]) -> None:
+    path, log = guided
+    with np.load(path) as file:
+        assert set(file.files) == {"episode", "stamp", "q", "tip", "box", "hand"}
+    encoders, frames = ~np.isnan(log.q[:, 0]), ~np.isnan(log.box[:, 0])
+    assert (encoders ^ frames).all()
+    np.testing.assert_allclose(np.diff(log.stamp[encoders]), 1e-3, atol=1e-9)
+    np.testing.assert_allclose(np.diff(log.stamp[frames]), 1 / 120, atol=1e-9)
+    again, other = (record_guided(steps=20, seed=seed) for seed in (3, 4))
+    np.testing.assert_array_equal(again.q, record_guided(steps=20, seed=3).q)
+    assert again.offset == log.offset != other.offset
+
+
+def test_the_offset_between_the_clocks_is_found(guided: tuple[Path, InstrumentLog]) -> None:
+    path, log = guided
+    found = signal_delays(read_recording(path, actions=[], **COLUMNS), Preprocess(**PREPROCESS))
+    assert {name for name in found if name != "hand[0]"} == {f"box[{i}]" for i in range(7)}
+    for delay in found.values():
+        assert delay == pytest.approx(log.offset, abs=3e-4)
+
+
+def test_transitions_of_a_guided_log_are_the_models(guided: tuple[Path, InstrumentLog]) -> None:
+    log = read_trajectories(guided[0], **COLUMNS, preprocess=Preprocess(**PREPROCESS))
+    assert (len(log), log.dt) == (300, 0.01)
+    space = ParameterSpace(SIM.model, SIM.parameters)
+    simulator = make_simulator("mujoco", space.model, parameters=space, frame_skip=5)
+    truth = torch.tensor([[SIM.truth[name] for name in space.names]], dtype=torch.float64)
+    states, actions = torch.from_numpy(log.observations.copy()), torch.from_numpy(log.actions.copy())
+    after = simulator.simulate(states, actions[:, None], truth)[:, 0].numpy()
+    off, moved = after - log.next_observations, log.next_observations - log.observations
+    assert np.abs(moved[:, 7:9]).sum(0).max() > 0.05
+    assert np.abs(off[:, :7]).max() < 0.1 * np.abs(moved[:, :7]).max()  # rad: the commands are right
+    assert np.median(np.abs(off[:, 7:9])) < 3e-4  # m: the camera's noise
+    assert np.abs(off[:, 7:9]).max() < 2e-3
+
+
+def test_the_recorders_command_guides_the_arm(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "log"
+    main([str(path), "--variant", "guided", "--episodes", "2", "--steps", "5"])
+    with np.load(path) as file:
+        assert capsys.readouterr().out == f"{len(file['stamp'])} samples in {path}\n"
+        assert set(file["episode"]) == {0, 1}
+    with pytest.raises(InputError, match="did you mean 'friction_x'"):
+        record_guided(truth={"frictionx": 1.0})
+    with pytest.raises(InputError, match="steps 0"):
+        record_guided(steps=0)

@@ -5,6 +5,9 @@ Every episode is one push, straight ahead, at a side of the box and with a headi
 ``point``         one box;
 ``noisy``         and every measurement carries noise;
 ``distribution``  the box's parameters are redrawn for every push from normals around the truth, as in the paper.
+
+And ``guided``, by :func:`dropo_sims.push.guided.record_guided`: samples of instruments, not transitions, of an arm that
+a hand guides around the box; an episode lasts as many steps of 10 ms.
 """
 
 from __future__ import annotations
@@ -14,8 +17,9 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from ..recorder import ObjectLog, check_names, check_request, record_object, run_recorder, transition
+from ..recorder import ObjectLog, Saved, check_names, check_request, record_object, run_recorder, transition
 from . import SIM
+from .guided import GUIDED, record_guided
 from .policy import Push, Pusher
 
 VARIANTS = ("point", "noisy", "distribution")
@@ -76,12 +80,14 @@ def _episode(model: mujoco.MjModel, push: Push, steps: int) -> tuple[np.ndarray,
 def main(arguments: Sequence[str] | None = None) -> None:
     """Record a log from the command line."""
 
-    def recorded(variant: str, episodes: int, steps: int, seed: int, robot: bool) -> ObjectLog:
+    def recorded(variant: str, episodes: int, steps: int, seed: int, robot: bool) -> Saved:
         truth = SIM.truth if robot else None
+        if variant == GUIDED:
+            return record_guided(episodes=episodes, steps=steps, seed=seed, truth=truth)
         return record(variant=variant, episodes=episodes, steps=steps, seed=seed, truth=truth)
 
     about = "a simulated arm that pushes a box"
-    run_recorder(recorded, arguments, what=about, variants=VARIANTS, episodes=20, steps=30)
+    run_recorder(recorded, arguments, what=about, variants=(*VARIANTS, GUIDED), episodes=20, steps=30)
 
 
 if __name__ == "__main__":
