@@ -42,6 +42,8 @@ HOME, NEAR = np.array([0.53, 0.0]), 0.05
 #: Seconds in which the hand stops or turns, about.
 REACTION = 0.04
 JOINTS = 7
+#: Inertia of the joints of a model whose arm follows a guided log, kg m², and how far its drives are behind, s.
+HEAVY, LAG = 100.0, 0.627 * DT
 #: Columns of the file.
 COLUMNS = ("episode", "stamp", "q", "tip", "box", "hand")
 
@@ -242,3 +244,21 @@ class _Hand:
         if np.linalg.norm(tip - box) > AROUND - 0.01:
             self._phase = self._round
         return self._line.velocity(tip, -GOING)
+
+
+def write_model(path: str | Path) -> None:
+    """Write the model whose arm moves as a guided log has it, whatever it touches.
+
+    Nobody logged what moved the arm: its motion is given, and says nothing of the box. So its joints are as heavy and
+    its drives as strong as to feel no contact. Told the velocity at a step's end, they pass through the measured
+    positions: a lag of ``LAG`` makes up for the acceleration within the step.
+    """
+    spec = mujoco.MjSpec.from_file(str(SIM.model))
+    for joint in spec.joints:
+        if joint.type == mujoco.mjtJoint.mjJNT_HINGE:
+            joint.armature = HEAVY
+    for drive in spec.actuators:
+        drive.gainprm[0], drive.biasprm[2] = HEAVY / LAG, -HEAVY / LAG
+        drive.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    spec.compile()
+    Path(path).write_text(spec.to_xml())
