@@ -2,12 +2,14 @@
 
 The log is what instruments write, not transitions: encoders at 1 kHz, with where the controller has the tip by them,
 and poses of box and rod by motion capture at 120 Hz, whose clock is another one.
-:class:`~dropo_torch.data.preprocess.Preprocess` makes transitions of it.
+:class:`~dropo_torch.data.preprocess.Preprocess` makes transitions of it, for the model that
+``python -m dropo_sims.push.guided MODEL.xml`` writes.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import argparse
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -262,3 +264,19 @@ def write_model(path: str | Path) -> None:
         drive.forcelimited = mujoco.mjtLimited.mjLIMITED_FALSE
     spec.compile()
     Path(path).write_text(spec.to_xml())
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Write the model from the command line."""
+    parser = argparse.ArgumentParser(description="Write the model whose arm moves as a guided log has it.")
+    parser.add_argument("path", type=Path, help="the MJCF file to write")
+    given = parser.parse_args(arguments)
+    try:
+        write_model(given.path)
+    except OSError as error:
+        parser.error(str(error))
+    print(f"an arm that feels no contact in {given.path}")
+
+
+if __name__ == "__main__":
+    main()
