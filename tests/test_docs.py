@@ -23,6 +23,7 @@ import pandas as pd
 import pytest
 import scipy.io
 import yaml
+from dropo_sims.push.guided import record_guided, write_model
 
 from dropo_torch.commands import cli
 from dropo_torch.config import make_config, parse_overrides
@@ -116,6 +117,8 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
         mujoco.mj_step(model, data, nstep=5)
     write_logs(folder, time, np.array(states), controls)
     shutil.copy(ROOT / "sims" / "hopper" / "log.npz", folder / "hopper.npz")
+    record_guided(steps=400).save(folder / "guided.npz")
+    write_model(folder / "guided.xml")
     (folder / "cart.py").write_text(blocks(ROOT / "docs" / "adapters.md", "python")[0])
     (folder / "robot.yaml").write_text(blocks(ROOT / "README.md", "yaml")[0])
     (folder / "out" / "policy").mkdir(parents=True)
