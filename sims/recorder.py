@@ -162,17 +162,19 @@ class Saved(Protocol):
 
 
 def run_recorder(
-    record: Callable[[str, int, int, int, bool], Saved], arguments: Sequence[str] | None, *, what: str,
-    variants: Sequence[str], episodes: int, steps: int,
+    record: Callable[..., Saved], arguments: Sequence[str] | None, *, what: str, variants: Sequence[str],
+    episodes: int, steps: int, add: Callable[[argparse.ArgumentParser], None] = lambda parser: None,
 ) -> None:  # fmt: skip
     """Record a log from the command line.
 
     Args:
-        record: called with variant, episodes, steps, seed, and whether the bundled log's robot is to be recorded.
+        record: called with variant, episodes, steps, seed, whether the bundled log's ``robot`` is to be recorded, and
+            what ``add`` adds, by name.
         arguments: those of the command line, by default the process's own.
         what: what is simulated.
         variants: kinds of logs.
         episodes, steps: of a log, by default.
+        add: adds options of one's own.
     """
     parser = argparse.ArgumentParser(description=f"Record a log of {what}.")
     parser.add_argument("path", type=Path, help="the .npz file to write")
@@ -181,10 +183,12 @@ def run_recorder(
     parser.add_argument("--steps", type=int, default=steps)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--robot", action="store_true", help="the robot of the bundled log, not the model as it is")
-    given = parser.parse_args(arguments)
+    add(parser)
+    given = vars(parser.parse_args(arguments))
+    path = given.pop("path")
     try:
-        log = record(given.variant, given.episodes, given.steps, given.seed, given.robot)
-        log.save(given.path)
+        log = record(**given)
+        log.save(path)
     except (InputError, OSError) as error:
         parser.error(str(error))
-    print(f"{log.size} in {given.path}")
+    print(f"{log.size} in {path}")

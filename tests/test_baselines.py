@@ -595,7 +595,7 @@ def test_a_log_of_single_transitions_has_nothing_for_bayessim(folder: Path) -> N
 TINY = Plan(
     seeds=1, steps=12, samples=8, droid_budget=40, simulations=20, horizon=6, epsilons=(1e-8, 1e-5, 1e-2),
     noise_variances=(1e-5,), sizes=(12,), resamples=2, cma_steps=8, cma_budget=24, cma_samples=4,
-    noise_steps=12, backend="mujoco",
+    noise_steps=12, backend="mujoco", paper=None,
 )  # fmt: skip
 
 

@@ -94,6 +94,30 @@ def test_each_transition_of_a_log_is_one_of_the_recorded_hopper() -> None:
         np.testing.assert_allclose(np.concatenate([data.qpos[1:], data.qvel]), after, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.parametrize(("variant", "noisy", "clean"), [("ends", 1, 0), ("starts", 0, 1)])
+def test_noise_is_on_one_side_of_transitions_alone(variant: str, noisy: int, clean: int) -> None:
+    columns = ("observations", "next_observations")
+    true, measured = (record(variant=v, steps=300, seed=2) for v in ("point", variant))
+    np.testing.assert_array_equal(getattr(measured, columns[clean]), getattr(true, columns[clean]))
+    noise = getattr(measured, columns[noisy]) - getattr(true, columns[noisy])
+    np.testing.assert_allclose(noise.var(0), NOISE_VARIANCE, rtol=0.2)
+
+
+def test_a_policy_acts_on_what_is_true() -> None:
+    """And on velocities that are cut off."""
+    seen: list[np.ndarray] = []
+
+    def policy(observation: np.ndarray) -> np.ndarray:
+        seen.append(observation)
+        return np.clip(observation[5:8], -1, 1)
+
+    log, clean = (record(variant=v, episodes=1, steps=100, seed=2, policy=policy) for v in ("noisy", "point"))
+    np.testing.assert_array_equal(log.actions, clean.actions)
+    assert np.abs(clean.observations[:, 5:]).max() > 10
+    np.testing.assert_array_equal(np.stack(seen[:100])[:, :5], clean.observations[:, :5])
+    np.testing.assert_array_equal(np.stack(seen[:100])[:, 5:], clean.observations[:, 5:].clip(-10, 10))
+
+
 def test_noise_is_on_every_measurement_and_has_its_variance() -> None:
     clean, noisy = (record(variant=variant, steps=300, seed=2) for variant in ("point", "noisy"))
     noise = noisy.observations - clean.observations

@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import functools
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import torch
 
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
-from dropo_torch.problem import Problem, make_problem
+from dropo_torch.problem import make_problem
 from dropo_torch.studies.study import run_cells
 from dropo_torch.studies.sweep import NEGLIGIBLE
 from dropo_torch.support.extras import require
 
-from . import LINKS, SIM
+from . import SIM, paper, paper_tables
+from .paper import PaperPlan, mse_at, truth_of
 from .record import NOISE_VARIANCE, HopperLog, record
 from .study_tables import write_results
 
@@ -51,6 +51,7 @@ class Plan:
         resamples: bootstrap samples of each size.
         cma_steps, cma_budget, cma_samples: length of the log's episodes, evaluations and K of the CMA-ES run.
         backend: of all fits. The logs are MuJoCo's own.
+        paper: how large the part with the paper's own masses and boxes is, or none.
     """
 
     seeds: int = 3
@@ -69,13 +70,14 @@ class Plan:
     cma_budget: int = 800
     cma_samples: int = 50
     backend: Literal["mujoco", "warp"] = "warp"
+    paper: PaperPlan | None = paper.FULL
 
 
 #: Minutes instead of hours: short logs, one seed, coarse sweeps.
 REDUCED = Plan(
     seeds=1, steps=60, samples=40, droid_budget=400, simulations=200, horizon=20,
     epsilons=(1e-8, 1e-6, 1e-4, 1e-2), noise_variances=(1e-5, 1e-4), noise_steps=60, sizes=(10, 30, 100), resamples=4,
-    cma_steps=20, cma_budget=60, cma_samples=10, backend="mujoco",
+    cma_steps=20, cma_budget=60, cma_samples=10, backend="mujoco", paper=paper.REDUCED,
 )  # fmt: skip
 
 
@@ -139,7 +141,7 @@ def run_study(
 
     Args:
         out: the folder: ``cells/`` and ``logs/``, and at the end ``study.json``, ``tables.md``,
-            ``report.html`` and figures.
+            ``report.html`` and figures; and ``paper/``, with the same of the part with the paper's masses and boxes.
         reduced: the plan :data:`REDUCED`.
         resume: keep finished cells of the same plan.
         report: called with what is being done and the share that is.
@@ -154,7 +156,28 @@ def run_study(
     run = functools.partial(run_cell, plan=plan, logs=out / "logs")
     results = run_cells(out, plan, all_cells(plan), run, resume=resume, workers=workers, report=report)
     report("tables and figures", 1.0)
-    return write_results(out, results, asdict(plan))
+    found = write_results(out, results, asdict(plan))
+    if plan.paper is None:
+        return found
+    more = run_paper(out / "paper", resume=resume, report=report, plan=plan.paper, workers=workers)
+    return [*found, *(f"{line}, with the paper's masses" for line in more)]
+
+
+def run_paper(
+    out: Path,
+    *,
+    resume: bool = False,
+    report: Callable[[str, float], None] = lambda stage, share: None,
+    plan: PaperPlan | None = None,
+    workers: int = 1,
+) -> Sequence[str]:
+    """Run the part with the paper's masses and boxes (:mod:`dropo_sims.hopper.paper`); as :func:`run_study`."""
+    require("baselines", "method: bayessim")
+    plan = plan or paper.FULL
+    run = functools.partial(paper.run_cell, plan=plan, logs=out / "logs")
+    results = run_cells(out, plan, paper.all_cells(plan), run, resume=resume, workers=workers, report=report)
+    report("tables and figures", 1.0)
+    return paper_tables.write_results(out, results, asdict(plan))
 
 
 def all_cells(plan: Plan) -> list[Cell]:
@@ -205,11 +228,11 @@ def run_cell(cell: Cell, *, plan: Plan, logs: Path, threads: int = 0) -> dict[st
     fit = fit_problem(problem)
     seconds = time.monotonic() - begun
     path.unlink()
-    truth = {f"{link}_mass": (float(m.mean()), float(m.std())) for link, m in zip(LINKS, log.masses.T, strict=True)}
+    truth = truth_of(log)
     return {
         "cell": asdict(cell),
-        "truth": {name: {"mean": mean, "std": std} for name, (mean, std) in truth.items()},
-        "mse_at_truth": mse_at(problem, {name: mean for name, (mean, _) in truth.items()}),
+        "truth": truth,
+        "mse_at_truth": mse_at(problem, {name: value["mean"] for name, value in truth.items()}),
         **({"robust_log_likelihood": fit.log_likelihood} if cell.noisy_starts else {}),
         "transitions": len(log.actions),
         "wall_seconds": round(seconds, 3),
@@ -238,13 +261,6 @@ def _document(cell: Cell, plan: Plan) -> dict[str, Any]:
     if cell.knows_noise or cell.noisy_starts:
         document["noise"] = (NOISE_VARIANCE if cell.knows_noise else cell.epsilon) ** 0.5
     return document
-
-
-def mse_at(problem: Problem, values: Mapping[str, float]) -> float:
-    """Return the mean squared error of the log's predicted ends at values of the parameters."""
-    row = [values[name] for name in problem.simulator.parameters.names]
-    two = torch.tensor([[row, row]], dtype=torch.float64)  # a likelihood needs two samples; both are the same
-    return problem.objective.evaluate_values(two)[0].mse
 
 
 def _log(cell: Cell, plan: Plan) -> HopperLog:

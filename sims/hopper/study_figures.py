@@ -28,16 +28,15 @@ def label(result: Result) -> str:
 def draw_all(results: Sequence[Result], tables: dict[str, list[dict[str, Any]]]) -> dict[str, Any]:
     """Return the study's figures by the names of their files."""
     return {
-        "recovery.png": recovery(results),
+        "recovery.png": recovery(pick(results, "recovery", seed=0)),
         "sweep.png": sweeps(tables["sweep"]),
         "noise.png": against_noise(tables["noise"]),
         "size.png": sizes(tables["size"]),
     }
 
 
-def recovery(results: Sequence[Result]) -> Any:
-    """Draw the fitted normals of the redrawn masses over the realised ones, first seed."""
-    chosen = pick(results, "recovery", seed=0)
+def recovery(chosen: Sequence[Result]) -> Any:
+    """Draw the fitted normals of the redrawn masses over the realised ones, of one log."""
     return draw_recovery(chosen, label, _COLOURS, {name: p["unit"] for name, p in SIM.parameters.items()})
 
 
