@@ -528,18 +528,29 @@ def test_energy_scores_are_those_of_a_normal() -> None:
     assert (far > 10 * scores).all()
 
 
-def test_a_twin_of_a_log_has_its_commands_and_noise() -> None:
+def test_the_noisy_hoppers_noise_is_where_it_is() -> None:
     example = load_example(ROOT / "examples" / "noisy_hopper.py")
-    log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz").select(slice(0, 300))
-    made = example.twin(log, 3)
-    assert made["actions"] == pytest.approx(log.actions)
-    starts = np.append(True, log.terminals[:-1])
-    again = example.twin(log, 4)
-    assert made["observations"][starts] == pytest.approx(log.observations[starts], abs=0.02)
-    difference = (made["observations"] - again["observations"]) / np.sqrt(2 * example.VARIANCE)
-    assert difference.std() == pytest.approx(1, rel=0.05)
+    log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz")
+    sigma, rng = np.sqrt(example.VARIANCE), np.random.default_rng(3)
+    for starts, ends in ((False, True), (True, False), (True, True)):
+        of_starts, of_ends, between = example.roughness(example.noisy(log, rng, starts=starts, ends=ends))
+        smooth = slice(0, 5)  # the positions
+        np.testing.assert_allclose(of_starts[smooth], sigma, rtol=0.3) if starts else None
+        np.testing.assert_allclose(of_ends[smooth], sigma, rtol=0.3) if ends else None
+        assert starts or (of_starts[smooth] < 0.3 * sigma).all()
+        assert ends or (of_ends[smooth] < 0.3 * sigma).all()
+        np.testing.assert_allclose(between, sigma * np.sqrt(starts + ends), rtol=0.2)
     today = mujoco.MjModel.from_xml_path(str(example.SIM.model))
     assert list(example.factors(today).values()) == pytest.approx([0.893, 0.903, 0.927, 0.874], abs=5e-4)
+
+
+def test_a_twin_begins_and_is_commanded_as_its_log() -> None:
+    example = load_example(ROOT / "examples" / "noisy_hopper.py")
+    log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz").select(slice(0, 20))
+    ends, free = example.simulate(mujoco.MjModel.from_xml_path(str(example.SIM.model)), log)
+    assert free.any()
+    assert np.abs(ends - log.next_observations).max() < 0.2  # its masses are others
+    assert np.abs(ends - log.observations).max() > 0.2
 
 
 def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
