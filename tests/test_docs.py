@@ -535,10 +535,8 @@ def test_the_noisy_hoppers_noise_is_where_it_is() -> None:
     for starts, ends in ((False, True), (True, False), (True, True)):
         of_starts, of_ends, between = example.roughness(example.noisy(log, rng, starts=starts, ends=ends))
         smooth = slice(0, 5)  # the positions
-        np.testing.assert_allclose(of_starts[smooth], sigma, rtol=0.3) if starts else None
-        np.testing.assert_allclose(of_ends[smooth], sigma, rtol=0.3) if ends else None
-        assert starts or (of_starts[smooth] < 0.3 * sigma).all()
-        assert ends or (of_ends[smooth] < 0.3 * sigma).all()
+        for found, there in ((of_starts, starts), (of_ends, ends)):
+            assert ((found[smooth] > 0.6 * sigma) == there).all()
         np.testing.assert_allclose(between, sigma * np.sqrt(starts + ends), rtol=0.2)
     today = mujoco.MjModel.from_xml_path(str(example.SIM.model))
     assert list(example.factors(today).values()) == pytest.approx([0.893, 0.903, 0.927, 0.874], abs=5e-4)
@@ -546,11 +544,11 @@ def test_the_noisy_hoppers_noise_is_where_it_is() -> None:
 
 def test_a_twin_begins_and_is_commanded_as_its_log() -> None:
     example = load_example(ROOT / "examples" / "noisy_hopper.py")
-    log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz").select(slice(0, 20))
+    log = read_trajectories(ROOT / "sims" / "hopper" / "log.npz")
     ends, free = example.simulate(mujoco.MjModel.from_xml_path(str(example.SIM.model)), log)
-    assert free.any()
-    assert np.abs(ends - log.next_observations).max() < 0.2  # its masses are others
-    assert np.abs(ends - log.observations).max() > 0.2
+    assert 0 < free.sum() < len(log)
+    error, change = (np.median(np.abs(x - log.next_observations)) for x in (ends, log.observations))
+    assert error < 0.2 * change  # its masses are others
 
 
 def test_authors_hopper_replays_a_log(capsys: pytest.CaptureFixture) -> None:
