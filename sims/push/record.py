@@ -54,12 +54,13 @@ def record(
     check_names("truth", {**(truth or {}), **(spread or {})}, SIM.parameters)
     widths = dict(SPREAD if spread is None else spread) if variant == "distribution" else {}
     return record_object(
-        SIM, lambda model, generator: _episode(model, _push(generator), steps), episodes=episodes, seed=seed,
+        SIM, lambda model, generator: _episode(model, random_push(generator), steps), episodes=episodes, seed=seed,
         truth=truth, spread=widths, quaternion=QUATERNION, noise=NOISE if variant == "noisy" else None,
     )  # fmt: skip
 
 
-def _push(generator: np.random.Generator) -> Push:
+def random_push(generator: np.random.Generator) -> Push:
+    """Return a push at a random side, heading and speed."""
     return Push(
         side=generator.uniform(-SIDE, SIDE), heading=generator.uniform(-HEADING, HEADING),
         speed=generator.uniform(*SPEEDS),

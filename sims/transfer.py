@@ -1,0 +1,270 @@
+"""From a raw log of a target to policies that act in it: what each method's policies reach, and what ``gap`` adds.
+
+The way of a user, seed by seed: a raw log is written, examined, and asked what the model lacks; distributions are
+fitted by each method to the model with it, and by DROPO to the model without; a policy is trained over each and carries
+out a few rollouts in the target.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from dropo_torch.baselines import fit_problem
+from dropo_torch.commands.check import told
+from dropo_torch.config import Config, make_config
+from dropo_torch.distribution import Distribution
+from dropo_torch.gap import add, find_gap
+from dropo_torch.logged import read_log
+from dropo_torch.models.bundled import BundledSim
+from dropo_torch.problem import make_problem
+from dropo_torch.report.gap_words import answer
+from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.problem import make_training
+from dropo_torch.rl.train import EvaluationPoint, TrainEntry, train
+from dropo_torch.studies.study import run_cells
+from dropo_torch.support.extras import require
+from dropo_torch.support.files import write_atomically
+
+from .target import Run, Target, log_config, write_raw
+from .transfer_tables import write_results
+
+#: Whose policies are compared, in the order of tables; those after the first two have a fit of their own.
+OWN, POINT = "own", "point"
+METHODS = (OWN, "dropo", POINT, "droid", "bayessim", "udr", "plain")
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How large a study is.
+
+    Attributes:
+        seeds: logs, each with fits and policies of its own.
+        methods: of :data:`METHODS`, those whose policies are trained.
+        boxes: of uniform randomisation, each with a policy.
+        runs: episodes of a log.
+        rollouts: of a policy in the target.
+        gap_seconds: after which no more effects are looked for.
+        samples: K.
+        droid_budget: simulations of the log by DROID.
+        simulations, horizon: of BayesSim, and logged steps that it replays.
+        algorithm, train: how policies are trained.
+        backend: of gap and fits, where the effects that are found allow it; policies are trained with MuJoCo.
+    """
+
+    seeds: int
+    methods: tuple[str, ...]
+    boxes: int
+    runs: int
+    rollouts: int = 5
+    gap_seconds: float = 600.0
+    samples: int = 100
+    droid_budget: int = 300
+    simulations: int = 300
+    horizon: int = 50
+    algorithm: str = "ppo"
+    train: Mapping[str, Any] = field(default_factory=dict)
+    backend: Literal["mujoco", "warp"] = "warp"
+
+
+@dataclass(frozen=True)
+class Robot:
+    """A target and the model that a user has of it.
+
+    Attributes:
+        sim: the model and its parameters, as a user has them.
+        make_target: makes the target.
+        record: returns runs of it: ``record(count, seed)``.
+        distances: how far from its goal the object lies after each rollout, m: ``distances(policy, count, seed)``.
+        start: where the part of a run that is fitted begins, s; see :func:`~dropo_sims.target.log_config`.
+        own: what a config says of the model that is as near to the target as the library allows: ``effects``,
+            and ``distribution`` with a value for each parameter.
+        title, lead: of the page.
+        plan, reduced: its whole and its reduced size.
+    """
+
+    sim: BundledSim
+    make_target: Callable[[], Target]
+    record: Callable[[int, int], list[Run]]
+    distances: Callable[[Policy, int, int], list[float]]
+    start: float
+    own: Mapping[str, Any]
+    title: str
+    lead: str
+    plan: Plan
+    reduced: Plan
+
+    def run(
+        self, out: Path, *, reduced: bool = False, resume: bool = False,
+        report: Callable[[str, float], None] = lambda stage, share: None, plan: Plan | None = None, workers: int = 1,
+    ) -> Sequence[str]:  # fmt: skip
+        """Run every cell that is not there yet, then write tables and figures; return what was found.
+
+        Args:
+            out: the folder: ``cells/``, a folder for each seed, and at the end ``study.json``, ``tables.md``,
+                ``report.html`` and figures.
+            reduced: the small plan.
+            resume: keep finished cells of the same plan, or of one with other methods, boxes or seeds; an interrupted
+                training goes on.
+            report: called with what is being done and the share that is.
+            plan: a size of one's own.
+            workers: processes that compute cells side by side. Fits and gaps do not depend on it.
+
+        Raises:
+            InputError: a folder with another study, or with one that is not to be resumed; a package that is missing.
+        """
+        plan = plan or (self.reduced if reduced else self.plan)
+        require("rl", "a policy")
+        if "bayessim" in plan.methods:
+            require("baselines", "method: bayessim")
+        run = functools.partial(run_cell, robot=self, plan=plan, out=out)
+        cells, stages, claim = all_cells(plan), ("gap", "fit", "policy"), replace(plan, seeds=0, methods=(), boxes=0)
+        for stage in stages:  # each needs the one before it
+            until = [c for c in cells if stages.index(c.stage) <= stages.index(stage)]
+            resume = resume or stage != stages[0]
+            results = run_cells(out, claim, until, run, resume=resume, workers=workers, report=report)
+        report("tables and figures", 1.0)
+        return write_results(out, self, results, asdict(plan))
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One step of the way.
+
+    Attributes:
+        stage: ``gap``, ``fit`` or ``policy``.
+        method: of :data:`METHODS`; none of a gap.
+        seed: of the log and all that follows.
+        box: of uniform randomisation.
+    """
+
+    stage: str
+    method: str = ""
+    seed: int = 0
+    box: int = 0
+
+    @property
+    def name(self) -> str:
+        """The cell's file, without suffix."""
+        return "-".join(part for part in (self.stage, self.variant, f"seed{self.seed}") if part)
+
+    @property
+    def variant(self) -> str:
+        """The method, and which box."""
+        return f"{self.method}{self.box}" if self.method == "udr" else self.method
+
+
+def all_cells(plan: Plan) -> list[Cell]:
+    """Return the study's cells, stage by stage."""
+    cells = []
+    for seed in range(plan.seeds):
+        cells.append(Cell("gap", seed=seed))
+        for method in plan.methods:
+            for box in range(plan.boxes if method == "udr" else 1):
+                cells += [Cell("fit", method, seed, box)] if method not in (OWN, POINT) else []
+                cells.append(Cell("policy", method, seed, box))
+        if POINT in plan.methods and "dropo" not in plan.methods:
+            cells.append(Cell("fit", "dropo", seed))
+    return cells
+
+
+def run_cell(cell: Cell, *, robot: Robot, plan: Plan, out: Path, threads: int = 0) -> dict[str, Any]:
+    """Take one step of the way; what later ones need is left in the seed's folder."""
+    folder = out / f"seed{cell.seed}"
+    folder.mkdir(parents=True, exist_ok=True)
+    step = {"gap": _gap, "fit": _fit, "policy": _policy}[cell.stage]
+    return step(cell, robot, plan, folder, threads)
+
+
+def _gap(cell: Cell, robot: Robot, plan: Plan, folder: Path, threads: int) -> dict[str, Any]:
+    """Write a raw log and the user's config; examine the one and ask what the model lacks."""
+    write_raw(folder / "log.csv", robot.make_target(), robot.record(plan.runs, cell.seed))
+    document = {
+        "sim": robot.sim.name, "data": log_config(folder.resolve() / "log.csv", robot.start), "backend": plan.backend,
+        "seed": cell.seed,
+    }  # fmt: skip
+    write_atomically(folder / "user.yaml", yaml.safe_dump(document, sort_keys=False).encode())
+    config = make_config({**document, "threads": threads}, base=folder)
+    findings = [told(finding) for finding in read_log(config).examined()]
+    problem = make_problem(config, general=True)
+    kept: dict[str, Any] = {"checkpoint": folder / "gap-progress.bin", "resume": True}
+    found = find_gap(problem, time_limit=plan.gap_seconds, report=functools.partial(_stage, cell.name, [""]), **kept)
+    (folder / "gap").mkdir(exist_ok=True)
+    notes = add(problem, found, folder / "gap")
+    headline, items = answer(found)
+    return {
+        "check": findings, "answer": [headline, *items], "gap": found.document(), "notes": notes,
+        "transitions": len(problem.trajectories),
+    }  # fmt: skip
+
+
+def _document(folder: Path, *, amended: bool) -> tuple[dict[str, Any], Path]:
+    """The config with what the model lacks, where anything has a name, or the user's own; and its folder."""
+    path = folder / "gap" / "config.yaml"
+    path = path if amended and path.exists() else folder / "user.yaml"
+    document: dict[str, Any] = yaml.safe_load(path.read_text())
+    return document, path.parent
+
+
+def _fit(cell: Cell, robot: Robot, plan: Plan, folder: Path, threads: int) -> dict[str, Any]:
+    """Fit a distribution by a method."""
+    document, base = _document(folder, amended=cell.method != "plain")
+    options: dict[str, dict[str, Any]] = {
+        "droid": {"budget": plan.droid_budget},
+        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon},
+        "udr": {"boxes": plan.boxes, "box": cell.box},
+    }
+    method = "dropo" if cell.method == "plain" else cell.method
+    settings = {"method": method, "method_options": options.get(method, {}), "samples": plan.samples}
+    config = make_config({**document, **settings, "seed": cell.seed, "threads": threads}, base=base)
+    fit = fit_problem(make_problem(config))
+    fit.save(folder / f"{cell.variant}.json")
+    return {"fit": fit.document()}
+
+
+def _policy(cell: Cell, robot: Robot, plan: Plan, folder: Path, threads: int) -> dict[str, Any]:
+    """Train a policy, or go on with it, and let it act in the target."""
+    problem = make_training(_training(cell, robot, plan, folder, threads))
+    kept, tell = folder / f"{cell.variant}-progress.bin", functools.partial(_tell, f"{cell.variant} seed {cell.seed}")
+    found = train(problem, checkpoint=kept, resume=True, on_progress=tell)
+    found.policy.save(folder / f"{cell.variant}.pt")
+    kept.unlink()
+    return {
+        "distances": robot.distances(found.policy, plan.rollouts, cell.seed),
+        "training_return": found.training.mean,
+        **{name: getattr(found, name) for name in ("steps", "episodes", "seconds", "simulating")},
+        "evaluations": [asdict(e) for e in found.evaluations],
+    }
+
+
+def _training(cell: Cell, robot: Robot, plan: Plan, folder: Path, threads: int) -> Config:
+    """The config of a training."""
+    if cell.method == OWN:
+        document, base = {"sim": robot.sim.name, **robot.own}, folder
+    else:
+        document, base = _document(folder, amended=cell.method != "plain")
+    if cell.method == POINT:
+        center = Distribution.load(folder / "dropo.json")
+        document["distribution"] = dict(zip(center.names, center.center.tolist(), strict=True))
+    elif cell.method != OWN:
+        document["distribution"] = str((folder / f"{cell.variant}.json").resolve())
+    learning = {"algorithm": plan.algorithm, "train": dict(plan.train), "backend": "mujoco"}
+    return make_config({**document, **learning, "seed": cell.seed, "threads": threads}, base=base)
+
+
+def _tell(name: str, entry: TrainEntry, evaluation: EvaluationPoint | None) -> None:
+    """Print each evaluation on the way."""
+    if evaluation is not None:
+        print(f"{name}: {entry.steps:,} steps, return {evaluation.mean:.2f} in training", flush=True)
+
+
+def _stage(name: str, last: list[str], stage: str, share: float) -> None:
+    """Print each stage of a search once."""
+    if stage != last[0]:
+        last[0] = stage
+        print(f"{name}: {stage}", flush=True)
