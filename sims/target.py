@@ -26,6 +26,8 @@ JOINTS, POSE = 7, 7
 FINER = 5
 #: Speed of a joint below which its dry friction fades, rad/s.
 SLIPS = 0.01
+#: Longest time between two samples of a signal of a raw log, s: blank cells are none.
+GAP = 0.03
 #: What a raw log has, in its order: at the controller's times, and at the camera's.
 READINGS = (*(f"q{i}" for i in range(1, JOINTS + 1)), "tip_x", "tip_y", "tip_z")
 COMMANDS = tuple(f"c{i}" for i in range(1, JOINTS + 1))
@@ -236,15 +238,20 @@ def log_config(path: str | Path, start: float) -> dict[str, object]:
         start: where the part that is used begins, s; a multiple of the time between commands, so that steps begin with
             them, and later than the camera's latency.
     """
-    pose = list(FRAMES[3:])
-    return {
-        "path": str(path), "time": "time", "episode": "run",
-        "observations": [*READINGS[:JOINTS], *pose, "tip_x", "marker_x"], "actions": list(COMMANDS),
-        "preprocess": {
-            "positions": [*READINGS[:JOINTS], *pose], "quaternions": [pose[3:]], "reference": "tip_x",
-            "align": ["marker_x"], "same_clock": list(pose), "start": start, "max_gap": 0.03,
-        },
+    joints, pose = READINGS[:JOINTS], FRAMES[3:]
+    preprocess = {
+        "positions": [*joints, *pose], "quaternions": [list(pose[3:])], "reference": "tip_x", "align": ["marker_x"],
+        "same_clock": list(pose), "start": start, "max_gap": GAP,
     }  # fmt: skip
+    columns = {"observations": [*joints, *pose, "tip_x", "marker_x"], "actions": list(COMMANDS)}
+    return {"path": str(path), "time": "time", "episode": "run", **columns, "preprocess": preprocess}
+
+
+def arm_config(path: str | Path, start: float) -> dict[str, object]:
+    """Return what a config says of a raw log of the arm alone; see :func:`log_config`."""
+    columns = {"observations": list(READINGS[:JOINTS]), "actions": list(COMMANDS)}
+    preprocess = {"start": start, "max_gap": GAP}
+    return {"path": str(path), "time": "time", "episode": "run", **columns, "preprocess": preprocess}
 
 
 def _turned(roll: float, pitch: float) -> np.ndarray:
@@ -261,14 +268,14 @@ def _turned(roll: float, pitch: float) -> np.ndarray:
 
 
 def main_of(
-    about: str, target: Target, record: Callable[[int, int], list[Run]], count: int, arguments: Sequence[str] | None
+    about: str, target: Target, record: Callable[..., list[Run]], count: int, arguments: Sequence[str] | None
 ) -> None:
     """Write a raw log from the command line.
 
     Args:
         about: what the target is.
         target: the target.
-        record: returns so many runs, by a seed.
+        record: returns runs: ``record(count, seed, alone=...)``.
         count: how many by default.
         arguments: those of the command line, by default the process's own.
     """
@@ -276,11 +283,12 @@ def main_of(
     parser.add_argument("path", type=Path, help="the .csv file to write")
     parser.add_argument("--runs", type=int, default=count)
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--alone", action="store_true", help="the arm alone, the object out of reach")
     given = parser.parse_args(arguments)
     try:
         if given.runs < 1 or given.seed < 0:
             raise InputError(f"runs {given.runs}, seed {given.seed}: expected 1 or more, 0 or more")
-        write_raw(given.path, target, record(given.runs, given.seed))
+        write_raw(given.path, target, record(given.runs, given.seed, alone=given.alone))
     except (InputError, OSError) as error:
         parser.error(str(error))
     print(f"{given.runs} runs in {given.path}")

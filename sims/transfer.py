@@ -1,8 +1,9 @@
 """From a raw log of a target to policies that act in it: what each method's policies reach, and what ``gap`` adds.
 
-The way of a user, seed by seed: a raw log is written, examined, and asked what the model lacks; distributions are
-fitted by each method to the model with it, and by DROPO to the model without; a policy is trained over each and carries
-out a few rollouts in the target.
+The way of a user, seed by seed. The arm is logged alone and then with the object, and both logs are examined. ``gap``
+is asked first what the arm's model lacks, and then, with that in it, what else does. Distributions are fitted by each
+method to the model with all of it, and by DROPO to the model as it was; a policy is trained over each and carries out
+a few rollouts in the target.
 """
 
 from __future__ import annotations
@@ -13,15 +14,18 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
+import mujoco
 import yaml
 
 from dropo_torch.baselines import fit_problem
 from dropo_torch.commands.check import told
-from dropo_torch.config import Config, make_config
+from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.distribution import Distribution
+from dropo_torch.effects import find_effect
 from dropo_torch.gap import add, find_gap
 from dropo_torch.logged import read_log
 from dropo_torch.models.bundled import BundledSim
+from dropo_torch.models.load import load_model
 from dropo_torch.problem import make_problem
 from dropo_torch.report.gap_words import answer
 from dropo_torch.rl.policy import Policy
@@ -31,8 +35,15 @@ from dropo_torch.studies.study import run_cells
 from dropo_torch.support.extras import require
 from dropo_torch.support.files import write_atomically
 
-from .target import Run, Target, log_config, write_raw
+from .target import Arm, Run, Target, arm_config, log_config, write_raw
 from .transfer_tables import write_results
+
+#: What the logs' columns are, of the arm alone and with the object. That lies flat: how high it is, and how it moves up
+#: or tips, is measured less well than the model knows it.
+ALONE = ("qpos[0:7]", "qvel[0:7]")
+TOGETHER = ("qpos[0:9]", "skip", "qpos[10:14]", "qvel[0:9]", "skip[3]", "qvel[12]")
+#: Where the part of a log of the arm alone that is used begins, s.
+FIRST = 0.06
 
 #: Whose policies are compared, in the order of tables; those after the first two have a fit of their own.
 OWN, POINT = "own", "point"
@@ -79,7 +90,7 @@ class Robot:
     Attributes:
         sim: the model and its parameters, as a user has them.
         make_target: makes the target.
-        record: returns runs of it: ``record(count, seed)``.
+        record: returns runs of it: ``record(count, seed, alone=...)``, with the object or the arm alone.
         distances: how far from its goal the object lies after each rollout, m: ``distances(policy, count, seed)``.
         start: where the part of a run that is fitted begins, s; see :func:`~dropo_sims.target.log_config`.
         own: what a config says of the model that is as near to the target as the library allows: ``effects``,
@@ -90,7 +101,7 @@ class Robot:
 
     sim: BundledSim
     make_target: Callable[[], Target]
-    record: Callable[[int, int], list[Run]]
+    record: Callable[..., list[Run]]
     distances: Callable[[Policy, int, int], list[float]]
     start: float
     own: Mapping[str, Any]
@@ -159,6 +170,18 @@ class Cell:
         return f"{self.method}{self.box}" if self.method == "udr" else self.method
 
 
+def arm_effects(arm: Arm, actuators: str) -> list[dict[str, Any]]:
+    """Return what a target's arm has beside its model, as a config's effects; actuators are numbered from 1."""
+    found: list[dict[str, Any]] = []
+    for i, (dry, viscous) in enumerate(zip(arm.dry, arm.viscous, strict=True), 1):
+        found += [
+            {"effect": "joint_friction", "target": f"joint{i}", "friction": dry},
+            {"effect": "joint_damping", "target": f"joint{i}", "damping": viscous},
+            {"effect": "actuator_delay", "target": f"{actuators}{i}", "delay": arm.delay},
+        ]
+    return found
+
+
 def all_cells(plan: Plan) -> list[Cell]:
     """Return the study's cells, stage by stage."""
     cells = []
@@ -182,31 +205,73 @@ def run_cell(cell: Cell, *, robot: Robot, plan: Plan, out: Path, threads: int = 
 
 
 def _gap(cell: Cell, robot: Robot, plan: Plan, folder: Path, threads: int) -> dict[str, Any]:
-    """Write a raw log and the user's config; examine the one and ask what the model lacks."""
-    write_raw(folder / "log.csv", robot.make_target(), robot.record(plan.runs, cell.seed))
-    document = {
-        "sim": robot.sim.name, "data": log_config(folder.resolve() / "log.csv", robot.start), "backend": plan.backend,
-        "seed": cell.seed,
+    """Write raw logs and the user's configs; examine them and ask what the model lacks, first of the arm alone."""
+    target, found = robot.make_target(), {}
+    for kind, alone in (("arm", True), ("user", False)):
+        write_raw(folder / f"{kind}.csv", target, robot.record(plan.runs, cell.seed, alone=alone))
+    common = {"backend": plan.backend, "seed": cell.seed}
+    arm = {
+        "sim": robot.sim.name, "data": arm_config(folder.resolve() / "arm.csv", FIRST), "observation": list(ALONE),
+        "parameters": {n: dict(s) for n, s in robot.sim.parameters.items() if _of_arm(s)}, **common,
     }  # fmt: skip
-    write_atomically(folder / "user.yaml", yaml.safe_dump(document, sort_keys=False).encode())
-    config = make_config({**document, "threads": threads}, base=folder)
+    user = {
+        "sim": robot.sim.name, "data": log_config(folder.resolve() / "user.csv", robot.start),
+        "observation": list(TOGETHER), **common,
+    }  # fmt: skip
+    _write(folder / "arm.yaml", arm)
+    _write(folder / "user.yaml", user)
+    found["arm"] = _searched(folder, "arm", plan, threads)
+    _write(folder / "object.yaml", _with_arm(robot, user, folder / "arm-gap"))
+    found["object"] = _searched(folder, "object", plan, threads)
+    return found
+
+
+def _of_arm(specification: Mapping[str, Any]) -> bool:
+    """Whether a parameter is one of the arm's drives."""
+    return str(specification.get("field", "")).startswith("actuator_")
+
+
+def _with_arm(robot: Robot, user: Mapping[str, Any], found: Path) -> dict[str, Any]:
+    """The user's config with the arm as it was found, whose numbers are fixed: only the object's are parameters."""
+    if not (found / "model.xml").exists():
+        return dict(user)
+    arm = yaml.safe_load((found / "config.yaml").read_text())
+    kept = [e for e in arm.get("effects", []) if not find_effect(e["effect"]).native or e["effect"] == "integration"]
+    spec, model = mujoco.MjSpec.from_file(str(found / "model.xml")), load_model(robot.sim.model)
+    spec.option.timestep, spec.option.integrator = model.opt.timestep, model.opt.integrator  # a finer one is an effect
+    spec.compile()
+    (found / "arm.xml").write_text(spec.to_xml())
+    own = {
+        "model": str((found / "arm.xml").resolve()), "task": robot.sim.name, "frame_skip": robot.sim.frame_skip,
+        "parameters": {n: dict(s) for n, s in robot.sim.parameters.items() if not _of_arm(s)},
+    }  # fmt: skip
+    return {**{k: v for k, v in user.items() if k != "sim"}, **own, **({"effects": kept} if kept else {})}
+
+
+def _searched(folder: Path, kind: str, plan: Plan, threads: int) -> dict[str, Any]:
+    """Examine a log and ask what the model of its config lacks; what is found is left in a folder beside it."""
+    config = load_config(folder / f"{kind}.yaml", {"threads": threads})
     findings = [told(finding) for finding in read_log(config).examined()]
-    problem = make_problem(config, general=True)
-    kept: dict[str, Any] = {"checkpoint": folder / "gap-progress.bin", "resume": True}
-    found = find_gap(problem, time_limit=plan.gap_seconds, report=functools.partial(_stage, cell.name, [""]), **kept)
-    (folder / "gap").mkdir(exist_ok=True)
-    notes = add(problem, found, folder / "gap")
+    problem, out = make_problem(config, general=True), folder / f"{kind}-gap"
+    out.mkdir(exist_ok=True)
+    kept: dict[str, Any] = {"checkpoint": out / "gap-progress.bin", "resume": True}
+    show = functools.partial(_stage, f"{folder.name} {kind}", [""])
+    found = find_gap(problem, time_limit=plan.gap_seconds, report=show, **kept)
+    notes = add(problem, found, out)
     headline, items = answer(found)
-    return {
-        "check": findings, "answer": [headline, *items], "gap": found.document(), "notes": notes,
-        "transitions": len(problem.trajectories),
-    }  # fmt: skip
+    return {"check": findings, "answer": [headline, *items], "notes": notes, "gap": found.document()}
+
+
+def _write(path: Path, document: Mapping[str, Any]) -> None:
+    write_atomically(path, yaml.safe_dump(dict(document), sort_keys=False).encode())
 
 
 def _document(folder: Path, *, amended: bool) -> tuple[dict[str, Any], Path]:
-    """The config with what the model lacks, where anything has a name, or the user's own; and its folder."""
-    path = folder / "gap" / "config.yaml"
-    path = path if amended and path.exists() else folder / "user.yaml"
+    """The config with what the model lacks, as far as anything has a name, or the user's own; and its folder."""
+    path = folder / "object-gap" / "config.yaml"
+    if not path.exists():
+        path = folder / "object.yaml"
+    path = path if amended else folder / "user.yaml"
     document: dict[str, Any] = yaml.safe_load(path.read_text())
     return document, path.parent
 

@@ -135,15 +135,13 @@ def sections(tables: Mapping[str, Any], drawn: Sequence[str]) -> list[Section]:
         both = [r for r, d in zip(rows, tables["distances"], strict=True) if d["method"] in ("own", "dropo", "plain")]
         found.append(Section("With and without gap before the fit", head[:3], [r[:3] for r in both], drawn[1]))
     said = [
-        [
-            str(r["cell"]["seed"]),
-            r["gap"]["verdict"],
-            " ".join(r["answer"]),
-            "; ".join(r["check"]) or "nothing is wrong",
-        ]
+        [str(r["cell"]["seed"]), log, r[log]["gap"]["verdict"], " ".join(r[log]["answer"])]
+        + ["; ".join(r[log]["check"]) or "nothing is wrong"]
         for r in tables["gap"]
+        for log in ("arm", "object")
     ]
-    found.append(Section("What dropo gap and dropo check say of the log", ["seed", "verdict", "gap", "check"], said))
+    head = ["seed", "log", "verdict", "gap", "check"]
+    found.append(Section("What dropo gap and dropo check say: of the arm alone, then with the object", head, said))
     methods = list(dict.fromkeys(key for row in tables["fits"] for key in row if key not in ("parameter", "truth")))
     lines = [
         [row["parameter"], "–" if row["truth"] is None else f"{row['truth']:.4g}"]

@@ -10,10 +10,12 @@ from collections.abc import Sequence
 import numpy as np
 import torch
 
-from ..target import Arm, Run, Target, main_of
+from dropo_torch.rl.policy import Policy
+
+from ..target import Arm, Control, Run, Target, main_of
 from . import SIM
 from .generator import LATENT, STEPS, load_decoder
-from .policy import HOME
+from .policy import HOME, STEP
 from .task import PuckTask
 
 #: The real puck, contact and gains.
@@ -30,6 +32,8 @@ ARM = Arm(delay=0.006, dry=(1.2, 1.2, 0.8, 0.8, 0.6, 0.25, 0.15), viscous=(3.0, 
 TILT = (0.012, -0.016)
 #: Commands after a motion's last, so that the puck has come to rest.
 AFTER = 100
+#: x of a puck that no motion hits, m.
+OUT_OF_REACH = 1.5
 
 
 def make_target() -> Target:
@@ -37,11 +41,13 @@ def make_target() -> Target:
     return Target(SIM, TRUTH, ARM, tilt=TILT)
 
 
-def record_runs(count: int, seed: int) -> list[Run]:
-    """Return hits of z ~ N(0, I), each from a place of the puck of its own."""
+def record_runs(count: int, seed: int, *, alone: bool = False) -> list[Run]:
+    """Return hits of z ~ N(0, I), each from a place of the puck of its own, or out of reach of the stick."""
     target, generator = make_target(), np.random.default_rng(seed)
     decoder, task = load_decoder(), PuckTask()
     starts = task.initial_states(count, torch.Generator().manual_seed(seed)).numpy()
+    if alone:
+        starts[:, 7] = OUT_OF_REACH
     z = torch.from_numpy(generator.standard_normal((count, LATENT))).float().clamp(-2, 2)
     return [
         target.run(start, _played(motion), STEPS, generator)
@@ -49,7 +55,7 @@ def record_runs(count: int, seed: int) -> list[Run]:
     ]
 
 
-def distances(policy: torch.nn.Module, count: int, seed: int) -> list[float]:
+def distances(policy: Policy, count: int, seed: int) -> list[float]:
     """Return how far from its target the puck comes to rest, m, in hits of a policy that sees what is measured."""
     target, task, found = make_target(), PuckTask(), []
     generator = np.random.default_rng(seed)
@@ -62,9 +68,9 @@ def distances(policy: torch.nn.Module, count: int, seed: int) -> list[float]:
     return found
 
 
-def _played(motion: np.ndarray):
+def _played(motion: np.ndarray) -> Control:
     """A motion's targets ``(S, 7)`` one after the other, and the last one held."""
-    return lambda time, state: motion[min(round(time / 0.01), len(motion) - 1)]
+    return lambda time, state: motion[min(round(time / STEP), len(motion) - 1)]
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

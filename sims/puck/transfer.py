@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-from ..transfer import METHODS, Plan, Robot
+from ..transfer import METHODS, Plan, Robot, arm_effects
 from . import SIM
 from .target import ARM, TILT, TRUTH, distances, make_target, record_runs
 
 #: What the model lacks of the target, as far as effects can say it: all but the finer step.
-_EFFECTS = [
-    {"effect": "gravity_tilt", "roll": -TILT[0], "pitch": -TILT[1]},
-    *(
-        entry
-        for i, (dry, viscous) in enumerate(zip(ARM.dry, ARM.viscous, strict=True), 1)
-        for entry in (
-            {"effect": "joint_friction", "target": f"joint{i}", "friction": dry},
-            {"effect": "joint_damping", "target": f"joint{i}", "damping": viscous},
-            {"effect": "actuator_delay", "target": f"servo{i}", "delay": ARM.delay},
-        )
-    ),
-]
+_EFFECTS = [{"effect": "gravity_tilt", "roll": -TILT[0], "pitch": -TILT[1]}, *arm_effects(ARM, "servo")]
 #: SAC learns this bandit from a third of the hits that single-step PPO needs.
 _LEARNING = {"num_envs": 32, "warmup": 512, "updates_per_step": 1.0, "learning_rate": 1e-3, "hidden": [64, 64]}
 
@@ -39,7 +28,7 @@ ROBOT = Robot(
         train={**_LEARNING, "steps": 2016, "evaluations": 9, "episodes": 16},
     ),
     reduced=Plan(
-        seeds=1, methods=("own", "dropo", "udr", "plain"), boxes=1, runs=6, gap_seconds=30, samples=20,
-        algorithm="sac",         train={**_LEARNING, "steps": 96, "warmup": 32, "minibatch": 16, "evaluations": 2, "episodes": 4},
+        seeds=1, methods=("own", "dropo", "udr", "plain"), boxes=1, runs=6, gap_seconds=30, samples=20, algorithm="sac",
+        train={**_LEARNING, "steps": 96, "warmup": 32, "minibatch": 16, "evaluations": 2, "episodes": 4},
     ),
 )  # fmt: skip

@@ -13,9 +13,9 @@ import torch
 
 from dropo_torch.rl.policy import Policy
 
-from ..target import Arm, Run, Target, main_of
+from ..target import Arm, Control, Equipment, Run, Target, main_of
 from . import SIM
-from .policy import Pusher
+from .policy import Push, Pusher
 from .record import random_push
 from .task import PushTask
 
@@ -26,11 +26,13 @@ ARM = Arm(delay=0.008, dry=(0.8, 0.8, 0.6, 0.6, 0.3, 0.25, 0.2), viscous=(2.0, 2
 STICKS, FADES = 0.4, 0.12
 #: Commands of a push that is logged.
 STEPS = 45
+#: y of a box that no push meets, m.
+OUT_OF_REACH = 1.0
 
 
 def make_target() -> Target:
     """Return the target."""
-    return Target(SIM, TRUTH, ARM, law=_friction_by_speed)
+    return Target(SIM, TRUTH, ARM, Equipment(period=0.004), law=_friction_by_speed)
 
 
 def _friction_by_speed(model: mujoco.MjModel, data: mujoco.MjData) -> None:
@@ -40,16 +42,22 @@ def _friction_by_speed(model: mujoco.MjModel, data: mujoco.MjData) -> None:
     model.pair_friction[model.pair("table_box").id, :2] = more * np.array([TRUTH["friction_y"], TRUTH["friction_x"]])
 
 
-def record_runs(count: int, seed: int) -> list[Run]:
-    """Return pushes like those of the bundled log, whose commands follow the measured joints."""
+def record_runs(count: int, seed: int, *, alone: bool = False) -> list[Run]:
+    """Return pushes like those of the bundled log, by the measured joints; alone, the box is out of reach."""
     target, generator = make_target(), np.random.default_rng(seed)
     pusher, found = Pusher(target.model), []
     for _ in range(count):
         push, start = random_push(generator), np.concatenate([target.model.qpos0, np.zeros(target.model.nv)])
         start[:7] = pusher.start(push)
-        run = target.run(start, lambda time, state, p=push: pusher.velocities(state[:7], p, time), STEPS, generator)
-        found.append(run)
+        if alone:
+            start[8] = OUT_OF_REACH
+        found.append(target.run(start, _carried_out(pusher, push), STEPS, generator))
     return found
+
+
+def _carried_out(pusher: Pusher, push: Push) -> Control:
+    """Velocities that carry out a push, by the measured joints."""
+    return lambda time, state: pusher.velocities(state[:7], push, time)
 
 
 def distances(policy: Policy, count: int, seed: int) -> list[float]:
