@@ -267,7 +267,7 @@ def _turned(roll: float, pitch: float) -> np.ndarray:
     return found.reshape(3, 3)
 
 
-def main_of(
+def run_writer(
     about: str, target: Target, record: Callable[..., list[Run]], count: int, arguments: Sequence[str] | None
 ) -> None:
     """Write a raw log from the command line.

@@ -221,7 +221,7 @@ def _gap(cell: Cell, robot: Robot, plan: Plan, folder: Path, threads: int) -> di
     _write(folder / "arm.yaml", arm)
     _write(folder / "user.yaml", user)
     found["arm"] = _searched(folder, "arm", plan, threads)
-    _write(folder / "object.yaml", _with_arm(robot, user, folder / "arm-gap"))
+    _write(folder / "object.yaml", with_arm(robot, user, folder / "arm-gap"))
     found["object"] = _searched(folder, "object", plan, threads)
     return found
 
@@ -231,7 +231,7 @@ def _of_arm(specification: Mapping[str, Any]) -> bool:
     return str(specification.get("field", "")).startswith("actuator_")
 
 
-def _with_arm(robot: Robot, user: Mapping[str, Any], found: Path) -> dict[str, Any]:
+def with_arm(robot: Robot, user: Mapping[str, Any], found: Path) -> dict[str, Any]:
     """The user's config with the arm as it was found, whose numbers are fixed: only the object's are parameters."""
     if not (found / "model.xml").exists():
         return dict(user)

@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import copy
+import importlib.util
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
+import mujoco
 import numpy as np
 import pytest
 import torch
 import yaml
 from dropo_sims.puck.transfer import ROBOT as PUCK
 from dropo_sims.push.transfer import ROBOT as PUSH
-from dropo_sims.transfer import METHODS, Cell, Plan, all_cells
+from dropo_sims.target import log_config, write_raw
+from dropo_sims.transfer import METHODS, TOGETHER, Cell, Plan, Robot, all_cells, with_arm
 from dropo_sims.transfer_tables import LABELS, all_findings, distance_rows, draw_distances, interval, write_results
 
 from dropo_torch.config import make_config
 from dropo_torch.errors import InputError
+from dropo_torch.problem import make_problem
 from dropo_torch.rl.policy import load_policy
 from dropo_torch.rl.problem import make_training
 
@@ -127,6 +131,62 @@ def test_the_targets_own_model_moves_as_the_target_does(name: str) -> None:
         ends[what] = env.states[0, 7:9].numpy()
     off = {what: float(np.linalg.norm(end - run.final[7:9])) for what, end in ends.items()}
     assert off["own"] < 0.3 * off["model"]
+
+
+@each
+def test_the_arm_as_it_was_found_stays_while_the_object_is_searched(name: str, tmp_path: Path) -> None:
+    """The model has what MJCF can say, effects the rest; the step is the model's own, and only the object varies."""
+    robot, model = ROBOTS[name], mujoco.MjSpec.from_file(str(ROBOTS[name].sim.model))
+    model.option.timestep, model.option.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
+    model.joint("joint2").damping = np.array([3.5, 0, 0])
+    model.compile()
+    (tmp_path / "model.xml").write_text(model.to_xml())
+    drive = robot.make_target().model.actuator(1).name
+    effects = [
+        {"effect": "actuator_delay", "target": drive, "delay": 0.004},
+        {"effect": "joint_damping", "target": "joint2", "damping": 2.5},
+        {"effect": "integration", "timestep": 1e-4},
+    ]
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump({"effects": effects}))
+    log, user = tmp_path / "log.csv", {"sim": name, "observation": list(TOGETHER), "backend": "mujoco"}
+    write_raw(log, robot.make_target(), robot.record(1, 0)[:1])
+    document = with_arm(robot, {**user, "data": log_config(log, robot.start)}, tmp_path)
+    problem = make_problem(make_config(document))
+    assert problem.space.model.opt.timestep == bundled_model(robot).opt.timestep
+    assert problem.space.model.opt.integrator == bundled_model(robot).opt.integrator
+    assert problem.space.model.joint("joint2").damping[0] == 3.5
+    assert [e["effect"] for e in document["effects"]] == ["actuator_delay", "integration"]
+    assert {"mass", "friction_x", "friction_y"} < set(problem.space.names)
+    assert not any(n.startswith(("kp", "kd")) for n in problem.space.names)
+    assert make_training(make_config({**document, "distribution": "nominal"})).training.task.name == name
+    (tmp_path / "model.xml").unlink()
+    assert with_arm(robot, user, tmp_path) == user  # nothing had a name
+
+
+def bundled_model(robot: Robot) -> mujoco.MjModel:
+    return mujoco.MjModel.from_xml_path(str(robot.sim.model))
+
+
+def test_the_command_chooses_a_part(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path, given = Path(__file__).parents[1] / "examples" / "transfer_manipulation.py", {}
+    spec = importlib.util.spec_from_file_location("transfer_manipulation", path)
+    assert spec is not None and spec.loader is not None
+    example = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(example)
+    monkeypatch.setattr(Robot, "run", lambda self, out, **options: given.update(options, robot=self) or ["holds: it"])
+    example.main(["puck", "--out", str(tmp_path), "--seeds", "1", "--methods", "plain", "own", "--resume"])
+    assert given["plan"] == replace(PUCK.plan, seeds=1, methods=("own", "plain"))
+    assert given["robot"] == PUCK
+    assert given["resume"]
+    assert "holds: it" in capsys.readouterr().out
+    example.main(["push", "--out", str(tmp_path), "--reduced", "--boxes", "2"])
+    assert given["plan"] == replace(PUSH.reduced, boxes=2)
+    for wrong in (["--boxes", "0"], ["--methods", "magic"]):
+        with pytest.raises(SystemExit) as stop:
+            example.main(["push", "--out", str(tmp_path), *wrong])
+        assert stop.value.code == 2
 
 
 def test_a_small_study_runs_from_the_log_to_the_page_and_grows(tmp_path: Path) -> None:

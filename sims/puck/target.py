@@ -12,7 +12,7 @@ import torch
 
 from dropo_torch.rl.policy import Policy
 
-from ..target import Arm, Control, Run, Target, main_of
+from ..target import Arm, Control, Run, Target, run_writer
 from . import SIM
 from .generator import LATENT, STEPS, load_decoder
 from .policy import HOME, STEP
@@ -75,7 +75,7 @@ def _played(motion: np.ndarray) -> Control:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write a raw log from the command line."""
-    main_of("a stand-in for a real arm that hits a puck", make_target(), record_runs, 8, arguments)
+    run_writer("a stand-in for a real arm that hits a puck", make_target(), record_runs, 8, arguments)
 
 
 if __name__ == "__main__":

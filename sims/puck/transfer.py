@@ -24,7 +24,7 @@ ROBOT = Robot(
         "with finer steps, a board that is not level, friction and delay in the arm, and noise, outside the library."
     ),
     plan=Plan(
-        seeds=3, methods=METHODS, boxes=10, runs=8, gap_seconds=900, algorithm="sac",
+        seeds=3, methods=METHODS, boxes=10, runs=8, gap_seconds=1800, algorithm="sac",
         train={**_LEARNING, "steps": 2016, "evaluations": 9, "episodes": 16},
     ),
     reduced=Plan(

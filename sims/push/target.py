@@ -13,7 +13,7 @@ import torch
 
 from dropo_torch.rl.policy import Policy
 
-from ..target import Arm, Control, Equipment, Run, Target, main_of
+from ..target import Arm, Control, Equipment, Run, Target, run_writer
 from . import SIM
 from .policy import Push, Pusher
 from .record import random_push
@@ -77,7 +77,7 @@ def distances(policy: Policy, count: int, seed: int) -> list[float]:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Write a raw log from the command line."""
-    main_of("a stand-in for a real arm that pushes a box", make_target(), record_runs, 16, arguments)
+    run_writer("a stand-in for a real arm that pushes a box", make_target(), record_runs, 16, arguments)
 
 
 if __name__ == "__main__":
