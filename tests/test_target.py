@@ -197,6 +197,6 @@ def test_the_log_is_in_order_and_a_seed_decides_it(tmp_path: Path, raw: tuple[Pa
 def test_a_log_that_cannot_be_written_is_refused(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     for arguments in (["x.csv", "--runs", "0"], [str(tmp_path / "no" / "x.csv"), "--runs", "1"]):
         with pytest.raises(SystemExit) as stop:
-            run_writer("a test", Target(PUSH, {}, arm()), lambda count, seed: [], 1, arguments)
+            run_writer("a test", Target(PUSH, {}, arm()), lambda count, seed, alone: [], 1, arguments)
         assert stop.value.code == 2
         assert "error: " in capsys.readouterr().err

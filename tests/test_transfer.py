@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import importlib.util
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from dropo_sims import transfer
 from dropo_sims.puck.transfer import ROBOT as PUCK
 from dropo_sims.push.transfer import ROBOT as PUSH
 from dropo_sims.target import log_config, write_raw
@@ -20,6 +22,7 @@ from dropo_sims.transfer import METHODS, TOGETHER, Cell, Plan, Robot, all_cells,
 from dropo_sims.transfer_tables import LABELS, all_findings, distance_rows, draw_distances, interval, write_results
 
 from dropo_torch.config import make_config
+from dropo_torch.effects import VOCABULARY
 from dropo_torch.errors import InputError
 from dropo_torch.problem import make_problem
 from dropo_torch.rl.policy import load_policy
@@ -137,7 +140,8 @@ def test_the_targets_own_model_moves_as_the_target_does(name: str) -> None:
 def test_the_arm_as_it_was_found_stays_while_the_object_is_searched(name: str, tmp_path: Path) -> None:
     """The model has what MJCF can say, effects the rest; the step is the model's own, and only the object varies."""
     robot, model = ROBOTS[name], mujoco.MjSpec.from_file(str(ROBOTS[name].sim.model))
-    model.option.timestep, model.option.integrator = 1e-4, mujoco.mjtIntegrator.mjINT_RK4
+    finer = model.option.timestep / 4
+    model.option.timestep, model.option.integrator = finer, mujoco.mjtIntegrator.mjINT_RK4
     model.joint("joint2").damping = np.array([3.5, 0, 0])
     model.compile()
     (tmp_path / "model.xml").write_text(model.to_xml())
@@ -145,7 +149,7 @@ def test_the_arm_as_it_was_found_stays_while_the_object_is_searched(name: str, t
     effects = [
         {"effect": "actuator_delay", "target": drive, "delay": 0.004},
         {"effect": "joint_damping", "target": "joint2", "damping": 2.5},
-        {"effect": "integration", "timestep": 1e-4},
+        {"effect": "integration", "timestep": finer},
     ]
     (tmp_path / "config.yaml").write_text(yaml.safe_dump({"effects": effects}))
     log, user = tmp_path / "log.csv", {"sim": name, "observation": list(TOGETHER), "backend": "mujoco"}
@@ -172,7 +176,8 @@ def test_the_command_chooses_a_part(
 ) -> None:
     path, given = Path(__file__).parents[1] / "examples" / "transfer_manipulation.py", {}
     spec = importlib.util.spec_from_file_location("transfer_manipulation", path)
-    assert spec is not None and spec.loader is not None
+    assert spec is not None
+    assert spec.loader is not None
     example = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(example)
     monkeypatch.setattr(Robot, "run", lambda self, out, **options: given.update(options, robot=self) or ["holds: it"])
@@ -189,7 +194,9 @@ def test_the_command_chooses_a_part(
         assert stop.value.code == 2
 
 
-def test_a_small_study_runs_from_the_log_to_the_page_and_grows(tmp_path: Path) -> None:
+def test_a_small_study_runs_from_the_log_to_the_page_and_grows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    few = functools.partial(transfer.find_gap, effects=[VOCABULARY["actuator_delay"]])  # the whole takes minutes
+    monkeypatch.setattr(transfer, "find_gap", few)
     learning = {"steps": 512, "num_envs": 8, "horizon": 32, "evaluations": 1, "episodes": 2}
     plan = Plan(1, ("own", "dropo"), 1, runs=6, rollouts=2, gap_seconds=1, samples=10, train=learning, backend="mujoco")
     told: list[str] = []
