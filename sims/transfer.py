@@ -33,7 +33,7 @@ from dropo_torch.rl.problem import make_training
 from dropo_torch.rl.train import EvaluationPoint, TrainEntry, train
 from dropo_torch.studies.study import run_cells
 from dropo_torch.support.extras import require
-from dropo_torch.support.files import write_atomically
+from dropo_torch.support.files import write_atomically, write_json
 
 from .target import Arm, Run, Target, arm_config, log_config, write_raw
 from .transfer_tables import write_results
@@ -232,7 +232,13 @@ def _of_arm(specification: Mapping[str, Any]) -> bool:
 
 
 def with_arm(robot: Robot, user: Mapping[str, Any], found: Path) -> dict[str, Any]:
-    """The user's config with the arm as it was found, whose numbers are fixed: only the object's are parameters."""
+    """Return the user's config with the arm as it was found; only the object's numbers are parameters then.
+
+    Args:
+        robot: whose arm it is.
+        user: the config of the log with the object.
+        found: what was written of the arm's gap. Where that holds no model, the config is as it was.
+    """
     if not (found / "model.xml").exists():
         return dict(user)
     arm = yaml.safe_load((found / "config.yaml").read_text())
@@ -240,7 +246,7 @@ def with_arm(robot: Robot, user: Mapping[str, Any], found: Path) -> dict[str, An
     spec, model = mujoco.MjSpec.from_file(str(found / "model.xml")), load_model(robot.sim.model)
     spec.option.timestep, spec.option.integrator = model.opt.timestep, model.opt.integrator  # a finer one is an effect
     spec.compile()
-    (found / "arm.xml").write_text(spec.to_xml())
+    write_atomically(found / "arm.xml", spec.to_xml().encode())
     own = {
         "model": str((found / "arm.xml").resolve()), "task": robot.sim.name, "frame_skip": robot.sim.frame_skip,
         "parameters": {n: dict(s) for n, s in robot.sim.parameters.items() if not _of_arm(s)},
@@ -258,6 +264,7 @@ def _searched(folder: Path, kind: str, plan: Plan, threads: int) -> dict[str, An
     show = functools.partial(_stage, f"{folder.name} {kind}", [""])
     found = find_gap(problem, time_limit=plan.gap_seconds, report=show, **kept)
     notes = add(problem, found, out)
+    write_json(out / "gap.json", found.document())
     headline, items = answer(found)
     return {"check": findings, "answer": [headline, *items], "notes": notes, "gap": found.document()}
 
