@@ -152,9 +152,9 @@ WRONG_LINES: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown command": ("fitt CONFIG --out OUT", ("unknown command 'fitt'", "did you mean 'fit'")),
     "option before the command": (
         "--foo fit CONFIG --out OUT",
-        ("--foo", "demo, check, gap, fit, view, train, sweep-epsilon, compare"),
+        ("--foo", "demo, init, check, gap, fit, view, train, sweep-epsilon, compare"),
     ),
-    "no command": ("--foo", ("--foo", "demo, check, gap, fit, view, train, sweep-epsilon, compare")),
+    "no command": ("--foo", ("--foo", "demo, init, check, gap, fit, view, train, sweep-epsilon, compare")),
     "no config": ("fit --out OUT", ("CONFIG", "usage: dropo fit")),
     "no folder": ("fit CONFIG", ("--out", "usage: dropo fit")),
     "folder without value": ("fit CONFIG --out", ("--out: expected one argument",)),
