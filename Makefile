@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 WORKERS ?= 2
 PYTEST := $(BIN)/python -m pytest -n $(WORKERS) --dist worksteal
 
-.PHONY: demo check test coverage study-reduced test-slow fuzz lint format benchmarks clean
+.PHONY: demo check test docs coverage study-reduced test-slow fuzz lint format benchmarks clean
 
 demo: $(STAMP)
 	$(BIN)/dropo demo --out out/demo
@@ -32,6 +32,12 @@ study-reduced: $(STAMP)
 
 test-slow: $(STAMP)
 	$(BIN)/python -m pytest -m slow --durations=20
+
+# The documentation as a site, in out/site: a page that is wrong, and a notebook that does not run, end it.
+docs: $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python -m sphinx -W --keep-going -q -b html docs out/site
+	@echo "out/site/index.html"
 
 # Ten minutes on two processors; SEED=N for other mutations.
 SEED ?= 0

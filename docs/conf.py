@@ -1,13 +1,19 @@
 """The documentation as a site: ``make docs``. Pages are Markdown, the reference is made from docstrings."""
 
 import importlib.metadata
+import os
+import sys
+from pathlib import Path
 
 project = "dropo_torch"
 author = "the dropo_torch developers"
 copyright = "the dropo_torch developers, MIT license"
 version = release = importlib.metadata.version("dropo_torch")
 
-extensions = ["myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton"]
+extensions = [
+    "myst_nb", "sphinx.ext.autodoc", "sphinx.ext.autosummary", "sphinx.ext.napoleon", "sphinx_copybutton",
+    "sphinxcontrib.programoutput",
+]  # fmt: skip
 exclude_patterns = ["_build"]
 
 # Markdown and notebooks. Notebooks hold no results: they are run when the site is built.
@@ -24,7 +30,11 @@ autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 autodoc_typehints_description_target = "documented"
 napoleon_google_docstring = True
+napoleon_use_ivar = True
 napoleon_numpy_docstring = False
+
+# What `dropo COMMAND --help` prints is shown as it is now.
+os.environ |= {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "COLUMNS": "100"}
 
 html_theme = "furo"
 html_title = "dropo_torch"

@@ -120,7 +120,7 @@ def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     record_guided(steps=400).save(folder / "guided.npz")
     write_model(folder / "guided.xml")
     (folder / "cart.py").write_text(blocks(ROOT / "docs" / "adapters.md", "python")[0])
-    (folder / "robot.yaml").write_text(blocks(ROOT / "README.md", "yaml")[0])
+    (folder / "robot.yaml").write_text(blocks(ROOT / "docs" / "config.md", "yaml")[0])
     (folder / "out" / "policy").mkdir(parents=True)
     network = {"num_observations": 4, "num_actions": 2, "hidden": [4], "head": "tanh", "activation": "relu"}
     Policy(network).save(folder / "out" / "policy" / "policy.pt")
@@ -249,7 +249,7 @@ def test_python_runs(page: Path, robot: Path, tmp_path: Path, monkeypatch: pytes
         exec(compile(text, page.name, "exec"), names)
 
 
-def test_readme_config_is_fitted_by_its_command(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+def test_shortest_config_is_fitted_by_its_command(robot: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     out = tmp_path / "out"
     assert cli.main(["fit", str(robot / "robot.yaml"), "--out", str(out), "--samples", "10", "--threads", "1"]) == 0
     written = {p.name for p in out.iterdir()}
