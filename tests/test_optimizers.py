@@ -30,11 +30,10 @@ from dropo_torch.baselines.udr import UdrOptimizer
 from dropo_torch.data.observation import parse_observation
 from dropo_torch.data.trajectory import Replay
 from dropo_torch.distribution import to_values, truncated_interval, truncated_moments
-from dropo_torch.fit import answer, fit, noise_of
-from dropo_torch.likelihood import gaussian_log_density, student_log_density
+from dropo_torch.fit import fit
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers import AdamSettings, CMAOptimizer, FisherOptimizer, FitSettings, Optimizer, make_optimizer
-from dropo_torch.optimizers.gauss_newton import MeansStage, normal_equations
+from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.sampled import SampledStage
 from dropo_torch.optimizers.sigma_points import SigmaPointStage
 from dropo_torch.parameters import ParameterSpace
@@ -493,33 +492,3 @@ def test_a_fit_resumed_from_any_checkpoint_is_the_fit_never_interrupted(tmp_path
             assert getattr(again, key) == getattr(whole, key), key
         np.testing.assert_array_equal(again.distribution.mean, whole.distribution.mean)
         np.testing.assert_array_equal(again.distribution.std, whole.distribution.std)
-
-
-def test_beside_noise_each_mean_is_judged_by_its_own_covariance():
-    objective = linear_problem(40, noise=0.05).objective()
-    search = make_optimizer(objective, FitSettings(samples=10))
-    own = []
-    while search.stop_reason is None:
-        request = search.ask()
-        if not request.widen:
-            own.append(request)
-            np.testing.assert_array_equal(objective.box.values(request.linearise_at[None])[0], request.values[0])
-        search.tell(answer(objective, request, noise_of(objective, request)).total)
-    assert len(own) > 1
-    mean, std = search.candidates()[-1]  # without σ, beside what the scoring finds
-    np.testing.assert_array_equal(std, objective.box.min_std)
-    assert any(np.array_equal(mean, request.linearise_at) for request in own)
-
-
-def test_with_the_volume_a_cost_is_a_likelihood():
-    generator = torch.Generator().manual_seed(0)
-    draw = lambda *shape: torch.randn(*shape, generator=generator, dtype=torch.float64)  # noqa: E731
-    features, measured, half, steps = draw(7, 3, 4), draw(7, 4), draw(7, 4, 4), torch.full((2,), 0.1).double()
-    first, second = (scale * (half @ half.mT + torch.eye(4)) for scale in (1.0, 3.0))
-    for robust, density in ((False, gaussian_log_density), (True, student_log_density)):
-        costs, values = zip(*(
-            (float(normal_equations(features, measured, c, steps, robust, volume=True)[0]),
-             float(density(measured - features[:, 0], c).sum()))
-            for c in (first, second)
-        ), strict=True)  # fmt: skip
-        assert costs[0] - costs[1] == pytest.approx(values[1] - values[0], rel=1e-9)

@@ -11,13 +11,9 @@ from dropo_torch.diagnostics import estimates
 from dropo_torch.distribution import Distribution
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
+from dropo_torch.optimizers.fisher import AT_REST, NOISY_ROUNDS
 from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.parameters import ParameterSpace
-
-#: Refits of a log with uncertain initial states, each around their noise propagated at the last fit.
-NOISY_ROUNDS = 6
-#: The means have converged when no refit moves them by more than this share of their box.
-AT_REST = 1e-3
 
 
 class LaplaceOptimizer(Optimizer):

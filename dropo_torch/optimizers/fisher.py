@@ -17,10 +17,12 @@ from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.optimizers.sigma_points import SigmaPointStage
 from dropo_torch.support.random import stratified_uniforms
 
-#: Iterations of the means that may gain little; and of those in which each candidate has its own noise.
-PATIENCE, NOISY_PATIENCE = 8, 4
-#: Standard errors by which residuals must exceed what the noise explains for σ to begin above its floor.
-SIGNIFICANCE = 2.0
+#: Refits of a log with uncertain initial states, each around their noise propagated at the last fit.
+NOISY_ROUNDS = 6
+#: The means have converged when no refit moves them by more than this share of their box.
+AT_REST = 1e-3
+#: Iterations of the means that may gain little.
+PATIENCE = 8
 #: Change of σ, as a share of it or of 1/20 of the search width, below which it has converged; and how often it is
 #: fitted anew.
 CONVERGED = 0.1
@@ -30,9 +32,9 @@ SPREAD_ROUNDS = 3
 class FisherOptimizer(LikelihoodOptimizer):
     """Gauss-Newton on μ, then Fisher scoring on (μ, log σ); the default.
 
-    On a log whose initial states are noisy, the noise is propagated anew at each μ: beside contacts, what it does to
-    the next state depends on μ as much as the next state itself. The scoring works on the covariance at the last one.
-    Where the simulation bends within the distribution, it goes on over ``samples`` samples.
+    On a log whose initial states are noisy, the noise is propagated at the current μ and the means are
+    refitted until convergence; the scoring then works on that covariance. Where the
+    simulation bends within the distribution, the scoring goes on over ``samples`` samples.
 
     With ``entropy`` β, the scoring maximises the log-likelihood plus β Σ log σ: the entropy of p_φ but for a
     constant, as in E-DROPO (arXiv 2506.10133). It keeps σ open where the log alone would close it.
@@ -43,33 +45,28 @@ class FisherOptimizer(LikelihoodOptimizer):
     """
 
     name = "fisher"
-    STATE: ClassVar[tuple[str, ...]] = ("_means", "_scoring", "_linearised", "_explained", "_spread_round")
+    STATE: ClassVar[tuple[str, ...]] = ("_means", "_scoring", "_round", "_linearised", "_explained", "_spread_round")
     KINDS = (MeansStage, SigmaPointStage, SampledStage)
 
     def __init__(self, objective: Objective, settings: FitSettings) -> None:
         super().__init__(objective, settings)
         self._uniforms = stratified_uniforms(settings.samples, len(self._space), settings.seed, 2)
-        # where the means gain little, σ has to explain what is left, and the scoring moves both
-        self._means = MeansStage(
-            self._box.low, self._box.high, self._box.middle, robust=True, volume=self._noisy,
-            patience=NOISY_PATIENCE if self._noisy else PATIENCE,
-        )  # fmt: skip
+        self._means = self._means_from(self._box.middle)
         self._scoring: SigmaPointStage | SampledStage | None = None
-        self._linearised: np.ndarray | None = None
+        self._round = 0
+        self._linearised: np.ndarray | None = self._means.point if self._noisy else None
         self._explained: np.ndarray | None = None  # σ of the last round, which no window need be widened for
         self._spread_round = 0
 
     def ask(self) -> Request:
         """Return the points of the stage at work."""
         stage = self._scoring or self._means
-        own = stage is self._means and self._noisy
         return Request(
             values=self._box.values(stage.points()),
             reduce=stage.reduction(),
             evaluations=1,
-            linearise_at=self._means.center if own else self._linearised,
+            linearise_at=self._linearised,
             linearise_std=self._explained,
-            widen=not own,
             is_stencil=stage is self._means,
         )
 
@@ -100,22 +97,30 @@ class FisherOptimizer(LikelihoodOptimizer):
         if self._scoring is not None:
             share = self._scoring.BEGUN_AT + 0.3 * min(1.0, self._scoring.iterations / 10)
             return Progress(self._scoring.TITLE, self._scoring.log_likelihood, share)
-        share = 0.4 * min(1.0, self._means.iterations / 10)
+        done = self._round / (NOISY_ROUNDS + 1) if self._noisy else 0.0
+        share = 0.4 * (done + (1 - done) * min(1.0, self._means.iterations / 10))
         return Progress("Gauss-Newton on the means", math.nan, share)
 
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Return the φ at which the last stage stopped, and where initial states are noisy the means alone, too."""
-        means, stage = (self._means.point, self._box.min_std), self._scoring
-        if stage is None:
-            return [means]
-        return [(stage.mean, stage.std), *([means] if self._noisy else [])]
+        """Return the φ at which the last stage stopped."""
+        stage = self._scoring
+        return [(self._means.point, self._box.min_std) if stage is None else (stage.mean, stage.std)]
+
+    def _means_from(self, point: np.ndarray) -> MeansStage:
+        """The stage of the means; where they gain little, σ has to explain what is left, and the scoring moves both."""
+        return MeansStage(self._box.low, self._box.high, point, robust=True, patience=PATIENCE)
 
     def _after_means(self) -> None:
-        """Go on to σ, around the noise propagated at the means where there is any."""
-        if self._noisy:
-            self._linearised = self._means.point
-        first = self._means.first_std(self._box, SIGNIFICANCE if self._noisy else 0.0)
-        self._scoring = SigmaPointStage(self._box, self._means.point, first)
+        """Refit the means around the noise propagated at them until convergence, then go on to σ."""
+        point, before = self._means.point, self._linearised
+        if before is not None:
+            self._linearised = point
+            converged = bool((np.abs(point - before) <= AT_REST * self._box.width).all())
+            if self._round < NOISY_ROUNDS and not converged:
+                self._round += 1
+                self._means = self._means_from(point)
+                return
+        self._scoring = SigmaPointStage(self._box, point, self._means.first_std(self._box))
 
     def _refit_if_moved(self, stage: Ascent) -> None:
         """Refit around noise whose windows are widened for what σ does not explain either, until σ has converged.

@@ -22,8 +22,6 @@ MAX_ITERATIONS = 40
 LEAST_RAISED = 1e-3
 #: Share by which the cost must fall for the patience of a stage to begin anew.
 NOTABLE = 0.01
-#: The same where the cost is a likelihood's, in nats.
-NOTABLE_NATS = 0.5
 #: Points spread over the box from which to begin where the first one loses transitions.
 STARTS = 16
 
@@ -40,7 +38,6 @@ class MeansStage:
         robust: whether the log-density is Student's t: beside a few transitions with an impact, which a wrong μ misses
             by orders of magnitude, the many smooth ones that lead to the right one would not count.
         patience: iterations after which it ends, if they have not made the cost notably smaller.
-        volume: whether ½ Σ log |C| is part of the cost, so that candidates with a C of their own can be compared.
         cost: ½ Σ rᵀC⁻¹r at ``point``, over the transitions that do not diverge there.
         lost: how many do; no cost outweighs one.
         starts: other points to try before any step, the next one last, ``(d,)`` each.
@@ -54,7 +51,6 @@ class MeansStage:
     shape: tuple[int, int] | None = None
     robust: bool = False
     patience: int = MAX_ITERATIONS
-    volume: bool = False
     damping: float = 1e-3
     cost: float = np.inf
     lost: float = np.inf
@@ -71,12 +67,11 @@ class MeansStage:
 
     def points(self) -> np.ndarray:
         """Return the stencil of the candidate: itself, then one moved point a parameter, ``(d + 1, d)``."""
-        return np.concatenate([self.center[None], self.center + np.diag(self.steps)])
+        return np.concatenate([self._center[None], self._center + np.diag(self.steps)])
 
     def reduction(self) -> Reduce:
         """Return the reduction to cost, losses, normal equations and moments, ``(2 + 2d + 2d²,)``."""
-        steps = torch.from_numpy(self.steps)
-        return partial(normal_equations, steps=steps, robust=self.robust, volume=self.volume)
+        return partial(normal_equations, steps=torch.from_numpy(self.steps), robust=self.robust)
 
     def tell(self, sums: torch.Tensor) -> None:
         """Accept or reject the candidate, and propose the next one.
@@ -85,7 +80,7 @@ class MeansStage:
         """
         d = len(self.low)
         cost, lost = float(sums[0]), float(sums[1])
-        step = np.inf if self.candidate is None else float(np.max(np.abs(self.center - self.point) / self._width))
+        step = np.inf if self.candidate is None else float(np.max(np.abs(self._center - self.point) / self._width))
         tries_starts = bool(self.starts)
         if self.candidate is None:
             self.starts = self._spread() if lost else []
@@ -93,7 +88,7 @@ class MeansStage:
             self.starts.pop()
         if np.isfinite(cost) and (lost, cost) < (self.lost, self.cost):
             gain = self.cost - cost if lost == self.lost else np.inf
-            self.point = self.center
+            self.point = self._center
             self.cost, self.lost = cost, lost
             self.gradient, self.excess = sums[2 : 2 + 2 * d].numpy().reshape(2, d).copy()
             self.hessian, self.squares = sums[2 + 2 * d :].numpy().reshape(2, d, d).copy()
@@ -123,7 +118,7 @@ class MeansStage:
     def _wait(self, iterations: int) -> None:
         """Count iterations, and those since the cost became notably smaller."""
         self.iterations += iterations
-        if self.cost < (self.mark - NOTABLE_NATS if self.volume else (1 - NOTABLE) * self.mark):
+        if self.cost < (1 - NOTABLE) * self.mark:
             self.mark, self.idle = self.cost, 0
         else:
             self.idle += iterations
@@ -162,21 +157,20 @@ class MeansStage:
         return self.high - self.low
 
     @property
-    def center(self) -> np.ndarray:
-        """The candidate that is evaluated next, or the point itself before there is one, ``(d,)``."""
+    def _center(self) -> np.ndarray:
+        """The candidate, or the point itself before there is one, ``(d,)``."""
         return self.point if self.candidate is None else self.candidate
 
     @property
     def steps(self) -> np.ndarray:
         """Signed steps of the candidate's differences, which stay inside the box, ``(d,)``."""
         step = DIFFERENCE_STEP * self._width
-        return np.where(self.center + step > self.high, -step, step)
+        return np.where(self._center + step > self.high, -step, step)
 
 
 def normal_equations(
-    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor,
-    robust: bool = False, volume: bool = False,
-) -> torch.Tensor:  # fmt: skip
+    features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor, steps: torch.Tensor, robust: bool = False
+) -> torch.Tensor:
     """Return cost, gradient and Gauss-Newton matrix of ½ Σ rᵀC⁻¹r, and two moments for σ, ``(2 + 2d + 2d²,)``.
 
     The robust cost is ½ (ν + m) Σ log(1 + rᵀC⁻¹r / ν), whose matrix is that of the reweighted squares.
@@ -189,7 +183,6 @@ def normal_equations(
         covariance: ``(t, m, m)``.
         steps: ``(d,)``.
         robust: whether the cost is the robust one.
-        volume: whether ½ Σ log |C| is added to the cost.
     """
     base, moved = features[:, 0], features[:, 1:]
     alive = torch.isfinite(base).all(-1)
@@ -206,8 +199,6 @@ def normal_equations(
         freedom = STUDENT_DOF + white.shape[1]
         cost = 0.5 * freedom * torch.log1p(chi2 / STUDENT_DOF).sum()
         white = white * (freedom / (STUDENT_DOF + chi2)).sqrt()[:, None, None]
-    if volume:
-        cost = cost + torch.diagonal(factor, dim1=-2, dim2=-1)[alive].log().sum()
     r, jac = white[..., 0], white[..., 1:]
     gradient = -(jac * r[..., None]).sum((0, 1))
     flat = jac.flatten(0, 1)
