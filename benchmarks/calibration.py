@@ -124,7 +124,7 @@ def fit_all(
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Fit every cell, with its progress, and return all results; what is wrong ends the command in one line."""
     for name in ("logs", "transitions", "workers"):
-        if (number := getattr(given, name)) < 1:
+        if (number := getattr(given, name, 1)) < 1:
             parser.error(f"--{name} {number}: expected 1 or more")
     try:
         return run_cells(

@@ -124,7 +124,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--workers", type=int, default=1, help="logs at a time")
     parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
     given = parser.parse_args(arguments)
-    given.transitions = 1
     plan = Plan(given.seed)
     cells = [CalibrationCell("fixed", sim, n) for sim in given.sims for n in range(given.logs)]
     found = calibration.fit_all(parser, given, plan, cells, functools.partial(fit_cell, plan=plan))
