@@ -38,10 +38,10 @@ from dropo_torch.support.files import write_atomically, write_json
 from .target import Arm, Run, Target, arm_config, log_config, write_raw
 from .transfer_tables import write_results
 
-#: What the logs' columns are, of the arm alone and with the object. That lies flat: how high it is, and how it moves up
-#: or tips, is measured less well than the model knows it.
+#: What the logs' columns are, of the arm alone and with the object. That lies on the table: how high it is, and how it
+#: moves up, is measured less well than the model knows it.
 ALONE = ("qpos[0:7]", "qvel[0:7]")
-TOGETHER = ("qpos[0:9]", "skip", "qpos[10:14]", "qvel[0:9]", "skip[3]", "qvel[12]")
+TOGETHER = ("qpos[0:9]", "skip", "qpos[10:14]", "qvel[0:9]", "skip", "qvel[10:13]")
 #: Where the part of a log of the arm alone that is used begins, s.
 FIRST = 0.06
 

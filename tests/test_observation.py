@@ -161,3 +161,6 @@ def test_joints_whose_velocity_is_not_observed_start_at_rest() -> None:
     assert parse_observation(ARM, ["qpos", f"{last}.velocity"]).at_rest[0] == first
     assert last not in parse_observation(ARM, ["qpos", f"{last}.velocity"]).at_rest
     assert parse_observation(BOX, ["root.position", "qvel[0:5]"]).at_rest == ("root",)
+    assert parse_observation(BOX, ["qpos[0:2]", "qpos[3:7]", "qvel[0:2]", "qvel[3:6]"]).at_rest == ()  # it lies flat
+    assert parse_observation(BOX, ["qpos[0:3]", "qvel[0:2]"]).at_rest == ("root",)
+    assert parse_observation(BOX, ["qpos[0:2]", "qvel[0:2]"]).at_rest == ()

@@ -76,7 +76,8 @@ class Observation:
         default_state: the state of what is not observed, ``(nq + nv,)``: the model's ``qpos0`` and zero.
         units: for each observed column ``"m"``, ``"rad"``, ``"m/s"``, ``"rad/s"`` or ``"-"``.
         quaternions: observed columns of each complete quaternion, a tuple of four each.
-        at_rest: joints whose position is observed and whose velocity is not: every window starts with them at rest.
+        at_rest: joints with a position that is observed and whose velocity is not: every window starts with that at
+            rest.
         reckoned: positions that are not observed, with their velocities, which are. Such a position is where its
             velocity has led since the episode's start, where it had its default.
     """
@@ -211,11 +212,7 @@ def parse_observation(
         default_state=tuple(default.tolist()),
         units=tuple(about[c][1] for c in columns),
         quaternions=_complete_quaternions(joints, columns),
-        at_rest=tuple(
-            joint.name
-            for joint in joints
-            if not joint.positions.keys().isdisjoint(columns) and not joint.velocities.keys() <= set(columns)
-        ),
+        at_rest=tuple(joint.name for joint in joints if _is_at_rest(joint, set(columns))),
         reckoned=_reckoned(model, joints, columns),
     )
 
@@ -247,6 +244,16 @@ def _joints(model: mujoco.MjModel) -> list[_Joint]:
         place = columns(f"{name}.position", positions, int(model.jnt_qposadr[j]))
         found.append(_Joint(name, place, columns(f"{name}.velocity", velocities, model.nq + int(model.jnt_dofadr[j]))))
     return found
+
+
+def _is_at_rest(joint: _Joint, columns: set[int]) -> bool:
+    """Whether a position of a joint is observed and its velocity is not; a quaternion's is that about three axes."""
+    positions, velocities = list(joint.positions), list(joint.velocities)
+    turned = positions[-4:] if len(positions) >= 4 else []
+    pairs = [([p], [v]) for p, v in zip(positions[: len(positions) - len(turned)], velocities, strict=False)]
+    if turned:
+        pairs.append((turned, velocities[-3:]))
+    return any(not columns.isdisjoint(own) and not columns.issuperset(rates) for own, rates in pairs)
 
 
 def _reckoned(model: mujoco.MjModel, joints: Sequence[_Joint], columns: Sequence[int]) -> tuple[Reckoned, ...]:
