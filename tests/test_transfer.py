@@ -204,7 +204,7 @@ def test_a_small_study_runs_from_the_log_to_the_page_and_grows(tmp_path: Path, m
     page = tmp_path / "out" / "tables.md"
     assert "DROPO" in page.read_text()
     assert yaml.safe_load((tmp_path / "out" / "seed0" / "user.yaml").read_text())["sim"] == "push"
-    assert load_policy(tmp_path / "out" / "seed0" / "own.pt").num_actions == 7
+    assert len(load_policy(tmp_path / "out" / "seed0" / "own.pt").low) == 7
     with pytest.raises(InputError, match="add --resume"):
         PUSH.run(tmp_path / "out", plan=plan)
     kept = {p: p.stat().st_mtime_ns for p in (tmp_path / "out" / "cells").iterdir()}
