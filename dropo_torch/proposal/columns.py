@@ -14,6 +14,7 @@ from dropo_torch.data.formats import open_tables
 from dropo_torch.data.tables import Table, missing, numbers
 from dropo_torch.errors import InputError
 from dropo_torch.proposal.words import Words, read_name
+from dropo_torch.support.given import MOST_TEXT
 
 #: Columns of a matrix beyond which it is a picture or a cloud of points, and no state.
 WIDEST = 200
@@ -104,14 +105,9 @@ def read_columns(path: str | Path) -> Columns:
     Raises:
         InputError: a file that cannot be read, or in which nothing has a row a sample.
     """
-    path, separator = Path(path), None
-    try:
-        tables = open_tables(path)
-    except InputError as error:
-        if "separator" not in str(error):
-            raise
-        separator = next(mark for mark in (";", "\t", ",") if repr(mark) in str(error))
-        tables = open_tables(path, separator=separator)
+    path = Path(path)
+    separator = _separator(path)
+    tables = open_tables(path, separator=separator)
     group = _group(tables[0].names)
     if group is not None:
         tables = open_tables(path, group=group)
@@ -122,6 +118,15 @@ def read_columns(path: str | Path) -> Columns:
     if not joined:
         raise InputError(f"{path}: nothing in it has a number a sample; expected columns of positions and commands")
     return Columns(path, str(path), tuple(joined), tuple(int(s) for s in starts), group, separator)
+
+
+def _separator(path: Path) -> str | None:
+    """What separates the columns of a text file, where its header has no comma; ``None`` for what readers expect."""
+    if path.suffix.lower() not in (".csv", ".txt") or not path.is_file():
+        return None
+    with path.open("rb") as file:
+        header = file.readline(MOST_TEXT).decode("utf-8-sig", errors="replace")
+    return next((mark for mark in (";", "\t") if mark in header and "," not in header), None)
 
 
 def _of_table(table: Table) -> list[Column]:
