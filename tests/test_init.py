@@ -186,6 +186,18 @@ def test_of_two_that_are_tied_the_one_that_models_have_right_goes() -> None:
     assert tied.with_ == (("a", pytest.approx(1.0, rel=1e-2)),)
 
 
+def test_a_scale_common_to_all_is_no_information() -> None:
+    """Masses and gains times one factor move nothing; differences of a step make it seem to move a little."""
+    rng = np.random.default_rng(2)
+    matrix = 300 * rng.standard_normal((200, 6))
+    matrix[:, 5] = -matrix[:, :5].sum(1) + 0.02 * rng.standard_normal(200)
+    names = [candidate(f"mass{i}") for i in range(5)] + [candidate("gain", "gain")]
+    found = choose(names, matrix.T @ matrix)
+    assert [t.candidate.name for t in found.told if not t.is_in] == ["gain"]
+    (group,) = found.groups
+    assert (len(group.names), len(group.directions)) == (6, 5)
+
+
 def test_nothing_is_left_out_that_is_told() -> None:
     rng = np.random.default_rng(1)
     for _ in range(20):

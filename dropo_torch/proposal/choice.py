@@ -27,8 +27,9 @@ WEIGHT, NAMED = 0.1, 4
 OFF = 0.3
 #: Standard error, in sizes, beyond which one is as bad as another: readiness alone then says what goes.
 LOST = 1.0
-#: What is not told at all counts as known to so many sizes.
-PRIOR = 30.0
+#: Share of what parameters do by themselves, squared, that a combination of them must do to count: differences are
+#: no more exact, nor are models. A scale common to all masses and gains does nothing, and would seem to do a little.
+ACCURACY, NOTHING = 1e-6, 1e-12
 
 
 @dataclass(frozen=True)
@@ -147,11 +148,23 @@ def choose(candidates: Sequence[Candidate], gram: np.ndarray, forced: Sequence[s
 
 
 def _errors(gram: np.ndarray, kept: Sequence[int]) -> np.ndarray:
-    """Standard errors of some candidates, fitted together, in their sizes."""
-    part = gram[np.ix_(kept, kept)] + np.eye(len(kept)) / PRIOR**2
-    scale = np.sqrt(np.diag(part))
-    inverse = np.linalg.pinv(part / np.outer(scale, scale), rcond=1e-13, hermitian=True)
-    return np.asarray(np.sqrt(np.maximum(np.diag(inverse), 1e-300)) / scale)
+    """Standard errors of some candidates, fitted together, in their sizes; infinite along what does nothing."""
+    scale, values, vectors = _normalised(gram[np.ix_(kept, kept)])
+    variance = (vectors**2) @ (1 / np.where(values > ACCURACY, values, NOTHING))
+    return np.asarray(np.sqrt(variance) / scale)
+
+
+def _normalised(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Scales with which an information matrix has a diagonal of 1, and its eigenvalues and vectors then."""
+    scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
+    return (scale, *np.linalg.eigh(part / np.outer(scale, scale)))
+
+
+def _inverse(part: np.ndarray) -> np.ndarray:
+    """The inverse of an information matrix, without what does nothing."""
+    scale, values, vectors = _normalised(part)
+    known = values > ACCURACY
+    return np.asarray((vectors[:, known] / values[known]) @ vectors[:, known].T / np.outer(scale, scale))
 
 
 def _eliminated(gram: np.ndarray, ready: np.ndarray, kept: list[int]) -> list[int]:
@@ -179,8 +192,7 @@ def _confused(gram: np.ndarray, kept: Sequence[int], left: Sequence[int]) -> dic
     if not kept:
         return found
     part = gram[np.ix_(kept, kept)]
-    scale = np.sqrt(np.diag(part))
-    inverse = np.linalg.pinv(part / np.outer(scale, scale), rcond=1e-12, hermitian=True) / np.outer(scale, scale)
+    inverse = _inverse(part)
     for i in left:
         weights = inverse @ gram[kept, i]
         explained = float(weights @ part @ weights) / float(gram[i, i])
@@ -214,7 +226,7 @@ def _group(candidates: Sequence[Candidate], gram: np.ndarray, members: list[int]
     block = gram[np.ix_(members, members)]
     if rest:
         across = gram[np.ix_(members, rest)]
-        block = block - across @ np.linalg.pinv(gram[np.ix_(rest, rest)], rcond=1e-12, hermitian=True) @ across.T
+        block = block - across @ _inverse(gram[np.ix_(rest, rest)]) @ across.T
     values, vectors = np.linalg.eigh(block)
     found = []
     for value, vector in zip(values[::-1], vectors.T[::-1], strict=True):

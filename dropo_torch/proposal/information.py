@@ -32,7 +32,7 @@ LAGS, LONGEST = (1, 2, 4, 8, 16, 32), 1.0
 #: Microseconds of simulation for one length of windows, about, and logged steps at least and at most.
 BUDGET, FEWEST, MOST = 1e6, 150, 3000
 #: Step of the differences, as a share of a candidate's bounds.
-STEP = 1e-4
+STEP = 1e-5
 #: Standard errors, in sizes of candidates, below which more does not count when the length of windows is chosen.
 FINE = 0.005
 #: Nats for each direction that a longer window must gain.
