@@ -346,3 +346,51 @@ def test_an_interactive_run_takes_corrections(
     document = yaml.safe_load(path.read_text())
     assert document["data"]["observations"][1] == "colour"
     assert "pole_centre_x" not in document["parameters"]
+
+
+# --- logs whose signals have names, and stamps, of their own ---
+
+
+def test_a_bag_tells_joints_by_name_and_commands_by_receipt(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    pytest.importorskip("rosbags")
+    import bags
+
+    t, q, v, u = log
+    made = bags.Messages()
+    rows = {float(time): row for row, time in enumerate(t)}
+
+    def state(time: float) -> object:
+        row = rows[time]
+        names, order = ["hinge", "slider"], [1, 0]
+        return made.joint_state(bags.START + time, names, q[row][order], v[row][order])
+
+    sent = bags.sent("/joint_states", "sensor_msgs/msg/JointState", rows, state)
+    sent += bags.sent("/push_controller/commands", "std_msgs/msg/Float64MultiArray", rows,
+                      lambda time: made.numbers(u[rows[time]]), late=0.0)  # fmt: skip
+    bag = bags.write(tmp_path / "log", sent)
+    (tmp_path / "robot.xml").write_text(CARTPOLE)
+    found = dropo.propose_config(tmp_path / "robot.xml", bag, out=tmp_path / "robot.yaml")
+    data = found.document["data"]
+    assert data["observations"] == [
+        "/joint_states.position[slider]", "/joint_states.position[hinge]", "/joint_states.velocity[slider]",
+        "/joint_states.velocity[hinge]",
+    ]  # fmt: skip
+    assert data["actions"] == ["/push_controller/commands.data[0]"]
+    assert data["stamps"] == {"/push_controller/commands": "received"}
+    assert data["preprocess"]["dt"] == pytest.approx(0.02)
+    assert len(dropo.make_problem(found.config).trajectories) > 300
+
+
+def test_columns_of_a_dataset_have_names(tmp_path: Path) -> None:
+    from test_readers import write_lerobot
+
+    folder, _ = write_lerobot(tmp_path)
+    columns = read_columns(folder)
+    known = {c.entry: c.words for c in columns.columns}
+    assert known["observation.state[elbow.pos]"].role == "position"
+    assert known["observation.state[elbow.vel]"].objects == ("elbow",)
+    clock = find_clock(columns, 0.005)
+    assert clock.column is not None
+    assert clock.column.entry == "timestamp"
+    assert clock.episode is not None
+    assert clock.episode.entry == "episode_index"

@@ -107,6 +107,14 @@ def open_bag(path: Path, stamps: Any) -> list[Table]:
     return [Table(str(path), tuple(names), _unread, choose=partial(choose, bag))]
 
 
+def unstamped(path: Path) -> dict[str, str]:
+    """Return the topics of a bag whose messages have no header, as ``stamps`` takes them: by their receipt."""
+    with _opened(path) as reader:
+        types = reader.typestore.fielddefs
+        fields = {name: types.get(str(info.msgtype), ((), ()))[1] for name, info in reader.topics.items()}
+    return {name: RECEIVED for name, of in fields.items() if of and all(label != "header" for label, _ in of)}
+
+
 def choose(bag: Bag, choice: Choice) -> Table:
     """Return the fields that some entries name, with a row for every time stamp.
 
@@ -168,7 +176,7 @@ class _Field:
             raise InputError(f"{where} has {lengths[0]} numbers in some messages and {lengths[-1]} in others")
         if "" in wanted:
             meant = choice.joints if self.keyed else ()
-            if self.keyed and not meant and len(labels) > 1:
+            if self.keyed and not meant and len(labels) > 1 and not choice.every:
                 raise InputError(
                     f"{where} has {len(labels)} columns in the sender's order; say which, in the model's order, with "
                     f"joints: [NAME, ...] or {name}[NAME, ...] (there are: {', '.join(labels[:20])})"

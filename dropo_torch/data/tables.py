@@ -59,11 +59,13 @@ class Choice:
         entries: what column maps name, with indices.
         joints: the joints that are meant where an entry names none.
         missing_allowed: whether NaN counts as no sample.
+        every: whether all joints are meant where neither does.
     """
 
     entries: tuple[str, ...]
     joints: tuple[str, ...] = ()
     missing_allowed: bool = False
+    every: bool = False
 
 
 @dataclass(frozen=True)

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import re
 from collections import Counter
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dropo_torch.data.bags import unstamped
 from dropo_torch.data.formats import open_tables
-from dropo_torch.data.tables import Table, missing, numbers
+from dropo_torch.data.streams import TIME
+from dropo_torch.data.tables import Choice, Table, missing, numbers
 from dropo_torch.errors import InputError
 from dropo_torch.proposal.words import Words, read_name
 from dropo_torch.support.given import MOST_TEXT
@@ -35,6 +39,7 @@ class Column:
         labels: what it holds as it stands, ``(N,)``.
         transposed: whether the array holds a sample in each column.
         words: what its name says.
+        label: what the file calls it in its array; empty where that has no names.
     """
 
     entry: str
@@ -44,6 +49,7 @@ class Column:
     labels: np.ndarray
     transposed: bool
     words: Words
+    label: str = ""
 
     @property
     def moves(self) -> bool:
@@ -68,6 +74,9 @@ class Columns:
         parts: first row of each part that the file itself keeps apart, such as HDF5 groups.
         group: pattern of these, as a config has it.
         separator: of a text file, where it is no comma.
+        stamps: of a bag, as a config has them.
+        apart: seconds between samples of the fastest signal, where each has time stamps of its own: columns are then
+            interpolated at that one's.
     """
 
     path: Path
@@ -76,6 +85,8 @@ class Columns:
     parts: tuple[int, ...] = (0,)
     group: str | None = None
     separator: str | None = None
+    stamps: Mapping[str, str] = field(default_factory=dict)
+    apart: float | None = None
 
     def __len__(self) -> int:
         """Return the number of rows."""
@@ -94,7 +105,7 @@ class Columns:
         """Return the columns of the first array of one of these names, by the last part of its path."""
         for name in names:
             found = tuple(c for c in self.columns if re.split(r"[./]", c.array.lower())[-1] == name)
-            if len(found) > 1 or (found and found[0].index is not None):
+            if (len(found) > 1 or (found and found[0].index is not None)) and not any(c.label for c in found):
                 return found
         return ()
 
@@ -108,6 +119,8 @@ def read_columns(path: str | Path) -> Columns:
     path = Path(path)
     separator = _separator(path)
     tables = open_tables(path, separator=separator)
+    if tables[0].choose is not None:
+        return _of_streams(path)
     group = _group(tables[0].names)
     if group is not None:
         tables = open_tables(path, group=group)
@@ -118,6 +131,37 @@ def read_columns(path: str | Path) -> Columns:
     if not joined:
         raise InputError(f"{path}: nothing in it has a number a sample; expected columns of positions and commands")
     return Columns(path, str(path), tuple(joined), tuple(int(s) for s in starts), group, separator)
+
+
+def _of_streams(path: Path) -> Columns:
+    """The columns of a bag, interpolated at the stamps of the fastest signal."""
+    stamps = unstamped(path)
+    (table,) = open_tables(path, stamps=stamps or None)
+    assert table.choose is not None
+    usable = []
+    for name in table.names:
+        with contextlib.suppress(InputError):  # what holds no numbers
+            table.choose(Choice((name,), missing_allowed=True, every=True))
+            usable.append(name)
+    if not usable:
+        raise InputError(f"{path}: no topic of it has numbers; expected joint states, poses or commands")
+    found = table.choose(Choice(tuple(usable), missing_allowed=True, every=True))
+    columns = [
+        c for name in usable for c in _of_array(name, np.asarray(found.read(name)), len(found.read(TIME)), found)
+    ]
+    time = np.asarray(found.read(TIME))
+    fastest = max(columns, key=lambda c: int(np.isfinite(c.values).sum()))
+    rows = np.isfinite(fastest.values)
+    kept = [_interpolated(c, time, time[rows]) for c in columns if np.isfinite(c.values).sum() > 1]
+    used = {name: whence for name, whence in stamps.items() if any(c.array.startswith(f"{name}.") for c in kept)}
+    apart = float(np.median(np.diff(time[rows])))
+    return Columns(path, str(path), tuple(kept), stamps=used, apart=apart)
+
+
+def _interpolated(column: Column, time: np.ndarray, at: np.ndarray) -> Column:
+    known = np.isfinite(column.values)
+    values = np.interp(at, time[known], column.values[known])
+    return replace(column, values=values, labels=values)
 
 
 def _separator(path: Path) -> str | None:
@@ -143,32 +187,40 @@ def _of_table(table: Table) -> list[Column]:
     if not counts:
         return []
     rows = max(counts, key=lambda n: (counts[n], n))
-    return [column for name, array in arrays.items() for column in _of_array(name, array, rows)]
+    return [column for name, array in arrays.items() for column in _of_array(name, array, rows, table)]
 
 
-def _of_array(name: str, array: np.ndarray, rows: int) -> list[Column]:
+def _of_array(name: str, array: np.ndarray, rows: int, table: Table) -> list[Column]:
+    labels = table.labels.get(name, ())
     if array.ndim == 2 and array.shape[0] != rows and array.shape[1] == rows:
-        return [] if len(array) > WIDEST else _of_matrix(name, array.T, transposed=True)
+        return [] if len(array) > WIDEST else _of_matrix(name, array.T, labels, transposed=True)
     if len(array) != rows:
         return []
     if array.ndim == 2:
-        return [] if array.shape[1] > WIDEST else _of_matrix(name, array, transposed=False)
+        return [] if array.shape[1] > WIDEST else _of_matrix(name, array, labels, transposed=False)
     try:
         values = numbers(array, name)
     except InputError:
         return [Column(name, name, None, np.empty(0), array, False, read_name(name))]
     if values.ndim == 2:
-        return [] if values.shape[1] > WIDEST else _of_matrix(name, values, transposed=False)
+        return [] if values.shape[1] > WIDEST else _of_matrix(name, values, labels, transposed=False)
     if array.dtype.kind == "O" and missing(array).all():
         return []
     return [Column(name, name, None, values, array, False, read_name(name))]
 
 
-def _of_matrix(name: str, matrix: np.ndarray, *, transposed: bool) -> list[Column]:
+def _of_matrix(name: str, matrix: np.ndarray, labels: Sequence[str], *, transposed: bool) -> list[Column]:
     try:
         values = matrix.astype(np.float64)
     except (TypeError, ValueError):
         return []
+    if len(labels) == values.shape[1]:
+        return [
+            Column(
+                f"{name}[{label}]", name, i, values[:, i], values[:, i], transposed, read_name(f"{name} {label}"), label
+            )
+            for i, label in enumerate(labels)
+        ]  # fmt: skip
     if values.shape[1] == 1 and not transposed:
         return [Column(name, name, None, values[:, 0], values[:, 0], False, read_name(name))]
     entries = [f"{name}[{i}]" for i in range(values.shape[1])]

@@ -109,7 +109,10 @@ def _document(
     source: dict[str, Any] = {"path": data}
     source |= {} if columns.group is None else {"group": columns.group}
     source |= {} if columns.separator is None else {"separator": columns.separator}
-    if clock.column is None:
+    source |= {"stamps": dict(columns.stamps)} if columns.stamps else {}
+    if columns.apart is not None:
+        pass  # time stamps are the signals' own
+    elif clock.column is None:
         source["dt"] = float(f"{dt:.6g}")
     else:
         unit = clock.unit
@@ -138,7 +141,11 @@ def _document(
         )
         notes += more
         notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
-        notes += [] if clock.even else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
+        notes += (
+            []
+            if clock.even or columns.apart
+            else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
+        )
     entries = [m.place.entry for m in positions + velocities]
     if derived:
         entries += _rates(positions, places)
