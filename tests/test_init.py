@@ -286,6 +286,7 @@ def test_a_urdf_without_actuators_gets_motors_for_the_efforts_of_a_log(tmp_path:
     assert found.document["model"] == "robot_motors.xml"
     assert [m.column.entry for m in found.matching.of("command")] == ["effort[0]", "effort[1]"]
     assert dropo.make_problem(found.config).space.names
+    assert yaml.safe_load(found.text) | {"seed": 0} == found.document
 
 
 def test_a_passive_motion_tells_ratios_only(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import yaml
@@ -40,6 +40,7 @@ def config_text(proposal: Proposal) -> str:
         "",
         *_comment(proposal.window),
         _key("lag", document["lag"]),
+        *(_key(name, document[name]) for name in ("seed", "threads") if document.get(name)),
         "",
         *_comment(f"Of {len(choice.told)} physical candidates, {choice.summary}."),
         "# Errors are those to expect of a fit to this log, relative to the model's value.",
@@ -105,11 +106,6 @@ def error_text(told: Told) -> str:
     if told.candidate.nominal and told.candidate.kind != "centre":
         return f"{100 * told.percent:.2g} %"
     return f"{told.error:.2g} {told.candidate.unit}".rstrip()
-
-
-def plain(document: Mapping[str, Any]) -> str:
-    """Return a config without comments."""
-    return yaml.safe_dump(dict(document), sort_keys=False, allow_unicode=True)
 
 
 def described(match: Match) -> tuple[str, ...]:
