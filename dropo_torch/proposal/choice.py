@@ -14,6 +14,8 @@ State = Literal["chosen", "stands for", "confounded", "unseen"]
 
 #: Standard error, in a candidate's size, up to which it counts as told apart.
 TOLD = 0.25
+#: One up to which nothing is left out.
+CERTAIN = 0.1
 #: How readily a candidate is left out: what models have right more often goes first.
 READINESS: dict[Kind, float] = {
     "mass": 1.0, "damping": 0.8, "friction": 0.7, "armature": 1.1, "stiffness": 1.0, "gain": 1.2, "contact": 0.8,
@@ -29,7 +31,7 @@ OFF = 0.3
 LOST = 1.0
 #: Share of what parameters do by themselves, squared, that a combination of them must do to count: differences are
 #: no more exact, nor are models. A scale common to all masses and gains does nothing, and would seem to do a little.
-ACCURACY, NOTHING = 1e-6, 1e-12
+ACCURACY, NOTHING = 1e-6, 1e-18
 
 
 @dataclass(frozen=True)
@@ -178,10 +180,19 @@ def _eliminated(gram: np.ndarray, ready: np.ndarray, kept: list[int]) -> list[in
 
 
 def _returned(gram: np.ndarray, ready: np.ndarray, kept: list[int], seen: Sequence[int]) -> list[int]:
-    """Candidates with those that fit beside them after all, the most wanted first."""
+    """Candidates with those that fit beside them after all, the most wanted first.
+
+    One that is certain takes the place of those that are not, if these are then told no longer.
+    """
     for i in sorted((i for i in seen if i not in kept), key=lambda i: ready[i]):
-        larger = sorted([*kept, i])
-        if (_errors(gram, larger) <= TOLD).all():
+        before, larger = dict(zip(kept, _errors(gram, kept), strict=True)), sorted([*kept, i])
+        while True:
+            errors = dict(zip(larger, _errors(gram, larger), strict=True))
+            lost = [k for k in larger if errors[k] > TOLD]
+            if not lost or errors[i] > CERTAIN or any(before[k] <= CERTAIN for k in lost):
+                break
+            larger.remove(max(lost, key=lambda k: errors[k]))
+        if not lost:
             kept = larger
     return kept
 
