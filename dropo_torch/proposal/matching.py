@@ -173,7 +173,7 @@ def _assigned(
             if partner is not None and names[i, j] > -1:
                 shares[i, j] = motion(partner.values, c.values, starts)[0]
                 scores[i, j] += 0.8 * shares[i, j]
-            scores[i, j] += _role_bonus(words[c.entry], p) + 1e-6 * (len(free) - j)
+            scores[i, j] += _role_bonus(words[c.entry], p) - 1e-6 * j - 1e-7 * abs(i - j)  # else in order
     rows, columns = linear_sum_assignment(np.where(scores < -1, -10.0, scores), maximize=True)
     matches = []
     for i, j in zip(rows, columns, strict=True):
@@ -190,6 +190,7 @@ def _matched(place: Place, column: Column, words: Words, name: float, share: flo
     spoken = "its name" if words.objects or words.axis else "its number" if words.numbers else "its kind"
     by = spoken if name >= LEAST else "its motion"
     sureness: Sureness = "sure" if name >= SURE or (name >= LEAST and share > LIKE) else "likely"
+    sureness = "guess" if name <= LEAST and share <= LIKE else sureness
     return Match(place, column, 1.0, sureness, by + (f" and motion (r² {share:.2f})" if share > LIKE else ""))
 
 
@@ -285,9 +286,9 @@ def _with_axes(columns: Sequence[Column]) -> list[Words]:
     for i, c in enumerate(columns):
         w = c.words
         if w.numbers and not w.axis and (w.objects or w.quaternion or w.angular):
-            groups.setdefault((w.role, w.objects, w.quaternion, w.angular, w.numbers[:-1]), []).append(i)
+            groups.setdefault((w.role, w.objects, w.quaternion, w.angular, w.scale, w.numbers[:-1]), []).append(i)
     found = [c.words for c in columns]
-    for (_, _, quaternion, _, _), members in groups.items():
+    for (_, _, quaternion, *_), members in groups.items():
         letters = "wxyz" if quaternion else "xyz"
         if len(members) == len(letters):
             ordered = sorted(members, key=lambda i: columns[i].words.numbers[-1])
@@ -307,7 +308,7 @@ def _ranks(columns: Sequence[Column], words: dict[str, Words], wanted: Sequence[
     for c in columns:
         w = words[c.entry]
         if w.numbers and not w.axis:
-            groups.setdefault((w.role, w.objects, w.commanded, w.numbers[:-1]), []).append(c)
+            groups.setdefault((w.role, w.objects, w.commanded, w.scale, w.numbers[:-1]), []).append(c)
     found: dict[str, int] = {}
     for members in groups.values():
         if len(members) != len(numbers):
