@@ -31,7 +31,7 @@ OFF = 0.3
 LOST = 1.0
 #: Share of what parameters do by themselves, squared, that a combination of them must do to count: differences are
 #: no more exact, nor are models. A scale common to all masses and gains does nothing, and would seem to do a little.
-ACCURACY, NOTHING = 1e-6, 1e-18
+ACCURACY, NOTHING = 1e-5, 1e-18
 
 
 @dataclass(frozen=True)
