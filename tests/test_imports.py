@@ -209,7 +209,7 @@ def test_the_objective_knows_no_backend() -> None:
 def test_extras_are_those_of_the_package() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     optional = project["optional-dependencies"]
-    assert set(optional) == set(EXTRAS) | {"all", "dev", "coverage-models"}
+    assert set(optional) == set(EXTRAS) | {"all", "dev", "docs", "coverage-models"}
     assert set(optional["all"][0].partition("[")[2].rstrip("]").split(",")) == set(EXTRAS)
     needed = " ".join(project["dependencies"])
     assert not [module for modules in EXTRAS.values() for module in modules if module in needed]

@@ -68,8 +68,8 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     """
     episode, flags = _episode(columns), _flags(columns)
     if columns.apart is not None:
-        why = f"every signal has time stamps of its own; the fastest is sampled every {columns.apart:.4g} s"
-        return Clock(None, 1.0, dt or columns.apart, False, 0.0, None, (), (), (why,))
+        own = f"every signal has time stamps of its own; the fastest is sampled every {columns.apart:.4g} s"
+        return Clock(None, 1.0, dt or columns.apart, False, 0.0, None, (), (), (own,))
     given = dt is not None
     empty = Clock(None, 1.0, dt, True, 0.0, episode, () if episode else flags, (), ())
     known = empty.starts(len(columns), columns.parts)
