@@ -265,10 +265,34 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
     found = dropo.propose_config(model, data, out=tmp_path / "robot.yaml")
     options = found.document["data"]["preprocess"]
     assert options["dt"] == pytest.approx(0.02)
+    assert options["actions"] == "mean"
     assert "velocities" not in options
     assert found.document["observation"] == ["slider.position", "hinge.position", "slider.velocity", "hinge.velocity"]
     assert not [f for f in found.findings if f.sure]
     assert dropo.make_problem(found.config).trajectories.observations.shape[1] == 4
+
+
+def test_commands_of_a_rate_that_the_model_has_not_are_those_that_acted(tmp_path: Path) -> None:
+    """Thirty rows a second are no whole number of steps of 5 ms: rows of 35 ms see parts of two commands."""
+    model = mujoco.MjModel.from_xml_string(CARTPOLE)
+    model.opt.timestep = 1 / 1200
+    data, rng = mujoco.MjData(model), np.random.default_rng(4)
+    rows = []
+    for row in range(400):
+        command = 0.6 * np.sin(0.35 * row) + 0.3 * rng.standard_normal()
+        rows.append([row / 30, *data.qpos, *data.qvel, command])
+        data.ctrl[:] = command
+        mujoco.mj_step(model, data, 40)
+    log = dict(zip(("time", "x", "theta", "x_dot", "theta_dot", "u"), np.array(rows).T, strict=True))
+    found = dropo.propose_config(*written(tmp_path, log), out=tmp_path / "robot.yaml")
+    errors = {}
+    for actions in ("mean", "hold"):
+        found.document["data"]["preprocess"]["actions"] = actions
+        problem = dropo.make_problem(dropo.make_config(found.document, base=tmp_path))
+        simulated = problem.objective.simulated(problem.space.nominal[None])[:, 0]
+        errors[actions] = simulated - problem.objective.measured
+    slider = {actions: float(error[:, 2].std()) for actions, error in errors.items()}
+    assert slider["mean"] < 0.3 * slider["hold"]
 
 
 def test_a_urdf_without_actuators_gets_motors_for_the_efforts_of_a_log(tmp_path: Path) -> None:

@@ -207,6 +207,10 @@ def _preprocess(
         joints = {m.place.partner for m in matching.of("command")} | {p.partner for p in matching.lacks("command")}
         options["controlled"] = [m.column.entry for m in positions if m.place.label in joints]
         notes.append("commands were not logged: servos are taken to have been told what was measured a row later")
+    elif matching.of("command"):
+        options["actions"] = (
+            "mean"  # one that changes within a row acts in part of it; on the log's own grid it is held
+        )
     return options, notes, smooth
 
 

@@ -14,6 +14,8 @@ from dropo_torch.report.formatting import joined, number, percent, plain, short,
 UNNAMED = "unnamed"
 #: Times in seconds below this are given in milliseconds.
 SHORT = 0.1
+#: Share of a gap without a name that the closest candidate leaves, below which it is told.
+CLOSE = 0.2
 #: Of effects with more numbers than this, the answer gives only the first.
 MOST_NUMBERS = 3
 #: What is missing, as it follows on "Your model lacks".
@@ -189,7 +191,7 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
             return f"Something is missing that has no name yet: {gap.refused}; {shows(gap)}.", []
         if gap.unfinished:
             return f"Something is missing, and the time for the search was over before it had a name; {shows(gap)}.", []
-        return f"Something is missing that {unexplained}; {shows(gap)}.", []
+        return f"Something is missing that {unexplained}{_closest(gap)}; {shows(gap)}.", []
     if gap.own_step is not None:
         own, finer = (short(x) for x in gap.own_step)
         step = f" (the model's own step leaves {own} times what noise would, a finer one {finer})"
@@ -211,6 +213,14 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     differ = any(_too_much(e) or _mixed(e) or e.effect in _CLAUSES for e in named)
     rest = step if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
     return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
+
+
+def _closest(gap: Gap) -> str:
+    """What would explain most of a gap that has no name, if it is most, as it goes on from "explains"."""
+    best = min(gap.ranking, key=lambda r: r.left if np.isfinite(r.left) else np.inf, default=None)
+    if best is None or not best.left < CLOSE:
+        return ""
+    return f" (the closest, {noun(best.effect, best.target)}, leaves {percent(best.left)} of it)"
 
 
 def by_force(named: Sequence[NamedEffect]) -> list[str]:
