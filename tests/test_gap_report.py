@@ -169,7 +169,7 @@ def test_what_comes_closest_to_a_gap_without_a_name_is_told() -> None:
     gap = unnamed()
     assert "closest" not in gap_words.answer(gap)[0]
     near = replace(gap, ranking=(*gap.ranking, Ranked("integration", None, {"step": 5e-4}, 0.052, 1)))
-    assert "(the closest, a finer integration step, leaves 5.2 % of it)" in gap_words.answer(near)[0]
+    assert "(the closest, a finer integration step, leaves 5.2\N{NO-BREAK SPACE}% of it)" in gap_words.answer(near)[0]
 
 
 CASES = {"single": single, "double": double, "null": null, "unnamed": unnamed}
