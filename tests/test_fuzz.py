@@ -228,7 +228,8 @@ def test_a_small_file_that_declares_much_is_refused_before_memory_is_taken(
 ) -> None:
     path = write(tmp_path, (100_000_000, 4))
     assert path.stat().st_size < 3_000_000
-    refused(path, r"declares 2\.98 GiB; at most 2 GiB of one array are read", observations="observations")
+    columns = {"observations": "observations", "actions": "observations"}
+    refused(path, r"declares 2\.98 GiB; at most 2 GiB of one array are read", **columns)
 
 
 def test_a_parquet_file_that_declares_much_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

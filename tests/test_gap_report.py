@@ -165,6 +165,13 @@ def test_curves_and_picture_show_what_was_predicted(tmp_path: Path) -> None:
     assert not (tmp_path / "other.png").exists()
 
 
+def test_a_position_that_rests_but_for_rounding_is_drawn(tmp_path: Path) -> None:
+    still = course("elbow.position")
+    level = 0.7 + 1e-16 * np.arange(still.time.size).reshape(still.time.shape)
+    resting = replace(still, measured=level, before=level + 1e-17, after=level)
+    assert "as measured and as predicted" in page(tmp_path, replace(double(), courses=(resting,)))
+
+
 def test_what_comes_closest_to_a_gap_without_a_name_is_told() -> None:
     gap = unnamed()
     assert "closest" not in gap_words.answer(gap)[0]

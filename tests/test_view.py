@@ -449,7 +449,7 @@ def test_a_video_has_a_pane_for_each_simulation(fitted: Path, tmp_path: Path, mo
     left, right = frames[0, :, :640].astype(int), frames[0, :, 640:].astype(int)
     warmth = [side[..., 0] - side[..., 2] for side in (left, right)]  # orange of the model's own values, blue fitted
     assert warmth[0].max() > 25 > 15 > -warmth[0].min()
-    assert -warmth[1].min() > 25 > 15 > warmth[1].max()
+    assert -warmth[1].min() > 25 > 20 > warmth[1].max()
 
 
 BROWSERS = [path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))]

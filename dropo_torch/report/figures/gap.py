@@ -122,7 +122,8 @@ def draw_course(axes: Any, course: Course, *, named: bool, width: float = 1.0) -
     lines += [(course.after, BLUE, 1.8)] if named else []
     shown = np.concatenate([course.measured, *(line for line, *_ in lines)])
     shown = shown[np.isfinite(shown)].clip(*frame)
-    margin = 0.06 * float(np.ptp(shown)) or 0.5
+    size = float(np.ptp(shown))  # of what rests but for rounding, nothing
+    margin = 0.06 * size if size > 1e-9 * float(np.abs(shown).max()) else 0.5
     for time in course.time[1:, 0]:
         axes.axvline(time, color=FAINT, linewidth=0.7 * width, zorder=0.5)
     for time, measured in zip(course.time, course.measured, strict=True):
