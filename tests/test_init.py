@@ -272,6 +272,17 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
     assert dropo.make_problem(found.config).trajectories.observations.shape[1] == 4
 
 
+def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """A misspelt column of a position that may be missing, and a hole in another, are no silent matter."""
+    t, q, v, u = log
+    theta = q[:, 1].copy()
+    theta[40] = np.nan
+    frame = {"t": t, "slidre": q[:, 0], "theta": theta, "x_dot": v[:, 0], "theta_dot": v[:, 1], "u": u[:, 0]}
+    found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
+    assert "not used, for nothing of the model is called so: slidre" in found.draft.notes
+    assert any(note.endswith("short gaps are bridged: 1 of theta") for note in found.draft.notes)
+
+
 def test_commands_of_a_rate_that_the_model_has_not_are_those_that_acted(tmp_path: Path) -> None:
     """Thirty rows a second are no whole number of steps of 5 ms: rows of 35 ms see parts of two commands."""
     model = mujoco.MjModel.from_xml_string(CARTPOLE)

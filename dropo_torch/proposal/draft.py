@@ -97,7 +97,7 @@ def _document(
 ) -> tuple[dict[str, Any], list[str], Filter | None]:
     dt = clock.dt
     assert dt is not None
-    notes: list[str] = []
+    notes = _lost(matching)
     positions, velocities = list(matching.of("position")), list(matching.of("velocity"))
     lacking = [p for p in matching.lacks("velocity") if p.partner == "" or matching.at(p.partner)]
     derived = derived or bool(lacking)
@@ -150,6 +150,19 @@ def _document(
     if derived:
         entries += _rates(positions, places)
     return {"model": model, "data": source, "frame_skip": skip, "observation": entries}, notes, smooth
+
+
+def _lost(matching: Matching) -> list[str]:
+    """What of the log is not used: columns that are nothing of the model's, and values that are no numbers."""
+    free = [c.entry for c in matching.unused]
+    notes = [f"not used, for nothing of the model is called so: {', '.join(free[:6])}" + ", ..." * (len(free) > 6)]
+    lost = {m.column.entry: int(np.isnan(m.column.values).sum()) for m in matching.matches}
+    holes = [f"{count} of {name}" for name, count in lost.items() if count]
+    return (notes if free else []) + (
+        [f"values that are NaN or blank count as not measured; short gaps are bridged: {', '.join(holes)}"]
+        if holes
+        else []
+    )
 
 
 def _standard(columns: Columns, matching: Matching) -> list[str] | None:
