@@ -273,13 +273,14 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
 
 
 def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
-    """A misspelt column of a position that may be missing, and a hole in another, are no silent matter."""
+    """A column that is nothing of the model's, and a hole in another, are no silent matter."""
     t, q, v, u = log
     theta = q[:, 1].copy()
     theta[40] = np.nan
-    frame = {"t": t, "slidre": q[:, 0], "theta": theta, "x_dot": v[:, 0], "theta_dot": v[:, 1], "u": u[:, 0]}
+    frame = {"t": t, "x": q[:, 0], "theta": theta, "x_dot": v[:, 0], "theta_dot": v[:, 1], "u": u[:, 0]}
+    frame["pressure"] = np.random.default_rng(1).standard_normal(len(t))
     found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
-    assert "not used, for nothing of the model is called so: slidre" in found.draft.notes
+    assert "not used, for nothing of the model is called so: pressure" in found.draft.notes
     assert any(note.endswith("short gaps are bridged: 1 of theta") for note in found.draft.notes)
 
 
