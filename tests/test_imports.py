@@ -251,7 +251,7 @@ def test_a_missing_extra_is_told_in_one_line(
         (tmp_path / f"log.{kind}").touch()
     verb, *options = command.split()
     arguments = [verb, str(config), "--out", str(tmp_path / "out"), *options]
-    if name in ("warp", "rl"):  # what needs these may have been imported already
+    if name in ("warp", "rl", "ros"):  # what needs these may have been imported already
         run = f"from dropo_torch.commands.cli import main; sys.exit(main({arguments}))"
         absent = f"import sys; sys.modules[{module!r}] = None; {run}"
         code = subprocess.run([sys.executable, "-c", absent], check=False, cwd=ROOT).returncode
