@@ -1,6 +1,7 @@
 """The pages are complete, warn where they should, and stand on their own."""
 
 import re
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,7 +12,7 @@ from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution
 from dropo_torch.fit import Fit, HistoryEntry
 from dropo_torch.report import words, write_fit_report, write_sweep_report
-from dropo_torch.report.figures import to_svg
+from dropo_torch.report.figures import drawing, to_svg
 from dropo_torch.report.figures.sweep import epsilon_panel
 from dropo_torch.report.fit import shown_columns, worst_stretch
 from dropo_torch.report.formatting import number
@@ -245,6 +246,24 @@ def test_numbers(value: float, uncertainty: float, text: str) -> None:
 def test_ticks_keep_their_digits() -> None:
     figure = epsilon_panel(np.array([1e-4, 1e-2]), np.array([1.121, 1.139]), 1e-4, "y", log=False)
     assert ">1.125<" in to_svg(figure)
+
+
+@pytest.mark.parametrize("first", ["plot", "scale"])
+@pytest.mark.parametrize("step", [0.0, 1e-16, 3e-16, 1e-12])
+@pytest.mark.parametrize("value", [1e-3, 1.0, 7.3e5])
+def test_values_that_rest_but_for_rounding_are_drawn(value: float, step: float, first: str) -> None:
+    """No warning that an axis has no length, and the axis has one."""
+    _, axes = drawing.new_panel(340, 225, "value", (58, 36, 12, 34))
+    steps: list[Callable[[], object]] = [
+        lambda: axes.plot([0, 1, 2], value * np.array([1, 1 + step, 1 - step])),
+        lambda: drawing.log_scale(axes, "y"),
+    ]
+    for act in steps if first == "plot" else steps[::-1]:
+        act()
+    drawing.few_ticks(axes, y=6)
+    low, high = axes.get_ylim()
+    assert low < 0.7 * value
+    assert high > 1.4 * value
 
 
 def test_sweep(tmp_path: Path) -> None:

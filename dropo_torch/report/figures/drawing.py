@@ -76,8 +76,21 @@ def new_panel(
 
 
 def log_scale(axes: Any, which: Which) -> None:
-    """Make an axis logarithmic."""
-    axes.set(**{f"{which}scale": "log"})
+    """Make an axis logarithmic; around values that are one but for rounding, it has an octave each way."""
+    from matplotlib.scale import LogScale
+    from matplotlib.ticker import LogLocator
+
+    class Decades(LogLocator):
+        def nonsingular(self, vmin: float, vmax: float) -> tuple[float, float]:
+            rests = 0 < vmin <= vmax <= vmin * (1 + 1e-9)
+            return super().nonsingular(*((vmin / 2, vmax * 2) if rests else (vmin, vmax)))
+
+    class Scale(LogScale):
+        def set_default_locators_and_formatters(self, axis: Any) -> None:
+            super().set_default_locators_and_formatters(axis)
+            axis.set_major_locator(Decades())
+
+    axes.set(**{f"{which}scale": Scale(axes.xaxis if which == "x" else axes.yaxis)})
     axes.minorticks_off()
 
 
