@@ -143,6 +143,26 @@ def test_many_numbers_may_leave_less_of_the_gap() -> None:
 
 
 @pytest.mark.parametrize(
+    ("left", "reduced", "names", "enough"),
+    [(0.04, 19.0, ("joint_friction",), True), (0.06, 1.3, ("joint_friction",), True),
+     (0.06, 1.7, ("joint_friction",), False), (0.11, 1.3, ("joint_friction",), False),
+     (0.06, 1.3, ("joint_cogging", "joint_stiffness"), False)],
+)  # fmt: skip
+def test_what_a_misjudged_noise_makes_is_no_rest(
+    left: float, reduced: float, names: tuple[str, ...], enough: bool
+) -> None:
+    """Of a gap that is little more than the noise, an error of a tenth in σ is more than a twentieth."""
+    base = refit(scene_of().evidence, scene_of().begin, iterations=0)
+    few = tuple(placed(n, *[0.1] * len(find_effect(n).quantities(scene_of().setting, "rail"))) for n in names)
+    excess = 1e3 * (reduced - 1)
+    named = dataclasses.replace(
+        base, hypothesis=Hypothesis((), few), cost=Cost(np.array([1e3 + excess]), np.zeros(1), 1e3)
+    )
+    missing = dataclasses.replace(base, cost=Cost(np.array([1e3 + excess / left]), np.zeros(1), 1e3))
+    assert accounts(named, missing, Rules()) == enough
+
+
+@pytest.mark.parametrize(
     ("names", "reduced", "enough"),
     [(("joint_friction",), 100.0, True), (("joint_cogging", "joint_stiffness"), 1.1, True),
      (("joint_cogging", "joint_stiffness"), 100.0, False)],

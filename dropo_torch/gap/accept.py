@@ -15,7 +15,7 @@ from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
 from dropo_torch.gap.renew import with_base
-from dropo_torch.gap.rules import accounts, allowance, beyond_free, most_left, remains, significant, simplest
+from dropo_torch.gap.rules import accounts, beyond_free, may_leave, most_left, remains, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -130,7 +130,7 @@ def imitates(ground: Ground, fitted: Refit) -> bool:
 def accounts_finely(ground: Ground, fitted: Refit, base: Refit) -> bool:
     """Return whether effects account for a gap, where what is wrong besides may be the model's own step."""
     rules = ground.rules
-    if accounts(fitted, base, rules) or fitted.cost.left_of(base.cost) > allowance(fitted.hypothesis, rules):
+    if accounts(fitted, base, rules) or fitted.cost.left_of(base.cost) > may_leave(fitted, rules):
         return accounts(fitted, base, rules)
     return resolved(ground.part, fitted).fit.cost.reduced <= rules.sound.wrong
 

@@ -261,6 +261,8 @@ class Rules:
         least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
         most: share of the excess that an effect removes without that pairs or families are tried in its place.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
+        misjudged: share that few numbers may leave where it is no more than ``sound.rest``: so much may be wrong with
+            the estimate of the noise.
         free: numbers of the named effects beyond which each halves what they may leave, for many numbers together
             imitate what none of them is; what they leave must be less than ``sound.wrong`` then.
         hopeless: share of the excess that the best candidate of a round may leave, or the search ends;
@@ -274,6 +276,7 @@ class Rules:
     least_reduced: float = 1.1
     most: float = 0.8
     accounted: float = 0.95
+    misjudged: float = 0.1
     free: int = 3
     hopeless: float = 0.8
     imitating: float = 0.5
@@ -318,6 +321,13 @@ def allowance(hypothesis: Hypothesis, rules: Rules) -> float:
     return (1 - rules.accounted) * 0.5 ** beyond_free(hypothesis, rules)
 
 
+def may_leave(named: Refit, rules: Rules) -> float:
+    """Return the share of the first excess that a fit may leave; more of it where the noise may be misjudged."""
+    most = allowance(named.hypothesis, rules)
+    small = not beyond_free(named.hypothesis, rules) and not remains(named.cost, rules)
+    return max(most, rules.misjudged) if small else most
+
+
 def most_left(current: Refit, rules: Rules) -> float:
     """Return the share of its excess that the best candidate beside a hypothesis may leave, or the search ends."""
     imitates = beyond_free(current.hypothesis, rules) and current.cost.reduced > rules.sound.wrong
@@ -331,7 +341,7 @@ def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
     """
     if beyond_free(named.hypothesis, rules) and named.cost.reduced > rules.sound.wrong:
         return False
-    return named.cost.left_of(base.cost) <= allowance(named.hypothesis, rules)
+    return named.cost.left_of(base.cost) <= may_leave(named, rules)
 
 
 def family_accounts(named: Refit, base: Refit, rules: Rules) -> bool:

@@ -18,7 +18,7 @@ from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, with_base
 from dropo_torch.gap.result import Ranked
-from dropo_torch.gap.rules import accounts, family_accounts, remains, significant
+from dropo_torch.gap.rules import accounts, family_accounts, may_leave, remains, significant
 from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
 from dropo_torch.support.checkpoint import Checkpoint
 
@@ -231,8 +231,9 @@ def conclude(ground: Ground, state: State) -> Ended:
 
 def may_account(ground: Ground, state: State) -> bool:
     """Return whether effects, or some of them, may account for the gap: together they leave little enough of it."""
-    left = state.current.cost.left_of(state.base.cost)
-    return ground.clears(state.base, state.current) or left <= 1 - ground.rules.accounted
+    current, rules = state.current, ground.rules
+    most = max(1 - rules.accounted, may_leave(current, rules))
+    return ground.clears(state.base, current) or current.cost.left_of(state.base.cost) <= most
 
 
 def judged(ground: Ground, state: State, found: Refit, unnamed: Naming) -> Naming:
