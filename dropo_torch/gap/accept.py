@@ -94,9 +94,10 @@ def is_of_step(ground: Ground, fitted: Refit) -> bool:
     if change is not None and significant(_least_beside(ground, fitted, change), rules):
         return False
     last = resolved(ground.part, fitted, anew=True)
+    most = last.fit.cost.left_of(fitted.cost) <= 1 - rules.most
     if not significant(last.fit.cost, rules):
-        return True
-    if last.fit.cost.left_of(fitted.cost) > 1 - rules.most:
+        return most or significant(fitted.cost, rules)  # of what is no more than noise, a finer step must leave less
+    if not most:
         return False
     again = refit(last.evidence, last.fit.hypothesis, iterations=ANEW, slopes=False)
     return not significant(again.cost, rules)
