@@ -267,6 +267,20 @@ def test_an_effect_that_is_a_finer_step_needs_no_other_one(
     assert accept.matters(SimpleNamespace(rules=Rules()), fitted(180_000), whole, without) == needed
 
 
+@pytest.mark.parametrize(("finer", "of_step"), [(1.08, False), (1.06, False), (1.01, True)])
+def test_of_what_is_no_more_than_noise_a_finer_step_must_leave_less(
+    finer: float, of_step: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second moment of inertia, of a gap that is little more than the noise: the first leaves no more than that."""
+
+    def leaving(reduced: float) -> SimpleNamespace:
+        return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
+
+    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(accept, "resolved", lambda *_, **__: SimpleNamespace(fit=leaving(finer)))
+    assert accept.is_of_step(SimpleNamespace(rules=Rules(), part=None), leaving(1.08)) == of_step
+
+
 @pytest.mark.parametrize(("stale", "fitted", "of_step"), [(20.0, 1.0, True), (20.0, 15.0, False), (300.0, 1.0, False)])
 def test_what_a_finer_step_mostly_explains_is_fitted_there(
     stale: float, fitted: float, of_step: bool, monkeypatch: pytest.MonkeyPatch
