@@ -122,6 +122,24 @@ def test_names_say_what_people_mean(
 
 
 @pytest.mark.parametrize(
+    ("name", "role", "objects"),
+    [
+        ("target_x_pos", "position", ("target", "x")),
+        ("target_x_vel", "velocity", ("target", "x")),
+        ("target_x", "", ("target", "x")),
+        ("target_y", "command", ()),
+        ("goal_cmd", "command", ("goal",)),
+        ("load_torque", "effort", ("load",)),
+        ("elbow_vel", "velocity", ("elbow",)),
+    ],
+)
+def test_the_words_of_a_joints_name_say_nothing_else(name: str, role: str, objects: tuple[str, ...]) -> None:
+    """A joint may be called after what other logs call a command, such as the two slides of Gymnasium's reacher."""
+    told = read_name(name, ["target_x", "goal", "load", "elbow"])
+    assert (told.role, told.objects) == (role, objects)
+
+
+@pytest.mark.parametrize(
     ("name", "axis", "quaternion", "angular"),
     [("box_qw", "w", True, False), ("vx", "x", False, False), ("base_wz", "z", False, True),
      ("box_quat_y", "y", True, False), ("imu.angular_velocity.x", "x", False, True)],

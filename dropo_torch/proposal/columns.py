@@ -48,7 +48,7 @@ class Column:
     values: np.ndarray
     labels: np.ndarray
     transposed: bool
-    words: Words
+    words: Words = field(default_factory=Words)
     label: str = ""
 
     @property
@@ -110,13 +110,28 @@ class Columns:
         return ()
 
 
-def read_columns(path: str | Path) -> Columns:
+def read_columns(path: str | Path, joints: Sequence[str] = ()) -> Columns:
     """Read all columns of a log.
+
+    Args:
+        path: the log.
+        joints: names of the model's joints, which may have words that otherwise tell a column's kind.
 
     Raises:
         InputError: a file that cannot be read, or in which nothing has a row a sample.
     """
     path = Path(path)
+    found = _read(path)
+    told = [replace(c, words=read_name(_spoken(c), joints)) for c in found.columns]
+    return replace(found, columns=tuple(told))
+
+
+def _spoken(column: Column) -> str:
+    """What a column is called, in words."""
+    return f"{column.array} {column.label}" if column.label else column.entry
+
+
+def _read(path: Path) -> Columns:
     separator = _separator(path)
     tables = open_tables(path, separator=separator)
     if tables[0].choose is not None:
@@ -201,12 +216,12 @@ def _of_array(name: str, array: np.ndarray, rows: int, table: Table) -> list[Col
     try:
         values = numbers(array, name)
     except InputError:
-        return [Column(name, name, None, np.empty(0), array, False, read_name(name))]
+        return [Column(name, name, None, np.empty(0), array, False)]
     if values.ndim == 2:
         return [] if values.shape[1] > WIDEST else _of_matrix(name, values, labels, transposed=False)
     if array.dtype.kind == "O" and missing(array).all():
         return []
-    return [Column(name, name, None, values, array, False, read_name(name))]
+    return [Column(name, name, None, values, array, False)]
 
 
 def _of_matrix(name: str, matrix: np.ndarray, labels: Sequence[str], *, transposed: bool) -> list[Column]:
@@ -216,18 +231,13 @@ def _of_matrix(name: str, matrix: np.ndarray, labels: Sequence[str], *, transpos
         return []
     if len(labels) == values.shape[1]:
         return [
-            Column(
-                f"{name}[{label}]", name, i, values[:, i], values[:, i], transposed, read_name(f"{name} {label}"), label
-            )
+            Column(f"{name}[{label}]", name, i, values[:, i], values[:, i], transposed, label=label)
             for i, label in enumerate(labels)
-        ]  # fmt: skip
+        ]
     if values.shape[1] == 1 and not transposed:
-        return [Column(name, name, None, values[:, 0], values[:, 0], False, read_name(name))]
+        return [Column(name, name, None, values[:, 0], values[:, 0], False)]
     entries = [f"{name}[{i}]" for i in range(values.shape[1])]
-    return [
-        Column(entry, name, i, values[:, i], values[:, i], transposed, read_name(entry))
-        for i, entry in enumerate(entries)
-    ]
+    return [Column(entry, name, i, values[:, i], values[:, i], transposed) for i, entry in enumerate(entries)]
 
 
 def _joined(parts: list[Column]) -> Column:

@@ -14,6 +14,7 @@ import numpy as np
 
 from dropo_torch.config import Config, make_config
 from dropo_torch.data.examination import Finding
+from dropo_torch.data.observation import joint_name
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
 from dropo_torch.problem import make_problem
@@ -132,7 +133,8 @@ def propose_config(
     tell = report or (lambda stage, share: None)
     path, base = Path(model), Path(out).resolve().parent
     tell("reading the model and the log", 0.0)
-    compiled, columns = load_model(path), read_columns(log)
+    compiled = load_model(path)
+    columns = read_columns(log, [joint_name(compiled, j) for j in range(compiled.njnt)])
     if len(prescribed_bodies(compiled)):
         raise InputError(
             f"model: {prescribed_names(compiled)}: mocap bodies act in this model, and their poses belong to the "

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 import re
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Literal
 
 Role = Literal["position", "velocity", "acceleration", "effort", "command", "time", "episode", "flag", "other", ""]
@@ -107,9 +108,20 @@ def object_words(name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
     return kept, tuple(int(w) for w in parts if w.isdigit())
 
 
-def read_name(name: str) -> Words:
-    """Return what a column's name says."""
+def read_name(name: str, joints: Sequence[str] = ()) -> Words:
+    """Return what a column's name says.
+
+    Args:
+        name: of the column.
+        joints: names of the model's joints: what stands in one of these, such as ``target_x``, says nothing else.
+    """
     every = split(name)
+    for own in sorted((split(j) for j in joints if _misleads(j)), key=len, reverse=True):
+        begins = [i for i in range(len(every) - len(own) + 1) if every[i : i + len(own)] == own]
+        if begins:
+            rest = read_name(" ".join(every[: begins[0]] + every[begins[0] + len(own) :]))
+            known, number = object_words(" ".join(own))
+            return replace(rest, objects=known + rest.objects, numbers=number + rest.numbers)
     words, numbers = [w for w in every if not w.isdigit()], tuple(int(w) for w in every if w.isdigit())
     words, scale = _unit(words)
     axis, quaternion, angular = "", False, False
@@ -145,6 +157,12 @@ def read_name(name: str) -> Words:
         role = "position"
     turns = bool(set(words) & _TURNS)
     return Words(role, scale, tuple(objects), numbers, axis, quaternion and not angular, angular, commanded, turns)
+
+
+def _misleads(joint: str) -> bool:
+    """Whether a joint's name has words that would say what kind of column it is, were they not its name."""
+    told = read_name(joint)
+    return len(joint) > 1 and bool(told.role or told.quaternion or told.angular or told.scale is not None)
 
 
 def time_unit(name: str) -> float | None:
