@@ -1,11 +1,13 @@
-"""Speed of the Hopper under random actions beside TorchRL's and Gymnasium's own, and the bare mujoco.batch, in one run.
+"""Speed of a task under random actions beside TorchRL's and Gymnasium's own, and the bare mujoco.batch, in one run.
 
-Every contestant steps Hoppers of frame skip 4 on the same cores; repeats are interleaved. TorchRL's is tried as its
-default ParallelEnv, a process a core and twice as many, and as a SerialEnv; Gymnasium's with several numbers of
-processes; the fastest counts. The bare rollout has parameters of its own in each simulation, too, and begins anew after
-as many steps as a random episode has on average.
+Every contestant steps the same model with the same frame skip on the same cores; repeats are interleaved. Gymnasium's
+AsyncVectorEnv is tried with several numbers of processes, and the fastest counts; for the Hopper its environments are
+Gymnasium's own, for others plain MuJoCo whose observation is the state and whose reward a number, which is less than
+the task's. The Hopper has TorchRL's beside it, too: as its default ParallelEnv, a process a core and twice as many, and
+as a SerialEnv; and the bare rollout, with parameters of its own in each simulation, which begins anew after as many
+steps as a random episode has on average.
 
-    python benchmarks/env_speed.py [--envs 1024] [--cores 2] [--repeats 5] [--seconds 3]
+    python benchmarks/env_speed.py [--sim push] [--envs 1024] [--cores 2] [--repeats 5] [--seconds 3]
 """
 
 from __future__ import annotations
@@ -25,8 +27,10 @@ from dropo_sims.hopper import SIM
 from dropo_sims.hopper.task import HopperTask
 from torchrl.envs import EnvBase, HopperEnv
 
+from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl import MujocoStepper, RandomizedEnv
+from dropo_torch.rl.task import load_task
 
 SKIP = SIM.frame_skip
 #: A contestant: makes environment steps until the given time has passed; returns steps per second.
@@ -54,11 +58,46 @@ def torchrl(env: EnvBase) -> Contestant:
     return lambda seconds: timed(step, seconds)
 
 
-def asynchronous(processes: int) -> tuple[Contestant, Callable[[], None]]:
-    """Gymnasium's Hopper in a number of processes, and what ends them."""
-    env = gymnasium.make_vec(
-        "Hopper-v5", num_envs=processes, vectorization_mode="async", xml_file=str(SIM.model), frame_skip=SKIP
-    )
+class Plain(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One environment of a bundled task, stepped by plain MuJoCo."""
+
+    def __init__(self, sim: str) -> None:
+        self.task = load_task(sim)
+        self.model = self.task.model
+        self.data = mujoco.MjData(self.model)
+        size = self.model.nq + self.model.nv
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (size,), np.float64)
+        self.action_space = gymnasium.spaces.Box(self.task.action_low, self.task.action_high, dtype=np.float64)
+        self.steps = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, object] | None = None) -> tuple[np.ndarray, dict]:
+        """Begin at one of the task's initial states."""
+        super().reset(seed=seed)
+        state = self.task.initial_states(1, torch.Generator().manual_seed(int(self.np_random.integers(1 << 31))))[0]
+        mujoco.mj_resetData(self.model, self.data)
+        self.data.qpos[:], self.data.qvel[:] = state[: self.model.nq], state[self.model.nq :]
+        self.steps = 0
+        return self._state(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
+        """Make a step; the reward is the state's first number."""
+        self.data.ctrl[:] = self.task.controls(torch.from_numpy(action)[None])[0]
+        mujoco.mj_step(self.model, self.data, self.task.frame_skip)
+        self.steps += 1
+        return self._state(), float(self.data.qpos[0]), False, self.steps >= self.task.max_episode_steps, {}
+
+    def _state(self) -> np.ndarray:
+        return np.concatenate([self.data.qpos, self.data.qvel])
+
+
+def asynchronous(processes: int, sim: str) -> tuple[Contestant, Callable[[], None]]:
+    """Gymnasium's environments in a number of processes, and what ends them."""
+    if sim == "hopper":
+        env = gymnasium.make_vec(
+            "Hopper-v5", num_envs=processes, vectorization_mode="async", xml_file=str(SIM.model), frame_skip=SKIP
+        )
+    else:
+        env = gymnasium.vector.AsyncVectorEnv([partial(Plain, sim)] * processes)
     env.reset(seed=0)
 
     def step() -> int:
@@ -113,9 +152,40 @@ def hoppers(number: int, *, parallel: bool) -> tuple[Contestant, Callable[[], No
     return torchrl(env), env.close
 
 
+def contestants_of(
+    sim: str, envs: int, cores: int, seconds: float
+) -> tuple[dict[str, Contestant], list[Callable[[], None]]]:
+    """The contestants of a bundled system, and what ends those that have processes."""
+    theirs, close = fastest(
+        "Gymnasium AsyncVectorEnv",
+        {f"{n} processes": partial(asynchronous, int(n), sim) for n in cores * np.array([1, 2, 4])},
+        seconds / 2,
+    )
+    found = bundled_sim(sim)
+    space = ParameterSpace(found.model, found.parameters)
+    own = torchrl(RandomizedEnv(sim, envs, space=space, num_threads=cores))
+    if sim != "hopper":
+        return {"RandomizedEnv": own, "Gymnasium AsyncVectorEnv": theirs}, [close]
+    length = mean_length(space, envs)
+    print(f"a random episode has {length} steps on average")
+    torchrls, close_torchrls = fastest(
+        "TorchRL HopperEnv",
+        {f"{n} processes": partial(hoppers, n, parallel=True) for n in (cores, 2 * cores)}
+        | {"16 serial": partial(hoppers, 16, parallel=False)},
+        seconds / 2,
+    )
+    return {
+        "RandomizedEnv": own,
+        "mujoco.batch rollout": bare(space, envs, cores, length),
+        "TorchRL HopperEnv": torchrls,
+        "Gymnasium AsyncVectorEnv": theirs,
+    }, [close, close_torchrls]
+
+
 def main() -> None:
     """Print rates and ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sim", choices=("hopper", "push"), default="hopper")
     parser.add_argument("--envs", type=int, default=1024)
     parser.add_argument("--cores", type=int, default=2)
     parser.add_argument("--repeats", type=int, default=5)
@@ -124,40 +194,21 @@ def main() -> None:
     os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[: given.cores])
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    space = ParameterSpace(SIM.model, SIM.parameters)
-    length = mean_length(space, given.envs)
-    print(f"{given.envs} environments, {given.cores} cores; a random episode has {length} steps on average")
-
-    theirs, close_theirs = fastest(
-        "TorchRL HopperEnv",
-        {f"{n} processes": partial(hoppers, n, parallel=True) for n in (given.cores, 2 * given.cores)}
-        | {"16 serial": partial(hoppers, 16, parallel=False)},
-        given.seconds / 2,
-    )
-    gymnasiums, close_gymnasiums = fastest(
-        "Gymnasium AsyncVectorEnv",
-        {f"{n} processes": partial(asynchronous, int(n)) for n in given.cores * np.array([1, 2, 4])},
-        given.seconds / 2,
-    )
-    contestants = {
-        "RandomizedEnv": torchrl(RandomizedEnv("hopper", given.envs, space=space, num_threads=given.cores)),
-        "mujoco.batch rollout": bare(space, given.envs, given.cores, length),
-        "TorchRL HopperEnv": theirs,
-        "Gymnasium AsyncVectorEnv": gymnasiums,
-    }
+    contestants, closes = contestants_of(given.sim, given.envs, given.cores, given.seconds)
     rates = {name: [] for name in contestants}
     for _ in range(given.repeats):
         for name, contestant in contestants.items():
             rates[name].append(contestant(given.seconds))
-    close_theirs()
-    close_gymnasiums()
+    for close in closes:
+        close()
     own = np.array(rates["RandomizedEnv"])
     for name, found in rates.items():
         ratio = own / np.array(found)
         shown = f"{np.median(ratio):.2f} ({ratio.min():.2f} to {ratio.max():.2f})"
         print(f"{name:26s} {np.median(found):10,.0f} steps/s; RandomizedEnv has {shown} times as many")
-    over = np.array(rates["mujoco.batch rollout"]) / own - 1
-    print(f"overhead over the bare rollout: {np.median(over):.1%} ({over.min():.1%} to {over.max():.1%})")
+    if given.sim == "hopper":
+        over = np.array(rates["mujoco.batch rollout"]) / own - 1
+        print(f"overhead over the bare rollout: {np.median(over):.1%} ({over.min():.1%} to {over.max():.1%})")
 
 
 if __name__ == "__main__":
