@@ -9,6 +9,8 @@ import dataclasses
 import functools
 import tempfile
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,6 +22,7 @@ from benchmarks.hidden.truths import Effect, simulate_truth
 from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
+from dropo_torch.gap import family as members
 from dropo_torch.gap.evidence import Cost, Linearisation
 from dropo_torch.gap.family import base_family, joint_of, not_needed, pushing, shares_of, without_steps
 from dropo_torch.gap.ground import Ground
@@ -244,3 +247,21 @@ def test_a_family_of_which_nothing_is_left_weighs_nothing(tmp_path: Path) -> Non
     ground = Ground(scene.evidence, tuple(VOCABULARY.values()))
     assert not_needed(ground, ground.refit(scene.begin), np.inf) == []
     assert shares_of(ground, ground.refit(scene.begin)) == ()
+
+
+@pytest.mark.parametrize(("softer", "judged"), [(False, 1), (True, 2)])
+def test_members_are_judged_once_after_what_refines_them(
+    softer: bool, judged: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each judgment may spare members that explain a few hundredths of what is left; slopes are judged as they come."""
+    found: list[object] = []
+    first, soft = SimpleNamespace(hypothesis=None), SimpleNamespace(hypothesis=None)
+    monkeypatch.setattr(members, "fitted_family", lambda *_: first)
+    monkeypatch.setattr(members, "needed", lambda _, fit: found.append(fit) or fit)
+    monkeypatch.setattr(members, "with_soft_friction", lambda _, fit: soft if softer else fit)
+    monkeypatch.setattr(members, "with_slopes", lambda _, fit: fit)
+    monkeypatch.setattr(members, "without_steps", lambda _, fit: fit)
+    monkeypatch.setattr(members, "spread_out", lambda *_: True)
+    ground: Any = SimpleNamespace(setting=None, rules=Rules())
+    assert members.whole_family(ground, Hypothesis(())) is (soft if softer else first)
+    assert len(found) == judged

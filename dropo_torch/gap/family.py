@@ -79,9 +79,8 @@ def has_family(ground: Ground) -> bool:
 def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
     """Return the base family with the members that are needed, if several are at several joints."""
     whole = needed(ground, fitted_family(ground, begin))
-    for refined in (with_soft_friction, with_slopes, with_soft_friction):
-        finer = None if whole is None else refined(ground, whole)
-        whole = finer if finer is None or finer is whole else needed(ground, finer)  # it may do what others made up for
+    for refined in (softened, with_slopes, softened):
+        whole = None if whole is None else refined(ground, whole)
     whole = None if whole is None else without_steps(ground, whole)
     if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
         return None
@@ -97,6 +96,12 @@ def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
         prompt.hypothesis.with_effects([p for p in family if p.effect.is_filter]), iterations=iterations
     )
     return late if late.loss < prompt.loss else prompt
+
+
+def softened(ground: Ground, whole: Refit) -> Refit | None:
+    """Return the family with dry friction that creeps at rest, where it is better so, without what made up for that."""
+    softer = with_soft_friction(ground, whole)
+    return whole if softer is whole else needed(ground, softer)
 
 
 def with_slopes(ground: Ground, whole: Refit) -> Refit:
