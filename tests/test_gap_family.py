@@ -249,19 +249,19 @@ def test_a_family_of_which_nothing_is_left_weighs_nothing(tmp_path: Path) -> Non
     assert shares_of(ground, ground.refit(scene.begin)) == ()
 
 
-@pytest.mark.parametrize(("softer", "judged"), [(False, 1), (True, 2)])
+@pytest.mark.parametrize(("softer", "judged"), [(False, 1), (True, 3)])
 def test_members_are_judged_once_after_what_refines_them(
     softer: bool, judged: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each judgment may spare members that explain a few hundredths of what is left; slopes are judged as they come."""
     found: list[object] = []
-    first, soft = SimpleNamespace(hypothesis=None), SimpleNamespace(hypothesis=None)
+    first, soft, sloped = (SimpleNamespace(hypothesis=None) for _ in range(3))
     monkeypatch.setattr(members, "fitted_family", lambda *_: first)
     monkeypatch.setattr(members, "needed", lambda _, fit: found.append(fit) or fit)
     monkeypatch.setattr(members, "with_soft_friction", lambda _, fit: soft if softer else fit)
-    monkeypatch.setattr(members, "with_slopes", lambda _, fit: fit)
+    monkeypatch.setattr(members, "with_slopes", lambda *_: sloped)
     monkeypatch.setattr(members, "without_steps", lambda _, fit: fit)
     monkeypatch.setattr(members, "spread_out", lambda *_: True)
     ground: Any = SimpleNamespace(setting=None, rules=Rules())
-    assert members.whole_family(ground, Hypothesis(())) is (soft if softer else first)
+    assert members.whole_family(ground, Hypothesis(())) is (soft if softer else sloped)
     assert len(found) == judged
