@@ -105,6 +105,7 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
     frame_skip = frame_skip_of(config, space.model, trajectories)
     width = trajectories.observations.shape[1]
     effects, since = None, None
+    sensed = _is_sensed(config, space.model, width)
     if config.has_effects:
         num_states = int(source.num_states if config.backend == "gymnasium" else source.nq + source.nv)
         observation = _observation(config, space.model, num_states, width)
@@ -116,14 +117,15 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
         simulator = _with_effects(config, source, effects, space, trajectories)
         since = first_known(effects, space, trajectories, simulator.timestep or 1.0)
     else:
-        simulator = _backend(config, source, frame_skip, space)
+        simulator = _backend(config, source, frame_skip, space, sensed)
     if config.backend != "gymnasium" and (memory := filter_memory(space)):
         known = filters_known(memory, frame_skip, np.bincount(trajectories.episodes))
         since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
     trajectories = reckoned(trajectories, observation, simulator.timestep, _ahead(space.model, frame_skip))
-    transitions = make_transitions(trajectories, observation, lag=config.lag, history=simulator.history, since=since)
+    lag = 1 if sensed else config.lag
+    transitions = make_transitions(trajectories, observation, lag=lag, history=simulator.history, since=since)
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}
     objective = Objective(simulator, transitions, observation, **likelihood)
     digest = _fingerprint(given, space.model, trajectories)
@@ -136,11 +138,43 @@ def _ahead(model: mujoco.MjModel | None, frame_skip: int) -> float:
     return 0.0 if explicit else 1 / frame_skip
 
 
-def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace) -> Simulator:
+def refuse_sensed(problem: Problem, what: str) -> None:
+    """Raise an :class:`InputError` where states are to be estimated, which somebody has to know."""
+    if problem.observation.is_sensed:
+        raise InputError(
+            f"observation: it names sensors and not the whole state, which {what} needs; fit takes such a log "
+            "(dropo fit)"
+        )
+
+
+def _is_sensed(config: Config, model: mujoco.MjModel | None, width: int) -> bool:
+    """Whether states are to be estimated from the log; refuse keys that then say nothing."""
+    if config.backend == "gymnasium" or model is None or not parse_observation(model, config.observation, width).is_sensed:
+        return False
+    if config.effects:
+        raise InputError("effects: they do not go with sensors in observation, between which states are estimated")
+    if config.method not in ("dropo", "laplace") or config.optimizer != "fisher":
+        key = "optimizer" if config.method == "dropo" else "method"
+        raise InputError(
+            f"{key}: {getattr(config, key)} needs logged states, and observation names sensors; use optimizer: fisher"
+        )
+    for key in ("epsilon", "covariance", "entropy", "scaling", "orientation"):
+        if (given := getattr(config, key)) != Config.model_fields[key].default:
+            raise InputError(
+                f"{key}: {given!r} given, which says nothing where observation names sensors: columns are weighed by "
+                "their noise, and parameters are one vector; leave it out"
+            )
+    return True
+
+
+def _backend(
+    config: Config, source: Any, frame_skip: int, space: ParameterSpace, sensors: bool = False
+) -> Simulator:
     """The simulator of the config's backend."""
     means: dict[str, Any] = {"num_threads": config.threads, "chunk_size": config.chunk_size, "device": config.device}
     if config.backend != "gymnasium":
         means["history"] = math.ceil(filter_memory(space) / frame_skip)
+        means["sensors"] = sensors
     return make_simulator(config.backend, source, parameters=space, frame_skip=frame_skip, **means)
 
 
@@ -234,7 +268,7 @@ def _check_log(trajectories: Trajectories, simulator: Simulator, frame_skip: int
 
 
 def _observation(config: Config, model: mujoco.MjModel | None, num_states: int, width: int) -> Observation:
-    if model is not None and num_states == model.nq + model.nv:
+    if model is not None and num_states in (model.nq + model.nv, model.nq + model.nv + model.nsensordata):
         return parse_observation(model, config.observation, width)
     if config.observation is not None:
         raise InputError("observation: this simulator's states have no names; leave the key out")

@@ -15,6 +15,8 @@ from dropo_torch.distribution import Distribution, SearchBox, to_values
 from dropo_torch.initial_noise import parameter_covariance
 from dropo_torch.objective import Objective
 
+#: Units of what is a position.
+POSITIONS = ("m", "rad", "-")
 Verdict = Literal["explained", "not_explained", "hopeless"]
 
 
@@ -147,7 +149,7 @@ def _without_skill(
         return f"{100 * diverged:.0f} % of the simulations diverge, wherever in the bounds: {check}."
     columns = zip(residual.T, change.T, given.T, expected.T, strict=True)
     skills = np.array([_skill(*column) for column in columns])
-    is_position = np.array([bool(unit) and not unit.endswith("/s") for unit in units])
+    is_position = np.array([unit in POSITIONS for unit in units])
     for name, kind, least in (("positions", is_position, t.position_skill), ("columns", ~is_position, t.skill)):
         own = skills[kind & np.isfinite(skills)]
         if len(own) and (own < least).mean() >= t.half:

@@ -1,7 +1,8 @@
 """What the columns of a log are: the map between observations and simulator states.
 
 A simulator state is ``[qpos, qvel]``, ``(nq + nv,)``. An observation is a list of state columns, in
-any order, some of which may be missing or of no interest. It is written as a list of entries:
+any order, some of which may be missing or of no interest, and of sensors' values: columns of the extended state
+``[qpos, qvel, sensordata]``. It is written as a list of entries:
 
 =============================  ==================================================================
 ``qpos``, ``qvel``             every generalized position, every generalized velocity
@@ -9,8 +10,13 @@ any order, some of which may be missing or of no interest. It is written as a li
 ``qpos[2]``                    one column
 ``qpos[elbow]``                every position column of the joint ``elbow``
 ``elbow.position``             the same, and ``elbow.velocity`` for its velocity columns
+``sensor[imu]``                every value of the sensor ``imu``; ``sensor[imu][1]``: one of them
+``sensor``, ``sensor[0:3]``    every value of every sensor, a slice of ``sensordata``
 ``skip``, ``skip[3]``          one column, three columns of the log which are no state
 =============================  ==================================================================
+
+A sensor that is a joint's encoder (``jointpos``, ``jointvel``, ``ballquat``, ``ballangvel``) stands for the columns of
+the state that it shows. With sensors, a state of which not every column is observed is estimated from the log.
 """
 
 from __future__ import annotations
@@ -23,8 +29,11 @@ from functools import cached_property
 import mujoco
 import numpy as np
 
+from dropo_torch.data.sensors import Sensor, sensors_of
 from dropo_torch.errors import InputError, choices
 
+_SLICE = re.compile(r"(-?\d+)|(-?\d*):(-?\d*)(?::(-?\d+))?")
+_SENSOR = re.compile(r"sensor(?:\[([^]]*)\])?(?:\[([^]]*)\])?")
 _Labels = tuple[tuple[str, str], ...]  # a suffix and a unit for each column
 _PLACE: _Labels = tuple((f"[{axis}]", "m") for axis in "xyz")
 _QUATERNION: _Labels = tuple((f"[q{axis}]", "-") for axis in "wxyz")
@@ -80,6 +89,8 @@ class Observation:
             rest.
         reckoned: positions that are not observed, with their velocities, which are. Such a position is where its
             velocity has led since the episode's start, where it had its default.
+        is_sensed: whether states are not what the log shows: they are to be estimated from it. Then states are
+            extended by ``sensordata``, at rest and reckoned are none.
     """
 
     columns: tuple[int, ...]
@@ -91,6 +102,7 @@ class Observation:
     quaternions: tuple[tuple[int, int, int, int], ...] = ()
     at_rest: tuple[str, ...] = ()
     reckoned: tuple[Reckoned, ...] = ()
+    is_sensed: bool = False
 
     @property
     def size(self) -> int:
@@ -186,11 +198,14 @@ def parse_observation(
         InputError: an entry that names nothing, a column named twice, a width that does not fit.
     """
     joints = _joints(model)
+    about = {c: entry for joint in joints for c, entry in (joint.positions | joint.velocities).items()}
+    sensors, num_states = sensors_of(model, about), model.nq + model.nv
     listed: list[int | None] = []  # a state column, or None, for each column of the log
     for entry in ("qpos", "qvel") if entries is None else entries:
-        listed += _entry_columns(model, joints, str(entry).strip())
+        listed += _entry_columns(model, joints, sensors, str(entry).strip())
     columns, width = [c for c in listed if c is not None], len(listed)
-    about = {c: entry for joint in joints for c, entry in (joint.positions | joint.velocities).items()}
+    about |= {c: entry for sensor in sensors for c, entry in sensor.columns.items()}
+    is_sensed = _names_sensors(entries or ()) and sorted(columns) != list(range(num_states))
     twice = {c for c in columns if columns.count(c) > 1}
     if twice:
         raise InputError(f"observation: {about[min(twice)][0]} stands there twice; name each state column once")
@@ -203,7 +218,7 @@ def parse_observation(
             f"list what each of the log's columns is (the model has nq={model.nq}, nv={model.nv}), 'skip' for none; "
             "velocities that it lacks are derived by data: preprocess"
         )
-    default = np.concatenate([model.qpos0, np.zeros(model.nv)])
+    default = np.concatenate([model.qpos0, np.zeros(model.nv + is_sensed * model.nsensordata)])
     return Observation(
         columns=tuple(columns),
         labels=tuple(about[c][0] for c in columns),
@@ -211,10 +226,15 @@ def parse_observation(
         log_width=width,
         default_state=tuple(default.tolist()),
         units=tuple(about[c][1] for c in columns),
-        quaternions=_complete_quaternions(joints, columns),
-        at_rest=tuple(joint.name for joint in joints if _is_at_rest(joint, set(columns))),
-        reckoned=_reckoned(model, joints, columns),
+        quaternions=_complete_quaternions(joints, sensors, columns),
+        at_rest=() if is_sensed else tuple(joint.name for joint in joints if _is_at_rest(joint, set(columns))),
+        reckoned=() if is_sensed else _reckoned(model, joints, columns),
+        is_sensed=is_sensed,
     )
+
+
+def _names_sensors(entries: Sequence[str]) -> bool:
+    return any(_SENSOR.fullmatch(str(entry).strip()) for entry in entries)
 
 
 def generic_observation(num_columns: int) -> Observation:
@@ -268,29 +288,64 @@ def _reckoned(model: mujoco.MjModel, joints: Sequence[_Joint], columns: Sequence
     return tuple(found)
 
 
-def _entry_columns(model: mujoco.MjModel, joints: Sequence[_Joint], entry: str) -> list[int] | list[None]:
+def _entry_columns(
+    model: mujoco.MjModel, joints: Sequence[_Joint], sensors: Sequence[Sensor], entry: str
+) -> list[int] | list[None]:
     """State columns of one entry; ``None`` for each log column to skip."""
     skip = re.fullmatch(r"skip(?:\[(\d+)\])?", entry)
     if skip:
         return [None] * int(skip[1] or 1)
+    if _SENSOR.fullmatch(entry):
+        return _sensor_columns(sensors, entry)
     match = re.fullmatch(r"(.+)\.(position|velocity)|(qpos|qvel)(?:\[(.*)\])?", entry)
     if match is None:
         raise InputError(
             f"observation: {entry!r} is not understood; expected qpos, qvel, a slice qpos[1:], a joint "
-            "qpos[elbow] or elbow.position, or skip" + choices(entry, ["qpos", "qvel", "skip"])
+            "qpos[elbow] or elbow.position, sensor[imu], or skip" + choices(entry, ["qpos", "qvel", "sensor", "skip"])
         )
     name, side, whole, inside = match.groups()
     of_position = side == "position" or whole == "qpos"
     every = range(model.nq) if of_position else range(model.nq, model.nq + model.nv)
     if whole and inside is None:
         return list(every)
-    part = whole and re.fullmatch(r"(-?\d+)|(-?\d*):(-?\d*)(?::(-?\d+))?", inside)
+    if whole and (found := _sliced(every, inside, entry, whole)):
+        return found
+    named = {joint.name: joint for joint in joints}
+    wanted = name or inside
+    if wanted not in named:
+        raise InputError(f"observation: {entry}: the model has no joint {wanted!r}" + choices(wanted, named))
+    return list(named[wanted].positions if of_position else named[wanted].velocities)
+
+
+def _sensor_columns(sensors: Sequence[Sensor], entry: str) -> list[int]:
+    """Columns of one entry that names sensors."""
+    match = _SENSOR.fullmatch(entry)
+    assert match is not None
+    inside, part = match.groups()
+    every = [(c, sensor) for sensor in sensors for c in sensor.columns]
+    named = {sensor.name: sensor for sensor in sensors}
+    if inside in named:
+        found = list(named[inside].columns)
+        if part is not None and (chosen := _sliced(found, part, entry, f"sensor[{inside}]")) is None:
+            raise InputError(f"observation: {entry}: {part!r} is no number or slice; sensor[{inside}][0] is its first")
+        found = found if part is None else chosen
+    elif part is None and (inside is None or _SLICE.fullmatch(inside)):
+        columns = [c for c, _ in every]
+        found = columns if inside is None else _sliced(columns, inside, entry, "sensor") or []
+    else:
+        raise InputError(f"observation: {entry}: the model has no sensor {inside!r}" + choices(inside or "", named))
+    if not found:
+        raise InputError(f"observation: {entry}: the model has no sensors")
+    for sensor in {sensor.name: sensor for c, sensor in every if c in found}.values():
+        sensor.check()
+    return found
+
+
+def _sliced(every: Sequence[int], inside: str, entry: str, whole: str) -> list[int] | None:
+    """The columns that a number or a slice names; ``None`` where it is neither."""
+    part = _SLICE.fullmatch(inside)
     if not part:
-        named = {joint.name: joint for joint in joints}
-        wanted = name or inside
-        if wanted not in named:
-            raise InputError(f"observation: {entry}: the model has no joint {wanted!r}" + choices(wanted, named))
-        return list(named[wanted].positions if of_position else named[wanted].velocities)
+        return None
     index, *bounds = (int(p) if p else None for p in part.groups())
     if index is not None:
         bounds = [index, index + 1 or None, None]
@@ -303,15 +358,20 @@ def _entry_columns(model: mujoco.MjModel, joints: Sequence[_Joint], entry: str) 
     return found
 
 
-def _complete_quaternions(joints: Sequence[_Joint], columns: list[int]) -> tuple[tuple[int, int, int, int], ...]:
+def _complete_quaternions(
+    joints: Sequence[_Joint], sensors: Sequence[Sensor], columns: list[int]
+) -> tuple[tuple[int, int, int, int], ...]:
+    blocks = [(f"joint {j.name!r}", list(j.positions)[-4:]) for j in joints if len(j.positions) >= 4]
+    known = {block[0] for _, block in blocks}
+    own = [(f"sensor {s.name!r}", list(s.columns)) for s in sensors if s.is_quaternion]
     found = []
-    for joint in joints:
-        present = [columns.index(c) for c in list(joint.positions)[-4:] if c in columns]
-        if len(joint.positions) < 4 or not present:
+    for name, block in blocks + [(n, b) for n, b in own if b[0] not in known]:
+        present = [columns.index(c) for c in block if c in columns]
+        if not present:
             continue
         if len(present) != 4:
             raise InputError(
-                f"observation: only {len(present)} of the 4 quaternion columns of joint {joint.name!r} are named; "
+                f"observation: only {len(present)} of the 4 quaternion columns of {name} are named; "
                 "name all four or none"
             )
         w, x, y, z = present

@@ -330,9 +330,22 @@ def make_replay(
     about_start: bool = False,
     since: np.ndarray | None = None,
 ) -> Replay:
-    """Cut a log into consecutive windows of ``horizon`` transitions; see :func:`make_transitions`.
+    """Cut a log into consecutive windows of about ``horizon`` transitions; see :func:`horizon_of`."""
+    steps = horizon_of(trajectories, horizon, since)
+    windows = make_transitions(trajectories, observation, lag=steps, history=history, since=since)
+    return Replay(
+        states=windows.states,
+        controls=windows.controls,
+        measured=measured_path(trajectories, observation, windows),
+        history=history,
+        about_start=about_start,
+    )
 
-    Of the lengths down to half the horizon (or half the longest episode), windows have the one that leaves the fewest
+
+def horizon_of(trajectories: Trajectories, horizon: int, since: np.ndarray | None = None) -> int:
+    """Return the length of consecutive windows: about ``horizon`` transitions.
+
+    Of the lengths down to half the horizon (or half the longest episode), it is the one that leaves the fewest
     transitions out, the longest of several.
 
     Raises:
@@ -342,17 +355,14 @@ def make_replay(
         raise InputError(f"horizon: {horizon} given; expected a whole number of logged steps, 1 or more")
     lengths = np.maximum(np.bincount(trajectories.episodes) - (0 if since is None else since), 0)
     longest = max(min(horizon, int(lengths.max())), 1)
-    steps = max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
-    windows = make_transitions(trajectories, observation, lag=steps, history=history, since=since)
-    rows = (windows.rows[:, None] + np.arange(steps)).reshape(-1)
+    return max(range((longest + 1) // 2, longest + 1), key=lambda h: (int((lengths // h * h).sum()), h))
+
+
+def measured_path(trajectories: Trajectories, observation: Observation, windows: Transitions) -> np.ndarray:
+    """Return the observed columns after each step of windows of H, ``(W, H, n)``."""
+    rows = (windows.rows[:, None] + np.arange(windows.lag)).reshape(-1)
     measured = observation.observed(trajectories.next_observations[rows])
-    return Replay(
-        states=windows.states,
-        controls=windows.controls,
-        measured=np.ascontiguousarray(measured.reshape(len(windows), steps, -1)),
-        history=history,
-        about_start=about_start,
-    )
+    return np.ascontiguousarray(measured.reshape(len(windows), windows.lag, -1))
 
 
 def column_names(name: str, width: int) -> list[str]:

@@ -34,6 +34,7 @@ def make_simulator(
     chunk_size: int = 10_000,
     device: str = "cpu",
     history: int = 0,
+    sensors: bool = False,
 ) -> Simulator:
     """Return the simulator of a backend.
 
@@ -47,14 +48,17 @@ def make_simulator(
         chunk_size: simulations held in memory at once.
         device: of the ``"warp"`` backend, ``"cpu"`` or a GPU such as ``"cuda:0"``.
         history: logged steps of controls before each transition, for actuators' filters; not of ``"gymnasium"``.
+        sensors: whether states are extended by ``sensordata``; of ``"mujoco"`` alone.
 
     Raises:
         InputError: an unknown backend, or a model that it does not support.
     """
+    if sensors and backend != "mujoco":
+        raise InputError(f"backend: {backend} simulates no sensors, which observation names; use backend: mujoco")
     if backend == "mujoco":
         return MujocoSimulator(
             model, parameters=parameters, frame_skip=frame_skip, num_threads=num_threads, chunk_size=chunk_size,
-            history=history,
+            history=history, sensors=sensors,
         )  # fmt: skip
     if backend == "gymnasium":
         return GymnasiumSimulator(model, parameters=parameters, frame_skip=frame_skip)

@@ -33,6 +33,8 @@ class MujocoSimulator(Simulator):
         chunk_size: rows that are simulated at once.
         history: logged steps before each transition whose controls come with it, ``(T, history + lag, ·)``: first-order
             filters of actuators are replayed over them. Without history, filters start settled at the first control.
+        sensors: whether states are extended by ``sensordata``, ``[qpos, qvel, sensordata]``: its values in the state
+            after a transition, under the control that led there. Those of initial states are not read.
 
     Controls of a model with mocap bodies that act on something are its ``nu`` controls and then the pose of each such
     body, position and quaternion ``(w, x, y, z)``, held throughout the transition.
@@ -52,6 +54,7 @@ class MujocoSimulator(Simulator):
         num_threads: int = 0,
         chunk_size: int = 10_000,
         history: int = 0,
+        sensors: bool = False,
     ) -> None:
         model = load_model(model)
         if frame_skip < 1 or chunk_size < 1:
@@ -60,7 +63,8 @@ class MujocoSimulator(Simulator):
         unmark_frames(self.model, parameters)
         self.parameters = parameters
         self.frame_skip = int(frame_skip)
-        self.num_states = model.nq + model.nv
+        self._sensors = sensors
+        self.num_states = model.nq + model.nv + sensors * model.nsensordata
         self._mocap = model.body_mocapid[prescribed_bodies(model)]
         self.num_controls = model.nu + POSE * len(self._mocap)
         self.history = int(history)
@@ -135,8 +139,11 @@ class MujocoSimulator(Simulator):
         ids = np.arange(num_rows, dtype=np.int32)
         batch.state[:num_rows] = self._row
         qpos, qvel, ctrl = field("qpos"), field("qvel"), field("ctrl")
+        shown, stage = [qpos, qvel], mujoco.mjtStage.mjSTAGE_NONE
+        if self._sensors:
+            shown, stage = [*shown, field("sensordata")], mujoco.mjtStage.mjSTAGE_ACC
         qpos[:] = np.repeat(start[:, : model.nq], num_k, axis=0)
-        qvel[:] = np.repeat(start[:, model.nq :], num_k, axis=0)
+        qvel[:] = np.repeat(start[:, model.nq : model.nq + model.nv], num_k, axis=0)
         if len(self._filters):
             field("act")[:, self._filters.activations] = self._activations(control, num_k)
         control = control[:, self.history :]
@@ -151,10 +158,10 @@ class MujocoSimulator(Simulator):
                 field("mocap_quat").reshape(num_rows, -1, 4)[:, self._mocap] = poses[..., 3:]
             try:
                 with quiet_mujoco():
-                    batch.step(ids, nstep=self.frame_skip)
+                    batch.step(ids, nstep=self.frame_skip, stage=stage)
             except mujoco.batch.SimulationError as error:
                 failed[error.ids] = True
-            out[:, step, : model.nq], out[:, step, model.nq :] = qpos, qvel
+            np.concatenate(shown, axis=1, out=out[:, step])
         failed |= ~(np.abs(out) < DIVERGED).all(axis=(1, 2))
         out[failed] = np.nan
         return out.reshape(len(start), num_k, *out.shape[1:])

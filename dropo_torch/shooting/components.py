@@ -1,0 +1,123 @@
+"""How noisy measurements are and how exactly windows join, from residuals and what the fit has taken off them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from dropo_torch.diagnostics import estimates
+from dropo_torch.shooting.equations import Normal, Residuals, Scales, Slopes
+
+#: Share of a kind of residuals that must be left to them for their size to be told.
+REDUNDANT = 0.02
+#: The smallest noise, as a share of a column's spread, and the smallest link.
+LEAST_NOISE, LEAST_LINK = 1e-6, 1e-6
+#: Power of a link's change that a look makes, since a link that is exact is approached slowly; and the largest change.
+HASTE, FASTEST = 1.8, 0.05
+
+
+@dataclass(frozen=True, eq=False)
+class Posterior:
+    """Covariances at a point, in sizes of moves and widths of the parameters' box.
+
+    Attributes:
+        parameters: ``(d, d)``, with a normal of the box's width for what the log does not tell.
+        states: of each window's initial state, ``(W, s, s)``.
+        before: of that with the one of the window before, ``(W, s, s)``.
+        shared: of that with the parameters, ``(W, s, d)``.
+    """
+
+    parameters: np.ndarray
+    states: np.ndarray
+    before: np.ndarray
+    shared: np.ndarray
+
+    @classmethod
+    def of(cls, normal: Normal) -> Posterior:
+        """Return that of undamped normal equations."""
+        error, correlation = estimates(normal.schur + np.eye(len(normal.schur)))
+        parameters = correlation * np.outer(error, error)
+        own, before = normal.chain.covariances()
+        shared = normal.shift @ parameters
+        own = own + shared @ normal.shift.swapaxes(1, 2)
+        before = before + shared @ np.roll(normal.shift, 1, axis=0).swapaxes(1, 2)
+        return cls(parameters, own, before, shared)
+
+
+def components(
+    at: Residuals, slope: Slopes, scales: Scales, normal: Normal, spread: np.ndarray, noise: np.ndarray | None
+) -> Scales:
+    """Return the scales that the residuals show: squares over the degrees of freedom that the fit leaves each kind.
+
+    Args:
+        at: residuals at the fit.
+        slope: their derivatives.
+        scales: by which they were weighed.
+        normal: the undamped normal equations.
+        spread: of each feature over the log, ``(m,)``.
+        noise: of each feature where it is known, ``(m,)``; then links alone are estimated.
+    """
+    posterior, kept = Posterior.of(normal), ~at.lost
+    link = _updated(
+        at.links[kept & at.follows], _of_links(at, slope, posterior)[kept & at.follows], scales.link, LEAST_LINK, HASTE
+    )
+    if noise is not None:
+        return Scales(noise, link)
+    m = len(scales.noise)
+    squares = _of_measured(slope, posterior).reshape(-1, m)
+    alive = np.repeat(kept, at.measured.shape[1] // m)
+    return Scales(_updated(at.measured.reshape(-1, m)[alive], squares[alive], scales.noise, LEAST_NOISE * spread), link)
+
+
+def _updated(
+    residual: np.ndarray, explained: np.ndarray, scale: np.ndarray, least: np.ndarray | float, haste: float = 1.0
+) -> np.ndarray:
+    """Scales ``(k,)`` of residuals ``(N, k)``, of whose variance the fit explains so much."""
+    left = len(residual) - (explained / scale**2).sum(0)
+    told = left > REDUNDANT * len(residual)
+    found = np.maximum(np.sqrt((residual**2).sum(0) / np.where(told, left, 1.0)), 1e-300)
+    found = scale * np.clip(found / scale, FASTEST, 1 / FASTEST) ** haste
+    return np.where(told, np.maximum(found, least), scale)
+
+
+def _of_measured(slope: Slopes, posterior: Posterior) -> np.ndarray:
+    """Variance that the posterior gives each simulated feature, ``(W, H m)``."""
+    joint = np.block([
+        [posterior.states, posterior.shared],
+        [posterior.shared.swapaxes(1, 2), np.broadcast_to(posterior.parameters, (len(slope.measured), *posterior.parameters.shape))],
+    ])  # fmt: skip
+    return ((slope.measured @ joint) * slope.measured).sum(-1)
+
+
+def _of_links(at: Residuals, slope: Slopes, posterior: Posterior) -> np.ndarray:
+    """Variance that the posterior gives each link, ``(W, s)``."""
+    before, s = slope.of_links(at.follows), at.links.shape[1]
+    earlier, shared = (np.roll(x, 1, axis=0) for x in (posterior.states, posterior.shared))
+    by_state, by_parameter = before[..., :s], before[..., s:]
+    covariance = posterior.states + by_state @ earlier @ by_state.swapaxes(1, 2)
+    covariance = covariance + by_parameter @ posterior.parameters @ by_parameter.swapaxes(1, 2)
+    cross = posterior.before @ by_state.swapaxes(1, 2) + posterior.shared @ by_parameter.swapaxes(1, 2)
+    cross = cross + by_state @ shared @ by_parameter.swapaxes(1, 2)
+    return np.asarray(np.diagonal(covariance + cross + cross.swapaxes(1, 2), axis1=1, axis2=2))
+
+
+def uncertainty(at: Residuals, slope: Slopes, scales: Scales, normal: Normal) -> tuple[np.ndarray, np.ndarray]:
+    """Return standard errors of the parameters, in widths of their box, ``(d,)``, and their correlation ``(d, d)``.
+
+    The larger of two: by the residuals' scales, and by how much the windows disagree (the sandwich of cluster-robust
+    errors), which also counts what the model lacks.
+    """
+    error, correlation = estimates(normal.schur + np.eye(len(normal.schur)))
+    covariance, s = correlation * np.outer(error, error), at.links.shape[1]
+    weight, of_link = at.weights(scales)
+    moved = normal.shift
+    own = (slope.measured[..., s:] + slope.measured[..., :s] @ moved) * weight[:, None]
+    before = slope.of_links(at.follows)
+    joins = moved + before[..., s:] + before[..., :s] @ np.roll(moved, 1, axis=0)
+    score = np.einsum("wnd,wn->wd", own, at.measured * weight)
+    score = score + np.einsum("wsd,ws->wd", joins * of_link[..., None], at.links * of_link)
+    count = len(score)
+    middle = score.T @ score * count / max(count - 1, 1)
+    clustered = np.sqrt(np.maximum(np.diag(covariance @ middle @ covariance), 0.0))
+    return np.maximum(error, clustered), correlation
