@@ -52,6 +52,7 @@ class Diagnostics:
         diverged: simulations that diverged.
         at_rest: joints at rest in every initial state, because the log has their position alone.
         noisy_starts: whether initial states are noisy, so that windows that follow on each other share a measurement.
+        is_sensed: whether windows start from estimated states.
     """
 
     labels: tuple[str, ...]
@@ -74,6 +75,7 @@ class Diagnostics:
     diverged: int
     at_rest: tuple[str, ...] = ()
     noisy_starts: bool = False
+    is_sensed: bool = False
 
     @property
     def residual(self) -> np.ndarray:
@@ -82,11 +84,21 @@ class Diagnostics:
 
 
 def diagnose(
-    objective: Objective, distribution: Distribution, *, samples: int = 50, seed: int = 0, max_transitions: int = 5000
-) -> Diagnostics:
+    objective: Objective, distribution: Distribution, *, samples: int = 50, seed: int = 0, max_transitions: int = 5000,
+    known: tuple[np.ndarray, np.ndarray] | None = None,
+) -> Diagnostics:  # fmt: skip
     """Simulate the log under a distribution, and around its center.
 
     A log of more than ``max_transitions`` windows is judged on about that many, in runs spread evenly over it.
+
+    Args:
+        objective: the likelihood of the log.
+        distribution: the fit.
+        samples: of the distribution.
+        seed: of the samples.
+        max_transitions: windows that are judged, about.
+        known: standard errors of the means, in coordinates, ``(d,)``, and the correlation of their estimates
+            ``(d, d)``, where more was estimated than the objective knows of.
     """
     if len(objective) > max_transitions:
         begins = np.linspace(0, len(objective) - RUN, max(1, max_transitions // RUN)).astype(int)
@@ -102,7 +114,12 @@ def diagnose(
     follows = np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
     together = None if initial is None else initial.carried[1:] * torch.from_numpy(follows[:-1, None, None])
     residual = objective.target(slice(None), initial) - mean
-    error, correlation, std_error = _standard_errors(objective, distribution, covariance, jacobian, residual, together)
+    if known is None:
+        error, correlation, std_error = _standard_errors(
+            objective, distribution, covariance, jacobian, residual, together
+        )
+    else:
+        (error, correlation), std_error = known, np.full(len(distribution), np.nan)
     started, columns = objective.evaluator.columns_at_start, objective.evaluator.columns
     names = distribution.names
     pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
@@ -127,6 +144,7 @@ def diagnose(
         diverged=lost,
         at_rest=objective.observation.at_rest,
         noisy_starts=objective.noise is not None,
+        is_sensed=objective.observation.is_sensed,
     )
 
 

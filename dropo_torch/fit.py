@@ -66,6 +66,21 @@ OnProgress = Callable[[HistoryEntry, Progress], None]
 
 
 @dataclass(frozen=True)
+class Estimated:
+    """What a fit has estimated beside its distribution, where the log does not show the states.
+
+    Attributes:
+        objective: the likelihood of the log's transitions from the estimated states.
+        standard_error: of each mean, in coordinates, states being unknown, ``(d,)``.
+        correlation: of the estimates of the means, ``(d, d)``.
+    """
+
+    objective: Objective
+    standard_error: np.ndarray
+    correlation: np.ndarray
+
+
+@dataclass(frozen=True)
 class Fit:
     """A fitted distribution and how it was found.
 
@@ -87,6 +102,7 @@ class Fit:
         extras: what that method found beside it, as plain data.
         judgment: whether the model explains the log, once that was judged.
         log_likelihood_eq3: the log-likelihood by eq. 3, which it is on a log without noise.
+        estimated: what else was estimated, where the log does not show the states.
     """
 
     distribution: Distribution
@@ -108,6 +124,7 @@ class Fit:
     extras: Mapping[str, Any] = field(default_factory=dict)
     judgment: Judgment | None = None
     log_likelihood_eq3: float = math.nan
+    estimated: Estimated | None = None
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``fit.json``."""
@@ -158,6 +175,10 @@ def fit(
         InputError: a parameter without effect on this log, a checkpoint that does not fit, or ``resume`` without one;
             with Adam, a gradient that the differences of MuJoCo do not confirm on 20 transitions.
     """
+    if objective.observation.is_sensed:
+        raise InputError(
+            "observation: it names sensors and not the whole state; use fit_problem, which estimates states"
+        )
     settings = settings or FitSettings()
     search = search or make_optimizer(objective, settings)
     if resume and checkpoint is None:

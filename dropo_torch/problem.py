@@ -142,14 +142,18 @@ def refuse_sensed(problem: Problem, what: str) -> None:
     """Raise an :class:`InputError` where states are to be estimated, which somebody has to know."""
     if problem.observation.is_sensed:
         raise InputError(
-            f"observation: it names sensors and not the whole state, which {what} needs; fit takes such a log "
-            "(dropo fit)"
+            f"observation: it names sensors and not the whole state, which {what} needs; dropo fit and dropo check "
+            "take such a log"
         )
 
 
 def _is_sensed(config: Config, model: mujoco.MjModel | None, width: int) -> bool:
     """Whether states are to be estimated from the log; refuse keys that then say nothing."""
-    if config.backend == "gymnasium" or model is None or not parse_observation(model, config.observation, width).is_sensed:
+    if (
+        config.backend == "gymnasium"
+        or model is None
+        or not parse_observation(model, config.observation, width).is_sensed
+    ):
         return False
     if config.effects:
         raise InputError("effects: they do not go with sensors in observation, between which states are estimated")
@@ -167,9 +171,7 @@ def _is_sensed(config: Config, model: mujoco.MjModel | None, width: int) -> bool
     return True
 
 
-def _backend(
-    config: Config, source: Any, frame_skip: int, space: ParameterSpace, sensors: bool = False
-) -> Simulator:
+def _backend(config: Config, source: Any, frame_skip: int, space: ParameterSpace, sensors: bool = False) -> Simulator:
     """The simulator of the config's backend."""
     means: dict[str, Any] = {"num_threads": config.threads, "chunk_size": config.chunk_size, "device": config.device}
     if config.backend != "gymnasium":

@@ -93,7 +93,8 @@ def judge(distribution: Distribution, method: str, diagnostics: Diagnostics, div
     residual = diagnostics.measured - diagnostics.at_center
     sizes = diagnostics.change, diagnostics.given, diagnostics.expected
     hopeless = _without_skill(diagnostics.units, residual, *sizes, diverged)
-    notes = [*_at_bounds(distribution), *([spread_note(distribution)] if is_dropo else [])]
+    wider = "method: laplace" if diagnostics.is_sensed else "entropy: 1"
+    notes = [*_at_bounds(distribution), *([spread_note(distribution, wider)] if is_dropo else [])]
     verdict: Verdict = "explained"
     if method == "udr":
         reason = f"this is a box drawn at random; the log was not used. {scale_of(diagnostics)}"
@@ -221,8 +222,8 @@ def scale_of(diagnostics: Diagnostics) -> str:
     )
 
 
-def spread_note(distribution: Distribution) -> str:
-    """Return what training would draw where σ is at its floor, and what widens it; empty where none is."""
+def spread_note(distribution: Distribution, wider: str = "entropy: 1") -> str:
+    """Return what training would draw where σ is at its floor, and what key widens it; empty where none is."""
     floor = np.flatnonzero(at_floor(distribution))
     if not len(floor):
         return ""
@@ -235,7 +236,7 @@ def spread_note(distribution: Distribution) -> str:
     more = f" and {len(floor) - 5} more likewise" if len(floor) > 5 else ""
     return (
         f"σ is at its floor: dropo train would draw {', '.join(drawn)}{more}, practically one value. "
-        "To train on more, fit with entropy: 1, or train with distribution: uniform."
+        f"To train on more, fit with {wider}, or train with distribution: uniform."
     )
 
 

@@ -94,6 +94,7 @@ LAYERS = (
     "logged",
     "effects",
     "problem",
+    "shooting",
     "baselines", "gap", "rl", "view",
     "proposal", "studies",
     "report",

@@ -22,6 +22,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit, HistoryEntry, fit
 from dropo_torch.optimizers import Optimizer, Progress
 from dropo_torch.problem import Problem
+from dropo_torch.shooting import fit_sensed
 
 __all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
 
@@ -70,7 +71,13 @@ def fit_problem(
     resume: bool = False,
     on_progress: Callable[[HistoryEntry, Progress], None] | None = None,
 ) -> Fit:
-    """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`."""
+    """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`.
+
+    Where the log does not show the states, they are estimated, too: :func:`dropo_torch.shooting.fit_sensed`.
+    """
+    if problem.observation.is_sensed:
+        make_search(problem)  # refuses options
+        return fit_sensed(problem, checkpoint=checkpoint, resume=resume, on_progress=on_progress)
     settings, search = problem.config.fit_settings(), make_search(problem)
     kept: dict[str, Any] = {"checkpoint": checkpoint, "resume": resume, "fingerprint": problem.fingerprint}
     return fit(problem.objective, settings, search=search, on_progress=on_progress, **kept)

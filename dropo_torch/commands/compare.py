@@ -32,13 +32,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo compare``, which writes ``compare.json`` and ``report.html``."""
-    from dropo_torch.problem import make_problem
+    from dropo_torch.problem import make_problem, refuse_sensed
     from dropo_torch.report import write_compare_report
     from dropo_torch.studies.compare import METHODS, compare
 
     config, out = load_config(given.config, overrides), given.out
     only_dropo(config, "compare runs the optimizers of DROPO")
     problem = make_problem(config)
+    refuse_sensed(problem, "compare")
     store = out / "compare-progress.json"
     prepare_folder(out, problem.model_path, resume=given.resume and store.exists())
 

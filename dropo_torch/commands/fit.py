@@ -70,11 +70,14 @@ def run_fit(
     check_first(logged_data(problem), console, force=force)
     continued = resume and (out / "checkpoint.bin").exists()
     make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
-    if not continued:
+    if not (continued or problem.observation.is_sensed):  # such a fit looks at them once it has states
         refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
     result = fit_shown(problem, console, checkpoint=out / "checkpoint.bin", resume=resume)
-    diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed)
+    if (estimated := result.estimated) is not None:
+        problem = replace(problem, objective=estimated.objective)
+    known = estimated and (estimated.standard_error, estimated.correlation)
+    diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed, known=known)
     lost = result.diverged / (len(problem.objective) * result.samples)
     result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))
     _write(problem, result, diagnostics, out)

@@ -39,7 +39,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     Where the config has an ε for every column, the values to try are the geometric mean of the columns'.
     """
     from dropo_torch.excitation import refuse_dead_parameters
-    from dropo_torch.problem import make_problem
+    from dropo_torch.problem import make_problem, refuse_sensed
     from dropo_torch.report import write_sweep_report
     from dropo_torch.studies import sweep as study
 
@@ -50,6 +50,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if noisy_starts and isinstance(config.epsilon, list):
         raise InputError(f"epsilon: {config.epsilon} given, but --noisy-starts tries one for all columns; leave it out")
     problem = make_problem(config)
+    refuse_sensed(problem, "sweep-epsilon")
     store = out / "sweep-progress.json"
     values = study.rising(given.epsilons or study.default_epsilons(problem.objective.measured.numpy()))
     continued = given.resume and store.exists()

@@ -30,7 +30,7 @@ from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.screen import all_candidates
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
-from dropo_torch.problem import Problem
+from dropo_torch.problem import Problem, refuse_sensed
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
@@ -96,6 +96,7 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     """
     if problem.space.model is None or problem.observation.size == 0:
         raise InputError("gap: this simulator is no MuJoCo model; effects can only be looked for in one")
+    refuse_sensed(problem, "gap")
     if blind := problem.observation.at_rest:
         raise InputError(
             f"gap: the velocity of {blind[0]} is not observed; derive velocities from positions "

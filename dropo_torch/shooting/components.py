@@ -83,10 +83,8 @@ def _updated(
 
 def _of_measured(slope: Slopes, posterior: Posterior) -> np.ndarray:
     """Variance that the posterior gives each simulated feature, ``(W, H m)``."""
-    joint = np.block([
-        [posterior.states, posterior.shared],
-        [posterior.shared.swapaxes(1, 2), np.broadcast_to(posterior.parameters, (len(slope.measured), *posterior.parameters.shape))],
-    ])  # fmt: skip
+    parameters = np.broadcast_to(posterior.parameters, (len(slope.measured), *posterior.parameters.shape))
+    joint = np.block([[posterior.states, posterior.shared], [posterior.shared.swapaxes(1, 2), parameters]])
     return ((slope.measured @ joint) * slope.measured).sum(-1)
 
 

@@ -93,8 +93,10 @@ def _stepped(windows: Windows, search: Search) -> tuple[Search, Residuals, Slope
                 break
             tries, found = tries + 1, residuals(windows, point, search.first)
             there = found if found.cost(search.scales) < cost else None
-            damping = search.damping / 8 if there else 6 * search.damping
-            search = replace(search, damping=max(damping, 1e-9 if there else 1e-3), point=point if there else search.point)
+            if there is None:
+                search = replace(search, damping=max(6 * search.damping, 1e-3))
+            else:
+                search = replace(search, damping=max(search.damping / 8, 1e-9), point=point)
         simulations += tries
         if there is None:
             search = replace(search, damping=DAMPING)

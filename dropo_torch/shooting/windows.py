@@ -17,6 +17,7 @@ from dropo_torch.problem import Problem
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.support.threads import single_thread
 
+_JOINT = mujoco.mjtJoint
 #: Logged steps of a window, about, where ``lag`` says nothing.
 LENGTH = 20
 
@@ -92,18 +93,14 @@ class Windows:
     def sizes(self) -> np.ndarray:
         """What counts as a large change of each move, ``(s,)``: a rad or half a range, and that within a window."""
         model, time = self.model, self.length * (self.simulator.timestep or 1.0)
-        position = np.ones(model.nq)
-        for j in range(model.njnt):
-            first, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
-            if kind in (mujoco.mjtJoint.mjJNT_FREE, mujoco.mjtJoint.mjJNT_SLIDE):
-                position[first : first + (3 if kind == mujoco.mjtJoint.mjJNT_FREE else 1)] = 0.5 * model.stat.extent
-            if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE) and model.jnt_limited[j]:
-                position[first] = min(position[first], 0.5 * float(np.ptp(model.jnt_range[j])))
-        speed = np.ones(model.nv)
-        for j in range(model.njnt):
-            dof, first = int(model.jnt_dofadr[j]), int(model.jnt_qposadr[j])
-            count = {int(mujoco.mjtJoint.mjJNT_FREE): 3, int(mujoco.mjtJoint.mjJNT_BALL): 0}.get(int(model.jnt_type[j]), 1)
-            speed[dof : dof + count] = position[first : first + count]
+        position, speed = np.ones(model.nq), np.ones(model.nv)
+        for kind, first, dof, limited, ends in zip(
+            model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, model.jnt_limited, model.jnt_range, strict=True
+        ):
+            count = {int(_JOINT.mjJNT_FREE): 3, int(_JOINT.mjJNT_BALL): 0}.get(int(kind), 1)
+            size = 1.0 if kind == _JOINT.mjJNT_HINGE else 0.5 * model.stat.extent
+            size = min(size, 0.5 * float(np.ptp(ends))) if limited and kind != _JOINT.mjJNT_BALL else size
+            position[first : first + count] = speed[dof : dof + count] = size
         plain = np.concatenate([position, speed / time])[list(self.chart.plain)]
         return np.concatenate([plain, np.ones(3 * len(self.chart.quaternions))])
 

@@ -130,6 +130,21 @@ def quantised(record: Record, rules: Rules) -> list[Finding]:
     )]  # fmt: skip
 
 
+def silent(record: Record, rules: Rules) -> list[Finding]:
+    """Return columns of sensors that never change."""
+    nq, nv = (0, 0) if record.model is None else (record.model.nq, record.model.nv)
+    columns = [
+        i for i, place in enumerate(record.observation.columns)
+        if record.observation.is_sensed and place >= nq + nv and np.ptp(record.before[:, i]) == 0
+    ]  # fmt: skip
+    if not columns:
+        return []
+    verb = "changes" if len(columns) == 1 else "change"
+    what = f"{record.named(columns)} never {verb}: a fit learns nothing from that"
+    advice = "where the sensor was not connected, list it as skip in observation"
+    return [Finding("silent", tuple(record.label(i) for i in columns), what, "doubtful", advice=advice)]
+
+
 def units(record: Record, rules: Rules) -> list[Finding]:
     """Return joints whose positions and velocities together are in another unit than the model's."""
     angles = [c for c, _ in record.positions if c.angle]

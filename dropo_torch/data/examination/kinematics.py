@@ -204,10 +204,9 @@ def _exchanged(record: Record, columns: Sequence[tuple[Pair, int, int]]) -> tupl
         for column, place in ((position, c.qpos), (velocity, nq + c.dof)):
             wanted[column] = place
             touched.add(column)
-    labels = {place: record.label(i) for i, place in own.items()}
     listed = ["skip"] * record.observation.log_width
     for i, place in wanted.items():
-        listed[record.observation.log_columns[i]] = entry(labels[place], place, nq)
+        listed[record.observation.log_columns[i]] = entry(record, place)
     names = [f"{record.signal(v)} is the velocity of {record.signal(p)}" for _, p, v in columns]
     what = f"columns stand in each other's place: {'; '.join(names)}"
     finding = Finding(

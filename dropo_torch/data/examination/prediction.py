@@ -85,7 +85,13 @@ def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
     """
     model = record.model
     columns = np.asarray(record.observation.columns)
-    if model is None or record.log.actions.shape[1] != model.nu or model.na or not (columns >= model.nq).any():
+    if (
+        model is None
+        or record.observation.is_sensed
+        or record.log.actions.shape[1] != model.nu
+        or model.na
+        or not (columns >= model.nq).any()
+    ):
         return 0.0, 0.0
     rows = chosen_rows(record, 2 * record.frame_skip)
     scale = np.ones(len(columns))

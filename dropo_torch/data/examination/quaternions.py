@@ -76,10 +76,9 @@ def _readings(record: Record, o: Orientation, rules: Rules) -> list[Finding]:
 
 def _reordered(record: Record, o: Orientation) -> dict[str, object]:
     """The observation with the quaternion's columns as they are meant."""
-    nq = 0 if record.model is None else record.model.nq
     listed = ["skip"] * record.observation.log_width
     for i, place in enumerate(record.observation.columns):
-        listed[record.observation.log_columns[i]] = entry(record.label(i), place, nq)
+        listed[record.observation.log_columns[i]] = entry(record, place)
     for component, column in zip((1, 2, 3, 0), o.quaternion, strict=True):
         listed[record.observation.log_columns[column]] = f"qpos[{o.qpos + component}]"
     return {"observation": listed}

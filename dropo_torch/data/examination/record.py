@@ -140,6 +140,10 @@ class Record:
         """The observed quaternions."""
         return () if self.model is None else tuple(_orientations(self.model, self.observation))
 
+    def is_velocity(self, place: int) -> bool:
+        """Return whether a column of the extended state is a velocity of the state."""
+        return self.model is None or self.model.nq <= place < self.model.nq + self.model.nv
+
     def label(self, column: int) -> str:
         """Return an observed column's label."""
         return self.observation.labels[column]
@@ -171,9 +175,9 @@ class Record:
 
 def resampled(record: Record, **settings: object) -> dict[str, object]:
     """Return the keys of a config that resample the log onto the simulation's steps: its positions, its velocities."""
-    nq = 0 if record.model is None else record.model.nq
     columns = list(enumerate(record.observation.columns))
-    positions, speeds = ([i for i, place in columns if (place >= nq) == moving] for moving in (False, True))
+    speeds = [i for i, place in columns if record.is_velocity(place)]
+    positions = [i for i, _ in columns if i not in speeds]
     options: dict[str, object] = {"dt": record.step}
     if record.orientations:
         options["quaternions"] = [[record.signal(i) for i in o.quaternion] for o in record.orientations]
@@ -186,12 +190,16 @@ def resampled(record: Record, **settings: object) -> dict[str, object]:
     cure: dict[str, object] = {"data": data | {"preprocess": options | settings}}
     if [i for i, _ in columns] != positions + speeds or "observations" in data:
         places = [record.observation.columns[i] for i in positions + speeds]
-        cure["observation"] = [entry(record.label(i), p, nq) for i, p in zip(positions + speeds, places, strict=True)]
+        cure["observation"] = [entry(record, p) for p in places]
     return cure
 
 
-def entry(label: str, place: int, nq: int) -> str:
-    """Return an entry of ``observation`` for one state column: its joint's, or its number where a joint has more."""
+def entry(record: Record, place: int) -> str:
+    """Return an entry of ``observation`` for one observed column: its joint's or sensor's, or its number."""
+    nq, nv = (0, 0) if record.model is None else (record.model.nq, record.model.nv)
+    label = record.label(record.observation.columns.index(place))
+    if place >= nq + nv > 0:
+        return f"sensor[{place - nq - nv}]"
     if "[" not in label:
         return label
     return f"qpos[{place}]" if place < nq else f"qvel[{place - nq}]"
