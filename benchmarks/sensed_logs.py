@@ -4,7 +4,7 @@
 
 Each log is simulated by plain ``mj_step`` with other numbers than the model's, and has noise on every column:
 
-``hopper``     gyroscope and accelerometer of the torso, encoders of the three joints, the foot's contact force;
+``hopper``     an IMU in the torso (orientation, gyroscope, accelerometer), encoders of the joints, the contact force;
 ``pendulum``   the position of a marker, as a camera sees it at 50 Hz; damping and dry friction are searched.
 
 Printed are the true and the fitted values, their difference in percent and in standard errors, and the seconds taken.
@@ -43,7 +43,7 @@ PENDULUM = """
   <sensor><framepos name="marker" objtype="site" objname="marker"/></sensor>
 </mujoco>"""
 #: Standard deviations of the noise: rad/s, m/s², rad, N, m.
-NOISE = {"gyro": 0.01, "accelerometer": 0.1, "encoder": 0.001, "touch": 2.0, "marker": 0.001}
+NOISE = {"orientation": 0.005, "gyro": 0.01, "accelerometer": 0.1, "encoder": 0.001, "touch": 2.0, "marker": 0.001}
 
 
 @dataclass(frozen=True)
@@ -77,6 +77,7 @@ def hopper_xml() -> str:
     )  # fmt: skip
     site, joint = mujoco.mjtObj.mjOBJ_SITE, mujoco.mjtObj.mjOBJ_JOINT
     kinds = mujoco.mjtSensor
+    spec.add_sensor(name="orientation", type=kinds.mjSENS_FRAMEQUAT, objtype=site, objname="imu")
     spec.add_sensor(name="gyro", type=kinds.mjSENS_GYRO, objtype=site, objname="imu")
     spec.add_sensor(name="accelerometer", type=kinds.mjSENS_ACCELEROMETER, objtype=site, objname="imu")
     for name in ("thigh", "leg", "foot"):
@@ -99,10 +100,11 @@ LINKS = {"torso": 3.665, "thigh": 4.058, "leg": 2.781, "foot": 5.316}
 SYSTEMS = {
     "hopper": System(
         hopper_xml, 4, ("sensor",),
-        (*[NOISE["gyro"]] * 3, *[NOISE["accelerometer"]] * 3, *[NOISE["encoder"]] * 3, NOISE["touch"]),
+        (*[NOISE["orientation"]] * 4, *[NOISE["gyro"]] * 3, *[NOISE["accelerometer"]] * 3, *[NOISE["encoder"]] * 3,
+         NOISE["touch"]),
         {f"{name}_mass": {"field": "body_mass", "name": name, "bounds": [0.5 * m, 1.7 * m], "unit": "kg"}
          for name, m in LINKS.items()},
-        _masses, lambda rng: {f"{name}_mass": m * rng.uniform(0.75, 1.3) for name, m in LINKS.items()}, 4, 250,
+        _masses, lambda rng: {f"{name}_mass": m * rng.uniform(0.75, 1.3) for name, m in LINKS.items()}, 6, 70,
     ),
     "pendulum": System(
         lambda: PENDULUM, 4, ("sensor[marker]",), (NOISE["marker"],) * 3,
@@ -125,7 +127,7 @@ def record(system: System, truth: dict[str, float], rng: np.random.Generator) ->
         system.start(data, rng)
         for step in range(system.steps + 1):
             if step:
-                command = np.clip(0.9 * command + 0.35 * rng.standard_normal(model.nu), -1, 1)
+                command = np.clip(0.9 * command + 0.1 * rng.standard_normal(model.nu), -1, 1)
                 actions.append(command)
                 data.ctrl[:] = command
                 mujoco.mj_step(model, data, system.frame_skip)
@@ -148,7 +150,7 @@ def write(system: System, folder: Path, seed: int) -> tuple[Path, dict[str, floa
     config.write_text(yaml.safe_dump({
         "model": "model.xml", "data": "log.npz", "frame_skip": system.frame_skip, "threads": 1,
         "observation": list(system.observation), "parameters": system.parameters,
-    }))  # fmt: skip
+    }, sort_keys=False))  # fmt: skip
     return config, truth
 
 

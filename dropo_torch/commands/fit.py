@@ -74,9 +74,10 @@ def run_fit(
         refuse_dead_parameters(problem.objective)
     prepare_folder(out, problem.model_path, resume=continued)
     result = fit_shown(problem, console, checkpoint=out / "checkpoint.bin", resume=resume)
+    known = None
     if (estimated := result.estimated) is not None:
         problem = replace(problem, objective=estimated.objective)
-    known = estimated and (estimated.standard_error, estimated.correlation)
+        known = estimated.standard_error, estimated.correlation
     diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed, known=known)
     lost = result.diverged / (len(problem.objective) * result.samples)
     result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))

@@ -326,9 +326,10 @@ def _sensor_columns(sensors: Sequence[Sensor], entry: str) -> list[int]:
     named = {sensor.name: sensor for sensor in sensors}
     if inside in named:
         found = list(named[inside].columns)
-        if part is not None and (chosen := _sliced(found, part, entry, f"sensor[{inside}]")) is None:
-            raise InputError(f"observation: {entry}: {part!r} is no number or slice; sensor[{inside}][0] is its first")
-        found = found if part is None else chosen
+        if part is not None:
+            found = _sliced(found, part, entry, f"sensor[{inside}]") or []
+            if not found:
+                raise InputError(f"observation: {entry}: {part!r} is no number or slice; expected sensor[{inside}][0]")
     elif part is None and (inside is None or _SLICE.fullmatch(inside)):
         columns = [c for c, _ in every]
         found = columns if inside is None else _sliced(columns, inside, entry, "sensor") or []

@@ -6,14 +6,15 @@ import mujoco
 import numpy as np
 
 from dropo_torch.optimizers.gauss_newton import DIFFERENCE_STEP
+from dropo_torch.shooting.equations import FIRST, huber, huber_weight
 from dropo_torch.shooting.windows import Windows
 
 #: States from which an episode's first window is tried, and how many of them are followed.
 CANDIDATES, FOLLOWED = 24, 4
-#: Iterations of a window's state.
-ITERATIONS = 12
-#: Standard deviation of an episode's first state, and of a later one about the end before it, in sizes of moves.
-FIRST, LATER = 10.0, 0.5
+#: Iterations of an episode's first state, and of a later one.
+ITERATIONS = (12, 5)
+#: Standard deviation of a later state about the end of the window before it, in sizes of moves.
+LATER = 0.1
 #: Noise of a column, at least, as a share of its spread: parameters may still be wrong.
 LEAST = 0.03
 
@@ -48,7 +49,7 @@ def first_states(windows: Windows, mean: np.ndarray, noise: np.ndarray, seed: in
         goes_on = (rows < len(windows)) & windows.follows[np.minimum(rows, len(windows) - 1)]
         begins, about = rows[goes_on], ends[goes_on]
         if len(begins):
-            states[begins], ends, _ = _settled(windows, begins, about, about, values, noise, LATER, ITERATIONS)
+            states[begins], ends, _ = _settled(windows, begins, about, about, values, noise, LATER, ITERATIONS[1])
     return states
 
 
@@ -63,7 +64,7 @@ def _tried(
     about = np.repeat(tried[:, 0], order.shape[1], axis=0)
     chosen = tried[own[:, None], order].reshape(-1, tried.shape[-1])
     many = np.repeat(rows, order.shape[1])
-    states, ends, cost = _settled(windows, many, chosen, about, values, noise, FIRST, ITERATIONS)
+    states, ends, cost = _settled(windows, many, chosen, about, values, noise, FIRST, ITERATIONS[0])
     best = np.argmin(cost.reshape(order.shape), axis=1) + own * order.shape[1]
     return states[best], ends[best]
 
@@ -104,7 +105,7 @@ def _settled(
         path = windows.paths(rows, tried[:, None], values)[:, 0, 0]
         found = windows.residuals(rows, path).reshape(len(rows), -1) * weight
         link = windows.between(tried, about) / scale
-        now = np.nan_to_num(0.5 * ((found**2).sum(1) + (link**2).sum(1)), nan=np.inf)
+        now = np.nan_to_num(huber(found).sum(1) + huber(link).sum(1), nan=np.inf)
         better = now < cost
         going &= ~better | (now < (1 - 1e-3) * cost)
         states[better], ends[better], off[better] = tried[better], path[better, -1, :width], found[better]
@@ -115,11 +116,14 @@ def _settled(
             break
         moved = windows.moved(np.repeat(states[:, None], s, axis=1), DIFFERENCE_STEP * np.eye(s))
         beside = windows.residuals(rows, windows.paths(rows, moved, values)[:, :, 0]).reshape(len(rows), s, -1) * weight
-        slope = np.nan_to_num((beside - off[:, None]) / DIFFERENCE_STEP)
+        factor = huber_weight(off)[:, None]
+        slope = np.nan_to_num((beside - off[:, None]) / DIFFERENCE_STEP) * factor
         normal = slope @ slope.swapaxes(1, 2)
         normal[:, range(s), range(s)] *= 1 + damping[:, None]
-        normal[:, range(s), range(s)] += 1 / scale**2
-        force = np.einsum("rsn,rn->rs", slope, off) + windows.between(states, about) / scale**2
+        link = windows.between(states, about) / scale
+        own = (huber_weight(link) / scale) ** 2
+        normal[:, range(s), range(s)] += own
+        force = np.einsum("rsn,rn->rs", slope, off * factor[:, 0]) + own * link * scale
         step = np.clip(np.linalg.solve(normal, -force[..., None])[..., 0], -1.0, 1.0)
         tried = np.where(going[:, None], windows.moved(states, step), states)
     return states, ends, cost

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 
 from dropo_torch.diagnostics import estimates
-from dropo_torch.shooting.equations import Normal, Residuals, Scales, Slopes
+from dropo_torch.shooting.equations import LEFT, Normal, Residuals, Scales, Slopes
 
 #: Share of a kind of residuals that must be left to them for their size to be told.
 REDUNDANT = 0.02
 #: The smallest noise, as a share of a column's spread, and the smallest link.
 LEAST_NOISE, LEAST_LINK = 1e-6, 1e-6
-#: Power of a link's change that a look makes, since a link that is exact is approached slowly; and the largest change.
-HASTE, FASTEST = 1.8, 0.05
+#: Power by which links shrink at a look, since exact ones are approached slowly; and the largest factor of a scale.
+HASTE, FASTEST = 1.8, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,25 +59,27 @@ def components(
         noise: of each feature where it is known, ``(m,)``; then links alone are estimated.
     """
     posterior, kept = Posterior.of(normal), ~at.lost
-    link = _updated(
-        at.links[kept & at.follows], _of_links(at, slope, posterior)[kept & at.follows], scales.link, LEAST_LINK, HASTE
-    )
+    weight, of_link = at.weights(scales)
+    joined = kept & at.follows
+    explained = _of_links(at, slope, posterior)[joined] * of_link[joined] ** 2
+    link = _updated(at.links[joined] * of_link[joined], explained, scales.link, LEAST_LINK, HASTE)
     if noise is not None:
         return Scales(noise, link)
     m = len(scales.noise)
-    squares = _of_measured(slope, posterior).reshape(-1, m)
-    alive = np.repeat(kept, at.measured.shape[1] // m)
-    return Scales(_updated(at.measured.reshape(-1, m)[alive], squares[alive], scales.noise, LEAST_NOISE * spread), link)
+    explained, off = (
+        x[kept].reshape(-1, m) for x in (_of_measured(slope, posterior) * weight**2, at.measured * weight)
+    )
+    return Scales(_updated(off, explained, scales.noise, LEAST_NOISE * spread), link)
 
 
 def _updated(
     residual: np.ndarray, explained: np.ndarray, scale: np.ndarray, least: np.ndarray | float, haste: float = 1.0
 ) -> np.ndarray:
-    """Scales ``(k,)`` of residuals ``(N, k)``, of whose variance the fit explains so much."""
-    left = len(residual) - (explained / scale**2).sum(0)
+    """Scales ``(k,)`` of weighted residuals ``(N, k)``, of whose variance the fit explains so much."""
+    left = LEFT * len(residual) - explained.sum(0)
     told = left > REDUNDANT * len(residual)
-    found = np.maximum(np.sqrt((residual**2).sum(0) / np.where(told, left, 1.0)), 1e-300)
-    found = scale * np.clip(found / scale, FASTEST, 1 / FASTEST) ** haste
+    ratio = np.sqrt((residual**2).sum(0) / np.where(told, left, 1.0))
+    found = scale * np.clip(np.where(ratio < 1, ratio**haste, ratio), 1 / FASTEST, FASTEST)
     return np.where(told, np.maximum(found, least), scale)
 
 
@@ -110,7 +112,7 @@ def uncertainty(at: Residuals, slope: Slopes, scales: Scales, normal: Normal) ->
     covariance, s = correlation * np.outer(error, error), at.links.shape[1]
     weight, of_link = at.weights(scales)
     moved = normal.shift
-    own = (slope.measured[..., s:] + slope.measured[..., :s] @ moved) * weight[:, None]
+    own = (slope.measured[..., s:] + slope.measured[..., :s] @ moved) * weight[..., None]
     before = slope.of_links(at.follows)
     joins = moved + before[..., s:] + before[..., :s] @ np.roll(moved, 1, axis=0)
     score = np.einsum("wnd,wn->wd", own, at.measured * weight)

@@ -11,8 +11,21 @@ from dropo_torch.optimizers.least_squares import bounded_step
 from dropo_torch.shooting.chain import Chain
 from dropo_torch.shooting.windows import Windows
 
-#: Standard deviation of an episode's first state about where it was found first, in large changes.
-WEAK = 10.0
+#: Scales from which on a residual counts linearly, and the share of a normal's variance that is left of it by that.
+FAR, LEFT = 2.0, 0.9545
+#: Standard deviation of an episode's first state, in sizes of moves, about the model's own, at rest, and what is seen.
+FIRST = 0.05
+
+
+def huber(residual: np.ndarray) -> np.ndarray:
+    """Return the costs of scaled residuals: half their squares, linear from afar."""
+    far = np.abs(residual)
+    return np.where(far < FAR, 0.5 * far**2, FAR * far - 0.5 * FAR**2)
+
+
+def huber_weight(residual: np.ndarray) -> np.ndarray:
+    """Return the factors of scaled residuals under which squares have the gradient of :func:`huber`."""
+    return np.sqrt(np.minimum(1.0, FAR / np.maximum(np.abs(residual), 1e-300)))
 
 
 @dataclass(frozen=True)
@@ -43,7 +56,7 @@ class Residuals:
     Attributes:
         measured: measured minus simulated features, ``(W, H m)``; 0 in windows that diverge.
         links: moves from the end of the window before to the start of each, ``(W, s)``; of windows that follow on
-            none, those from where they were first.
+            none, those from where the log and the model have them.
         ends: states at the ends, ``(W, nq + nv)``.
         lost: windows that diverge, ``(W,)`` bool.
         follows: of the windows.
@@ -55,36 +68,53 @@ class Residuals:
     lost: np.ndarray
     follows: np.ndarray
 
+    @classmethod
+    def of(
+        cls, windows: Windows, states: np.ndarray, measured: np.ndarray, ends: np.ndarray, lost: np.ndarray
+    ) -> Residuals:
+        """Return those of initial states ``(W, nq + nv)`` with what came of them."""
+        ends = np.where(lost[:, None], states, ends)
+        about = np.where(windows.follows[:, None], np.roll(ends, 1, axis=0), windows.starts)
+        links = windows.between(states, about)
+        links[np.roll(lost, 1) & windows.follows] = 0.0
+        return cls(np.where(lost[:, None], 0.0, measured), links, ends, lost, windows.follows)
+
     def weights(self, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
-        """Return the inverse standard deviations of both kinds, ``(H m,)`` and ``(W, s)``."""
+        """Return the factors of both kinds of residuals, ``(W, H m)`` and ``(W, s)``, squares of which are least.
+
+        They are inverse scales, less for what lies :data:`FAR` off: a contact that a wrong state misses must not count
+        for all that moves smoothly (Huber).
+        """
         repeats = self.measured.shape[1] // len(scales.noise)
-        link = np.where(self.follows[:, None], scales.link, WEAK)
-        return np.tile(1 / scales.noise, repeats), 1 / link
+        link = np.where(self.follows[:, None], scales.link, FIRST)
+        kinds = (self.measured, np.tile(scales.noise, repeats)), (self.links, link)
+        measured, links = (huber_weight(r / s) / s for r, s in kinds)
+        return measured, links
+
+    def costs(self, scales: Scales) -> tuple[np.ndarray, np.ndarray]:
+        """Return ½ χ² of each window's measurements and of its link, linear from afar, ``(W,)`` each."""
+        repeats = self.measured.shape[1] // len(scales.noise)
+        link = np.where(self.follows[:, None], scales.link, FIRST)
+        kinds = (self.measured, np.tile(scales.noise, repeats)), (self.links, link)
+        measured, links = (huber(residual / scale).sum(1) for residual, scale in kinds)
+        return np.where(self.lost, np.inf, measured), links
 
     def cost(self, scales: Scales) -> tuple[int, float]:
-        """Return what points compare by, smallest best: windows that diverge, then ½ χ²."""
-        measured, link = self.weights(scales)
-        chi2 = np.square(self.measured * measured).sum() + np.square(self.links * link).sum()
-        return int(self.lost.sum()), 0.5 * float(chi2)
+        """Return what points compare by, smallest best: windows that diverge, then the others' costs."""
+        measured, links = self.costs(scales)
+        return int(self.lost.sum()), float(measured[~self.lost].sum() + links.sum())
 
 
-def residuals(windows: Windows, point: Point, first: np.ndarray) -> Residuals:
-    """Simulate windows at a point; ``first`` are states ``(W, nq + nv)`` about which those of episodes' begins lie."""
+def residuals(windows: Windows, point: Point) -> Residuals:
+    """Simulate windows at a point."""
     values, parts, ends = windows.box.values(point.mean)[None], [], []
     for rows in windows.blocks(1):
         path = windows.paths(rows, point.states[rows][:, None], values)[:, 0, 0]
         parts.append(windows.residuals(rows, path).reshape(len(rows), -1))
         ends.append(path[:, -1, : point.states.shape[1]])
-    return _residuals(windows, point, first, np.concatenate(parts), np.concatenate(ends))
-
-
-def _residuals(windows: Windows, point: Point, first: np.ndarray, found: np.ndarray, ends: np.ndarray) -> Residuals:
+    found = np.concatenate(parts)
     lost = ~np.isfinite(found).all(1)
-    ends = np.where(lost[:, None], point.states, ends)
-    about = np.where(windows.follows[:, None], np.roll(ends, 1, axis=0), first)
-    links = windows.between(point.states, about)
-    links[np.roll(lost, 1) & windows.follows] = 0.0
-    return Residuals(np.where(lost[:, None], 0.0, found), links, ends, lost, windows.follows)
+    return Residuals.of(windows, point.states, found, np.concatenate(ends), lost)
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,11 +181,11 @@ class Normal:
     shift: np.ndarray
 
     @classmethod
-    def of(cls, at: Residuals, slope: Slopes, scales: Scales, damping: float = 0.0) -> Normal:
-        """Assemble them; states are damped by a share of their diagonal."""
+    def of(cls, at: Residuals, slope: Slopes, scales: Scales, damping: np.ndarray | float = 0.0) -> Normal:
+        """Assemble them; states are damped by a share of their diagonal, one or each window's, ``(W,)``."""
         s = at.links.shape[1]
         weight, of_link = at.weights(scales)
-        own, off = slope.measured * weight[:, None], at.measured * weight
+        own, off = slope.measured * weight[..., None], at.measured * weight
         before = slope.of_links(at.follows) * of_link[..., None]
         link, both = at.links * of_link, own.swapaxes(1, 2) @ own
         pulled = -np.einsum("wni,wn->wi", own, off)
@@ -173,7 +203,7 @@ class Normal:
         passed = np.einsum("wis,wi->ws", before, link)
         force[:-1] -= passed[1:, :s]
         pull = pull - passed[:, s:].sum(0)
-        diagonal[:, index, index] *= 1 + damping
+        diagonal[:, index, index] *= 1 + np.reshape(damping, (-1, 1))
         chain = Chain.of(diagonal, below)
         found = chain.solve(np.concatenate([border, force[..., None]], axis=2))
         flat = border.reshape(-1, border.shape[2])

@@ -52,7 +52,7 @@ def fit_sensed(
     begun = time.monotonic() - (history[-1].seconds if history else 0.0)
     if search is None:
         search = begin(windows, problem.config.seed)
-        at = residuals(windows, search.point, search.first)
+        at = residuals(windows, search.point)
         if at.lost.all():
             raise InputError(
                 "observation: no initial state was found from which the model can be simulated; check frame_skip, "
@@ -62,7 +62,7 @@ def fit_sensed(
         search = replace(search, simulated_transitions=spent)
     while search.reason is None:
         search = improved(windows, search, known)
-        at = residuals(windows, search.point, search.first)
+        at = residuals(windows, search.point)
         progress = Progress("Gauss-Newton on parameters and states", _log_likelihood(at, search.scales), _share(search))
         history = [*history, _entry(search, progress, time.monotonic() - begun, problem.objective)]
         if kept is not None:
@@ -77,7 +77,7 @@ def _concluded(
 ) -> Fit:
     """The fit: its standard errors, the objective about the estimated states, and what the residuals say."""
     config, box, scales = problem.config, windows.box, search.scales
-    at = residuals(windows, search.point, search.first)
+    at = residuals(windows, search.point)
     slope = slopes(windows, search.point, at)
     error, correlation = uncertainty(at, slope, scales, Normal.of(at, slope, scales))
     error, objective = error * box.width, _objective(problem, windows, search.point, scales)

@@ -9,12 +9,13 @@ import numpy as np
 from dropo_torch.shooting.begin import first_states, rough_noise
 from dropo_torch.shooting.components import components
 from dropo_torch.shooting.equations import Normal, Point, Residuals, Scales, Slopes, residuals, slopes
+from dropo_torch.shooting.fusion import fused
 from dropo_torch.shooting.windows import Windows
 
 #: Looks at the residuals, at most, and steps between two.
 LOOKS, STEPS = 30, 4
 #: Link of a state with the end of the window before, at first, in sizes of moves.
-LOOSE = 0.3
+LOOSE = 0.1
 #: Share by which scales may still change, and by which parameters may still move, in widths, at the end.
 SETTLED, AT_REST = 0.05, 1e-4
 #: Damping at first.
@@ -29,20 +30,21 @@ class Search:
 
     Attributes:
         point: the best so far.
-        first: states about which the episodes' first ones lie, ``(W, nq + nv)``.
         scales: by which residuals are weighed.
-        damping: of the next step.
+        damping: of the next step: each window's, and the parameters', ``(W + 1,)``.
         looks: at the residuals, so far.
+        is_free: whether noise may be larger than the columns' second differences: not before parameters have come to
+            rest, since states that are still wrong are no noise.
         stencils: derivatives taken so far.
         simulated_transitions: logged steps simulated so far.
         reason: why it has stopped, in words, or ``None``.
     """
 
     point: Point
-    first: np.ndarray
     scales: Scales
-    damping: float = DAMPING
+    damping: np.ndarray
     looks: int = 0
+    is_free: bool = False
     stencils: int = 0
     simulated_transitions: int = 0
     reason: str | None = None
@@ -54,7 +56,7 @@ def begin(windows: Windows, seed: int) -> Search:
     mean = windows.box.middle
     states = first_states(windows, mean, noise, seed)
     link = np.full(len(windows.sizes), LOOSE)
-    return Search(Point(mean, states), states, Scales(noise, link))
+    return Search(Point(mean, states), Scales(noise, link), np.full(len(windows) + 1, DAMPING))
 
 
 def improved(windows: Windows, search: Search, noise: np.ndarray | None) -> Search:
@@ -68,44 +70,54 @@ def improved(windows: Windows, search: Search, noise: np.ndarray | None) -> Sear
     before = search.point.mean
     search, at, slope = _stepped(windows, search)
     normal = Normal.of(at, slope, search.scales)
-    scales = components(at, slope, search.scales, normal, rough_noise(windows)[1], noise)
+    rough, spread = rough_noise(windows)
+    scales = components(at, slope, search.scales, normal, spread, noise)
+    if noise is None and not search.is_free:
+        scales = replace(scales, noise=np.minimum(scales.noise, rough))
     moved = float(np.abs((search.point.mean - before) / windows.box.width).max())
     pairs = ((scales.noise, search.scales.noise), (scales.link, search.scales.link))
     change = max(float(np.abs(np.log(ours / theirs)).max()) for ours, theirs in pairs)
-    reason = None
-    if search.looks and change < SETTLED and moved < AT_REST:
+    rests, reason = search.looks > 0 and change < SETTLED and moved < AT_REST, None
+    if rests and search.is_free:
         reason = "parameters, states and noise are at rest"
     elif search.looks + 1 >= LOOKS:
         reason = f"{LOOKS} looks at the residuals"
-    return replace(search, scales=scales, looks=search.looks + 1, reason=reason)
+    return replace(search, scales=scales, looks=search.looks + 1, reason=reason, is_free=search.is_free or rests)
 
 
 def _stepped(windows: Windows, search: Search) -> tuple[Search, Residuals, Slopes]:
     """A few damped steps under the same scales, the residuals where they lead, and derivatives near there."""
-    at, simulations = residuals(windows, search.point, search.first), 1
+    scales, joined = search.scales, _joined(windows, search.point)
+    point, at, _ = fused(windows, search.point.mean, (search.point.states, joined), scales)
+    search, simulations = replace(search, point=point), 3
     for _ in range(STEPS):
-        slope = slopes(windows, search.point, at)
+        slope, cost, is_better = slopes(windows, search.point, at), at.cost(scales), False
         search, simulations = replace(search, stencils=search.stencils + 1), simulations + slope.simulations
-        there, cost, tries = None, at.cost(search.scales), 0
-        while there is None:
-            point = Normal.of(at, slope, search.scales, search.damping).step(windows, search.point, search.damping)
-            if _length(windows, search.point, point) < LEAST_MOVE:
+        while not is_better:
+            of_windows, of_parameters = search.damping[:-1], float(search.damping[-1])
+            step = Normal.of(at, slope, scales, of_windows).step(windows, search.point, of_parameters)
+            if _length(windows, search.point, step) < LEAST_MOVE:
                 break
-            tries, found = tries + 1, residuals(windows, point, search.first)
-            there = found if found.cost(search.scales) < cost else None
-            if there is None:
-                search = replace(search, damping=max(6 * search.damping, 1e-3))
-            else:
-                search = replace(search, damping=max(search.damping / 8, 1e-9), point=point)
-        simulations += tries
-        if there is None:
-            search = replace(search, damping=DAMPING)
+            point, found, choice = fused(windows, step.mean, (search.point.states, step.states), scales)
+            simulations += 2
+            is_better = found.cost(scales) < cost
+            factors = np.append(np.where(choice == 1, 1 / 8, 6.0), 1 / 8 if is_better else 6.0)
+            search = replace(search, damping=np.clip(search.damping * factors, 1e-9, 1e9))
+            if is_better:
+                search, at = replace(search, point=point), found
+        if not is_better:
+            search = replace(search, damping=np.full_like(search.damping, DAMPING))
             break
-        at = there
-        if cost[1] - at.cost(search.scales)[1] < LEAST_GAIN:
+        if cost[1] - at.cost(scales)[1] < LEAST_GAIN:
             break
     steps = simulations * len(windows) * windows.length
     return replace(search, simulated_transitions=search.simulated_transitions + steps), at, slope
+
+
+def _joined(windows: Windows, point: Point) -> np.ndarray:
+    """States with which windows begin where those before end: a contact may be missed for ever from others."""
+    ends = np.roll(residuals(windows, point).ends, 1, axis=0)
+    return np.where(windows.follows[:, None], ends, point.states)
 
 
 def _length(windows: Windows, start: Point, end: Point) -> float:

@@ -19,7 +19,7 @@ from dropo_torch.support.threads import single_thread
 
 _JOINT = mujoco.mjtJoint
 #: Logged steps of a window, about, where ``lag`` says nothing.
-LENGTH = 20
+LENGTH = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,14 +59,15 @@ class Windows:
     def of(cls, problem: Problem) -> Windows:
         """Cut a problem's log into windows that follow on each other."""
         log, objective, lag = problem.trajectories, problem.objective, problem.config.lag
+        assert problem.space.model is not None
         steps = horizon_of(log, lag if lag > 1 else LENGTH, problem.since)
         history = problem.simulator.history
         cut = make_transitions(log, problem.observation, lag=steps, history=history, since=problem.since)
         follows = (np.diff(cut.rows) == steps) & (np.diff(cut.episodes) == 0)
-        model = problem.space.model
+        width = problem.simulator.num_states - problem.space.model.nsensordata
         return cls(
             problem.simulator, problem.observation, objective.features, objective.box, cut.controls,
-            measured_path(log, problem.observation, cut), cut.states[:, : model.nq + model.nv],
+            measured_path(log, problem.observation, cut), cut.states[:, :width],
             np.append(False, follows), cut.rows, cut.episodes, problem.config.chunk_size,
         )  # fmt: skip
 
@@ -91,14 +92,14 @@ class Windows:
 
     @cached_property
     def sizes(self) -> np.ndarray:
-        """What counts as a large change of each move, ``(s,)``: a rad or half a range, and that within a window."""
+        """What counts as a large change of each move, ``(s,)``: a rad, a body or half a range; that within a window."""
         model, time = self.model, self.length * (self.simulator.timestep or 1.0)
         position, speed = np.ones(model.nq), np.ones(model.nv)
         for kind, first, dof, limited, ends in zip(
             model.jnt_type, model.jnt_qposadr, model.jnt_dofadr, model.jnt_limited, model.jnt_range, strict=True
         ):
             count = {int(_JOINT.mjJNT_FREE): 3, int(_JOINT.mjJNT_BALL): 0}.get(int(kind), 1)
-            size = 1.0 if kind == _JOINT.mjJNT_HINGE else 0.5 * model.stat.extent
+            size = 1.0 if kind == _JOINT.mjJNT_HINGE else float(model.stat.meansize)
             size = min(size, 0.5 * float(np.ptp(ends))) if limited and kind != _JOINT.mjJNT_BALL else size
             position[first : first + count] = speed[dof : dof + count] = size
         plain = np.concatenate([position, speed / time])[list(self.chart.plain)]
