@@ -176,9 +176,7 @@ def fit(
             with Adam, a gradient that the differences of MuJoCo do not confirm on 20 transitions.
     """
     if objective.observation.is_sensed:
-        raise InputError(
-            "observation: it names sensors and not the whole state; use fit_problem, which estimates states"
-        )
+        raise InputError("observation: it names sensors and not the whole state; fit_problem estimates it")
     settings = settings or FitSettings()
     search = search or make_optimizer(objective, settings)
     if resume and checkpoint is None:
