@@ -18,6 +18,10 @@ LOOKS, STEPS = 30, 4
 LOOSE = 0.1
 #: Share by which scales may still change, and by which parameters may still move, in widths, at the end.
 SETTLED, AT_REST = 0.05, 1e-4
+#: States about a window's beginning that are tried at each look.
+DRAWS = 6
+#: How much more a second step is damped that is tried beside each.
+SHORT = 30.0
 #: Damping at first.
 DAMPING = 1e-2
 #: The shortest step that is tried, in widths and sizes, and the smallest gain in ½ χ² after which another follows.
@@ -87,9 +91,10 @@ def improved(windows: Windows, search: Search, noise: np.ndarray | None) -> Sear
 
 def _stepped(windows: Windows, search: Search) -> tuple[Search, Residuals, Slopes]:
     """A few damped steps under the same scales, the residuals where they lead, and derivatives near there."""
-    scales, joined = search.scales, _joined(windows, search.point)
-    point, at, _ = fused(windows, search.point.mean, (search.point.states, joined), scales)
-    search, simulations = replace(search, point=point), 3
+    scales, tried = search.scales, _others(windows, search)
+    point, at, _ = fused(windows, search.point.mean, (search.point.states, *tried), scales)
+    damping = np.append(np.minimum(search.damping[:-1], DAMPING), search.damping[-1])
+    search, simulations = replace(search, point=point, damping=damping), 2 + len(tried)
     for _ in range(STEPS):
         slope, cost, is_better = slopes(windows, search.point, at), at.cost(scales), False
         search, simulations = replace(search, stencils=search.stencils + 1), simulations + slope.simulations
@@ -98,10 +103,13 @@ def _stepped(windows: Windows, search: Search) -> tuple[Search, Residuals, Slope
             step = Normal.of(at, slope, scales, of_windows).step(windows, search.point, of_parameters)
             if _length(windows, search.point, step) < LEAST_MOVE:
                 break
-            point, found, choice = fused(windows, step.mean, (search.point.states, step.states), scales)
-            simulations += 2
+            short = Normal.of(at, slope, scales, SHORT * of_windows + SHORT * DAMPING)
+            short_step = short.step(windows, search.point, of_parameters)
+            tried = (search.point.states, step.states, short_step.states)
+            point, found, choice = fused(windows, step.mean, tried, scales)
+            simulations += len(tried)
             is_better = found.cost(scales) < cost
-            factors = np.append(np.where(choice == 1, 1 / 8, 6.0), 1 / 8 if is_better else 6.0)
+            factors = np.append(np.array([6.0 * SHORT, 1 / 8, 6.0])[choice], 1 / 8 if is_better else 6.0)
             search = replace(search, damping=np.clip(search.damping * factors, 1e-9, 1e9))
             if is_better:
                 search, at = replace(search, point=point), found
@@ -114,10 +122,15 @@ def _stepped(windows: Windows, search: Search) -> tuple[Search, Residuals, Slope
     return replace(search, simulated_transitions=search.simulated_transitions + steps), at, slope
 
 
-def _joined(windows: Windows, point: Point) -> np.ndarray:
-    """States with which windows begin where those before end: a contact may be missed for ever from others."""
-    ends = np.roll(residuals(windows, point).ends, 1, axis=0)
-    return np.where(windows.follows[:, None], ends, point.states)
+def _others(windows: Windows, search: Search) -> list[np.ndarray]:
+    """Other states that windows may take: where those before end, and about there as links allow.
+
+    From a state that misses a contact, or makes one too many, no derivative leads to the right one.
+    """
+    ends = np.roll(residuals(windows, search.point).ends, 1, axis=0)
+    about = np.where(windows.follows[:, None], ends, search.point.states)
+    draws = np.random.default_rng(search.looks).standard_normal((DRAWS, len(windows), len(windows.sizes)))
+    return [about, *(windows.moved(about, search.scales.link * draw) for draw in draws)]
 
 
 def _length(windows: Windows, start: Point, end: Point) -> float:
