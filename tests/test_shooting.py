@@ -268,6 +268,9 @@ def test_the_command_writes_what_it_always_writes(pendulum, tmp_path, capsys):
     assert document["verdict"] == "explained"
     assert set(document["noise"]) == {"marker[x]", "marker[y]", "marker[z]"}
     assert set(document["standard_errors"]) == {"damping", "friction"}
+    page = (out / "report.html").read_text()
+    assert "The log does not show the states" in page
+    assert "dropo view" not in page
     assert {p.name for p in out.iterdir()} >= {"report.html", "model.xml", "fitted_config.yaml", "checkpoint.bin"}
     assert "method: laplace" in capsys.readouterr().out
 

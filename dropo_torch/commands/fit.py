@@ -98,6 +98,7 @@ def _write(problem: Problem, result: Fit, diagnostics: Diagnostics, out: Path) -
     write_atomically(out / "fitted_config.yaml", portable.encode())
     title, notes = f"Fit of {config.sim or config.model or config.environment}", _write_model(problem, result, out)
     notes += [*([_left_out(problem)] if problem.left_out else []), *problem.simulator.notes]
+    notes += [_sensed(result)] if result.estimated is not None else []
     about = {"title": title, "notes": notes, **provenance(config)}
     write_fit_report(out / "report.html", fit=result, diagnostics=diagnostics, space=problem.space, **about)
 
@@ -161,6 +162,17 @@ def _left_out(problem: Problem) -> str:
     return (
         f"{problem.left_out} transitions are left out: commands from before the log still act in them, by a delay, a "
         "lag or play."
+    )
+
+
+def _sensed(result: Fit) -> str:
+    """What was estimated beside the parameters, in words."""
+    windows = result.extras["windows"]
+    noise = ", ".join(f"{name} {value:.2g}" for name, value in result.extras["noise"].items())
+    return (
+        f"The log does not show the states: {windows['count']} windows of {windows['steps']} logged steps have initial "
+        "states of their own, which were estimated with the parameters; standard errors count that. Noise of the "
+        f"columns, whose square stands for ε here: {noise}."
     )
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dropo_torch.diagnostics import estimates
 from dropo_torch.shooting.begin import first_states, rough_noise
 from dropo_torch.shooting.components import components
 from dropo_torch.shooting.equations import Normal, Point, Residuals, Scales, Slopes, residuals, slopes
@@ -16,8 +17,8 @@ from dropo_torch.shooting.windows import Windows
 LOOKS, STEPS = 30, 4
 #: Link of a state with the end of the window before, at first, in sizes of moves.
 LOOSE = 0.1
-#: Share by which scales may still change, and by which parameters may still move, in widths, at the end.
-SETTLED, AT_REST = 0.05, 1e-4
+#: Share by which scales may still change, and standard errors by which parameters may still move, at the end.
+SETTLED, AT_REST = 0.1, 0.05
 #: States about a window's beginning that are tried at each look.
 DRAWS = 6
 #: How much more a second step is damped that is tried beside each.
@@ -78,7 +79,8 @@ def improved(windows: Windows, search: Search, noise: np.ndarray | None) -> Sear
     scales = components(at, slope, search.scales, normal, spread, noise)
     if noise is None and not search.is_free:
         scales = replace(scales, noise=np.minimum(scales.noise, rough))
-    moved = float(np.abs((search.point.mean - before) / windows.box.width).max())
+    error = estimates(normal.schur + np.eye(len(before)))[0] * windows.box.width
+    moved = float(np.abs((search.point.mean - before) / error).max())
     pairs = ((scales.noise, search.scales.noise), (scales.link, search.scales.link))
     change = max(float(np.abs(np.log(ours / theirs)).max()) for ours, theirs in pairs)
     rests, reason = search.looks > 0 and change < SETTLED and moved < AT_REST, None
