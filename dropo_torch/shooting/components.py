@@ -56,20 +56,19 @@ def components(
         scales: by which they were weighed.
         normal: the undamped normal equations.
         spread: of each feature over the log, ``(m,)``.
-        noise: of each feature where it is known, ``(m,)``; then links alone are estimated.
+        noise: of each feature where it is known, ``(m,)``; of those with 0 it is estimated.
     """
     posterior, kept = Posterior.of(normal), ~at.lost
     weight, of_link = at.weights(scales)
     joined = kept & at.follows
     explained = _of_links(at, slope, posterior)[joined] * of_link[joined] ** 2
     link = _updated(at.links[joined] * of_link[joined], explained, scales.link, LEAST_LINK, HASTE)
-    if noise is not None:
-        return Scales(noise, link)
     m = len(scales.noise)
     explained, off = (
         x[kept].reshape(-1, m) for x in (_of_measured(slope, posterior) * weight**2, at.measured * weight)
     )
-    return Scales(_updated(off, explained, scales.noise, LEAST_NOISE * spread), link)
+    found = _updated(off, explained, scales.noise, LEAST_NOISE * spread)
+    return Scales(found if noise is None else np.where(noise > 0, noise, found), link)
 
 
 def _updated(

@@ -70,15 +70,16 @@ def improved(windows: Windows, search: Search, noise: np.ndarray | None) -> Sear
     Args:
         windows: the log.
         search: where it stands.
-        noise: of each feature where it is known, ``(m,)``.
+        noise: of each feature where it is known, ``(m,)``; of those with 0 it is estimated.
     """
     before = search.point.mean
     search, at, slope = _stepped(windows, search)
     normal = Normal.of(at, slope, search.scales)
     rough, spread = rough_noise(windows)
     scales = components(at, slope, search.scales, normal, spread, noise)
-    if noise is None and not search.is_free:
-        scales = replace(scales, noise=np.minimum(scales.noise, rough))
+    if not search.is_free:
+        most = rough if noise is None else np.maximum(rough, noise)
+        scales = replace(scales, noise=np.minimum(scales.noise, most))
     error = estimates(normal.schur + np.eye(len(before)))[0] * windows.box.width
     moved = float(np.abs((search.point.mean - before) / error).max())
     pairs = ((scales.noise, search.scales.noise), (scales.link, search.scales.link))
