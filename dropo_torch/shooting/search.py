@@ -108,9 +108,9 @@ def _stepped(windows: Windows, search: Search) -> tuple[Search, Residuals, Slope
                 break
             short = Normal.of(at, slope, scales, SHORT * of_windows + SHORT * DAMPING)
             short_step = short.step(windows, search.point, of_parameters)
-            tried = (search.point.states, step.states, short_step.states)
-            point, found, choice = fused(windows, step.mean, tried, scales)
-            simulations += len(tried)
+            options = (search.point.states, step.states, short_step.states)
+            point, found, choice = fused(windows, step.mean, options, scales)
+            simulations += len(options)
             is_better = found.cost(scales) < cost
             factors = np.append(np.array([6.0 * SHORT, 1 / 8, 6.0])[choice], 1 / 8 if is_better else 6.0)
             search = replace(search, damping=np.clip(search.damping * factors, 1e-9, 1e9))
