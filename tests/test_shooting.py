@@ -214,6 +214,13 @@ def test_the_friction_of_a_pendulum_is_found_by_a_marker(pendulum):
     assert residual.std().item() == pytest.approx(0.001, rel=0.2)
 
 
+@pytest.mark.slow
+def test_the_masses_of_a_hopper_are_found_by_what_a_robot_has(tmp_path):
+    path, truth = write(SYSTEMS["hopper"], tmp_path, 0)
+    found = fit_problem(make_problem(load_config(path))).distribution
+    assert found.center == pytest.approx([truth[name] for name in found.names], rel=0.02)
+
+
 @pytest.mark.parametrize("names", [["q1", "q2"], ["gyro", "marker"], ["q1", "q2", "force", "accelerometer"]])
 def test_masses_of_the_arm_are_found_by_what_it_has(names, tmp_path):
     noise = 1e-4
@@ -243,6 +250,49 @@ def test_a_state_that_is_seen_is_fitted_as_it_is_without_sensors(tmp_path):
     by_transitions, by_windows = found
     assert (np.abs(by_windows.mean - by_transitions.mean) < 3 * by_transitions.std).all()
     assert (by_windows.std < by_transitions.std).all()  # windows of many steps tell more than single transitions
+
+
+def test_the_centre_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope(tmp_path):
+    """Its states have an orientation, which no column shows."""
+    xml = """
+    <mujoco>
+      <option timestep=".005"/>
+      <worldbody>
+        <body name="box" pos="0 0 1">
+          <freejoint name="root"/>
+          <inertial pos="{} 0 0" mass="1" diaginertia=".004 .006 .008"/>
+          <geom type="box" size=".1 .08 .05" contype="0" conaffinity="0"/>
+          <site name="corner" pos=".1 .08 .05"/>
+        </body>
+      </worldbody>
+      <sensor><framepos name="marker" objtype="site" objname="corner"/><gyro name="gyro" site="corner"/></sensor>
+    </mujoco>"""
+    truth, noise, rng = 0.03, np.array([0.001] * 3 + [0.01] * 3), np.random.default_rng(0)
+    model = mujoco.MjModel.from_xml_string(xml.format(truth))
+    paths = []
+    for _ in range(2):
+        data = mujoco.MjData(model)
+        data.qvel[:] = [*rng.normal(size=3), *(4 * rng.normal(size=3))]
+        path = []
+        for step in range(41):
+            if step:
+                mujoco.mj_step(model, data, 2)
+            mujoco.mj_forward(model, data)
+            path.append(data.sensordata + noise * rng.standard_normal(6))
+        paths.append(np.array(path))
+    log = {
+        "observations": np.concatenate([p[:-1] for p in paths]),
+        "next_observations": np.concatenate([p[1:] for p in paths]),
+        "actions": np.zeros((80, 0)), "terminals": np.arange(80) % 40 == 39,
+    }  # fmt: skip
+    path = arm(
+        tmp_path, log, model="box.xml", observation=["sensor"],
+        parameters={"centre": {"field": "body_ipos", "name": "box", "index": 0, "bounds": [-0.05, 0.05]}},
+    )  # fmt: skip
+    (tmp_path / "box.xml").write_text(xml.format(0))
+    found = fit_problem(make_problem(load_config(path)))
+    assert found.distribution.center[0] == pytest.approx(truth, abs=1e-3)
+    assert list(found.extras["noise"].values()) == pytest.approx(noise, rel=0.35)
 
 
 def test_a_fit_that_was_interrupted_goes_on_to_the_same_result(pendulum, tmp_path):
