@@ -53,6 +53,7 @@ class Diagnostics:
         at_rest: joints at rest in every initial state, because the log has their position alone.
         noisy_starts: whether initial states are noisy, so that windows that follow on each other share a measurement.
         is_sensed: whether windows start from estimated states.
+        unjoined: coordinates in which such states are not what the model leads to, and by how much, in words.
     """
 
     labels: tuple[str, ...]
@@ -76,6 +77,7 @@ class Diagnostics:
     at_rest: tuple[str, ...] = ()
     noisy_starts: bool = False
     is_sensed: bool = False
+    unjoined: tuple[str, ...] = ()
 
     @property
     def residual(self) -> np.ndarray:

@@ -73,11 +73,13 @@ class Estimated:
         objective: the likelihood of the log's transitions from the estimated states.
         standard_error: of each mean, in coordinates, states being unknown, ``(d,)``.
         correlation: of the estimates of the means, ``(d, d)``.
+        unjoined: coordinates in which the model does not lead from one window to the next, and by how much, in words.
     """
 
     objective: Objective
     standard_error: np.ndarray
     correlation: np.ndarray
+    unjoined: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -186,6 +186,11 @@ def _doubt(distribution: Distribution, diagnostics: Diagnostics, is_dropo: bool)
     if is_dropo and (top := at_largest_std(distribution)).any():
         names = ", ".join(compress(distribution.names, top))
         return f"the simulator explains the log only if parameters vary as much as the search allows ({names})"
+    if diagnostics.unjoined:
+        return (
+            "the simulator does not lead from one window's state to the next one's, in most windows "
+            f"(rms {', '.join(diagnostics.unjoined)}): an effect is missing"
+        )
     together, least = autocorrelation(diagnostics)
     if (kept := (together > least) & (size > THRESHOLDS.counts)).any():
         worst = int(np.argmax(np.where(kept, together, -np.inf)))

@@ -325,6 +325,16 @@ def test_the_command_writes_what_it_always_writes(pendulum, tmp_path, capsys):
     assert "method: laplace" in capsys.readouterr().out
 
 
+def test_a_model_that_lacks_friction_does_not_explain_what_a_camera_saw(pendulum, tmp_path):
+    damping = json.dumps(load_config(pendulum[0]).parameters["damping"])
+    assert (
+        main(["fit", str(pendulum[0]), "--out", str(tmp_path / "out"), "--parameters", f"{{damping: {damping}}}"]) == 0
+    )
+    document = json.loads((tmp_path / "out" / "fit.json").read_text())
+    assert document["verdict"] == "not_explained"
+    assert "hinge.velocity" in document["verdict_reason"]
+
+
 # --- what is refused, and what is examined ---
 
 

@@ -79,6 +79,7 @@ def run_fit(
         problem = replace(problem, objective=estimated.objective)
         known = estimated.standard_error, estimated.correlation
     diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed, known=known)
+    diagnostics = replace(diagnostics, unjoined=estimated.unjoined if estimated else ())
     lost = result.diverged / (len(problem.objective) * result.samples)
     result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))
     _write(problem, result, diagnostics, out)

@@ -13,8 +13,14 @@ from dropo_torch.shooting.equations import LEFT, Normal, Residuals, Scales, Slop
 REDUNDANT = 0.02
 #: The smallest noise, as a share of a column's spread, and the smallest link.
 LEAST_NOISE, LEAST_LINK = 1e-6, 1e-6
+#: Median of a standard normal's absolute values.
+MEDIAN = 0.6745
 #: Power by which links shrink at a look, since exact ones are approached slowly; and the largest factor of a scale.
 HASTE, FASTEST = 1.8, 4.0
+#: Share of links' variance that must be their own, the typical link as a share of their scale, and links, for windows
+#: that do not join: where the model is right they have 0.1 to 0.2 and 0.2 to 0.3, with a few windows over contacts 0.8
+#: and 0.6; without a pendulum's friction 0.9 and 0.9.
+OWN, TYPICAL, FEWEST = 0.5, 0.75, 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,3 +126,13 @@ def uncertainty(at: Residuals, slope: Slopes, scales: Scales, normal: Normal) ->
     middle = score.T @ score * count / max(count - 1, 1)
     clustered = np.sqrt(np.maximum(np.diag(covariance @ middle @ covariance), 0.0))
     return np.maximum(error, clustered), correlation
+
+
+def unjoined(at: Residuals, slope: Slopes, scales: Scales, normal: Normal) -> np.ndarray:
+    """Return of which moves the links are no accident, ``(s,)`` bool: the model leads elsewhere in most windows."""
+    joined, (_, of_link) = at.follows & ~at.lost, at.weights(scales)
+    if joined.sum() < FEWEST:
+        return np.zeros(len(scales.link), dtype=bool)
+    explained = (_of_links(at, slope, Posterior.of(normal))[joined] * of_link[joined] ** 2).mean(0)
+    typical = np.median(np.abs(at.links[joined]), axis=0) / MEDIAN / scales.link
+    return (1 - explained > OWN) & (typical > TYPICAL)

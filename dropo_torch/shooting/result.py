@@ -19,7 +19,7 @@ from dropo_torch.fit import Estimated, Fit, HistoryEntry, OnProgress
 from dropo_torch.objective import LIMITS, Objective
 from dropo_torch.optimizers import Progress
 from dropo_torch.problem import Problem
-from dropo_torch.shooting.components import uncertainty
+from dropo_torch.shooting.components import uncertainty, unjoined
 from dropo_torch.shooting.equations import Normal, Point, Residuals, Scales, residuals, slopes
 from dropo_torch.shooting.search import LOOKS, Search, begin, improved
 from dropo_torch.shooting.windows import Windows
@@ -79,7 +79,8 @@ def _concluded(
     config, box, scales = problem.config, windows.box, search.scales
     at = residuals(windows, search.point)
     slope = slopes(windows, search.point, at)
-    error, correlation = uncertainty(at, slope, scales, Normal.of(at, slope, scales))
+    normal = Normal.of(at, slope, scales)
+    error, correlation = uncertainty(at, slope, scales, normal)
     error, objective = error * box.width, _objective(problem, windows, search.point, scales)
     is_posterior = config.method == "laplace"
     std = np.maximum(error, box.min_std) if is_posterior else box.min_std
@@ -106,8 +107,14 @@ def _concluded(
         history=history,
         method=config.method,
         extras=_extras(windows, at, scales),
-        estimated=Estimated(objective, error, correlation),
+        estimated=Estimated(objective, error, correlation, _jumps(windows, at, unjoined(at, slope, scales, normal))),
     )
+
+
+def _jumps(windows: Windows, at: Residuals, told: np.ndarray) -> tuple[str, ...]:
+    """By how much states jump from one window to the next, in words, where that is no accident."""
+    size, chart = np.sqrt(np.square(at.links[at.follows]).mean(0)) * windows.sizes, windows.chart
+    return tuple(f"{chart.labels[i]} {size[i]:.2g} {chart.units[i]}" for i in np.flatnonzero(told))
 
 
 def _extras(windows: Windows, at: Residuals, scales: Scales) -> dict[str, Any]:
