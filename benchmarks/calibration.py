@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 
 import dropo_torch as dropo
+from dropo_torch.commands.options import workers
 from dropo_torch.studies.calibration import KINDS, CalibrationCell, CalibrationRun, Coverage, calibrate, coverages
 from dropo_torch.studies.study import run_cells
 
@@ -113,7 +114,7 @@ def options(doc: str | None) -> argparse.ArgumentParser:
     parser.add_argument("--logs", type=int, default=100, help="of each kind")
     parser.add_argument("--transitions", type=int, default=60)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--workers", type=int, default=1, help="logs at a time")
+    parser.add_argument("--workers", type=workers, default=1, metavar="N|ray", help="logs at a time")
     parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
     return parser
 
@@ -123,7 +124,7 @@ def fit_all(
     work: Callable[..., dict[str, Any]],
 ) -> list[dict[str, Any]]:  # fmt: skip
     """Fit every cell, with its progress, and return all results; what is wrong ends the command in one line."""
-    for name in ("logs", "transitions", "workers"):
+    for name in ("logs", "transitions"):
         if (number := getattr(given, name, 1)) < 1:
             parser.error(f"--{name} {number}: expected 1 or more")
     try:

@@ -17,7 +17,6 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +27,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.hidden.cases import CaseSpec, cases, select
 from benchmarks.hidden.systems import SYSTEMS
 from benchmarks.hidden.truths import Case, Effect, observed
+from dropo_torch.commands.options import workers
+from dropo_torch.errors import InputError
 from dropo_torch.support.parallel import in_parallel
 
 KINDS = ("null", "single", "double", "outside")
@@ -356,14 +357,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--cases", default="*", metavar="PATTERN", help="only the cases whose name matches")
     parser.add_argument("--only", choices=KINDS, help="only the cases of one kind")
     parser.add_argument("--small", action="store_true", help="a short list")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--jobs", type=workers, default=1, metavar="N|ray", help="processes")
     parser.add_argument("--backend", choices=("mujoco", "warp"), default="mujoco")
     parser.add_argument("--out", type=Path, help="folder of results.jsonl, written as results come")
     parser.add_argument("--resume", action="store_true", help="skip the cases that are in results.jsonl; its seed")
     parser.add_argument("--list", action="store_true", help="print the cases' names and stop")
     given = parser.parse_args(arguments)
-    if given.jobs < 1:
-        parser.error(f"--jobs {given.jobs}: expected 1 or more")
     if given.resume and given.out is None:
         parser.error("--resume needs --out")
     path = None if given.out is None else given.out / "results.jsonl"
@@ -390,9 +389,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if path is not None:
                 with path.open("a", encoding="utf-8") as stream:
                     stream.write(json.dumps(result) + "\n")
-    except BrokenProcessPool:
+    except InputError as error:
         missing = [s.name for s in specs if s.name not in {r["name"] for r in results}]
-        print(f"a process died, of the first of these: {', '.join(missing)}", flush=True)
+        print(f"{error}; not done: {', '.join(missing)}", flush=True)
     print("\n" + confusion(results) + "\n")
     print(by_trait(results) + "\n")
     for name, value in scores(results).items():

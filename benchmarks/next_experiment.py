@@ -29,6 +29,7 @@ from benchmarks.hidden.cases import OPTIONS, drawn
 from benchmarks.hidden.systems import SYSTEMS, System
 from benchmarks.hidden.truths import Effect, Log, Recording, make_case, make_recording, repeat
 from benchmarks.hidden_effects import judge, run_case, share
+from dropo_torch.commands.options import workers
 from dropo_torch.gap.suggest import COMMANDS, STARTS
 from dropo_torch.support.parallel import in_parallel
 
@@ -121,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seed", type=int, help="fresh from the clock where absent")
     parser.add_argument("--cases", type=int, default=60, help="draws of a system and an effect")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--jobs", type=workers, default=1, metavar="N|ray", help="processes")
     parser.add_argument("--backend", choices=("mujoco", "warp"), default="mujoco")
     given = parser.parse_args(arguments)
     seed = int(time.time()) % 1_000_000 if given.seed is None else given.seed

@@ -24,6 +24,7 @@ import dropo_sims.push.record
 import numpy as np
 
 import dropo_torch as dropo
+from dropo_torch.commands.options import workers
 from dropo_torch.gap.refit import Z90
 from dropo_torch.models.bundled import BundledSim
 from dropo_torch.studies.calibration import CalibrationCell, wilson
@@ -121,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--logs", type=int, default=20, help="of each simulation")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, required=True)
-    parser.add_argument("--workers", type=int, default=1, help="logs at a time")
+    parser.add_argument("--workers", type=workers, default=1, metavar="N|ray", help="logs at a time")
     parser.add_argument("--resume", action="store_true", help="keep the fits that --out holds")
     given = parser.parse_args(arguments)
     plan = Plan(given.seed)

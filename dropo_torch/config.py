@@ -104,6 +104,9 @@ class Config(pydantic.BaseModel):
         {}, "name: value, the model on which a trained policy is evaluated beside the nominal one", "policy"
     )
     threads: int = _key(0, "threads of the simulator, 0 for all processors", "machine", ge=0, le=4096)
+    workers: Annotated[int, Field(ge=1, le=4096)] | Literal["ray"] = _key(
+        1, "processes that fit side by side in a sweep or comparison, or ray for those of a cluster", "machine"
+    )
     chunk_size: int = _key(10_000, "simulations held in memory at once", "machine", ge=1, le=10**9)
 
     #: Folder that relative paths start from; not a key of the file.
@@ -167,8 +170,9 @@ class Config(pydantic.BaseModel):
         return str(self.path(source).resolve())
 
     def fingerprint(self, *ignored: str) -> str:
-        """Return a digest of everything that decides a run's result; threads and chunks do not."""
-        document = {k: v for k, v in self.document().items() if k not in {"threads", "chunk_size", *ignored}}
+        """Return a digest of everything that decides a run's result; threads, workers and chunks do not."""
+        left_out = {"threads", "workers", "chunk_size", *ignored}
+        document = {k: v for k, v in self.document().items() if k not in left_out}
         return hashlib.sha256(json.dumps(document, sort_keys=True).encode()).hexdigest()[:16]
 
 

@@ -129,9 +129,10 @@ def compare_on(
     system = SYSTEMS[name]()
     transitions, observation, truth = record(system, 0, steps)
 
-    def fit_with(optimizer: str, backend: str, seed: int) -> tuple[dropo.Fit, dropo.Objective]:
+    def fit_with(optimizer: str, backend: str, seed: int, *, threads: int) -> tuple[dropo.Fit, dropo.Objective]:
         space = dropo.ParameterSpace(system.model, system.parameters)
-        simulator = dropo.make_simulator(backend, system.model, parameters=space, frame_skip=system.frame_skip)
+        about = {"parameters": space, "frame_skip": system.frame_skip, "num_threads": threads}
+        simulator = dropo.make_simulator(backend, system.model, **about)
         objective = dropo.Objective(simulator, transitions, observation, epsilon=EPSILON)
         evaluations = budget or BUDGET[len(space)]
         settings = dropo.FitSettings(optimizer, samples=samples, seed=seed, adam=adam, budget=evaluations)

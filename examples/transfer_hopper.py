@@ -32,6 +32,7 @@ from dropo_sims.hopper import SIM
 from dropo_sims.hopper.record import nominal_masses, record
 
 import dropo_torch as dropo
+from dropo_torch.commands.options import workers
 from dropo_torch.rl.problem import make_training
 from dropo_torch.rl.train import EvaluationPoint, TrainEntry, train
 from dropo_torch.support.files import write_atomically
@@ -186,13 +187,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--epsilon", type=float, default=EPSILON, help="of the fit")
     parser.add_argument("--log-steps", type=int, default=500, help="transitions of each of the log's two episodes")
     parser.add_argument("--threads", type=int, default=0, help="of the simulator")
-    parser.add_argument("--workers", type=int, default=1, help="trainings side by side")
+    parser.add_argument("--workers", type=workers, default=1, metavar="N|ray", help="trainings side by side")
     parser.add_argument(
         "--train", nargs=2, action="append", default=[], metavar=("KEY", "VALUE"), help="a setting of the training"
     )
     given = parser.parse_args(arguments)
-    if given.workers < 1:
-        parser.error(f"--workers {given.workers}: expected 1 or more")
     if not same_settings(given):
         parser.error(f"{given.out} holds a study with other settings; name another folder")
     for seed in range(given.seeds):

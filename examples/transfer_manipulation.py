@@ -19,6 +19,7 @@ from pathlib import Path
 
 from dropo_sims.transfer import METHODS, Robot
 
+from dropo_torch.commands.options import workers
 from dropo_torch.errors import InputError
 
 ROBOTS = {"puck": "dropo_sims.puck.transfer:ROBOT", "push": "dropo_sims.push.transfer:ROBOT"}
@@ -33,9 +34,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--seeds", type=int, help="logs")
     parser.add_argument("--boxes", type=int, help="boxes of uniform randomisation")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="whose policies are trained")
-    parser.add_argument("--workers", type=int, default=1, help="processes side by side")
+    parser.add_argument("--workers", type=workers, default=1, metavar="N|ray", help="processes side by side")
     given = parser.parse_args(arguments)
-    for name in ("seeds", "boxes", "workers"):
+    for name in ("seeds", "boxes"):
         if (value := getattr(given, name)) is not None and value < 1:
             parser.error(f"--{name} {value}: expected 1 or more")
     robot: Robot = pkgutil.resolve_name(ROBOTS[given.robot])

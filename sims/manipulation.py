@@ -18,6 +18,7 @@ from dropo_torch.distribution import Distribution
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.studies.study import run_cells
 from dropo_torch.support.extras import require
+from dropo_torch.support.parallel import Workers
 
 from .manipulation_tables import About, write_results
 
@@ -86,7 +87,8 @@ class Study:
 
     def run(
         self, out: Path, *, reduced: bool = False, resume: bool = False,
-        report: Callable[[str, float], None] = lambda stage, share: None, plan: Plan | None = None, workers: int = 1,
+        report: Callable[[str, float], None] = lambda stage, share: None, plan: Plan | None = None,
+        workers: Workers = 1,
     ) -> Sequence[str]:  # fmt: skip
         """Run every cell that is not there yet, then write tables and figures; return what it found.
 

@@ -34,6 +34,7 @@ from dropo_torch.rl.train import EvaluationPoint, TrainEntry, train
 from dropo_torch.studies.study import run_cells
 from dropo_torch.support.extras import require
 from dropo_torch.support.files import write_atomically, write_json
+from dropo_torch.support.parallel import Workers
 
 from .target import Arm, Run, Target, arm_config, log_config, write_raw
 from .transfer_tables import write_results
@@ -112,7 +113,8 @@ class Robot:
 
     def run(
         self, out: Path, *, reduced: bool = False, resume: bool = False,
-        report: Callable[[str, float], None] = lambda stage, share: None, plan: Plan | None = None, workers: int = 1,
+        report: Callable[[str, float], None] = lambda stage, share: None, plan: Plan | None = None,
+        workers: Workers = 1,
     ) -> Sequence[str]:  # fmt: skip
         """Run every cell that is not there yet, then write tables and figures; return what was found.
 
@@ -124,7 +126,7 @@ class Robot:
                 training goes on.
             report: called with what is being done and the share that is.
             plan: a size of one's own.
-            workers: processes that compute cells side by side. Fits and gaps do not depend on it.
+            workers: processes that compute cells side by side, or ``"ray"``. Fits and gaps do not depend on it.
 
         Raises:
             InputError: a folder with another study, or with one that is not to be resumed; a package that is missing.

@@ -72,7 +72,7 @@ def test_default_values_span_ten_decades_below_the_logs_variance() -> None:
     assert all(v > 0 for v in default_epsilons(np.zeros((5, 2))))
 
 
-def point_at(epsilon: float) -> SweepPoint:
+def point_at(epsilon: float, threads: int = 0) -> SweepPoint:
     mse = max(1e-6, 1e-12 / epsilon)
     return SweepPoint(epsilon=epsilon, mse=mse, log_likelihood=-epsilon, mean={"m": 1 / 3}, std={"m": epsilon})
 
@@ -81,7 +81,7 @@ def test_an_interrupted_sweep_repeats_no_finished_fit(tmp_path: Path) -> None:
     whole = sweep_epsilon(point_at, EPSILONS)
     done: list[float] = []
 
-    def interrupted(epsilon: float) -> SweepPoint:
+    def interrupted(epsilon: float, threads: int) -> SweepPoint:
         if len(done) == 2:
             raise KeyboardInterrupt
         done.append(epsilon)
@@ -91,7 +91,7 @@ def test_an_interrupted_sweep_repeats_no_finished_fit(tmp_path: Path) -> None:
         sweep_epsilon(interrupted, EPSILONS, fingerprint="f", store=tmp_path / "store")
     later: list[float] = []
     resumed = sweep_epsilon(
-        lambda e: later.append(e) or point_at(e), EPSILONS, fingerprint="f", store=tmp_path / "store"
+        lambda e, threads: later.append(e) or point_at(e), EPSILONS, fingerprint="f", store=tmp_path / "store"
     )
     assert sorted(done + later) == EPSILONS
     assert resumed == whole

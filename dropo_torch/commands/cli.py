@@ -13,7 +13,7 @@ import importlib.metadata
 import io
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 from dropo_torch.commands.options import Parser
@@ -78,6 +78,10 @@ GROUPS = {
         ),
     },
 }  # fmt: skip
+#: Shells whose command line is completed.
+SHELLS = ("bash", "zsh", "fish")
+#: Commands of several fits, which workers do side by side.
+SHARED = ("sweep-epsilon", "compare", "reproduce")
 COMMANDS = {name: command for group in GROUPS.values() for name, command in group.items()}
 
 
@@ -118,14 +122,18 @@ def _silence() -> None:
 def _dispatch(given: list[str]) -> int:
     """Run the command that was given, and return its exit code; what it does not know are overrides of its config."""
     command = given[0] if given else ""
-    if command not in (*COMMANDS, "", "-h", "--help", "--version"):
+    if command.partition("=")[0] not in (*COMMANDS, "", "-h", "--help", "--version", "--completion"):
         if command.startswith("-"):
             raise InputError(f"unknown option {command}; a command comes first: {', '.join(COMMANDS)}")
         raise InputError(f"unknown command {command!r}" + choices(command, COMMANDS))
-    parser = _parser(command)
+    parser = _parser([command])
     parsed, rest = parser.parse_known_args(given)
     if parsed.version:
         print(f"dropo_torch {importlib.metadata.version('dropo_torch')}")
+    elif parsed.completion is not None:
+        from dropo_torch.commands.completion import script
+
+        print(script(_parser(COMMANDS, "what to do"), parsed.completion))
     elif parsed.command is None:
         parser.print_help()
     else:
@@ -134,28 +142,39 @@ def _dispatch(given: list[str]) -> int:
         from dropo_torch.commands.folder import claimed
         from dropo_torch.config import parse_overrides
 
+        overrides = parse_overrides(rest)
+        if "workers" in overrides and command not in SHARED:
+            raise InputError(
+                f"{command}: --workers is not understood, as its work is not divided; {', '.join(SHARED)} take it, and "
+                "--threads is how many processors a simulator uses"
+            )
         console = Console(highlight=False, markup=False, emoji=False)  # names are the user's, and no markup
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
         with claimed(parsed.out) if parsed.out is not None else contextlib.nullcontext():
-            return parsed.run(parsed, parse_overrides(rest), console) or 0
+            return parsed.run(parsed, overrides, console) or 0
     return 0
 
 
-def _parser(called: str) -> argparse.ArgumentParser:
-    """The parser of the command that is called; of the others it knows the names."""
+def _parser(called: Collection[str], about: str = argparse.SUPPRESS) -> argparse.ArgumentParser:
+    """The parser of the commands that are called; of the others it knows the names. ``about`` is the list's help."""
     parser = Parser(
         prog="dropo", usage="dropo COMMAND ...", description=_OVERVIEW.format("\n\n".join(map(_group, GROUPS))),
         allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter,
     )  # fmt: skip
     parser.add_argument("--version", action="store_true", help="show the version and exit")
-    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser, help=argparse.SUPPRESS)
+    parser.add_argument(
+        "--completion",
+        choices=SHELLS,
+        help="print what makes a shell complete command lines: docs/install.md",
+    )
+    commands = parser.add_subparsers(dest="command", metavar="COMMAND", parser_class=Parser, help=about)
     for name, (module, summary, examples) in COMMANDS.items():
         shown = "\n".join(f"  {line}" for line in examples)
         command = commands.add_parser(
-            name, description=f"{summary[0].upper()}{summary[1:]}.\n\nexamples:\n{shown}", allow_abbrev=False,
-            formatter_class=argparse.RawDescriptionHelpFormatter, prog=f"dropo {name}",
+            name, help=summary, description=f"{summary[0].upper()}{summary[1:]}.\n\nexamples:\n{shown}",
+            allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, prog=f"dropo {name}",
         )  # fmt: skip
-        if name == called:
+        if name in called:
             verb = importlib.import_module(f"dropo_torch.commands.{module}")
             verb.add_arguments(command)
             command.set_defaults(run=verb.run)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -11,9 +12,9 @@ from rich.console import Console
 from dropo_torch.commands.fit import show_report
 from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config, count
-from dropo_torch.commands.progress import fit_shown
+from dropo_torch.commands.progress import fit_shown, fits_side_by_side
 from dropo_torch.commands.sweep import only_dropo
-from dropo_torch.config import load_config
+from dropo_torch.config import Config, load_config
 from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.support.files import write_json
 
@@ -42,23 +43,35 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     refuse_sensed(problem, "compare")
     store = out / "compare-progress.json"
     prepare_folder(out, problem.model_path, resume=given.resume and store.exists())
-
-    def fit_with(optimizer: str, backend: str, seed: int) -> tuple[Fit, Objective]:
-        part = make_problem(config.model_copy(update={"optimizer": optimizer, "backend": backend, "seed": seed}))
-        return fit_shown(part, console, f"{optimizer} on {backend}, seed {seed}"), part.objective
-
-    def show(run: Run) -> None:
-        console.print(
-            f"{run.method}, seed {run.seed}: log-likelihood {run.log_likelihood:.1f}, "
-            f"{run.simulated_transitions} simulated transitions, {run.seconds:.1f} s",
-        )
-
     truth = bundled_sim(config.sim).truth if config.sim and config.data is None else {}
     methods = METHODS if given.methods is None else [m.strip() for m in given.methods.split(",")]
     seeds = range(config.seed, config.seed + given.seeds)
     reference = {n: truth[n] for n in problem.space.names} if truth else None
-    kept: dict[str, Any] = {"store": store, "fingerprint": problem.fingerprint}
-    comparison = compare(fit_with, methods=methods, seeds=seeds, reference=reference, on_run=show, **kept)
+    with fits_side_by_side(console, "compare", len(methods) * len(seeds), config.workers) as count:
+
+        def show(run: Run) -> None:
+            count()
+            console.print(
+                f"{run.method}, seed {run.seed}: log-likelihood {run.log_likelihood:.1f}, "
+                f"{run.simulated_transitions} simulated transitions, {run.seconds:.1f} s",
+            )
+
+        comparison = compare(
+            functools.partial(fit_by, config=config, console=console if config.workers == 1 else None),
+            methods=methods, seeds=seeds, reference=reference, store=store, fingerprint=problem.fingerprint,
+            workers=config.workers, on_run=show,
+        )  # fmt: skip
     write_json(out / "compare.json", comparison.document())
     write_compare_report(out / "report.html", comparison, **provenance(config))
     show_report(out, console)
+
+
+def fit_by(
+    optimizer: str, backend: str, seed: int, *, config: Config, console: Console | None, threads: int
+) -> tuple[Fit, Objective]:
+    """Fit by an optimizer on a backend, showing how far it is if there is a console; return the objective, too."""
+    from dropo_torch.problem import make_problem
+
+    keys = {"optimizer": optimizer, "backend": backend, "seed": seed, "threads": config.threads or threads}
+    part = make_problem(config.model_copy(update=keys))
+    return fit_shown(part, console, f"{optimizer} on {backend}, seed {seed}"), part.objective

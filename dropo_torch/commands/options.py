@@ -11,6 +11,7 @@ from dropo_torch.errors import InputError
 
 if TYPE_CHECKING:
     from dropo_torch.config import Config
+    from dropo_torch.support.parallel import Workers
 
 
 class Parser(argparse.ArgumentParser):
@@ -76,6 +77,15 @@ def count(text: str) -> int:
     """Return a whole number, 1 or more."""
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} given; expected a whole number, 1 or more")
+    return int(text)
+
+
+def workers(text: str) -> Workers:
+    """Return how many processes work side by side, 1 or more, or ``"ray"``."""
+    if text == "ray":
+        return "ray"
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} given; expected a whole number, 1 or more, or ray")
     return int(text)
 
 

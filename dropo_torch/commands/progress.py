@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +19,7 @@ if TYPE_CHECKING:
     from dropo_torch.gap.remaining import Remaining
     from dropo_torch.optimizers import Progress as OptimizerProgress
     from dropo_torch.problem import Problem
+    from dropo_torch.support.parallel import Workers
 
 #: Seconds between lines where the output is no terminal.
 INTERVAL = 10.0
@@ -104,12 +107,32 @@ class TrainProgress(_Live):
         self._show(f"{steps:,} of {self._steps:,} steps{late}{left}", steps / self._steps)
 
 
+@contextlib.contextmanager
+def fits_side_by_side(console: Console, label: str, total: int, workers: Workers) -> Iterator[Callable[[], None]]:
+    """Show how many fits of a study are done, by what is called after each; those in turn show their own progress."""
+    if workers == 1:
+        yield lambda: None
+        return
+    done = itertools.count(1)
+    with StageProgress(console, label) as progress:
+        progress.show("fitting side by side", 0.0)
+
+        def count() -> None:
+            number = next(done)
+            progress.show(f"fits done: {number}", number / total)
+
+        yield count
+
+
 def fit_shown(
-    problem: Problem, console: Console, label: str = "fit", *, checkpoint: Path | None = None, resume: bool = False
-) -> Fit:
-    """Fit as the config says, and show how far it is."""
+    problem: Problem, console: Console | None, label: str = "fit", *, checkpoint: Path | None = None,
+    resume: bool = False,
+) -> Fit:  # fmt: skip
+    """Fit as the config says, and show how far it is, if there is somewhere to."""
     from dropo_torch.baselines import fit_problem
 
+    if console is None:
+        return fit_problem(problem, checkpoint=checkpoint, resume=resume)
     with FitProgress(console, label) as progress:
         return fit_problem(problem, checkpoint=checkpoint, resume=resume, on_progress=progress.show)
 

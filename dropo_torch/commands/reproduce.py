@@ -8,7 +8,7 @@ from typing import Any
 
 from rich.console import Console
 
-from dropo_torch.commands.options import add_folder, count
+from dropo_torch.commands.options import add_folder, workers
 from dropo_torch.commands.progress import StageProgress
 from dropo_torch.errors import InputError
 from dropo_torch.models.bundled import bundled_study
@@ -20,7 +20,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("study", metavar="STUDY", help="hopper, push or puck: the DROPO paper's experiments, simulated")
     add_folder(parser)
     parser.add_argument("--reduced", action="store_true", help="short logs and few seeds: minutes instead of hours")
-    parser.add_argument("--workers", type=count, metavar="N", help="fits side by side (default: one a processor)")
+    parser.add_argument(
+        "--workers", type=workers, metavar="N|ray",
+        help="fits side by side, each a process (default: one a processor); or ray, for those of a cluster",
+    )  # fmt: skip
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
@@ -29,9 +32,9 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     for key in overrides:
         raise InputError(f"reproduce: --{key} is not understood; it takes --out, --resume, --reduced and --workers")
     study, out = bundled_study(given.study), given.out
-    workers = processors() if given.workers is None else given.workers
+    side_by_side = processors() if given.workers is None else given.workers
     with StageProgress(console, f"reproduce {given.study}") as progress:
-        found = study(out, reduced=given.reduced, resume=given.resume, report=progress.show, workers=workers)
+        found = study(out, reduced=given.reduced, resume=given.resume, report=progress.show, workers=side_by_side)
     lines = [*(f"  - {line}" for line in found), f"tables: {out / 'tables.md'}; report: {out / 'report.html'}"]
     for line in lines:
         console.print(line, soft_wrap=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -14,7 +15,7 @@ from rich.text import Text
 from dropo_torch.commands.fit import show_report
 from dropo_torch.commands.folder import prepare_folder, provenance
 from dropo_torch.commands.options import add_config
-from dropo_torch.commands.progress import fit_shown
+from dropo_torch.commands.progress import fit_shown, fits_side_by_side
 from dropo_torch.config import Config, load_config
 from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_json
@@ -63,19 +64,32 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
             return study.noise_keys(problem.objective, epsilon)
         return study.epsilon_keys(config.epsilon, epsilon)
 
-    def point_at(epsilon: float) -> SweepPoint:
-        part = make_problem(config.model_copy(update=keys_of(epsilon)))
-        fit = fit_shown(part, console, f"ε = {epsilon:g}")
-        return study.SweepPoint.of(epsilon, fit, noisy_starts=noisy_starts)
-
-    sweep = study.sweep_epsilon(
-        point_at, values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store
-    )
+    with fits_side_by_side(console, "sweep-epsilon", len(values), config.workers) as count:
+        sweep = study.sweep_epsilon(
+            functools.partial(
+                point_at, keys={epsilon: keys_of(epsilon) for epsilon in values}, config=config,
+                noisy_starts=noisy_starts, console=console if config.workers == 1 else None,
+            ),
+            values, noisy_starts=noisy_starts, fingerprint=problem.fingerprint, store=store, workers=config.workers,
+            on_point=lambda point: count(),
+        )  # fmt: skip
     chosen = keys_of(sweep.chosen) | ({"scaling": True} if config.scaling else {})  # which ε is in units of
     _show(sweep, chosen, problem.space.names, console)
     write_json(out / "sweep.json", {**sweep.document(), "use": chosen})
     write_sweep_report(out / "report.html", sweep, use=chosen, **provenance(config))
     show_report(out, console)
+
+
+def point_at(
+    epsilon: float, *, keys: Mapping[float, Mapping[str, Any]], config: Config, noisy_starts: bool,
+    console: Console | None, threads: int,
+) -> SweepPoint:  # fmt: skip
+    """Fit at an ε, by the keys of the config that stand for it, showing how far it is if there is a console."""
+    from dropo_torch.problem import make_problem
+    from dropo_torch.studies.sweep import SweepPoint
+
+    part = make_problem(config.model_copy(update={"threads": config.threads or threads, **keys[epsilon]}))
+    return SweepPoint.of(epsilon, fit_shown(part, console, f"ε = {epsilon:g}"), noisy_starts=noisy_starts)
 
 
 def only_dropo(config: Config, what: str) -> None:

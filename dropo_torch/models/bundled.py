@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol, cast
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.parallel import Workers
 
 GROUP = "dropo_torch.sims"
 
@@ -48,9 +49,9 @@ class Study(Protocol):
     """A published study, redone: results into a folder, finished parts kept where it resumes."""
 
     def __call__(
-        self, out: Path, *, reduced: bool, resume: bool, report: Callable[[str, float], None], workers: int
+        self, out: Path, *, reduced: bool, resume: bool, report: Callable[[str, float], None], workers: Workers
     ) -> Sequence[str]:
-        """Run it by so many processes; return what it found, in sentences."""
+        """Run it by so many processes, or by a cluster; return what it found, in sentences."""
 
 
 def bundled_sim(name: str, *, key: str = "sim") -> BundledSim:

@@ -14,6 +14,7 @@ from dropo_torch.errors import InputError, choices
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
 from dropo_torch.studies.study import Store
+from dropo_torch.support.parallel import Workers
 from dropo_torch.support.random import draw_uniforms
 
 SCHEMA = "dropo-torch/compare/1"
@@ -81,24 +82,27 @@ class Comparison:
 
 
 def compare(
-    fit_with: Callable[[str, str, int], tuple[Fit, Objective]],
+    fit_with: Callable[..., tuple[Fit, Objective]],
     *,
     methods: Sequence[str],
     seeds: Sequence[int],
     reference: dict[str, float] | None,
     store: Path | None = None,
     fingerprint: str = "",
-    on_run: Callable[[Run], None] | None = None,
+    workers: Workers = 1,
+    on_run: Callable[[Run], None] = lambda run: None,
 ) -> Comparison:
     """Run every method on every seed.
 
     Args:
-        fit_with: ``(optimizer, backend, seed)`` → the fit and the objective it maximised.
+        fit_with: ``fit_with(optimizer, backend, seed, threads=...)`` → the fit and the objective it maximised; where
+            there are several workers it is pickled.
         methods: of :data:`METHODS`.
         seeds: of the optimizers' random numbers.
         reference: known values of the parameters; ``None`` for the means of the run with the best likelihood.
         store: file in which finished runs are kept; those of the same fingerprint are not repeated.
         fingerprint: identifies config and log.
+        workers: processes that fit side by side, or ``"ray"``. What is found does not depend on it, but seconds do.
         on_run: called after each run.
 
     Raises:
@@ -109,18 +113,24 @@ def compare(
             raise InputError(f"methods: unknown {method!r}" + choices(method, METHODS))
     kept: Store[dict[str, Any]] = Store(store, fingerprint, "comparison", dict)
 
-    def run(method: str, seed: int) -> dict[str, Any]:
-        optimizer, backend = method.split("-")
-        found = _record(method, seed, *fit_with(optimizer, backend, seed))
-        if on_run is not None:
-            on_run(_judge(found, reference or found["mean"]))
-        return found
-
-    raw = [kept.get(f"{m}/{seed}", functools.partial(run, m, seed)) for m in methods for seed in seeds]
+    raw = kept.results(
+        {f"{method}/{seed}": (method, seed) for method in methods for seed in seeds},
+        functools.partial(_run, fit_with=fit_with),
+        workers,
+        lambda found: on_run(_judge(found, reference or found["mean"])),
+    )
     best = max(raw, key=lambda r: r["log_likelihood"])
     values = reference or best["mean"]
     known = "the values the log was recorded with" if reference else f"the means of {best['method']}, the likeliest run"
     return Comparison(tuple(_judge(r, values) for r in raw), values, known)
+
+
+def _run(
+    task: tuple[str, int], *, fit_with: Callable[..., tuple[Fit, Objective]], threads: int
+) -> dict[str, Any]:  # fmt: skip
+    """Fit by a method from a seed, and return the run as plain data."""
+    method, seed = task
+    return _record(method, seed, *fit_with(*method.split("-"), seed, threads=threads))
 
 
 def _record(method: str, seed: int, fit: Fit, objective: Objective) -> dict[str, Any]:

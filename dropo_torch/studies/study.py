@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
 from dropo_torch.support.given import reading
-from dropo_torch.support.parallel import in_parallel
+from dropo_torch.support.parallel import Task, Workers, in_parallel
 
 SCHEMA = "dropo-torch/study/1"
 
@@ -38,7 +38,7 @@ def run_cells(
     run: Callable[..., dict[str, Any]],
     *,
     resume: bool = False,
-    workers: int = 1,
+    workers: Workers = 1,
     report: Callable[[str, float], None] = lambda stage, share: None,
 ) -> list[dict[str, Any]]:
     """Run every cell whose file is not there yet, and return all results, each with its ``cell``, in the cells' order.
@@ -49,7 +49,7 @@ def run_cells(
         cells: what is to be run.
         run: called as ``run(cell, threads=...)``, gives plain data; of a module's top level, as it is pickled.
         resume: go on with the study that the folder holds.
-        workers: processes that run cells side by side. The results do not depend on it.
+        workers: processes that run cells side by side, or ``"ray"``. The results do not depend on it.
         report: called with what is being done and the share that is.
 
     Raises:
@@ -60,8 +60,8 @@ def run_cells(
     waiting = [cell for cell in cells if not files[cell.name].exists()]
     done = len(cells) - len(waiting)
     report(f"{done} of {len(cells)} fits are done", done / len(cells))
-    work = functools.partial(_write_cell, run=run, folder=out / "cells")
-    for number, (cell, _) in enumerate(in_parallel(work, waiting, workers), done + 1):
+    for number, (cell, found) in enumerate(in_parallel(run, waiting, workers), done + 1):
+        write_atomically(files[cell.name], json.dumps(found, indent=1).encode() + b"\n")
         report(f"{number} of {len(cells)}: {cell.name}", number / len(cells))
     return [{**json.loads(files[cell.name].read_text()), "cell": asdict(cell)} for cell in cells]
 
@@ -93,14 +93,33 @@ class Store(Generic[Result]):
                 f"resume: {path} belongs to another config or log, or to other options; start again without --resume"
             )
 
-    def get(self, key: str, compute: Callable[[], Result]) -> Result:
-        """Return the result of a key, computed and kept where there is none yet."""
-        if key not in self._results:
-            self._results[key] = compute()
+    def results(
+        self,
+        tasks: Mapping[str, Task],
+        work: Callable[..., Result],
+        workers: Workers = 1,
+        on_result: Callable[[Result], None] = lambda result: None,
+    ) -> list[Result]:
+        """Return the results of tasks by key, in their order, each computed and kept where there is none yet.
+
+        Args:
+            tasks: independent of each other.
+            work: called as ``work(task, threads=...)``; see :func:`~dropo_torch.support.parallel.in_parallel`.
+            workers: processes that do them side by side, or ``"ray"``.
+            on_result: called with each that is computed.
+        """
+        waiting = [item for item in tasks.items() if item[0] not in self._results]
+        for (key, _), result in in_parallel(functools.partial(_by_key, work=work), waiting, workers):
+            self._results[key] = result
             if self._path is not None:
                 content = {"fingerprint": self._fingerprint, "results": self._results}
                 write_atomically(self._path, json.dumps(content, default=asdict).encode())
-        return self._results[key]
+            on_result(result)
+        return [self._results[key] for key in tasks]
+
+
+def _by_key(item: tuple[str, Task], *, work: Callable[..., Result], threads: int) -> Result:
+    return work(item[1], threads=threads)
 
 
 def grouped(items: Iterable[Item], key: Callable[[Item], Key]) -> dict[Key, list[Item]]:
@@ -150,11 +169,6 @@ def markdown(title: str, introduction: str, sections: Iterable[Section]) -> str:
             parts.append(f"![{section.title}]({section.figure})\n")
         parts.append("\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n")
     return "\n".join(parts)
-
-
-def _write_cell(cell: Cell, *, run: Callable[..., dict[str, Any]], folder: Path, threads: int) -> None:
-    found = run(cell, threads=threads)
-    write_atomically(folder / f"{cell.name}.json", json.dumps(found, indent=1).encode() + b"\n")
 
 
 def _claim(out: Path, plan: Any, *, resume: bool) -> None:

@@ -5,7 +5,6 @@ Or, where initial states are as noisy as the ends of transitions: raise the nois
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -18,6 +17,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.fit import Fit
 from dropo_torch.objective import Objective
 from dropo_torch.studies.study import Store
+from dropo_torch.support.parallel import Workers
 
 SCHEMA = "dropo-torch/sweep/1"
 #: An error within this share of the smallest one counts as no larger.
@@ -171,29 +171,33 @@ def rising(epsilons: Sequence[float]) -> list[float]:
 
 
 def sweep_epsilon(
-    point_at: Callable[[float], SweepPoint],
+    point_at: Callable[..., SweepPoint],
     epsilons: Sequence[float],
     *,
     noisy_starts: bool = False,
     fingerprint: str = "",
     store: Path | None = None,
+    workers: Workers = 1,
+    on_point: Callable[[SweepPoint], None] = lambda point: None,
 ) -> Sweep:
     """Fit at each ε and choose by the elbow, or with noisy initial states by the robust log-likelihood.
 
     Args:
-        point_at: fits at an ε.
+        point_at: fits at an ε: ``point_at(epsilon, threads=...)``; where there are several workers it is pickled.
         epsilons: the values to try.
         noisy_starts: whether ε stands for the variance of initial states and ends alike; its points are then judged by
             their robust log-likelihood.
         fingerprint: identifies config and log.
         store: file in which finished fits are kept; those of the same fingerprint are not repeated.
+        workers: processes that fit side by side, or ``"ray"``. The result does not depend on it.
+        on_point: called after each fit.
 
     Raises:
         InputError: fewer than three values, or one that is not positive.
     """
     values = rising(epsilons)
     kept = Store(store, fingerprint + ("-noisy-starts" if noisy_starts else ""), "sweep", SweepPoint)
-    points = tuple(kept.get(repr(value), functools.partial(point_at, value)) for value in values)
+    points = tuple(kept.results({repr(value): value for value in values}, point_at, workers, on_point))
     if noisy_starts:
         robust = [math.nan if p.robust_log_likelihood is None else p.robust_log_likelihood for p in points]
         chosen, reason = likeliest(values, robust)

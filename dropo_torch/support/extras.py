@@ -14,6 +14,7 @@ EXTRAS = {
     "formats": ("h5py", "pandas", "pyarrow"),
     "gymnasium": ("gymnasium",),
     "minari": ("minari",),
+    "ray": ("ray",),
     "ros": ("rosbags",),
     "rl": ("torchrl", "tensordict", "gymnasium"),
     "tensorboard": ("tensorboard",),
