@@ -10,16 +10,15 @@ import mujoco
 import numpy as np
 import pytest
 from dropo_sims.hopper import SIM
+from dropo_sims.hopper.fits import METHODS, UNMODELED
 from dropo_sims.hopper.paper import (
     EPSILON,
     FULL,
     GIVEN,
     LIGHT,
     MASSES,
-    METHODS,
     PARAMETERS,
     REDUCED,
-    UNMODELED,
     WHY,
     Cell,
     all_cells,

@@ -10,17 +10,13 @@ there.
 
 from __future__ import annotations
 
-import time
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import mujoco
 import numpy as np
-import torch
 
-from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.diagnostics import diagnose
 from dropo_torch.distribution import Distribution
@@ -29,7 +25,8 @@ from dropo_torch.problem import Problem, make_problem
 from dropo_torch.rl.policy import load_policy
 from dropo_torch.studies.recovery import Result
 
-from . import LINKS, SIM
+from . import SIM
+from .fits import METHODS, UNMODELED, Size, fitted, method_keys, mse_at
 from .record import NOISE_VARIANCE, HopperLog, record
 
 POLICY = Path(__file__).parent / "policy.pt"
@@ -37,37 +34,21 @@ POLICY = Path(__file__).parent / "policy.pt"
 MASSES = {"torso_mass": 3.534, "thigh_mass": 3.927, "leg_mass": 2.714, "foot_mass": 5.089}
 #: Half to double of them, as in the paper.
 PARAMETERS = {name: {**SIM.parameters[name], "bounds": [mass / 2, 2 * mass]} for name, mass in MASSES.items()}
-#: Mass of the torso in the model that is wrong, kg, and the parameter that is then no parameter.
-LIGHT, UNMODELED = 2.534, "torso_mass"
-#: Methods of Table 1, with BayesSim's features.
-METHODS = (("dropo", ""), ("droid", ""), ("bayessim", "mdnn"), ("bayessim", "mdrff"))
+#: Mass of the torso in the model that is wrong, kg.
+LIGHT = 2.534
 #: Cases of Table 1 and of the recovery of a distribution, with the paper's ε where it says so.
 EPSILON = {"point": 1e-8, "ends": NOISE_VARIANCE, "noisy": NOISE_VARIANCE, "unmodeled": 1e-3, "distribution": 1e-7}
 
 
 @dataclass(frozen=True)
-class PaperPlan:
+class PaperPlan(Size):
     """How large this part is.
 
     Attributes:
-        seeds: logs of each kind.
-        episodes, steps: of a log, and transitions of each.
-        samples: K.
-        droid_budget: simulations of the log by DROID.
-        simulations, horizon: of BayesSim, and the logged steps that it replays.
         noises: noises of one log whose estimates are compared.
-        backend: of all fits. The logs are MuJoCo's own.
     """
 
-    seeds: int = 3
-    episodes: int = 2
-    steps: int = 500
-    samples: int = 100
-    droid_budget: int = 2000
-    simulations: int = 1000
-    horizon: int = 50
     noises: int = 10
-    backend: Literal["mujoco", "warp"] = "warp"
 
 
 #: Of the study.
@@ -162,33 +143,18 @@ def run_cell(cell: Cell, *, plan: PaperPlan, logs: Path, threads: int = 0) -> Re
     problem = make_problem(make_config(document, base=folder))
     if cell.epsilon == 0:
         problem = make_problem(make_config({**document, "epsilon": mse_at(problem, MASSES)}, base=folder))
-    begun = time.monotonic()
-    fit = fit_problem(problem)
-    seconds = time.monotonic() - begun
+    found = fitted(problem, log)
     for path in folder.iterdir():
         path.unlink()
     folder.rmdir()
-    return {
-        "truth": truth_of(log),
-        "transitions": len(log.actions),
-        "wall_seconds": round(seconds, 3),
-        "fit": fit.document(),
-        **({"standard_error": told(problem)} if cell.block == "noises" else {}),
-    }
+    return found | ({"standard_error": told(problem)} if cell.block == "noises" else {})
 
 
 def config_of(cell: Cell, plan: PaperPlan) -> dict[str, Any]:
     """Return the config of a cell's fit, but for its model and its log."""
-    options = {
-        "droid": {"budget": plan.droid_budget},
-        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
-    }
     document = {
+        **method_keys(cell.method, cell.features, plan),
         "parameters": {k: v for k, v in PARAMETERS.items() if cell.variant != "unmodeled" or k != UNMODELED},
-        "backend": plan.backend,
-        "method": cell.method,
-        "method_options": options.get(cell.method, {}),
-        "samples": plan.samples,
         "seed": cell.seed,
         "lag": cell.lag,
         "epsilon": cell.epsilon or NOISE_VARIANCE,
@@ -211,25 +177,12 @@ def log_of(cell: Cell, plan: PaperPlan) -> HopperLog:
     return record(variant="point" if cell.variant == "unmodeled" else cell.variant, seed=cell.seed, **about)
 
 
-def truth_of(log: HopperLog) -> dict[str, dict[str, float]]:
-    """Return mean and standard deviation of the masses that were in force in a log."""
-    drawn = zip(LINKS, log.masses.T, strict=True)
-    return {f"{link}_mass": {"mean": float(m.mean()), "std": float(m.std())} for link, m in drawn}
-
-
 def light_torso() -> mujoco.MjModel:
     """Return the Hopper whose torso's mass is wrong, and nothing else of it, as in the paper's simulator."""
     model = load_model(SIM.model)
     model.body("torso").mass[0] = LIGHT
     mujoco.mj_setConst(model, mujoco.MjData(model))
     return model
-
-
-def mse_at(problem: Problem, values: Mapping[str, float]) -> float:
-    """Return the mean squared error of the log's predicted ends at values of the parameters."""
-    row = [values[name] for name in problem.simulator.parameters.names]
-    two = torch.tensor([[row, row]], dtype=torch.float64)  # a likelihood needs two samples; both are the same
-    return problem.objective.evaluate_values(two)[0].mse
 
 
 def told(problem: Problem) -> dict[str, float]:

@@ -25,7 +25,8 @@ from dropo_torch.studies.recovery import (
 )
 from dropo_torch.studies.study import Finding, Section, grouped
 
-from .paper import GIVEN, MASSES, UNMODELED
+from .fits import UNMODELED
+from .paper import GIVEN, MASSES
 from .study_figures import label, recovery
 from .study_tables import table_findings
 

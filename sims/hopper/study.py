@@ -7,60 +7,41 @@ digit.
 from __future__ import annotations
 
 import functools
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
-from dropo_torch.baselines import fit_problem
 from dropo_torch.config import make_config
 from dropo_torch.problem import make_problem
 from dropo_torch.studies.study import run_cells
 from dropo_torch.studies.sweep import NEGLIGIBLE
 from dropo_torch.support.extras import require
+from dropo_torch.support.parallel import Workers
 
 from . import SIM, paper, paper_tables
-from .paper import PaperPlan, mse_at, truth_of
+from .fits import METHODS, UNMODELED, Size, fitted, method_keys, mse_at
+from .paper import PaperPlan
 from .record import NOISE_VARIANCE, HopperLog, record
 from .study_tables import write_results
 
-#: Methods of Table 1, with BayesSim's features.
-METHODS = (("dropo", ""), ("droid", ""), ("bayessim", "mdnn"), ("bayessim", "mdrff"))
-#: What the torso's mass is not among in the ``unmodeled`` variant.
-UNMODELED = "torso_mass"
-
 
 @dataclass(frozen=True)
-class Plan:
+class Plan(Size):
     """How large a study is.
 
     Attributes:
-        seeds: logs of each kind.
-        episodes, steps: of a log.
-        samples: K.
-        droid_budget: simulations of the log by DROID.
-        simulations: of BayesSim.
-        horizon: logged steps that BayesSim replays.
         epsilons: values of the sweeps.
         noise_variances: of the sweeps against noise.
         noise_steps: length of the episodes of their log.
         sizes: numbers of transitions whose estimates are compared.
         resamples: bootstrap samples of each size.
         cma_steps, cma_budget, cma_samples: length of the log's episodes, evaluations and K of the CMA-ES run.
-        backend: of all fits. The logs are MuJoCo's own.
         paper: how large the part with the paper's own masses and boxes is, or none.
     """
 
-    seeds: int = 3
-    episodes: int = 2
-    steps: int = 500
-    samples: int = 100
-    droid_budget: int = 2000
-    simulations: int = 1000
-    horizon: int = 50
     epsilons: tuple[float, ...] = tuple(10.0**k for k in range(-9, 0))
     noise_variances: tuple[float, ...] = (1e-7, 1e-6, 1e-5, 1e-4, 1e-3)
     noise_steps: int = 100
@@ -69,7 +50,6 @@ class Plan:
     cma_steps: int = 50
     cma_budget: int = 800
     cma_samples: int = 50
-    backend: Literal["mujoco", "warp"] = "warp"
     paper: PaperPlan | None = paper.FULL
 
 
@@ -135,7 +115,7 @@ def run_study(
     resume: bool = False,
     report: Callable[[str, float], None] = lambda stage, share: None,
     plan: Plan | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Sequence[str]:
     """Run every cell that is not there yet, then write tables and figures.
 
@@ -146,7 +126,7 @@ def run_study(
         resume: keep finished cells of the same plan.
         report: called with what is being done and the share that is.
         plan: a size of one's own.
-        workers: processes that fit cells side by side. The results do not depend on it.
+        workers: processes that fit cells side by side, or ``"ray"``. The results do not depend on it.
 
     Raises:
         InputError: a folder with another study, or with one that is not to be resumed; ``sbi`` is not installed.
@@ -169,7 +149,7 @@ def run_paper(
     resume: bool = False,
     report: Callable[[str, float], None] = lambda stage, share: None,
     plan: PaperPlan | None = None,
-    workers: int = 1,
+    workers: Workers = 1,
 ) -> Sequence[str]:
     """Run the part with the paper's masses and boxes (:mod:`dropo_sims.hopper.paper`); as :func:`run_study`."""
     require("baselines", "method: bayessim")
@@ -224,35 +204,22 @@ def run_cell(cell: Cell, *, plan: Plan, logs: Path, threads: int = 0) -> dict[st
     path.parent.mkdir(parents=True, exist_ok=True)
     log.save(path)
     problem = make_problem(make_config({**_document(cell, plan), "data": str(path.resolve()), "threads": threads}))
-    begun = time.monotonic()
-    fit = fit_problem(problem)
-    seconds = time.monotonic() - begun
+    found = fitted(problem, log)
     path.unlink()
-    truth = truth_of(log)
     return {
         "cell": asdict(cell),
-        "truth": truth,
-        "mse_at_truth": mse_at(problem, {name: value["mean"] for name, value in truth.items()}),
-        **({"robust_log_likelihood": fit.log_likelihood} if cell.noisy_starts else {}),
-        "transitions": len(log.actions),
-        "wall_seconds": round(seconds, 3),
-        "fit": fit.document(),
+        "mse_at_truth": mse_at(problem, {name: value["mean"] for name, value in found["truth"].items()}),
+        **({"robust_log_likelihood": found["fit"]["log_likelihood"]} if cell.noisy_starts else {}),
+        **found,
     }
 
 
 def _document(cell: Cell, plan: Plan) -> dict[str, Any]:
     """The config of a cell's fit, but for its log."""
-    options = {
-        "droid": {"budget": plan.droid_budget},
-        "bayessim": {"simulations": plan.simulations, "horizon": plan.horizon, "features": cell.features or "mdnn"},
-    }
     document = {
+        **method_keys(cell.method, cell.features, plan),
         "sim": "hopper",
-        "backend": plan.backend,
         "parameters": {k: v for k, v in SIM.parameters.items() if cell.variant != "unmodeled" or k != UNMODELED},
-        "method": cell.method,
-        "method_options": options.get(cell.method, {}),
-        "samples": plan.samples,
         "seed": cell.seed,
         "epsilon": cell.epsilon * (NEGLIGIBLE if cell.noisy_starts else 1),
     }
