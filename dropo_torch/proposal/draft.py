@@ -53,48 +53,45 @@ class Draft:
     smooth: Filter | None = None
 
 
-def make_draft(
-    model: str,
-    data: str,
-    columns: Columns,
-    matching: Matching,
-    places: Sequence[Place],
-    clock: Clock,
-    timestep: float,
-    base: Path,
-) -> Draft:
-    """Return the keys that read a log, corrected by what its examination surely finds.
+@dataclass(frozen=True)
+class Reading:
+    """What is known of a log and its model before a config reads it.
 
-    Args:
+    Attributes:
         model, data: paths as the config has them.
         columns, matching, clock: the log, what its columns are and when its rows were taken.
         places: of the model.
         timestep: the model's, seconds.
         base: folder of the config.
+    """
+
+    model: str
+    data: str
+    columns: Columns
+    matching: Matching
+    places: Sequence[Place]
+    clock: Clock
+    timestep: float
+    base: Path
+
+
+def make_draft(reading: Reading) -> Draft:
+    """Return the keys that read a log, corrected by what its examination surely finds.
 
     Raises:
         InputError: a log that cannot be read so.
     """
-    document, notes, smooth = _document(model, data, columns, matching, places, clock, timestep, derived=False)
-    logged, findings, cured = _cured(document, base)
+    document, notes, smooth = _document(reading, derived=False)
+    logged, findings, cured = _cured(document, reading.base)
     if any(f.name == "angular_frame" for f in findings):
-        document, notes, smooth = _document(model, data, columns, matching, places, clock, timestep, derived=True)
+        document, notes, smooth = _document(reading, derived=True)
         notes += ["angular velocities are in the world's frame: all velocities are derived"]
-        logged, findings, cured = _cured(document, base)
+        logged, findings, cured = _cured(document, reading.base)
     return Draft(document, logged, findings, (*notes, *cured), smooth)
 
 
-def _document(
-    model: str,
-    data: str,
-    columns: Columns,
-    matching: Matching,
-    places: Sequence[Place],
-    clock: Clock,
-    timestep: float,
-    *,
-    derived: bool,
-) -> tuple[dict[str, Any], list[str], Filter | None]:
+def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[str], Filter | None]:
+    columns, matching, clock, timestep = reading.columns, reading.matching, reading.clock, reading.timestep
     dt = clock.dt
     assert dt is not None
     notes = _lost(matching)
@@ -106,7 +103,7 @@ def _document(
     missing = any(np.isnan(m.column.values).any() for m in matching.matches)
     smooth: Filter | None = None
     resampled = derived or not clock.even or not whole or missing
-    source: dict[str, Any] = {"path": data}
+    source: dict[str, Any] = {"path": reading.data}
     source |= {} if columns.group is None else {"group": columns.group}
     source |= {} if columns.separator is None else {"separator": columns.separator}
     source |= {"stamps": dict(columns.stamps)} if columns.stamps else {}
@@ -125,7 +122,7 @@ def _document(
         source["breaks"] = list(clock.breaks)
     if not resampled and (whole_arrays := _standard(columns, matching)) is not None:
         source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
-        return {"model": model, "data": source, "frame_skip": skip, "observation": whole_arrays}, notes, None
+        return {"model": reading.model, "data": source, "frame_skip": skip, "observation": whole_arrays}, notes, None
     if derived:
         velocities = []
         names = ", ".join(dict.fromkeys(p.label for p in lacking))
@@ -148,8 +145,8 @@ def _document(
         )
     entries = [m.place.entry for m in positions + velocities]
     if derived:
-        entries += _rates(positions, places)
-    return {"model": model, "data": source, "frame_skip": skip, "observation": entries}, notes, smooth
+        entries += _rates(positions, reading.places)
+    return {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}, notes, smooth
 
 
 def _lost(matching: Matching) -> list[str]:

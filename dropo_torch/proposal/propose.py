@@ -22,7 +22,7 @@ from dropo_torch.proposal.candidates import Candidate, all_candidates
 from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
-from dropo_torch.proposal.draft import Draft, make_draft
+from dropo_torch.proposal.draft import Draft, Reading, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
 from dropo_torch.proposal.motors import drivable, motor_spec, write_with_motors
@@ -154,9 +154,8 @@ def propose_config(
         places = tuple(p for p in places if p.label in keep)
         matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
     tell("examining the log", 0.1)
-    draft = make_draft(
-        _relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base
-    )
+    data = _relative(columns.path, base)
+    draft = make_draft(Reading(_relative(path, base), data, columns, matching, places, clock, step, base))
     document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
     tell("estimating the noise", 0.2)
     noise, candidates, document = _with_noise(document, draft, base)
