@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 import dropo_torch as dropo
+from benchmarks.init.systems import ROBOTS
 from dropo_torch.commands.cli import main
 from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
@@ -24,21 +25,7 @@ from dropo_torch.proposal.words import read_name
 
 DEG = 180 / math.pi
 
-CARTPOLE = """
-<mujoco>
-  <option timestep="0.005"/>
-  <worldbody>
-    <body name="cart">
-      <joint name="slider" type="slide" axis="1 0 0"/>
-      <geom type="box" size=".1 .05 .05" mass="1"/>
-      <body name="pole">
-        <joint name="hinge" type="hinge" axis="0 1 0"/>
-        <geom type="capsule" fromto="0 0 0 0 0 -.6" size=".02" mass=".25"/>
-      </body>
-    </body>
-  </worldbody>
-  <actuator><motor name="push" joint="slider"/></actuator>
-</mujoco>"""
+CARTPOLE = (ROBOTS / "cartpole.xml").read_text(encoding="utf-8").replace("0.004", "0.005")
 
 URDF = """<robot name="two"><link name="world_link"/>
 <joint name="arm_joint1" type="revolute"><parent link="world_link"/><child link="link1"/><axis xyz="0 1 0"/>
