@@ -321,11 +321,29 @@ def test_a_folder_that_cannot_be_locked_is_left_to_whoever_writes_there(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_refused_run_leaves_no_empty_folder(refused: Callable[..., str], tmp_path: Path) -> None:
+#: What each command is refused for, before and after it has read what it is given; other commands take a config.
+REFUSED = {
+    "demo": ("demo --out OUT --epsilonn 1", "demo --out OUT --backend none"),
+    "init": ("init none.xml none.csv --out OUT/robot.yaml", "init MODEL none.csv --out OUT/robot.yaml"),
+    "view": ("view none --out OUT", "view WRONG --out OUT"),
+    "reproduce": ("reproduce hoper --out OUT", "reproduce hopper --out OUT --workers ray"),
+}
+WITH_CONFIG = ("{} none.yaml --out OUT", "{} WRONG --out OUT")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_refused_command_leaves_no_folder(
+    command: str, folder: Folder, refused: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
+    wrong = folder.config(**mass(name="nothing"))
     (tmp_path / "there").mkdir()
-    for out in ("there/new/one", "there"):
-        refused("fit", tmp_path / "none.yaml", "--out", tmp_path / out)
-    assert [p.name for p in tmp_path.rglob("*")] == ["there"]
+    for line in REFUSED.get(command, WITH_CONFIG):
+        for out in ("there/new/one", "there"):
+            words = {"MODEL": folder.path / "arm.xml", "WRONG": wrong, "OUT": tmp_path / out}
+            text = line.format(command).replace("OUT/", f"{tmp_path / out}/")
+            refused(*(words.get(word, word) for word in text.split()))
+            assert [p.name for p in tmp_path.rglob("*")] == ["there"], line
 
 
 def test_a_run_touches_nothing_of_the_users_in_its_folder(

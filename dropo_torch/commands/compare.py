@@ -17,6 +17,7 @@ from dropo_torch.commands.sweep import only_dropo
 from dropo_torch.config import Config, load_config
 from dropo_torch.models.bundled import bundled_sim
 from dropo_torch.support.files import write_json
+from dropo_torch.support.parallel import check_workers
 
 if TYPE_CHECKING:
     from dropo_torch.fit import Fit
@@ -39,6 +40,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
 
     config, out = load_config(given.config, overrides), given.out
     only_dropo(config, "compare runs the optimizers of DROPO")
+    check_workers(config.workers)
     problem = make_problem(config)
     refuse_sensed(problem, "compare")
     store = out / "compare-progress.json"

@@ -42,8 +42,8 @@ def claimed(folder: Path) -> Iterator[None]:
     """
     import filelock
 
-    made = [p for p in (folder, *folder.parents) if not os.path.lexists(p)]
     with contextlib.ExitStack() as stack:
+        stack.enter_context(made_for_use(folder))
         with contextlib.suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True)
         with contextlib.suppress(OSError):
@@ -51,14 +51,19 @@ def claimed(folder: Path) -> Iterator[None]:
             stack.callback(os.close, handle)
             if not filelock.lock_descriptor(handle, blocking=False):  # a FileLock would leave its file in the folder
                 raise InputError(f"--out: another run is using {folder}; wait for it, or name another folder")
-        stack.callback(_remove_empty, made)
         yield
 
 
-def _remove_empty(folders: list[Path]) -> None:
-    for folder in folders:
-        with contextlib.suppress(OSError):
-            folder.rmdir()
+@contextlib.contextmanager
+def made_for_use(folder: Path) -> Iterator[None]:
+    """Take a folder, and those around it, away again where they are made within and nothing is put into them."""
+    absent = [p for p in (folder, *folder.parents) if not os.path.lexists(p)]
+    try:
+        yield
+    finally:
+        for path in absent:
+            with contextlib.suppress(OSError):
+                path.rmdir()
 
 
 def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:

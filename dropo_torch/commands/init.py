@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from rich.console import Console
 from rich.table import Table
 
-from dropo_torch.commands.folder import versions
+from dropo_torch.commands.folder import made_for_use, versions
 from dropo_torch.commands.options import seconds
 from dropo_torch.commands.progress import StageProgress
 from dropo_torch.errors import InputError
@@ -55,15 +55,15 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     from dropo_torch.report import write_init_report
 
     began = time.perf_counter()
-    path.parent.mkdir(parents=True, exist_ok=True)
     review = Questions(console) if given.interactive else None
-    with StageProgress(console, "init") as progress:
+    with made_for_use(path.parent), StageProgress(console, "init") as progress:
+        path.parent.mkdir(parents=True, exist_ok=True)  # one that cannot be made is told at once
         if review is not None:
             progress.stop()
         proposal = propose_config(
             given.model, given.data, out=path, dt=given.dt, review=review, report=progress.show
         )  # fmt: skip
-    write_atomically(path, proposal.text.encode())
+        write_atomically(path, proposal.text.encode())
     took = time.perf_counter() - began
     write_init_report(page, proposal, seconds=took, title=f"A config for {given.model.name}", versions=versions())
     _show(proposal, path, page, took, console)

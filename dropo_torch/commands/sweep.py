@@ -19,6 +19,7 @@ from dropo_torch.commands.progress import fit_shown, fits_side_by_side
 from dropo_torch.config import Config, load_config
 from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_json
+from dropo_torch.support.parallel import check_workers
 
 if TYPE_CHECKING:
     from dropo_torch.studies.sweep import Sweep, SweepPoint
@@ -50,6 +51,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
         raise InputError(f"noise: {config.noise} given, which --noisy-starts is to find; leave one of them out")
     if noisy_starts and isinstance(config.epsilon, list):
         raise InputError(f"epsilon: {config.epsilon} given, but --noisy-starts tries one for all columns; leave it out")
+    check_workers(config.workers)
     problem = make_problem(config)
     refuse_sensed(problem, "sweep-epsilon")
     store = out / "sweep-progress.json"

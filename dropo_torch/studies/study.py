@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Generic, Protocol, TypeVar
 from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
 from dropo_torch.support.given import reading
-from dropo_torch.support.parallel import Task, Workers, in_parallel
+from dropo_torch.support.parallel import Task, Workers, check_workers, in_parallel
 
 SCHEMA = "dropo-torch/study/1"
 
@@ -53,8 +53,9 @@ def run_cells(
         report: called with what is being done and the share that is.
 
     Raises:
-        InputError: a folder with another study, or with one that is not to be resumed.
+        InputError: a folder with another study, or with one that is not to be resumed; a cluster that is not there.
     """
+    check_workers(workers)
     _claim(out, plan, resume=resume)
     files = {cell.name: out / "cells" / f"{cell.name}.json" for cell in cells}
     waiting = [cell for cell in cells if not files[cell.name].exists()]

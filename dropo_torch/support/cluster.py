@@ -41,16 +41,14 @@ def by_ray(work: Callable[..., Result], tasks: Sequence[Task], retries: int) -> 
         InputError: no cluster answers, a node sees other files, or processes die again and again.
         Exception: what ``work`` raised first.
     """
-    with extra("ray", "workers: ray"):
-        import ray
-        from ray import cloudpickle
+    ray = ready()
     if not tasks:
         return
     with _connected(ray):
         threads = threads_of_a_task([int(n["Resources"].get("CPU", 0)) for n in ray.nodes() if n["Alive"]], len(tasks))
         answer = ray.remote(_answer).options(num_cpus=threads, max_retries=retries, retry_exceptions=False)
         here = ([path or os.getcwd() for path in sys.path], os.getcwd())
-        running = {answer.remote(cloudpickle.dumps((work, t)), *here, threads): n for n, t in enumerate(tasks)}
+        running = {answer.remote(ray.cloudpickle.dumps((work, t)), *here, threads): n for n, t in enumerate(tasks)}
         try:
             while running:
                 (done,), _ = ray.wait(list(running))
@@ -59,6 +57,21 @@ def by_ray(work: Callable[..., Result], tasks: Sequence[Task], retries: int) -> 
         finally:
             for waiting in running:  # nobody waits for the rest
                 ray.cancel(waiting, force=True)
+
+
+def ready() -> Any:
+    """Return Ray's module.
+
+    Raises:
+        InputError: it is not installed, or nothing listens at ``RAY_ADDRESS``.
+    """
+    with extra("ray", "workers: ray"):
+        import ray
+        import ray.cloudpickle
+    if not ray.is_initialized():
+        with _told():
+            _call_up(os.environ.get("RAY_ADDRESS", ""))
+    return ray
 
 
 def threads_of_a_task(nodes: Sequence[int], tasks: int) -> int:
@@ -81,18 +94,25 @@ def _connected(ray: Any) -> Iterator[None]:
     here = {"num_cpus": processors(), "object_store_memory": STORE, "include_dashboard": False}
     for key, value in _QUIET.items():
         os.environ.setdefault(key, value)
-    try:
-        _call_up(address)
+    with _told():
         ray.init(address or "local", logging_level=logging.ERROR, log_to_driver=False, **({} if address else here))
-    except (OSError, RuntimeError, ValueError) as error:
-        where = f"RAY_ADDRESS={address}" if address else "this machine"
-        raise InputError(
-            f"workers: ray: no cluster at {where} ({error}); begin one with `ray start --head`, or unset RAY_ADDRESS"
-        ) from None
     try:
         yield
     finally:
         ray.shutdown()
+
+
+@contextlib.contextmanager
+def _told() -> Iterator[None]:
+    """Raise an :class:`InputError` where no cluster can be reached or begun."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError) as error:
+        address = os.environ.get("RAY_ADDRESS")
+        where = f"RAY_ADDRESS={address}" if address else "this machine"
+        raise InputError(
+            f"workers: ray: no cluster at {where} ({error}); begin one with `ray start --head`, or unset RAY_ADDRESS"
+        ) from None
 
 
 def _call_up(address: str) -> None:

@@ -60,6 +60,18 @@ def in_parallel(work: Callable[..., Result], tasks: Sequence[Task], workers: Wor
             raise died(tasks[next(iter(waiting))])
 
 
+def check_workers(workers: Workers) -> None:
+    """Refuse a cluster that is not there, before anything is written.
+
+    Raises:
+        InputError: Ray is not installed, or nothing listens at ``RAY_ADDRESS``.
+    """
+    if workers == "ray":
+        from dropo_torch.support.cluster import ready
+
+        ready()
+
+
 def died(task: object) -> InputError:
     """Return what is raised where a task's process dies again and again."""
     return InputError(
