@@ -336,7 +336,7 @@ def test_a_refused_command_leaves_no_folder(
     command: str, folder: Folder, refused: Callable[..., str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:1")
-    wrong = folder.config(**mass(name="nothing"))
+    wrong = folder.config(data="absent.npz", **mass(name="nothing"))
     (tmp_path / "there").mkdir()
     for line in REFUSED.get(command, WITH_CONFIG):
         for out in ("there/new/one", "there"):
