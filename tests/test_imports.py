@@ -237,6 +237,7 @@ MISSING = {
     "parquet": ("pyarrow", {"data": "log.parquet"}, "fit", "log.parquet needs pyarrow"),
     "hdf5": ("h5py", {"data": "log.h5"}, "fit", "log.h5 needs h5py"),
     "ros": ("rosbags", {"data": "log.mcap"}, "fit", "log.mcap needs rosbags"),
+    "ray": ("ray", {"workers": "ray"}, "sweep-epsilon", "workers: ray needs ray"),
 }  # fmt: skip
 
 
