@@ -25,7 +25,7 @@ Entries = dict[str, Any]
 
 
 #: What the config's keys are about, as the command line groups them.
-GROUPS = ("model and log", "fit", "policy", "machine")
+GROUPS = ("model and log", "fit", "policy", "plan", "machine")
 
 
 def _key(default: Any, description: str, about: str = "fit", **limits: Any) -> Any:
@@ -103,6 +103,9 @@ class Config(pydantic.BaseModel):
     target: Entries = _key(
         {}, "name: value, the model on which a trained policy is evaluated beside the nominal one", "policy"
     )
+    plan: Entries = _key(
+        {}, "limits of a planned motion: velocity, acceleration, position, force, workspace ...: docs/plan.md", "plan"
+    )
     threads: int = _key(0, "threads of the simulator, 0 for all processors", "machine", ge=0, le=4096)
     workers: Annotated[int, Field(ge=1, le=4096)] | Literal["ray"] = _key(
         1, "processes that fit side by side in a sweep or comparison, or ray for those of a cluster", "machine"
@@ -177,8 +180,9 @@ class Config(pydantic.BaseModel):
 
 
 KEYS = tuple(k for k in Config.model_fields if k != "base")
-#: Keys that only training reads.
+#: Keys that only training reads, and that only a plan does.
 TRAINING_KEYS = ("task", "algorithm", "distribution", "train", "target")
+PLANNING_KEYS = ("plan",)
 
 
 def load_config(path: str | Path, overrides: Mapping[str, Any] | None = None) -> Config:

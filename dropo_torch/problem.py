@@ -12,7 +12,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from dropo_torch.config import TRAINING_KEYS, Config
+from dropo_torch.config import PLANNING_KEYS, TRAINING_KEYS, Config
 from dropo_torch.data.observation import Observation, generic_observation, parse_observation
 from dropo_torch.data.trajectory import Trajectories, make_transitions, reckoned
 from dropo_torch.effects import find_effect, load_effects
@@ -280,7 +280,7 @@ def _observation(config: Config, model: mujoco.MjModel | None, num_states: int, 
 
 
 def _fingerprint(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> str:
-    digest = hashlib.sha256(config.fingerprint(*TRAINING_KEYS).encode())
+    digest = hashlib.sha256(config.fingerprint(*TRAINING_KEYS, *PLANNING_KEYS).encode())
     for name in ("observations", "next_observations", "actions", "terminals"):
         digest.update(np.ascontiguousarray(getattr(trajectories, name)).tobytes())
     where, _, _ = (config.environment or "").rpartition(":")

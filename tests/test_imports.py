@@ -96,7 +96,7 @@ LAYERS = (
     "problem",
     "shooting",
     "baselines", "gap", "rl", "view",
-    "proposal", "studies",
+    "proposal", "studies", "planning",
     "report",
     "commands", "__main__",
     "testing",

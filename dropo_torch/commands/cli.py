@@ -54,6 +54,13 @@ GROUPS = {
             "view", "show measured and simulated motion side by side",
             ("dropo view out/robot", "dropo view out/gap --episode 2 --start 4 --seconds 3"),
         ),
+        "plan": Command(
+            "plan", "propose the motion to record next, by what it is to tell",
+            (
+                "dropo plan robot.yaml --out out/plan --seconds 20",
+                "dropo plan robot.yaml --out out/plan --at out/robot/fit.json --plan.velocity 1.5",
+            ),
+        ),
         "train": Command(
             "train", "train a policy over the distribution",
             ("dropo train robot.yaml --out out/policy --task arm.py:Reach --distribution out/robot/fit.json",),

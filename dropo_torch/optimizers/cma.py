@@ -33,9 +33,13 @@ class Normals:
 
 
 def evolution(
-    dimensions: int, *, seed: int, budget: int, population: int | None, tolerances: dict[str, float]
-) -> cma.CMAEvolutionStrategy:
-    """Return pycma's search over [0, 4] in each dimension, from the middle with step 1; ``tolerances`` end it."""
+    dimensions: int, *, seed: int, budget: int, population: int | None, tolerances: dict[str, float],
+    start: np.ndarray | None = None, step: float = 1.0,
+) -> cma.CMAEvolutionStrategy:  # fmt: skip
+    """Return pycma's search over [0, 4] in each dimension; ``tolerances`` end it.
+
+    It starts from the middle with step 1 unless told where and how wide.
+    """
     options = {
         "bounds": [0, SearchBox.WIDTH],
         "randn": Normals(seed),
@@ -47,7 +51,8 @@ def evolution(
     }
     if population:
         options["popsize"] = population
-    return cma.CMAEvolutionStrategy(np.full(dimensions, SearchBox.WIDTH / 2), 1.0, options | tolerances)
+    begin = np.full(dimensions, SearchBox.WIDTH / 2) if start is None else start
+    return cma.CMAEvolutionStrategy(begin, step, options | tolerances)
 
 
 def why_stopped(search: cma.CMAEvolutionStrategy, budget: str, value: str) -> str | None:
