@@ -15,7 +15,7 @@ from dropo_torch.data.trajectory import make_transitions
 from dropo_torch.distribution import SearchBox
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.log import make_setting, start_values
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.twin import Twin
@@ -80,7 +80,8 @@ def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
     log = replace(problem.trajectories, dt=problem.trajectories.dt or problem.simulator.timestep)
     setting = make_setting(problem, log)
     twin = Twin(setting, problem.space, num_threads=problem.config.threads)
-    found = free_forces(twin, short_windows(setting, log), Variant(()))
+    own = Variant(tuple(start_values(problem).tolist()))
+    found = free_forces(twin, short_windows(setting, log), own)
     spread = problem.observation.observed(log.observations).std(0)
     columns = Features.of(problem.observation).column_noise(found.noise)
     if smooth is not None:
