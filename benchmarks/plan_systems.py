@@ -155,9 +155,9 @@ def config_of(system: System, folder: Path, evaluations: int, **changes: Any) ->
     model = mujoco.MjModel.from_xml_string(system.model)
     noise = [system.noise[0]] * model.nq + [system.noise[1]] * model.nv
     document = {
-        "model": "robot.xml", "frame_skip": system.every, "noise": noise, "epsilon": 1e-10, "samples": 30, "threads": 1,
+        "model": "robot.xml", "frame_skip": system.every, "noise": noise, "epsilon": 1e-10, "samples": 10, "threads": 1,
         "parameters": {k: dict(v) for k, v in system.parameters.items()},
-        "plan": {**system.plan, "evaluations": evaluations}, **system.extra, **changes,
+        "plan": {**system.plan, "evaluations": evaluations, "models": 2}, **system.extra, **changes,
     }  # fmt: skip
     return make_config(document, base=folder)
 
@@ -233,7 +233,7 @@ def multisine(ground: Ground, seed: int) -> Plan:
 def beyond(plan: Plan, states: np.ndarray, model: mujoco.MjModel, every: int) -> float:
     """Return by what share of a limit the true model's motion is beyond it; 0 where it keeps all."""
     each = np.repeat(plan.commands[None], every, axis=1)
-    kept = plan.ground.limits.kept([model], states[None, None], each, float(model.opt.timestep))
+    kept = plan.ground.limits.kept([model], states[None, None], each, float(model.opt.timestep), per=every)
     return max(0.0, float(np.nanmax(kept.excess))) + float(kept.depth[0]) / 0.01
 
 

@@ -76,9 +76,12 @@ def table(names: list[str], times: Any, rows: Any) -> bytes:
 
 
 def _show(plan: Plan, out: Path, console: Console) -> None:
-    shown = Table("parameter", "at", "unit", *(["by the log"] if plan.ground.has_log else []), "by the plan", "by both")
+    kinds = {"plan": "by the motion"}
+    if plan.ground.has_log:
+        kinds = {"log": "by the log", **kinds, "both": "by both"}
+    shown = Table("parameter", "at", "unit", *kinds.values())
     for name, entry in plan.document()["parameters"].items():
-        errors = [f"± {e:.2g}" for e in entry["standard_error"].values() if e is not None]
+        errors = [f"± {entry['standard_error'][kind]:.2g}" for kind in kinds]
         shown.add_row(name, f"{entry['value']:.4g}", entry["unit"], *errors)
     console.print(shown)
     for line in plan.remarks:

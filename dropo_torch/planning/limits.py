@@ -98,7 +98,7 @@ class Limits:
 
     def kept(
         self, models: Sequence[mujoco.MjModel], states: np.ndarray, commands: np.ndarray, timestep: float, *,
-        every: int | None = 1, share: float = 1.0,
+        per: int = 1, every: int | None = 1, share: float = 1.0,
     ) -> Kept:  # fmt: skip
         """Return how far motions go, whatever the model.
 
@@ -107,13 +107,14 @@ class Limits:
             states: simulated, ``(P, K, N + 1, nq + nv)``.
             commands: that act from each state on, ``(P, N, nu)``.
             timestep: seconds from a state to the next.
+            per: states of a command, over which accelerations are taken.
             every: positions in space, forces and contacts are looked at in one state of so many; ``None`` for in none.
             share: of the limits that is allowed.
         """
         columns = np.array([x.column for x in self.limits], dtype=int)
         low, high = np.full((2, len(states), len(columns)), np.nan)
         kinds = np.array([x.kind for x in self.limits])
-        speeds = np.diff(states, axis=2) / timestep
+        speeds = np.diff(states[:, :, ::per], axis=2) / (per * timestep)
         for kind, values in (("position", states), ("velocity", states), ("acceleration", speeds)):
             own = np.flatnonzero(kinds == kind)
             low[:, own], high[:, own] = (f(values[..., columns[own]], axis=(1, 2)) for f in (np.min, np.max))

@@ -284,7 +284,7 @@ def finished(ground: Ground, found: Found, tell: Report, began: float) -> Plan:
         if not np.isfinite(states).all():
             scale *= LESS
             continue
-        kept = ground.limits.kept(models, states, each, step)
+        kept = ground.limits.kept(models, states, each, step, per=skip)
         if kept.total[0] == 0:
             shown = states[0, 0, ::skip]
             tells = information_of(ground.problem_of(shown, commands[0]).objective, ground.point)[0]

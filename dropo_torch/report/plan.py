@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -27,16 +28,17 @@ def write_plan_report(path: str | Path, plan: Plan, **frame: Unpack[Frame]) -> N
         frame: the page's title and versions.
     """
     ground, document = plan.ground, plan.document()
-    errors = {kind: e for kind, e in plan.errors.items() if e is not None}
+    errors = {kind: e for kind, e in plan.errors.items() if e is not None and (ground.has_log or kind != "both")}
     space, width = ground.problem.space, ground.width * np.where(ground.problem.space.is_log, ground.values[0], 1.0)
     shares = {kind: np.minimum(e / width, 1.0) for kind, e in errors.items()}
+    known = "both" if ground.has_log else "plan"
     seconds, labels = ground.steps * ground.timestep, plan.columns[0]
     content: dict[str, Any] = {
         "lead": _lead(plan, shares),
         "tiles": [
             (duration(seconds), "of motion"),
-            (whole(len(plan.actuators), "command"), f"every {1000 * ground.timestep:.4g} ms"),
-            (percent(float(np.median(shares["both"]))), "of its bounds is the median standard error"),
+            (whole(len(plan.actuators), "actuator"), f"commanded every {1000 * ground.timestep:.4g} ms"),
+            (percent(float(np.median(shares[known]))), "of its bounds is the median standard error"),
             (f"{len(space) - len(plan.unidentified)} of {len(space)}", "parameters will be known"),
             (whole(len(ground.values), "model"), "that keep all limits"),
             (percent(_least_room(document)), "least margin of a limit"),
@@ -45,7 +47,7 @@ def write_plan_report(path: str | Path, plan: Plan, **frame: Unpack[Frame]) -> N
         "bars": figures.error_bars(space.names, shares),
         "keys": [(WORDS[kind], figures.COLOURS[kind]) for kind in errors],
         "kinds": [WORDS[kind] for kind in errors],
-        "parameters": [_parameter(name, p) for name, p in document["parameters"].items()],
+        "parameters": [_parameter(name, p, errors) for name, p in document["parameters"].items()],
         "commands": _commands(plan),
         "states": _states(plan),
         "start": [
@@ -88,10 +90,10 @@ def _least_room(document: dict[str, Any]) -> float:
     return min(rooms, default=float("nan"))
 
 
-def _parameter(name: str, p: dict[str, Any]) -> dict[str, Any]:
+def _parameter(name: str, p: dict[str, Any], kinds: Collection[str]) -> dict[str, Any]:
     errors = [
         {"error": score(e), "relative": "" if p["relative"][kind] is None else percent(p["relative"][kind])}
-        for kind, e in p["standard_error"].items() if e is not None
+        for kind, e in p["standard_error"].items() if kind in kinds
     ]  # fmt: skip
     return {
         "name": name, "value": plain(p["value"]), "unit": p["unit"], "low": plain(p["low"]), "high": plain(p["high"]),

@@ -35,7 +35,7 @@ class Checkpoint:
 
     Attributes:
         path: the file.
-        kind: whose state it is, for messages: fit, gap or training.
+        kind: whose state it is, for messages: fit, gap, plan or training.
         owner: identifies the run: one of another is refused.
         roots: the dataclasses in the state; those in their fields are known by these.
         named: classes of which an object is kept by its ``name``, each with what finds it again.
