@@ -220,7 +220,7 @@ def test_the_command_writes_what_a_robot_and_a_person_need(tmp_path: Path) -> No
     document = config(tmp_path, data="log.npz", noise=...).document()
     path, out = tmp_path / "robot.yaml", tmp_path / "out"
     path.write_text(yaml.safe_dump(document))
-    assert main(["plan", str(path), "--out", str(out), "--seconds", "1.5", "--evaluations", "12"]) == 0
+    assert main(["plan", str(path), "--out", str(out), "--seconds", "1.5", "--evaluations", "12", "--no-video"]) == 0
     assert {p.name for p in out.iterdir()} == {
         "plan.json", "commands.csv", "expected.csv", "report.html", "plan-progress.bin",
     }  # fmt: skip

@@ -25,7 +25,7 @@ _MARKS = (
 _RESULTS = (
     *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "gap-progress-rare.bin",
     "distribution.yaml", "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "picture.png", "tensorboard",
-    "commands.csv", "expected.csv",
+    "commands.csv", "expected.csv", "motion.mp4",
 )  # fmt: skip
 #: What ``dropo view`` writes beside a run's results, and goes with them.
 _VIEWS = ("view.html", "view.mp4")

@@ -20,8 +20,8 @@ from dropo_torch.support.files import write_atomically, write_json
 if TYPE_CHECKING:
     from dropo_torch.planning import Plan
 
-#: Seconds of a motion, unless told otherwise.
-SECONDS = 20.0
+#: Seconds of a motion, unless told otherwise, and the file of its video.
+SECONDS, VIDEO = 20.0, "motion.mp4"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -36,11 +36,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--gap", type=Path, metavar="DIR", help="folder of a dropo gap: the motion is to tell its tied effects apart"
     )
+    parser.add_argument("--no-video", action="store_true", help="write no video of the expected motion")
     parser.add_argument("--evaluations", type=count, metavar="N", help="motions to try; the config's plan.evaluations")
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
-    """Run ``dropo plan``, which writes ``plan.json``, ``commands.csv``, ``expected.csv`` and ``report.html``.
+    """Run ``dropo plan``: ``plan.json``, ``commands.csv``, ``expected.csv``, ``report.html``, and a video if it can.
 
     Raises:
         InputError: a fit that is not there, or what :func:`~dropo_torch.planning.make_plan` refuses.
@@ -63,8 +64,20 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     write_json(out / "plan.json", plan.document() | {"config": config.portable()})
     write_atomically(out / "commands.csv", table(["time", *plan.actuators], plan.times[:-1], plan.commands))
     write_atomically(out / "expected.csv", table(["time", *plan.columns[0]], plan.times, plan.states))
+    note = "" if given.no_video else _video(plan, out / VIDEO, console)
     write_plan_report(out / "report.html", plan, **provenance(config))
     _show(plan, out, console)
+    if note:
+        console.print(note, soft_wrap=True)
+
+
+def _video(plan: Plan, path: Path, console: Console) -> str:
+    """Write a video of the expected motion; return why there is none, or nothing."""
+    from dropo_torch.planning.shown import view_of
+    from dropo_torch.view import write_video
+
+    with StageProgress(console, "plan") as progress:
+        return write_video(path, view_of(plan), lambda done, of: progress.show("drawing the video", done / of))
 
 
 def table(names: list[str], times: Any, rows: Any) -> bytes:

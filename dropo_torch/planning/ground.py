@@ -34,6 +34,8 @@ FASTEST, PERIOD, SLOWEST, PERIODS = 5.0, 10, 0.1, 2.0
 SETTLE, REST = 4.0, 0.01
 #: Windows of a motion that a search looks at, and how many follow on each other.
 WINDOWS, RUN = 120, 4
+#: Windows of a log from which on some stand for all, and how many of these follow on each other.
+LOGGED, LONG_RUN = 3000, 50
 #: Commands of a motion at least.
 FEWEST = 20
 
@@ -312,10 +314,14 @@ def _point(problem: Problem, at: Path | None) -> np.ndarray:
 
 def _known(problem: Problem, point: np.ndarray) -> Information:
     """What the log tells; of a long one, from runs of windows spread over it."""
-    total = Information.none(len(point))
-    for found in information_of(problem.objective, point):
+    objective, share, total = problem.objective, 1.0, Information.none(len(point))
+    if len(objective) > LOGGED:
+        begins = np.linspace(0, len(objective) - LONG_RUN, LOGGED // LONG_RUN).astype(int)
+        rows = np.unique(begins[:, None] + np.arange(LONG_RUN))
+        share, objective = len(objective) / len(rows), objective.on(objective.transitions.select(rows))
+    for found in information_of(objective, point):
         total = total + found
-    return total
+    return Information(share * total.gram, share * total.shared)
 
 
 def _others(problem: Problem, point: np.ndarray, known: Information, count: int) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -120,11 +120,9 @@ class Plan:
             found.append(
                 f"The amplitude was reduced to {100 * self.scale:.0f} % so that other possible models keep the limits."
             )
-        if ground.noise_source != "the config" and ground.problem.objective.noise is not None:
-            listed = ", ".join(f"{x:.3g}" for x in ground.problem.objective.noise.tolist())
-            found.append(
-                f"The noise is what the log shows; a fit that is to reach these errors needs noise: [{listed}]."
-            )
+        if ground.noise_source == "the log":
+            keys = {"noise": ground.config.noise, "epsilon": ground.config.epsilon}
+            found.append(f"The noise is what the log shows; a fit that is to reach these errors needs {_listed(keys)}.")
         return found
 
     @property
@@ -189,6 +187,12 @@ class Plan:
             "kind": limit.kind, "name": limit.name, "unit": limit.unit, "low": limit.low, "high": limit.high,
             "source": limit.source, "lowest": low, "highest": high, "margin": margin,
         }  # fmt: skip
+
+
+def _listed(keys: Mapping[str, Any]) -> str:
+    """Keys of a config as it has them."""
+    each = ((k, v if isinstance(v, list) else [v]) for k, v in keys.items())
+    return " and ".join(f"{k}: [{', '.join(f'{x:.3g}' for x in v)}]" for k, v in each)
 
 
 def make_plan(
