@@ -219,14 +219,7 @@ def save(log: Trajectories, path: Path) -> None:
 
 def multisine(ground: Ground, seed: int) -> Plan:
     """Return a multi-sine within the same limits."""
-    rng, settings = np.random.default_rng([seed, 31]), ground.settings
-    count, family = len(ground.drives), ground.family
-    numbers = np.zeros((count, 2 + 3 * settings.waves))
-    numbers[:, 0], numbers[:, 1] = 0.5, 1.0
-    numbers[:, 2::3], numbers[:, 3::3] = 1.0, np.linspace(0, 1, settings.waves)
-    numbers[:, 4::3] = rng.random((count, settings.waves))
-    flat = np.concatenate([[1.0], numbers.ravel()])
-    assert len(flat) == family.dimensions
+    flat = ground.family.multisines(1, np.random.default_rng([seed, 31]))[0]
     return finished(ground, Found(flat, 0.0, 1, "a multi-sine"), lambda stage, share: None, time.perf_counter())
 
 

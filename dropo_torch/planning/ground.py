@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import mujoco
@@ -18,7 +19,7 @@ from dropo_torch.logged import completed
 from dropo_torch.models.load import load_model
 from dropo_torch.planning.drives import Drive, Tracker, drives_of
 from dropo_torch.planning.information import Information, information_of
-from dropo_torch.planning.limits import Limits, make_limits
+from dropo_torch.planning.limits import Limits, check_names, make_limits
 from dropo_torch.planning.motion import Family, Paths
 from dropo_torch.planning.separation import Ties, read_ties
 from dropo_torch.planning.settings import PlanSettings, plan_settings
@@ -89,7 +90,7 @@ class Ground:
         """Width of the parameters' box in coordinates, ``(d,)``."""
         return self.problem.objective.box.width
 
-    @property
+    @cached_property
     def models(self) -> list[mujoco.MjModel]:
         """The model at each of :attr:`values`."""
         return [self.problem.space.apply(v) if self.problem.space.fields else self.model for v in self.values]
@@ -154,56 +155,25 @@ def prepare(config: Config, seconds: float, at: Path | None = None, gap: Path | 
     Raises:
         InputError: no MuJoCo model, no actuators, no parameters, a start outside the limits, or a motion too short.
     """
-    given = plan_settings(config.plan)
-    if config.backend == "gymnasium":
-        raise InputError("backend: gymnasium has a model of its own; a plan needs backend: mujoco or warp")
-    ties, point = None, None
+    if gap is not None and at is not None:
+        raise InputError("--at: a plan with --gap is made at the numbers that dropo gap found; leave one of both out")
+    given, ties, found = plan_settings(config.plan), None, None
     if gap is not None:
-        if at is not None:
-            raise InputError(
-                "--at: a plan with --gap is made at the numbers that dropo gap found; leave one of both out"
-            )
         ties = read_ties(gap)
-        config, point = _amended(config, gap)
-    mine = config.model_copy(update={"backend": "mujoco"})  # which Warp equals to rounding, and is quick for one motion
-    own = completed(mine)
-    model = load_model(own.path(str(own.model)))
-    if not model.nu:
-        raise InputError("model: it has no actuators, so that no motion can be commanded; add motors or servos")
-    if prescribed := prescribed_bodies(model):
-        assert prescribed
-        raise InputError(
-            f"model: {prescribed_names(model)}: mocap bodies act in this model; plan commands actuators only"
-        )
-    if not own.parameters:
-        raise InputError("parameters: none given, so that there is nothing to tell apart; dropo init proposes some")
-    has_log = own.data is not None
-    noise_source = "the config"
-    if has_log:
-        problem = make_problem(mine)
-        if config.noise is None:
-            mine, noise_source = _noisy(mine, problem), "the log"
-            problem = make_problem(mine)
-    else:
-        if own.frame_skip is None:
-            raise InputError(
-                "frame_skip: not given, and there is no log that tells it; give the physics steps of a command"
-            )
-        noise_source = noise_source if config.noise is not None else "√ε of the config, which gives no noise"
-        problem = make_problem(mine, log=_at_rest(own, model))
-    point = (
-        _point(problem, at) if point is None else np.clip(point, problem.objective.box.low, problem.objective.box.high)
-    )
-    center = problem.objective.box.values(point)
+        config, found = _amended(config, gap)
+    model = _usable(config, given)
+    config, problem, noise_source = _with_noise(config.model_copy(update={"backend": "mujoco"}), model)
+    has_log, box = config.data is not None or config.sim is not None, problem.objective.box
+    point, varies = _point(problem, at) if found is None else (np.clip(found, box.low, box.high), np.zeros(len(found)))
+    center = box.values(point)
     model = problem.space.apply(center) if problem.space.fields else model
     known = _known(problem, point) if has_log else Information.none(len(point))
-    values = np.concatenate([center[None], _others(problem, point, known, given.models)])
+    certain = known if at is not None or gap is not None else Information.none(len(point))
+    values = np.concatenate([center[None], _others(problem, point, certain, varies, given.models)])
     begin, starts, settled = _starts(problem, model, given, has_log, values)
-    drives, step = drives_of(model, begin), _step(problem)
-    log = problem.trajectories
+    drives, step, log = drives_of(model, begin), _step(problem), problem.trajectories
     logged = problem.observation.states(log.observations, log.unseen) if has_log else None
     limits = make_limits(model, drives, given, starts[0], logged, log.actions if has_log else None)
-    tracker = Tracker(model, drives, step, limits.force)
     steps = round(seconds / step)
     if steps < FEWEST:
         raise InputError(
@@ -213,11 +183,48 @@ def prepare(config: Config, seconds: float, at: Path | None = None, gap: Path | 
         drives, limits.reach, _places(drives, model, begin), steps=steps, timestep=step, waves=given.waves,
         frequency=given.frequency or _frequency(seconds, step),
     )  # fmt: skip
-    alone = mine.model_copy(update={"data": None, "trajectories": None, "frame_skip": problem.simulator.frame_skip})
+    alone = config.model_copy(update={"data": None, "trajectories": None, "frame_skip": problem.simulator.frame_skip})
     return Ground(
-        alone, problem, has_log, noise_source, given, model, point, values, starts, settled, drives, tracker, family,
-        limits, known, steps, ties,
+        alone, problem, has_log, noise_source, given, model, point, values, starts, settled, drives,
+        Tracker(model, drives, step, limits.force), family, limits, known, steps, ties,
     )  # fmt: skip
+
+
+def _usable(config: Config, settings: PlanSettings) -> mujoco.MjModel:
+    """The model, if a motion can be planned for it.
+
+    Raises:
+        InputError: why none can.
+    """
+    if config.backend == "gymnasium":
+        raise InputError("backend: gymnasium has a model of its own; a plan needs backend: mujoco or warp")
+    own = completed(config)
+    model = load_model(own.path(str(own.model)))
+    if not own.parameters:
+        raise InputError("parameters: none given, so that there is nothing to tell apart; dropo init proposes some")
+    if own.data is None and own.frame_skip is None:
+        raise InputError(
+            "frame_skip: not given, and there is no log that tells it; give the physics steps of a command"
+        )
+    if prescribed_bodies(model):
+        raise InputError(
+            f"model: {prescribed_names(model)}: mocap bodies act in this model; a plan commands actuators only"
+        )
+    check_names(model, drives_of(model, np.concatenate([model.qpos0, np.zeros(model.nv)])), settings)
+    return model
+
+
+def _with_noise(config: Config, model: mujoco.MjModel) -> tuple[Config, Problem, str]:
+    """The config with the noise that is reckoned with, its problem, and where the noise is from."""
+    source = "the config" if config.noise is not None else "√ε of the config, which gives no noise"
+    own = completed(config)
+    if own.data is None:
+        return config, make_problem(config, log=_at_rest(own, model)), source
+    problem = make_problem(config)
+    if config.noise is not None:
+        return config, problem, source
+    config = _noisy(config, problem)
+    return config, make_problem(config), "the log"
 
 
 def _amended(config: Config, gap: Path) -> tuple[Config, np.ndarray]:
@@ -298,18 +305,20 @@ def _at_rest(config: Config, model: mujoco.MjModel) -> Trajectories:
     return Trajectories.of_samples(shown, np.zeros((rows, model.nu)), dt=step, source="no log")
 
 
-def _point(problem: Problem, at: Path | None) -> np.ndarray:
-    """Where the parameters are taken to be, in coordinates."""
+def _point(problem: Problem, at: Path | None) -> tuple[np.ndarray, np.ndarray]:
+    """Where the parameters are taken to be, in coordinates, and by what they vary, ``(d,)`` each."""
     box = problem.objective.box
     if at is None:
-        return box.middle
+        return box.middle, np.zeros(len(box.middle))
     found = Distribution.load(at)
     if set(found.names) != set(problem.space.names):
         raise InputError(
             f"--at: {at} has the parameters {', '.join(found.names)}; the config has {', '.join(problem.space.names)}"
         )
-    values = problem.space.vector(dict(zip(found.names, found.center.tolist(), strict=True)))
-    return np.clip(to_coordinates(values, problem.space.is_log), box.low, box.high)
+    center, std = (
+        problem.space.vector(dict(zip(found.names, x.tolist(), strict=True))) for x in (found.center, found.std)
+    )
+    return np.clip(to_coordinates(center, problem.space.is_log), box.low, box.high), std
 
 
 def _known(problem: Problem, point: np.ndarray) -> Information:
@@ -324,10 +333,18 @@ def _known(problem: Problem, point: np.ndarray) -> Information:
     return Information(share * total.gram, share * total.shared)
 
 
-def _others(problem: Problem, point: np.ndarray, known: Information, count: int) -> np.ndarray:
-    """Other parameters that are possible, ``(count, d)``: of a normal by what is known, and within the bounds."""
+def _others(problem: Problem, point: np.ndarray, known: Information, varies: np.ndarray, count: int) -> np.ndarray:
+    """Other parameters that are possible, ``(count, d)``: of a normal about a point, within the bounds.
+
+    Args:
+        problem: gives the bounds.
+        point: in coordinates, ``(d,)``.
+        known: what is known about it beside the bounds.
+        varies: standard deviations by which parameters vary, ``(d,)``.
+        count: of models.
+    """
     box, rng = problem.objective.box, np.random.default_rng([problem.config.seed, 11])
-    covariance = known.covariance(box.width / math.sqrt(12))
+    covariance = known.covariance(box.width / math.sqrt(12)) + np.diag(varies**2)
     values, vectors = np.linalg.eigh(covariance)
     draws = rng.standard_normal(((count + 1) // 2, len(point)))
     draws = np.concatenate([draws, -draws])[:count] * np.sqrt(np.maximum(values, 0))

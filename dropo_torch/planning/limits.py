@@ -23,6 +23,8 @@ SPEED, AWAY = {"rad": 2.0, "m": 0.5}, {"rad": np.pi / 2, "m": 0.25}
 RISE = 0.1
 #: Share of a log's speeds that counts as what it showed, and by how much its positions are widened, of their range.
 SHOWN, WIDER = 0.999, 0.5
+#: Share of its range by which a joint that rests on a stop may be beyond it.
+STOP = 0.02
 #: Depth in m to which bodies that must not touch may be found in each other: rounding.
 TOUCH = 1e-6
 
@@ -235,7 +237,6 @@ def make_limits(
     Raises:
         InputError: limits of something that the model does not have.
     """
-    _check_names(model, drives, settings)
     found: list[Limit] = []
     for drive in drives:
         found += _of_drive(model, drive, settings, start, states)
@@ -253,17 +254,20 @@ def make_limits(
             found.append(Limit("workspace", place, "m", least, most, "plan.workspace", first + axis))
     driven = {drive.joint for drive in drives}
     found += [
-        _range(model, j) for j in range(model.njnt) if model.jnt_limited[j] and j not in driven and _single(model, j)
+        _range(model, j, start)
+        for j in range(model.njnt)
+        if model.jnt_limited[j] and j not in driven and _single(model, j)
     ]
     touch = {frozenset(int(model.body_weldid[_body(model, b)]) for b in pair) for pair in settings.touch}
     touch |= _touching(model, start[None]) | (set() if states is None else _touching(model, states))
     return Limits(tuple(found), _reach(drives, found, low, high), force, frozenset(touch))
 
 
-def _range(model: mujoco.MjModel, joint: int) -> Limit:
-    """The range of a joint that nothing drives, but which moves along."""
+def _range(model: mujoco.MjModel, joint: int, start: np.ndarray) -> Limit:
+    """The range of a joint that nothing drives, but which moves along; it may rest on a stop."""
     low, high = (float(x) for x in model.jnt_range[joint])
     column = int(model.jnt_qposadr[joint])
+    low, high = min(low, float(start[column])), max(high, float(start[column]))
     return Limit("position", joint_name(model, joint), _unit(model, joint), low, high, "range", column)
 
 
@@ -280,11 +284,12 @@ def _of_drive(
     unit, name = _unit(model, drive.joint), drive.name
     low, high, source = _interval(model, drive, settings, float(start[drive.position]), states)
     at = float(start[drive.position])
-    if not low <= at <= high:
+    if not low - STOP * (high - low) <= at <= high + STOP * (high - low):
         raise InputError(
             f"plan: {name} starts at {at:.4g} {unit}, outside its limits from {low:.4g} to {high:.4g} ({source}); "
             f"set plan.start or plan.position of {name}"
         )
+    low, high = min(low, at), max(high, at)
     speed, said = _given(settings.velocity, name), "plan.velocity"
     if speed is None and states is not None and np.ptp(states[:, drive.velocity]) > 0:
         speed, said = float(np.quantile(np.abs(states[:, drive.velocity]), SHOWN)), "what the log showed"
@@ -375,16 +380,16 @@ def _unit(model: mujoco.MjModel, joint: int) -> str:
     return "rad" if int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE else "m"
 
 
-def _check_names(model: mujoco.MjModel, drives: Sequence[Drive], settings: PlanSettings) -> None:
-    """Refuse limits of what is not there."""
+def check_names(model: mujoco.MjModel, drives: Sequence[Drive], settings: PlanSettings) -> None:
+    """Raise an :class:`InputError` for a limit, or a start, of what is not there."""
     joints, actuators = [d.name for d in drives if d.joint >= 0], object_names(model, "actuator")
-    every = [joint_name(model, j) for j in range(model.njnt)]
+    every = [joint_name(model, j) for j in range(model.njnt) if _single(model, j)]
     for key, known in (("velocity", joints), ("acceleration", joints), ("position", joints), ("force", actuators),
                        ("start", every)):  # fmt: skip
         given = getattr(settings, key)
         for name in given if isinstance(given, Mapping) else ():
             if name not in known:
-                what = {"force": "actuator", "start": "joint"}.get(key, "joint that an actuator moves")
+                what = {"force": "actuator", "start": "hinge or slide"}.get(key, "joint that an actuator moves")
                 raise InputError(f"plan.{key}: no {what} {name!r}" + choices(name, known))
 
 

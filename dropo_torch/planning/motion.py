@@ -75,6 +75,17 @@ class Family:
         """Numbers of a motion."""
         return 1 + self._count * (2 + 3 * self._waves)
 
+    def multisines(self, count: int, rng: np.random.Generator) -> np.ndarray:
+        """Return motions of sines as large as each other, spread over all frequencies, with phases at random.
+
+        They are about where the drives start, and as large as limits allow, ``(count, dimensions)``.
+        """
+        each = np.empty((count, self._count, 2 + 3 * self._waves))
+        each[..., 0], each[..., 1], each[..., 2::3] = 0.5, 1.0, 1.0
+        each[..., 3::3] = (np.arange(self._waves) + 0.5) / self._waves
+        each[..., 4::3] = rng.random((count, self._count, self._waves))
+        return np.concatenate([np.ones((count, 1)), each.reshape(count, -1)], 1)
+
     def share(self, numbers: np.ndarray) -> np.ndarray:
         """Return the share of the amplitude that limits allow that motions ``(P, dimensions)`` have, ``(P,)``."""
         return np.asarray(LEAST_SHARE ** (1 - numbers[:, 0]))

@@ -33,9 +33,11 @@ PENALTY, ANY = 60.0, 2.0
 #: Factors of an amplitude at least and at most by which a motion is brought near a limit.
 LEAST, MOST = 0.02, 4.0
 #: Times that a motion is reduced until it keeps all limits, and factor of the amplitude, or less, each time.
-ATTEMPTS, LESS = 40, 0.96
+ATTEMPTS, LESS = 45, 0.93
 #: Factor of the amplitude below which it is told.
 REDUCED = 0.9
+#: σ from which on effects count as told apart.
+SURELY = 4.0
 #: Share of its bounds' width above which a parameter's standard error counts as none.
 UNKNOWN = 0.25
 
@@ -108,7 +110,7 @@ class Plan:
     def remarks(self) -> list[str]:
         """What to know before the motion is recorded, in sentences."""
         ground = self.ground
-        found = [f"It would tell {a} from {b} by {sigma:.1f} σ." for a, b, sigma in self.ties]
+        found = [_told(*tie) for tie in self.ties]
         if not ground.settled:
             found.append(
                 "The model does not come to rest where the motion starts: begin there at rest, held by hand or a stand."
@@ -189,6 +191,16 @@ class Plan:
         }  # fmt: skip
 
 
+def _told(one: str, other: str, sigma: float) -> str:
+    """By how much two effects would be told apart, in a sentence."""
+    if sigma < SURELY:
+        return (
+            f"No motion that was tried would tell {one} from {other} (at best {sigma:.1f} σ): on this robot they may "
+            "be the same thing."
+        )
+    return f"It would tell {one} from {other} by {sigma:.0f} σ."
+
+
 def _listed(keys: Mapping[str, Any]) -> str:
     """Keys of a config as it has them."""
     each = ((k, v if isinstance(v, list) else [v]) for k, v in keys.items())
@@ -219,7 +231,7 @@ def make_plan(
         asked = (f"{ground.steps}", repr(ground.values.tolist()))
         kept = Checkpoint(checkpoint, "plan", (ground.config.fingerprint(), ground.problem.fingerprint, *asked))
     found = search(
-        cost_of(ground), ground.family.dimensions, seed=ground.config.seed, evaluations=settings.evaluations,
+        cost_of(ground), ground.family, seed=ground.config.seed, evaluations=settings.evaluations,
         population=settings.population, report=tell, kept=kept, resume=resume,
     )  # fmt: skip
     return finished(ground, found, tell, began)

@@ -12,10 +12,13 @@ import numpy as np
 from dropo_torch.distribution import SearchBox
 from dropo_torch.errors import InputError
 from dropo_torch.optimizers.cma import evolution, why_stopped
+from dropo_torch.planning.motion import Family
 from dropo_torch.support.checkpoint import Checkpoint
 
-#: Generations of motions at random among which a search begins, and cost of a motion that diverges.
+#: Generations of multi-sines and motions at random among which a search begins, and cost of a motion that diverges.
 FIRST, DIVERGED = 4, 1e6
+#: Motions that are tried unless told otherwise: at least, and for each of a motion's numbers.
+FEWEST, EACH = 400, 15
 #: Width of the search that begins there, of [0, 1] in each number.
 STEP = 0.15
 
@@ -43,16 +46,16 @@ class Found:
 
 
 def search(
-    cost: Cost, dimensions: int, *, seed: int, evaluations: int, population: int | None, report: Report,
+    cost: Cost, family: Family, *, seed: int, evaluations: int | None, population: int | None, report: Report,
     kept: Checkpoint | None = None, resume: bool = False,
 ) -> Found:  # fmt: skip
     """Return the motion that costs least.
 
     Args:
         cost: of motions.
-        dimensions: numbers of a motion.
+        family: of the motions.
         seed: of all that is drawn.
-        evaluations: motions that may be tried.
+        evaluations: motions that may be tried; by default more where they have more numbers.
         population: of a generation; pycma's choice by default.
         report: is told the share of them that is done.
         kept: where the search's state is kept after every generation.
@@ -61,10 +64,10 @@ def search(
     told: list[list[float]] = []
     if resume and kept is not None and kept.path.exists():
         told = kept.load()["told"]
-    size = population or 4 + int(3 * np.log(dimensions))
-    rng = np.random.default_rng([seed, 7])
-    first = rng.random((min(FIRST * size, evaluations), dimensions))
-    first[0] = 0.5  # all alike, about the start
+    size = population or 4 + int(3 * np.log(family.dimensions))
+    budget = evaluations or max(FEWEST, EACH * family.dimensions)
+    rng, count = np.random.default_rng([seed, 7]), min(FIRST * size, budget)
+    first = np.concatenate([family.multisines(count - count // 2, rng), rng.random((count // 2, family.dimensions))])
     done = 0
 
     def value(points: np.ndarray, label: str) -> np.ndarray:
@@ -80,21 +83,21 @@ def search(
             if kept is not None:
                 kept.save({"told": told})
         done += 1
-        report(label, min(1.0, sum(map(len, told[:done])) / evaluations))
+        report(label, min(1.0, sum(map(len, told[:done])) / budget))
         return costs
 
     parts = [first[i : i + size] for i in range(0, len(first), size)]
-    costs = np.concatenate([value(part, "trying motions at random") for part in parts])
+    costs = np.concatenate([value(part, "trying multi-sines and motions at random") for part in parts])
     best = Found(first[costs.argmin()], float(costs.min()), len(first))
-    engine = _engine(best.numbers, seed, evaluations - len(first), size)
+    engine = _engine(best.numbers, seed, budget - len(first), size)
     while engine is not None and not engine.stop():
         points = np.array(engine.ask()) / SearchBox.WIDTH
-        costs = value(points, f"searching, best so far {-best.cost:.2f} nats")
+        costs = value(points, "searching")
         engine.tell(list(points * SearchBox.WIDTH), costs.tolist())
         best.evaluations += len(points)
         if costs.min() < best.cost:
             best.numbers, best.cost = points[costs.argmin()], float(costs.min())
-    best.why = f"{evaluations} motions were tried" if engine is None else _why(engine, evaluations)
+    best.why = f"{budget} motions were tried" if engine is None else _why(engine, budget)
     return best
 
 

@@ -31,7 +31,7 @@ class PlanSettings(pydantic.BaseModel):
         frequency: lowest and highest frequency of the motion's sines in Hz.
         waves: sines of each joint.
         models: other models, of those that the bounds and the log leave possible, that keep the limits, too.
-        evaluations: motions that are tried.
+        evaluations: motions that are tried; by default 15 for each of a motion's numbers, 400 at least.
         population: motions of a generation.
     """
 
@@ -47,7 +47,7 @@ class PlanSettings(pydantic.BaseModel):
     frequency: tuple[Positive, Positive] | None = None
     waves: Annotated[int, pydantic.Field(ge=1, le=20)] = 3
     models: Annotated[int, pydantic.Field(ge=0, le=100)] = 4
-    evaluations: Count = 600
+    evaluations: Count | None = None
     population: Annotated[int, pydantic.Field(ge=4, le=1000)] | None = None
 
     @pydantic.model_validator(mode="after")
