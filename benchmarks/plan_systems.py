@@ -283,10 +283,10 @@ def keeps_limits(number: int, folder: Path) -> dict[str, Any]:
     name = str(rng.choice(list(SYSTEMS)))
     system = SYSTEMS[name]
     plan = {k: (v * float(rng.uniform(0.4, 1.5)) if isinstance(v, int | float) else v) for k, v in system.plan.items()}
-    config = config_of(replace(system, plan=plan), folder, 30, seed=number)
+    config = config_of(replace(system, plan=plan), folder, 12, seed=number)
     config = config.model_copy(update={"plan": {**config.plan, "models": int(rng.integers(0, 4))}})
     try:
-        found = make_plan(prepare(config, float(rng.uniform(2, 4))))
+        found = make_plan(prepare(config, float(rng.uniform(1.5, 3))))
     except InputError as error:
         return {"number": number, "system": name, "refused": str(error)}
     most, ground = 0.0, found.ground

@@ -51,6 +51,11 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     config, out = load_config(given.config, overrides), given.out
     if given.at is not None and not given.at.is_file():
         raise InputError(f"--at: no file {given.at}; expected the fit.json of a dropo fit")
+    for source in filter(None, (given.at and given.at.parent, given.gap)):
+        if source.resolve() == out.resolve():
+            raise InputError(
+                f"--out: {out} holds what the plan starts from, which would be moved aside; name another folder"
+            )
     from dropo_torch.planning import make_plan, prepare
     from dropo_torch.report import write_plan_report
 
@@ -65,7 +70,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     write_atomically(out / "commands.csv", table(["time", *plan.actuators], plan.times[:-1], plan.commands))
     write_atomically(out / "expected.csv", table(["time", *plan.columns[0]], plan.times, plan.states))
     note = "" if given.no_video else _video(plan, out / VIDEO, console)
-    write_plan_report(out / "report.html", plan, **provenance(config))
+    shown = VIDEO if (out / VIDEO).is_file() else ""
+    write_plan_report(out / "report.html", plan, video=shown, **provenance(config))
     _show(plan, out, console)
     if note:
         console.print(note, soft_wrap=True)

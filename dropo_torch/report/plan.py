@@ -19,12 +19,13 @@ PANELS = 36
 WORDS = {"log": "the log so far", "plan": "the motion alone", "both": "both together"}
 
 
-def write_plan_report(path: str | Path, plan: Plan, **frame: Unpack[Frame]) -> None:
+def write_plan_report(path: str | Path, plan: Plan, *, video: str = "", **frame: Unpack[Frame]) -> None:
     """Write the page on a planned motion.
 
     Args:
         path: the HTML file; written whole or not at all.
         plan: what it shows.
+        video: file beside the page with the motion expected; empty for none.
         frame: the page's title and versions.
     """
     ground, document = plan.ground, plan.document()
@@ -43,7 +44,7 @@ def write_plan_report(path: str | Path, plan: Plan, **frame: Unpack[Frame]) -> N
             (whole(len(ground.values), "model"), "that keep all limits"),
             (percent(_least_room(document)), "least margin of a limit"),
         ],
-        "remarks": plan.remarks,
+        "remarks": plan.remarks, "video": video,
         "bars": figures.error_bars(space.names, shares),
         "keys": [(WORDS[kind], figures.COLOURS[kind]) for kind in errors],
         "kinds": [WORDS[kind] for kind in errors],
