@@ -70,6 +70,7 @@ CASES: dict[str, tuple[str, tuple[str, ...], Callable[[Path], Path]]] = {
     "fit-cma": ("fit", (), cart_pole(noise=None, optimizer="cma", budget=150)),
     "fit-adam": ("fit", (), cart_pole(noise=None, optimizer="adam", backend="warp", adam={"steps": 20, "samples": 4})),
     "gap": ("gap", (), cart_pole()),
+    "plan": ("plan", ("--seconds", "2", "--evaluations", "60", "--no-video"), cart_pole(noise=1e-3)),
     "compare": ("compare", ("--methods", "fisher-mujoco,cma-mujoco", "--seeds", "1"), cart_pole(budget=30)),
     "sweep-epsilon": ("sweep-epsilon", ("--epsilons", "1e-6,1e-5,1e-4"), cart_pole(noise=None)),
     "train-ppo": ("train", (), hopper("ppo", steps=1024, horizon=32, minibatch=32)),
@@ -163,7 +164,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="*", choices=CASES, default=list(CASES))
     parser.add_argument("--out", type=Path, default=Path("out/kill_resume"))
     given = parser.parse_args()
-    for module in ("commands.fit", "problem", "baselines", "report.fit", "diagnostics", "gap", "rl.train"):
+    for module in ("commands.fit", "problem", "baselines", "report.fit", "diagnostics", "gap", "planning", "rl.train"):
         importlib.import_module(f"dropo_torch.{module}")  # so that kills fall on work, and not on imports
     console, table = Console(), Table("command", "seconds", "killed", "resumed from a checkpoint", "equal")
     wrong = 0

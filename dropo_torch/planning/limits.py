@@ -23,7 +23,7 @@ SPEED, AWAY = {"rad": 2.0, "m": 0.5}, {"rad": np.pi / 2, "m": 0.25}
 RISE = 0.1
 #: Share of a log's speeds that counts as what it showed, and by how much its positions are widened, of their range.
 SHOWN, WIDER = 0.999, 0.5
-#: Share of its range by which a joint that rests on a stop may be beyond it.
+#: Share of its range by which a joint that rests on a stop may go beyond it.
 STOP = 0.02
 #: Depth in m to which bodies that must not touch may be found in each other: rounding.
 TOUCH = 1e-6
@@ -267,8 +267,16 @@ def _range(model: mujoco.MjModel, joint: int, start: np.ndarray) -> Limit:
     """The range of a joint that nothing drives, but which moves along; it may rest on a stop."""
     low, high = (float(x) for x in model.jnt_range[joint])
     column = int(model.jnt_qposadr[joint])
-    low, high = min(low, float(start[column])), max(high, float(start[column]))
-    return Limit("position", joint_name(model, joint), _unit(model, joint), low, high, "range", column)
+    low, high, source = _yielding(low, high, float(start[column]), "range")
+    return Limit("position", joint_name(model, joint), _unit(model, joint), low, high, source, column)
+
+
+def _yielding(low: float, high: float, at: float, source: str) -> tuple[float, float, str]:
+    """Limits of a position, moved a little where a joint rests on its stop, which is soft, and who says so."""
+    gives = STOP * (high - low)
+    if low < at < high:
+        return low, high, source
+    return low - gives * (at <= low), high + gives * (at >= high), f"{source}, and what its stop gives"
 
 
 def _single(model: mujoco.MjModel, joint: int) -> bool:
@@ -289,7 +297,7 @@ def _of_drive(
             f"plan: {name} starts at {at:.4g} {unit}, outside its limits from {low:.4g} to {high:.4g} ({source}); "
             f"set plan.start or plan.position of {name}"
         )
-    low, high = min(low, at), max(high, at)
+    low, high, source = _yielding(low, high, at, source)
     speed, said = _given(settings.velocity, name), "plan.velocity"
     if speed is None and states is not None and np.ptp(states[:, drive.velocity]) > 0:
         speed, said = float(np.quantile(np.abs(states[:, drive.velocity]), SHOWN)), "what the log showed"

@@ -146,7 +146,7 @@ class Plan:
         noise, observed = objective.noise, ground.problem.observation.labels
         return {
             "schema": SCHEMA,
-            "seconds": round(ground.steps * ground.timestep, 9),
+            "duration": round(ground.steps * ground.timestep, 9),
             "timestep": ground.timestep,
             "commands": ground.steps,
             "start": dict(zip(labels[: ground.model.nq], ground.starts[0, : ground.model.nq].tolist(), strict=True)),
@@ -165,7 +165,7 @@ class Plan:
                 "evaluations": self.found.evaluations, "nats": -self.found.cost, "stop_reason": self.found.why,
                 "seed": ground.config.seed,
             },
-            "wall_seconds": round(self.seconds, 3),
+            "seconds": round(self.seconds, 3),
         }  # fmt: skip
 
     def _parameters(self) -> dict[str, dict[str, Any]]:
