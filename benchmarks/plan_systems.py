@@ -148,7 +148,7 @@ SYSTEMS: dict[str, System] = {
 }  # fmt: skip
 
 
-def config_of(system: System, folder: Path, evaluations: int, **changes: Any) -> Config:
+def config_of(system: System, folder: Path, evaluations: int | None, **changes: Any) -> Config:
     """Return the config of a system whose model is written to a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     (folder / "robot.xml").write_text(system.model)
@@ -230,7 +230,7 @@ def beyond(plan: Plan, states: np.ndarray, model: mujoco.MjModel, every: int) ->
     return max(0.0, float(np.nanmax(kept.excess))) + float(kept.depth[0]) / 0.01
 
 
-def attempt(name: str, folder: Path, seconds: float, evaluations: int, recordings: int) -> dict[str, Any]:
+def attempt(name: str, folder: Path, seconds: float, evaluations: int | None, recordings: int) -> dict[str, Any]:
     """Plan, record and fit one system, and compare it with multi-sines."""
     system, began = SYSTEMS[name], time.perf_counter()
     config = config_of(system, folder, evaluations)
@@ -265,8 +265,9 @@ def attempt(name: str, folder: Path, seconds: float, evaluations: int, recording
         assert errors is not None
         gains.append(errors / promised)
     return {
-        "system": name, "kept": float(np.sqrt(np.mean(np.square(off)))), "stated": float(np.median(stated)),
-        "kept_by_parameter": np.sqrt(np.mean(np.square(off), 0)).tolist(), "names": space.names,
+        "system": name, "kept": float(np.sqrt(np.mean(np.square(off)))) if off else None,
+        "stated": float(np.median(stated)) if off else None,
+        "off": [z.tolist() for z in off], "names": space.names,
         "promised": promised.tolist(), "gain": float(np.exp(np.mean(np.log(gains)))),
         "gains": np.exp(np.mean(np.log(gains), 1)).tolist(),
         "gain_by_parameter": np.exp(np.mean(np.log(gains), 0)).tolist(),
@@ -297,6 +298,10 @@ def keeps_limits(number: int, folder: Path) -> dict[str, Any]:
     return {"number": number, "system": name, "beyond": most, "scale": found.scale}
 
 
+def _number(value: float | None) -> str:
+    return "-" if value is None else f"{value:.2f}"
+
+
 def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
@@ -304,8 +309,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     )
     parser.add_argument("--systems", default=",".join(SYSTEMS), help="which ones")
     parser.add_argument("--seconds", type=float, default=8.0, help="of a motion")
-    parser.add_argument("--evaluations", type=int, default=400, help="motions that are tried")
-    parser.add_argument("--recordings", type=int, default=6, help="of each plan, with fresh noise")
+    parser.add_argument("--evaluations", type=int, help="motions that are tried; the planner's choice by default")
+    parser.add_argument("--recordings", type=int, default=6, help="of each plan, with fresh noise; 0 for gains alone")
     parser.add_argument("--limits", type=int, default=0, help="short plans of random limits")
     given = parser.parse_args(arguments)
     given.out.mkdir(parents=True, exist_ok=True)
@@ -316,7 +321,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             done.write_text(json.dumps(result, indent=1))
         r = json.loads(done.read_text())
         print(
-            f"{name}: kept {r['kept']:.2f}, stated {r['stated']:.2f}, gain {r['gain']:.2f}, beyond limits "
+            f"{name}: kept {_number(r['kept'])}, stated {_number(r['stated'])}, gain {r['gain']:.2f}, beyond limits "
             f"{100 * r['beyond']:.1f} %, {r['seconds']:.0f} s", flush=True,
         )  # fmt: skip
     store = given.out / "limits.jsonl"

@@ -18,7 +18,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.logged import completed
 from dropo_torch.models.load import load_model
 from dropo_torch.planning.drives import Drive, Tracker, drives_of
-from dropo_torch.planning.information import Information, information_of
+from dropo_torch.planning.information import Information, inefficiency, information_of
 from dropo_torch.planning.limits import Limits, check_names, make_limits
 from dropo_torch.planning.motion import Family, Paths
 from dropo_torch.planning.separation import Ties, read_ties
@@ -136,7 +136,11 @@ class Ground:
         chosen = (np.arange(len(states))[:, None] * whole + rows).ravel()
         found = information_of(objective.on(every.select(chosen)), self.point, quick=True)
         share, together = whole / len(rows), (whole - 1) / pairs
-        return [Information(share * i.gram, together * i.shared) for i in found]
+        wasted = 0.0 if objective.noise is None else inefficiency(objective.features.size) - 1
+        return [
+            Information(share * i.gram, together * (i.shared + wasted * i.gram) - share * wasted * i.gram)
+            for i in found
+        ]  # fmt: skip
 
     def problem_of(self, states: np.ndarray, commands: np.ndarray) -> Problem:
         """Return the problem that a fit of one motion ``(N + 1, nq + nv)`` has."""

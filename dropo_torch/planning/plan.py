@@ -276,11 +276,8 @@ def moved(ground: Ground, numbers: np.ndarray, scale: np.ndarray) -> tuple[np.nd
     """Return commands ``(P, N, nu)``, states of all models ``(P, K, N + 1, nq + nv)``, and how far motions go."""
     commands = ground.commands(ground.family.paths(numbers, scale))
     states = ground.states(commands, len(ground.values))
-    return (
-        commands,
-        states,
-        ground.limits.kept(ground.models, states, commands, ground.timestep, every=EVERY, share=SHARE),
-    )
+    kept = ground.limits.kept(ground.models, states, commands, ground.timestep, every=EVERY, share=SHARE)
+    return commands, states, kept
 
 
 def finished(ground: Ground, found: Found, tell: Report, began: float) -> Plan:
