@@ -140,16 +140,16 @@ def test_a_plan_keeps_all_limits_in_all_models(tmp_path: Path, actuator: str) ->
             previous = data.qvel[0]
     errors = plan.errors
     assert errors["log"] is None
-    assert (errors["plan"] < 0.2 * plan.ground.width).all()  # type: ignore[operator]
+    assert (errors["plan"] < 0.5 * plan.ground.width).all()  # type: ignore[operator]
 
 
 def test_a_site_stays_in_its_workspace(tmp_path: Path) -> None:
-    box = {"tip": [[-0.2, 0.1], [-1, 1], [0, 1]]}
+    box = {"tip": [[-0.04, 0.05], [-1, 1], [0, 1]]}
     plan, free = made(tmp_path, plan={"workspace": box}), made(tmp_path)
-    tip = [0.6 * 0 - 0.5 * np.sin(p.states[:, 0]) for p in (plan, free)]
-    assert tip[0].min() >= -0.2
-    assert tip[0].max() <= 0.1
-    assert tip[1].min() < -0.2 or tip[1].max() > 0.1
+    tip = [-0.5 * np.sin(p.states[:, 0]) for p in (plan, free)]
+    assert tip[0].min() >= -0.04
+    assert tip[0].max() <= 0.05
+    assert tip[1].min() < -0.04 or tip[1].max() > 0.05
 
 
 def test_nothing_touches_that_need_not(tmp_path: Path) -> None:
