@@ -32,6 +32,7 @@ PENDULUM = """
       <site name="tip" pos="0 0 -.5"/>
     </body>
   </worldbody>
+  <sensor><framepos name="marker" objtype="site" objname="tip"/></sensor>
   <actuator>{actuator}</actuator>
 </mujoco>"""
 MOTOR = '<motor name="drive" joint="pivot" ctrlrange="-3 3" ctrllimited="true"/>'
@@ -195,6 +196,7 @@ REFUSED = {
     "start outside": ({"plan": {"position": {"pivot": [0.5, 1]}}}, 1.5, "pivot starts at .*outside its limits"),
     "unknown site": ({"plan": {"workspace": {"hand": [[0, 1]] * 3}}}, 1.5, "no site and no body 'hand'"),
     "workspace": ({"plan": {"workspace": {"tip": [[0.3, 1]] * 3}}}, 1.5, "the workspace of tip.x reaches .*beyond"),
+    "sensors": ({"observation": ["sensor"], "noise": ...}, 1.5, "names sensors and not the whole state"),
     "adapter": ({"backend": "gymnasium", "environment": "x.py:make"}, 1.5, "backend: gymnasium has a model of its own"),
 }  # fmt: skip
 

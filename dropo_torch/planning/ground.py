@@ -214,6 +214,10 @@ def _usable(config: Config, settings: PlanSettings) -> mujoco.MjModel:
         raise InputError(
             f"model: {prescribed_names(model)}: mocap bodies act in this model; a plan commands actuators only"
         )
+    if parse_observation(model, own.observation).is_sensed:
+        raise InputError(
+            "observation: it names sensors and not the whole state, which a plan needs; name qpos and qvel for the plan"
+        )
     check_names(model, drives_of(model, np.concatenate([model.qpos0, np.zeros(model.nv)])), settings)
     return model
 
