@@ -152,9 +152,9 @@ WRONG_LINES: dict[str, tuple[str, tuple[str, ...]]] = {
     "unknown command": ("fitt CONFIG --out OUT", ("unknown command 'fitt'", "did you mean 'fit'")),
     "option before the command": (
         "--foo fit CONFIG --out OUT",
-        ("--foo", "demo, init, check, gap, fit, view, train, sweep-epsilon, compare"),
+        ("--foo", "demo, init, check, gap, fit, view, plan, train, sweep-epsilon, compare"),
     ),
-    "no command": ("--foo", ("--foo", "demo, init, check, gap, fit, view, train, sweep-epsilon, compare")),
+    "no command": ("--foo", ("--foo", "demo, init, check, gap, fit, view, plan, train, sweep-epsilon, compare")),
     "no config": ("fit --out OUT", ("CONFIG", "usage: dropo fit")),
     "no folder": ("fit CONFIG", ("--out", "usage: dropo fit")),
     "folder without value": ("fit CONFIG --out", ("--out: expected one argument",)),
@@ -453,8 +453,10 @@ def help_of(command: str, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 def test_a_command_tells_the_keys_that_matter_to_it(capsys: pytest.CaptureFixture[str]) -> None:
-    keys = {c: {k for k in KEYS if f"\n  --{k} " in help_of(c, capsys)} for c in ("check", "fit", "gap", "train")}
-    assert keys["fit"] | keys["train"] == set(KEYS)
+    keys = {
+        c: {k for k in KEYS if f"\n  --{k} " in help_of(c, capsys)} for c in ("check", "fit", "gap", "plan", "train")
+    }
+    assert keys["fit"] | keys["plan"] | keys["train"] == set(KEYS)
     assert keys["check"] == keys["gap"] == keys["fit"] & keys["train"]
     assert {"model", "data", "threads"} <= keys["check"]
     assert "epsilon" in keys["fit"] - keys["train"]
