@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--seconds", type=seconds, default=SECONDS, metavar="S", help=f"how long the motion is ({SECONDS:g})"
     )
     parser.add_argument(
-        "--at", type=Path, metavar="FIT", help="fit.json at whose means it is planned (the middle of the bounds)"
+        "--at", type=Path, metavar="FIT", help="fit.json at whose means it is planned (the model's own values)"
     )
     parser.add_argument(
         "--gap", type=Path, metavar="DIR", help="folder of a dropo gap: the motion is to tell its tied effects apart"

@@ -37,6 +37,8 @@ SETTLE, REST = 4.0, 0.01
 WINDOWS, RUN = 120, 4
 #: Windows of a log from which on some stand for all, and how many of these follow on each other.
 LOGGED, LONG_RUN = 3000, 50
+#: Share of the bounds by which the model's own values are kept inside them.
+INSIDE = 0.01
 #: Commands of a motion at least.
 FEWEST = 20
 
@@ -153,7 +155,7 @@ def prepare(config: Config, seconds: float, at: Path | None = None, gap: Path | 
     Args:
         config: the model, its parameters with bounds, and a log and noise where there are any.
         seconds: how long the motion is.
-        at: a fit at whose means it is planned; else at the middle of the bounds.
+        at: a fit at whose means it is planned; else at the model's own values, within the bounds.
         gap: folder of a ``dropo gap`` whose tied effects it is to tell apart; the model is then that with the effects.
 
     Raises:
@@ -317,7 +319,10 @@ def _point(problem: Problem, at: Path | None) -> tuple[np.ndarray, np.ndarray]:
     """Where the parameters are taken to be, in coordinates, and by what they vary, ``(d,)`` each."""
     box = problem.objective.box
     if at is None:
-        return box.middle, np.zeros(len(box.middle))
+        with np.errstate(divide="ignore"):  # a friction of 0 with a logarithm
+            own = to_coordinates(problem.space.nominal, problem.space.is_log)
+        edge = INSIDE * (box.high - box.low)
+        return np.where(np.isnan(own), box.middle, np.clip(own, box.low + edge, box.high - edge)), np.zeros(len(own))
     found = Distribution.load(at)
     if set(found.names) != set(problem.space.names):
         raise InputError(
