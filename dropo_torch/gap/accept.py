@@ -15,7 +15,7 @@ from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
 from dropo_torch.gap.renew import with_base
-from dropo_torch.gap.rules import accounts, beyond_free, may_leave, most_left, remains, significant, simplest
+from dropo_torch.gap.rules import accounts, allowance, beyond_free, may_leave, most_left, remains, significant, simplest
 from dropo_torch.gap.screen import promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -141,14 +141,17 @@ def is_done(ground: Ground, state: State) -> bool:
 
     The latter where it is a small part of the gap, or where the model as given shows no step.
 
-    Of a gap that is itself little more than noise, what is left may be both no more than that and too much to be named.
+    Of a gap that is itself little more than noise, what is left may be both no more than that and a large part of it:
+    there may be another effect, however well the noise is known.
     """
     base, current, rules = state.base, state.current, ground.rules
+    left = current.cost.left_of(base.cost)
     if ground.clears(base, current):
         return True
     if not significant(current.cost, rules):
-        return accounts(current, base, rules) or current.cost.misfit < 0.5 * rules.gate * current.cost.sigma
-    if current.cost.left_of(base.cost) >= rules.least and step_shows(ground, base):
+        small = left <= allowance(current.hypothesis, rules) and accounts(current, base, rules)
+        return small or current.cost.misfit < 0.5 * rules.gate * current.cost.sigma
+    if left >= rules.least and step_shows(ground, base):
         return False
     return is_of_step(ground, current)
 
