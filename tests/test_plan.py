@@ -139,9 +139,8 @@ def test_a_plan_keeps_all_limits_in_all_models(tmp_path: Path, actuator: str) ->
                 assert abs(data.actuator_force[0]) <= 2.5 + 1e-9
             assert abs(data.qvel[0] - previous) <= 15 * 0.02 * (1 + 1e-6)
             previous = data.qvel[0]
-    errors = plan.errors
-    assert errors["log"] is None
-    assert (errors["plan"] < 0.5 * plan.ground.width).all()  # type: ignore[operator]
+    assert plan.errors["log"] is None
+    assert not plan.unidentified
 
 
 def test_a_site_stays_in_its_workspace(tmp_path: Path) -> None:

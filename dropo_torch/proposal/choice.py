@@ -101,7 +101,7 @@ class Choice:
         single = sum(t.state == "chosen" for t in self.told)
         unseen = sum(t.state == "unseen" for t in self.told)
         parts = [f"{single} {'is' if single == 1 else 'are'} identifiable one by one"]
-        together, count = (sum(len(getattr(g, what)) for g in self.groups) for what in ("names", "directions"))
+        together, count = sum(len(g.names) for g in self.groups), sum(len(g.directions) for g in self.groups)
         parts += [f"{together} only as {count} combination{'' if count == 1 else 's'}"] if together else []
         loose = len(self.told) - single - unseen - together
         parts += [f"{loose} weakly, beside the others"] if loose > 0 else []
