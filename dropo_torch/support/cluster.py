@@ -48,7 +48,7 @@ def by_ray(work: Callable[..., Result], tasks: Sequence[Task], retries: int) -> 
         threads = threads_of_a_task([int(n["Resources"].get("CPU", 0)) for n in ray.nodes() if n["Alive"]], len(tasks))
         answer = ray.remote(_answer).options(num_cpus=threads, max_retries=retries, retry_exceptions=False)
         here = ([path or os.getcwd() for path in sys.path], os.getcwd())
-        running = {answer.remote(ray.cloudpickle.dumps((work, t)), *here, threads): n for n, t in enumerate(tasks)}
+        running = {answer.remote([ray.put((work, t))], *here, threads): n for n, t in enumerate(tasks)}
         try:
             while running:
                 (done,), _ = ray.wait(list(running))
@@ -67,7 +67,6 @@ def ready() -> Any:
     """
     with extra("ray", "workers: ray"):
         import ray
-        import ray.cloudpickle
     if not ray.is_initialized():
         with _told():
             _call_up(os.environ.get("RAY_ADDRESS", ""))
@@ -132,15 +131,22 @@ def _got(ray: Any, reference: Any, task: object) -> Any:
         raise died(task) from None
 
 
-def _answer(call: bytes, path: list[str], folder: str, threads: int) -> Any:
-    """Do a task where and as the process would that has it done."""
+def _answer(call: list[Any], path: list[str], folder: str, threads: int) -> Any:
+    """Do a task where and as the process would that has it done.
+
+    Args:
+        call: a reference to work and task, in a list: Ray would otherwise load them before ``path`` tells from where.
+        path: where that process finds modules.
+        folder: where it runs.
+        threads: of the task.
+    """
+    import ray
     import torch
-    from ray import cloudpickle
 
     if not os.path.isdir(folder):
         raise InputError(f"workers: ray: {platform.node()} has no folder {folder}; all nodes must see the same files")
     os.chdir(folder)
     sys.path[:] = [*path, *(p for p in sys.path if p not in path)]
     torch.set_num_threads(threads)
-    work, task = cloudpickle.loads(call)
+    work, task = ray.get(call[0])
     return work(task, threads=threads)
