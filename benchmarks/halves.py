@@ -4,7 +4,8 @@
 
 Trajectories are dealt out in turn; where there are fewer than four, each is cut into blocks first. So the halves share
 no row, and each has all parts of a motion. A name is the same where one half names what the other one names or has as
-its tie. With --fit, the config's parameters are fitted to each half, and their intervals are compared.
+its tie. Where the other half does without an effect, it also says how large that may be all the same: a name is
+contradicted if none of the sizes that it may have are allowed there. With --fit, the config's parameters are fitted to each half, and their intervals are compared.
 """
 
 from __future__ import annotations
@@ -102,6 +103,26 @@ def numbers(gap: Gap) -> Intervals:
     return found
 
 
+def allowed(gap: Gap) -> Intervals:
+    """Return the 90 % interval of every number of what was not needed; all there are, where it has none."""
+    return {
+        (e.effect, str(e.target), key): (s.low, s.high) if np.isfinite(s.low) else (-np.inf, np.inf)
+        for e in gap.left_out
+        for key, s in e.parameters.items()
+    }
+
+
+def contradicted(first: Gap, second: Gap) -> tuple[set[tuple[str, str]], set[tuple[str, str]]]:
+    """Return what only the first half names, and of this what the second does not allow as it is there, or at all."""
+    only, there, other = names(first) - names(second, ties=True), numbers(first), allowed(second)
+    refuted = set()
+    for effect, target in only:
+        own = {key: there[key] for key in there if key[:2] == (effect, target)}
+        if any(k not in other or max(own[k][0], other[k][0]) > min(own[k][1], other[k][1]) for k in own):
+            refuted.add((effect, target))
+    return only, refuted
+
+
 def compare_intervals(first: Intervals, second: Intervals) -> None:
     """Print the numbers that both halves have, and how many of their intervals overlap."""
     common, overlap = sorted(first.keys() & second.keys()), 0
@@ -117,9 +138,12 @@ def compare_names(first: Gap, second: Gap) -> None:
     """Print what only one of the halves names, and how many names are alike."""
     said = [names(first), names(second)]
     alike = (said[0] & names(second, ties=True)) | (said[1] & names(first, ties=True))
-    for label, own, gap in (("first", said[0], second), ("second", said[1], first)):
-        print(f"only in the {label} half: {sorted(own - names(gap, ties=True))}")
-    print(f"names alike: {len(alike)} of {len(said[0] | said[1])}")
+    refuted = 0
+    for label, one, other in (("first", first, second), ("second", second, first)):
+        only, against = contradicted(one, other)
+        refuted += len(against)
+        print(f"only in the {label} half: {sorted(only)}; the other one does not allow {sorted(against) or 'none'}")
+    print(f"names alike: {len(alike)} of {len(said[0] | said[1])}; contradicted: {refuted}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -247,30 +247,6 @@ def shares_of(ground: Ground, whole: Refit) -> tuple[float, ...]:
     return tuple((offsets(ground.setting, whole) ** 2 / np.maximum(variance, 1e-300))[first:].tolist())
 
 
-def family_ties(ground: Ground, whole: Refit) -> tuple[tuple[Placed, ...], ...]:
-    """Return for each member those that could stand in its place at its joint, by the derivatives at the fit."""
-    setting, hypothesis = ground.setting, whole.hypothesis
-    taken = {(p.effect.known_as or p.effect.name, p.target) for p in hypothesis.placed}
-    idle = [p for p in base_family(setting, ground.effects) if p.key not in taken]
-    absent = [p.at(np.array([p.effect.quantities(setting, p.target)[0].neutral])) for p in idle]
-    beside = refit(ground.part, hypothesis.with_effects(absent), linear=whole.linear, iterations=0)
-    (slope, residual), first = beside.weighted(ground.part.caps), len(hypothesis.declared)
-    off, own = offsets(setting, beside), np.arange(len(hypothesis.vector))
-    margin = max(ground.rules.alike.chi2, ground.rules.alike.share * whole.cost.misfit)
-
-    def left(rows: np.ndarray, gone: int | None) -> float:
-        moved = residual if gone is None else residual - off[gone] * slope[gone]
-        return float(((moved - slope[rows].T @ np.linalg.lstsq(slope[rows].T, moved, rcond=1e-9)[0]) ** 2).sum())
-
-    with_all, found = left(own, None), []
-    for index, member in enumerate(hypothesis.placed):
-        at, joint = first + index, joint_of(setting, member)
-        others = [j for j, p in enumerate(idle) if joint_of(setting, p) == joint]
-        rest = np.delete(own, at)
-        found.append(tuple(idle[j] for j in others if left(np.append(rest, len(own) + j), at) < with_all + margin))
-    return tuple(found)
-
-
 def spread_out(setting: Setting, hypothesis: Hypothesis, members: int) -> bool:
     """Return whether at least half of the joints, and two, have so many members each."""
     joints = [joint_of(setting, p) for p in hypothesis.placed]

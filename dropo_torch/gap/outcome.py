@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -19,7 +19,18 @@ from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.renew import moved, noise_beside
-from dropo_torch.gap.result import FAMILY, Gap, JointForce, NamedEffect, Ranked, Remaining, Residuals, Score, Strength
+from dropo_torch.gap.result import (
+    FAMILY,
+    Gap,
+    JointForce,
+    LeftOut,
+    NamedEffect,
+    Ranked,
+    Remaining,
+    Residuals,
+    Score,
+    Strength,
+)
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
@@ -124,6 +135,7 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         unfinished=naming.unfinished,
         own_step=own_step,
         joints=joint_names(setting) if naming.family else {},
+        left_out=_left_out(setting, naming.left_out),
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",
     )
 
@@ -142,9 +154,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
     chi2 = [refit(evidence, h, iterations=0, slopes=False).cost.reduced for h in (scene.begin, hypothesis)]
     named = []
     for placed, halves, share, tied in zip(view.placed, view.halves, view.shares, view.ties, strict=True):
-        found = zip(placed.effect.quantities(setting, placed.target), placed.values, halves, strict=True)
-        numbers = {q.name: _strength(q, value, float(half)) for q, value, half in found}
-        named.append(NamedEffect.of(placed, numbers, share, tied))
+        named.append(NamedEffect.of(placed, _strengths(setting, placed, halves), share, tied))
     kinds = {n: max(e.share_of_gap for e in named if e.effect == n) for n in {e.effect for e in named}}
     after_score, constant = score(evidence, held, hypothesis), constant_velocity(evidence, held.rollouts)
     skill = has_skill(after_score, gap.noise_floor, constant, scene.rules.sound)
@@ -164,6 +174,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
         remaining=None,
         own_step=None,
         joints={},
+        left_out=_left_out(setting, view.left_out),
         next_experiment=None,
         notes=(
             f"Constant velocity has an open-loop error of {constant:.3g} on held-out data, the model with the effects "
@@ -224,7 +235,9 @@ def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Nami
         names = "friction, inertia, offset and delay of all joints"
     sizes = f"open loop {after.rollout_rmse:.3g} against {rival:.3g}"
     reason = f"with {names}, which would account for most of the misfit, {why} ({sizes})"
-    return replace(naming, final=naming.base, named=False, ties=(), shares=(), partial=False, refused=reason)
+    return replace(
+        naming, final=naming.base, named=False, ties=(), shares=(), left_out=(), partial=False, refused=reason
+    )
 
 
 def _remaining(
@@ -281,13 +294,21 @@ def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffec
     final, halves = last.fit, half_widths(last)
     own, found = iter(halves[len(final.hypothesis.declared) :]), []
     for placed, tied, excess in zip(final.hypothesis.placed, naming.ties, naming.shares, strict=True):
-        quantities = placed.effect.quantities(setting, placed.target)
-        numbers = {
-            q.name: _strength(q, value, half) for q, value, half in zip(quantities, placed.values, own, strict=False)
-        }
+        numbers = _strengths(setting, placed, [next(own) for _ in placed.values])
         share = float(np.clip(excess / naming.base.cost.above(naming.final.cost), 0, 1))
         found.append(NamedEffect.of(placed, numbers, share, tied))
     return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)
+
+
+def _left_out(setting: Setting, allowed: Iterable[tuple[Placed, np.ndarray]]) -> tuple[LeftOut, ...]:
+    """What was not needed, by how large it may be all the same."""
+    return tuple(LeftOut(*placed.key, _strengths(setting, placed, halves)) for placed, halves in allowed)
+
+
+def _strengths(setting: Setting, placed: Placed, halves: Sequence[float] | np.ndarray) -> Mapping[str, Strength]:
+    """The numbers of an effect with their intervals, by the half-widths of these."""
+    found = zip(placed.effect.quantities(setting, placed.target), placed.values, halves, strict=True)
+    return {q.name: _strength(q, value, float(half)) for q, value, half in found}
 
 
 def _strength(quantity: Quantity, value: float, half: float) -> Strength:

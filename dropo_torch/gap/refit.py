@@ -188,7 +188,7 @@ def refit(
     for _ in range(iterations):
         if not sloped:
             here, sloped = _sloped(evidence, here, limits, residuals), True
-        trial = here.hypothesis.vector + _move(here, limits, evidence.caps, damping) * limits.scale
+        trial = here.hypothesis.vector + newton_step(here, limits, evidence.caps, damping) * limits.scale
         trial = np.clip(trial, limits.low, limits.high)
         if _distance(trial, here.hypothesis, limits) < LEAST_MOVE:
             break
@@ -243,8 +243,8 @@ def _fitted(
     return Refit(hypothesis, cost, residual, slope, linear, scale, factor, loss)
 
 
-def _move(here: Refit, limits: Limits, caps: np.ndarray | float, damping: float) -> np.ndarray:
-    """The damped step in units of the scales, ``(q,)``, of residuals with caps of their windows, ``(W,)``."""
+def newton_step(here: Refit, limits: Limits, caps: np.ndarray | float, damping: float) -> np.ndarray:
+    """Return the damped step in units of the scales, ``(q,)``, of residuals with caps of their windows, ``(W,)``."""
     if not len(here.slope):
         return np.zeros(0)
     flat, residual = here.weighted(caps)
@@ -383,7 +383,7 @@ def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
         if best is not None and there.loss >= best.loss:
             break
         best = there
-        move = _move(best, limits, finer.caps, LEAST_DAMPING)
+        move = newton_step(best, limits, finer.caps, LEAST_DAMPING)
         if np.abs(move).max(initial=0.0) < LEAST_MOVE:
             break
         trial = trial.at(np.clip(trial.vector + move * limits.scale, limits.low, limits.high))

@@ -77,6 +77,21 @@ class NamedEffect:
 
 
 @dataclass(frozen=True)
+class LeftOut:
+    """An effect that has no name because nothing needs it, and how large it may be all the same.
+
+    Attributes:
+        effect: its name in the vocabulary.
+        target: where it would sit.
+        parameters: its numbers, with the 90 % intervals that they have beside all others of its kind.
+    """
+
+    effect: str
+    target: str | None
+    parameters: Mapping[str, Strength]
+
+
+@dataclass(frozen=True)
 class Score:
     """How far a model is from held-out data.
 
@@ -198,6 +213,7 @@ class Gap:
         ranking: candidates that were tried, best first.
         residuals: pictures of what is missing.
         courses: positions on held-out data, as measured and as predicted; empty where predictions did not decide.
+        left_out: of what real joints have, where several were named together: what was not needed.
         cannot_judge: candidates that change nothing on this log.
         rollout_seconds: length of an open-loop prediction.
         window: logged steps of the windows on which hypotheses were compared.
@@ -230,6 +246,7 @@ class Gap:
     ranking: tuple[Ranked, ...] = ()
     residuals: tuple[Residuals, ...] = ()
     courses: tuple[Course, ...] = ()
+    left_out: tuple[LeftOut, ...] = ()
     cannot_judge: tuple[tuple[str, str | None], ...] = ()
     rollout_seconds: float = 0.0
     window: int = 0
@@ -280,6 +297,10 @@ class Gap:
             "noise": dict(zip(self.labels, self.noise, strict=True)),
             "chi2_per_degree": dict(zip(("before", "after"), self.reduced, strict=True)),
             "ranking": [asdict(r) for r in self.ranking],
+            "left_out": [
+                {**_pair((e.effect, e.target)), "parameters": {n: asdict(s) for n, s in e.parameters.items()}}
+                for e in self.left_out
+            ],
             "cannot_judge": [_pair(p) for p in self.cannot_judge],
             "symbolic": self.symbolic or None,
             "notes": self.notes,

@@ -10,9 +10,10 @@ import numpy as np
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
+from dropo_torch.gap.absent import Allowed, family_ties, left_out, with_absent
 from dropo_torch.gap.accept import accounts_finely, add, everywhere, extend, imitates, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.family import family_ties, has_family, shares_of, whole_family, with_family
+from dropo_torch.gap.family import has_family, shares_of, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -48,6 +49,7 @@ class Naming:
         refused: why what was found has no name.
         unfinished: the stage in which the time for the search was over, or empty.
         family: whether what is named is the base family.
+        left_out: what this does without, and how large that may be.
     """
 
     evidence: Evidence
@@ -63,6 +65,7 @@ class Naming:
     refused: str = ""
     unfinished: str = ""
     family: bool = False
+    left_out: tuple[Allowed, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -300,7 +303,8 @@ def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
     reasons = nonsense(ground, current)
     if reasons or not family_accounts(current, state.base, ground.rules):
         return replace(unnamed, attempts=state.attempts, refused=reasons[0] if reasons else LEAVES)
+    beside = with_absent(ground, current)
     return replace(
-        unnamed, refused="", final=current, named=True, family=True, ties=family_ties(ground, current),
-        shares=shares_of(ground, current), attempts=state.attempts,
+        unnamed, refused="", final=current, named=True, family=True, ties=family_ties(ground, current, beside),
+        left_out=left_out(ground, current, beside), shares=shares_of(ground, current), attempts=state.attempts,
     )  # fmt: skip

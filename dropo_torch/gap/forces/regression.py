@@ -205,6 +205,21 @@ def _standard_errors(regression: Regression, chosen: np.ndarray) -> np.ndarray:
     return np.asarray(np.sqrt((count - 1) * moved.var(0)))
 
 
+def widest(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+    """Return half-widths of the 90 % intervals of coefficients ``(P,)``, as wide as their priors where nothing shows.
+
+    The larger of the jackknife's and of what the squares that are left and the priors make: a prior that holds a
+    coefficient holds it without any block, too.
+    """
+    picked = np.flatnonzero(chosen)
+    weights = 1 / np.maximum(regression.squares(coefficients).mean(0), 1e-300)
+    weighted = np.einsum("bjpq,j->pq", regression.products, weights)[np.ix_(picked, picked)]
+    normal = weighted / regression.correlated + np.diag(1 / regression.prior[picked] ** 2)
+    found = np.zeros(len(chosen))
+    found[picked] = np.sqrt(np.maximum(np.diag(np.linalg.pinv(normal, rcond=1e-12, hermitian=True)), 0.0))
+    return np.maximum(half_widths(regression, chosen), stats.norm.ppf(0.95) * found)
+
+
 def neutral_chances(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
     """Return how likely coefficients ``(P,)`` are as large by chance, were they 0; 1 for those not chosen."""
     errors = np.maximum(_standard_errors(regression, chosen), 1e-300)

@@ -26,6 +26,7 @@ from dropo_torch.gap.forces.regression import (
     score,
     select,
     unseen,
+    widest,
 )
 from dropo_torch.gap.forces.terms import CENTER, FRICTION, PRESLIDING, Terms, linear_effects, needed, terms
 from dropo_torch.gap.rules import Forces
@@ -48,6 +49,7 @@ class ForceView:
         shares: share of the unseen forces' mean squares that comes back without each.
         ties: for each effect those that may stand in its place: others that explain the log as well, and centres of
             mass of other bodies, which are only known together.
+        left_out: what none of the forces needs, with half-widths of the 90 % intervals of its numbers.
     """
 
     velocity: np.ndarray
@@ -58,6 +60,7 @@ class ForceView:
     halves: tuple[np.ndarray, ...] = ()
     shares: tuple[float, ...] = ()
     ties: tuple[tuple[Placed, ...], ...] = ()
+    left_out: tuple[tuple[Placed, np.ndarray], ...] = ()
 
     @property
     def before(self) -> np.ndarray:
@@ -126,6 +129,7 @@ def force_view(
         halves=tuple(halves(setting, parts, seen, regression, chosen, found)),
         shares=_shares(regression, chosen, seen.owner),
         ties=_ties(seen, regression, chosen, bent.rivals),
+        left_out=_left_out(seen, regression, chosen),
     )
 
 
@@ -253,6 +257,23 @@ def _ties(
         rivals = [n for n in others if score(unseen(regression, without | (found.owner == n))) <= most]
         ties.append((*(found.placed[n] for n in (*grouped, *rivals)), *(told[n] for n in {member} & {*told})))
     return tuple(ties)
+
+
+def _left_out(found: Terms, regression: Regression, chosen: np.ndarray) -> tuple[tuple[Placed, np.ndarray], ...]:
+    """The effects that are not chosen, as large as they are beside all others, and how sure that is.
+
+    The displacement of friction that gives is none of the numbers that are fitted, so it has no interval.
+    """
+    every = np.ones_like(chosen)
+    coefficients = fit(regression, every)
+    widths, members = widest(regression, every, coefficients), set(found.owner[chosen].tolist())
+    return tuple(
+        (moved, np.append(widths[own], np.full(len(moved.values) - own.sum(), np.nan)))
+        for n in range(len(found.placed))
+        if n not in members
+        for own in [found.owner == n]
+        for moved in [_moved(found.placed[n], coefficients[own])]
+    )
 
 
 def _rms(values: np.ndarray) -> np.ndarray:
