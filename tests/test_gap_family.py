@@ -121,6 +121,23 @@ def test_the_offsets_of_a_leg_are_found_and_no_delay_is() -> None:
     assert not any(effect == "actuator_delay" for effect, _ in numbers)
 
 
+def test_what_a_family_does_without_is_limited(tmp_path: Path) -> None:
+    """The limits hold the truth: nothing of a rotor where there is none, and what is too little for a name."""
+    gap = found(damping=DAMPING, friction=FRICTION, rotor=(0.02, 2e-5, 0.0), offset=(0.2, -0.3, 2e-4))
+    allowed = {(e.effect, str(e.target).removesuffix("_servo")): e.parameters for e in gap.left_out}
+    assert not {*allowed} & {*told(gap)}
+    for effect, joint, true in (
+        ("armature", "knee", 2e-5), ("armature", "ankle", 0.0), ("actuator_bias", "ankle", 2e-4),
+        ("actuator_delay", "hip", 0.0), ("joint_friction_slope", "knee", 0.0),
+    ):  # fmt: skip
+        (limit,) = allowed[effect, joint].values()
+        assert limit.low - 1e-9 <= true <= limit.high
+        assert limit.high - limit.low < {"armature": 2e-3, "actuator_bias": 0.01, "actuator_delay": 2e-3}.get(
+            effect, 0.1
+        )
+    assert gap.document()["left_out"][0].keys() == {"effect", "target", "parameters"}
+
+
 def test_a_leg_with_its_base_family_predicts_nearly_as_well_as_its_sensors_allow() -> None:
     gap = everything()
     assert gap.after.rollout_rmse < 3 * gap.noise_floor.rollout_rmse < 0.1 * gap.before.rollout_rmse

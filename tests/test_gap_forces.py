@@ -199,6 +199,22 @@ def test_intervals_hold_the_truth(tmp_path: Path) -> None:
     assert np.mean(inside) >= 0.7
 
 
+def test_limits_of_what_is_not_needed_hold_the_truth(tmp_path: Path) -> None:
+    """Offsets, dampings and rotors that are not there, beside friction that is, and centers that only a prior holds."""
+    inside, wide = [], []
+    for seed in range(20, 26):
+        view = view_of(problem_of(tmp_path, seed, friction=(0.5, 0.8, 0.3), ripple=0.05))
+        assert not {p.key for p in view.placed} & {p.key for p, _ in view.left_out}
+        for p, half in view.left_out:
+            if p.effect.name == "center_of_mass":
+                wide += half.tolist()
+            else:
+                inside.append(abs(p.values[0]) <= half[0])
+    assert {len(p.values) == len(h) for p, h in view.left_out} == {True}
+    assert np.mean(inside) >= 0.8
+    assert min(wide) > 1e-4
+
+
 @pytest.mark.parametrize("ripple", [0.0, 0.003, 0.1])
 def test_a_right_model_has_nothing_named(tmp_path: Path, ripple: float) -> None:
     view = view_of(problem_of(tmp_path, 3, ripple=ripple))

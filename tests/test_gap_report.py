@@ -14,7 +14,18 @@ from rich.console import Console
 
 from dropo_torch.commands.gap import _show
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap.result import Course, Gap, NamedEffect, Place, Ranked, Remaining, Residuals, Score, Strength
+from dropo_torch.gap.result import (
+    Course,
+    Gap,
+    LeftOut,
+    NamedEffect,
+    Place,
+    Ranked,
+    Remaining,
+    Residuals,
+    Score,
+    Strength,
+)
 from dropo_torch.report import gap_words, write_gap_picture, write_gap_report
 from dropo_torch.report.figures.drawing import BLUE, ORANGE
 from dropo_torch.report.figures.gap import running_median
@@ -246,6 +257,15 @@ def test_single(tmp_path: Path) -> None:
     assert text.count("<svg") == text.count("</svg>") == 3 + 2
     assert text.count('class="bar wide log cold"') == 1
     assert "attention" not in re.sub(r"<style>.*?</style>", "", text, flags=re.DOTALL)
+
+
+def test_what_was_not_needed_is_limited(tmp_path: Path) -> None:
+    limit = LeftOut("armature", "wrist", {"armature": Strength(0.001, 0.0, 0.0042, "kg·m²")})
+    gap = replace(single(), left_out=(limit,))
+    text = page(tmp_path, gap)
+    assert "Not needed" in text
+    assert re.search(r"0\.0000? to 0\.0042?0?", text)
+    assert "Not needed" not in page(tmp_path, single())
 
 
 def test_double_with_ties(tmp_path: Path) -> None:
