@@ -5,7 +5,8 @@
 Trajectories are dealt out in turn; where there are fewer than four, each is cut into blocks first. So the halves share
 no row, and each has all parts of a motion. A name is the same where one half names what the other one names or has as
 its tie. Where the other half does without an effect, it also says how large that may be all the same: a name is
-contradicted if none of the sizes that it may have are allowed there. With --fit, the config's parameters are fitted to each half, and their intervals are compared.
+contradicted if none of the sizes that it may have are allowed there. With --fit, the config's parameters are fitted to
+each half, and their intervals are compared.
 """
 
 from __future__ import annotations

@@ -126,15 +126,14 @@ def test_what_a_family_does_without_is_limited(tmp_path: Path) -> None:
     gap = found(damping=DAMPING, friction=FRICTION, rotor=(0.02, 2e-5, 0.0), offset=(0.2, -0.3, 2e-4))
     allowed = {(e.effect, str(e.target).removesuffix("_servo")): e.parameters for e in gap.left_out}
     assert not {*allowed} & {*told(gap)}
+    wide = {"armature": 2e-3, "actuator_bias": 0.01, "actuator_delay": 2e-3}
     for effect, joint, true in (
         ("armature", "knee", 2e-5), ("armature", "ankle", 0.0), ("actuator_bias", "ankle", 2e-4),
         ("actuator_delay", "hip", 0.0), ("joint_friction_slope", "knee", 0.0),
     ):  # fmt: skip
         (limit,) = allowed[effect, joint].values()
         assert limit.low - 1e-9 <= true <= limit.high
-        assert limit.high - limit.low < {"armature": 2e-3, "actuator_bias": 0.01, "actuator_delay": 2e-3}.get(
-            effect, 0.1
-        )
+        assert limit.high - limit.low < wide.get(effect, 0.1)
     assert gap.document()["left_out"][0].keys() == {"effect", "target", "parameters"}
 
 
