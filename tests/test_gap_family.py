@@ -121,7 +121,7 @@ def test_the_offsets_of_a_leg_are_found_and_no_delay_is() -> None:
     assert not any(effect == "actuator_delay" for effect, _ in numbers)
 
 
-def test_what_a_family_does_without_is_limited(tmp_path: Path) -> None:
+def test_what_a_family_does_without_is_limited() -> None:
     """The limits hold the truth: nothing of a rotor where there is none, and what is too little for a name."""
     gap = found(damping=DAMPING, friction=FRICTION, rotor=(0.02, 2e-5, 0.0), offset=(0.2, -0.3, 2e-4))
     allowed = {(e.effect, str(e.target).removesuffix("_servo")): e.parameters for e in gap.left_out}
