@@ -33,7 +33,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 
-from benchmarks.init_systems import ARM, CARTPOLE, PUSHER, SERVO
+from benchmarks.init.systems import ROBOTS
 from dropo_torch.baselines import fit_problem
 from dropo_torch.config import Config, make_config
 from dropo_torch.data.trajectory import Trajectories
@@ -48,6 +48,8 @@ from dropo_torch.problem import make_problem
 SINES, COMPARED = 5, 4
 #: Share of a limit that the true model may be beyond it.
 BEYOND = 0.03
+
+ARM, CARTPOLE, PUSHER, SERVO = ((ROBOTS / f"{name}.xml").read_text() for name in ("arm", "cartpole", "pusher", "servo"))
 
 DRIVE = """
 <mujoco model="drive">

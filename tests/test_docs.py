@@ -102,6 +102,27 @@ def load_example(path: Path) -> ModuleType:
     return module
 
 
+@pytest.mark.parametrize("path", sorted((ROOT / "benchmarks").glob("*.py")), ids=lambda path: path.stem)
+def test_every_benchmark_begins(
+    path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With all that it imports; one that is a program says how it is used."""
+    program = load_example(path)
+    if hasattr(program, "main"):
+        monkeypatch.setattr(sys, "argv", [path.name, "--help"])
+        with pytest.raises(SystemExit) as ended:
+            program.main()
+        assert ended.value.code == 0
+        assert "usage:" in capsys.readouterr().out
+
+
+def test_programs_that_pages_name_are_there() -> None:
+    program = re.compile(r"python ((?:benchmarks|examples)/[\w./-]+\.py)")
+    named = {name for page in PAGES for name in program.findall(page.read_text())}
+    assert len(named) > 20
+    assert sorted(name for name in named if not (ROOT / name).is_file()) == []
+
+
 @pytest.fixture(scope="module")
 def robot(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with the model and with its log in every format that the pages name."""
