@@ -2,7 +2,7 @@
 
 from dropo_torch.gap.add import add
 from dropo_torch.gap.refit import Hypothesis
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Score, Strength
+from dropo_torch.gap.result import Gap, LeftOut, NamedEffect, Place, Score, Strength
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.run import find_gap, locate, name, open_loop, verify
 from dropo_torch.gap.scene import Scene, prepare
@@ -11,6 +11,7 @@ from dropo_torch.gap.search import Naming
 __all__ = [
     "Gap",
     "Hypothesis",
+    "LeftOut",
     "NamedEffect",
     "Naming",
     "Place",

@@ -296,7 +296,7 @@ class Cost:
     @property
     def sigma(self) -> float:
         """Standard deviation of χ² where only noise is left."""
-        return float(np.sqrt(2 * self.degrees))
+        return float(np.sqrt(2 * max(self.degrees, 1.0)))
 
 
 def cost_of(
