@@ -1277,6 +1277,22 @@ def test_differences_are_taken_with_a_step_that_costs_less(monkeypatch: pytest.M
     assert not np.array_equal(easy.slope, full.slope)
 
 
+@pytest.mark.parametrize("finer", [4, 8])
+def test_so_are_those_of_a_log_that_is_compared_with_a_finer_step(finer: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, hypothesis = scene_of("joint_friction"), true(hidden("joint_friction"))
+    step = scene.setting.model.opt.timestep
+    evidence = dataclasses.replace(scene.evidence, twin=scene.twin.finer(step / finer))
+    assert evidence.twin.eased is scene.twin.finer(step / 2)
+    assert scene.twin.finer(step / 2).eased is scene.twin.finer(step / 2)
+    assert scene.twin.eased is scene.twin
+    easy = refit(evidence, hypothesis, iterations=0)
+    monkeypatch.setattr(type(evidence.twin), "eased", property(lambda self: self))
+    full = refit(evidence, hypothesis, iterations=0)
+    assert np.linalg.norm(easy.slope - full.slope) < 0.05 * np.linalg.norm(full.slope)
+    assert np.linalg.norm(easy.residual - full.residual) < 0.05 * np.linalg.norm(full.residual)
+    assert not np.array_equal(easy.slope, full.slope)
+
+
 # --- outliers -------------------------------------------------------------------------------------------------
 
 

@@ -148,7 +148,8 @@ class Evidence:
     ) -> np.ndarray:  # fmt: skip
         """Return by how much residuals of hypotheses differ from those of one that is near, ``(K, W, N)``.
 
-        They are taken where simulations cost less, if there is such a place: see :meth:`Effect.eased`.
+        They are taken where simulations cost less, if there is such a place: see :meth:`Effect.eased` and
+        :attr:`Twin.eased`.
 
         Args:
             own: the one that is near.
@@ -156,11 +157,11 @@ class Evidence:
             others: the hypotheses, K of them, with
             moved, pushes: see :meth:`residuals`.
         """
-        setting = self.twin.setting
+        setting, near = self.twin.setting, replace(self, twin=self.twin.eased)
         easy = own.eased(setting)
-        if easy != own:
-            at = self.residuals([easy])[0][0]
-        found, _ = self.residuals([v.eased(setting) for v in others], moved, pushes)
+        if easy != own or near.twin is not self.twin:
+            at = near.residuals([easy])[0][0]
+        found, _ = near.residuals([v.eased(setting) for v in others], moved, pushes)
         return found - at
 
     def linearise(self, variant: Variant) -> Linearisation:

@@ -104,6 +104,18 @@ class Twin:
             )  # fmt: skip
         return self._finer[step]
 
+    @property
+    def eased(self) -> Twin:
+        """The same with a step under which differences cost less, where this one has a finer one than they need.
+
+        What changes with initial states and other numbers changes alike: see :meth:`Effect.eased`.
+        """
+        if self._coarser is None:
+            return self
+        setting, effect = self._coarser.setting, find_effect("integration")
+        (step,) = effect.eased(setting, (effect.quantities(setting, None)[0].low,))
+        return self if step <= self.setting.model.opt.timestep else self._coarser.finer(step)
+
     def effects(self, variant: Variant) -> tuple[Placed, ...]:
         """Return all effects of a variant, those that every variant has among them."""
         standing = () if self._standing is None else self._standing(np.asarray(variant.declared))
