@@ -16,7 +16,7 @@ from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import accounts, allowance, beyond_free, may_leave, most_left, remains, significant, simplest
-from dropo_torch.gap.screen import promising_families, promising_pairs, screen
+from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
 #: Places from which on an effect is a family, whose members stand together.
@@ -176,14 +176,10 @@ def add(ground: Ground, state: State) -> State:
         return replace(state, done=True)
     best = simplest(singles, rules)
     if best.cost.left_of(current.cost) > 1 - rules.most and not accounts(current, state.base, rules):
-        focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
-        pairs = promising_pairs(
-            focus, screen(focus, [c.placed for c in alive[: rules.tried.paired]], rules.tried), rules.tried
-        )
+        pairs, state = paired(ground, state, alive)
         families = promising_families(ground.focus(current), alive, rules.tried)
-        for words, groups in (("pairs", pairs), ("families", families)):
-            tried, state = ground.refits(state, current, groups, f"refitting {words}")
-            tried = sound(ground, tried)
+        several, state = ground.refits(state, current, families, "refitting families")
+        for tried in (pairs, sound(ground, several)):
             if tried and tried[0].cost.left_of(best.cost) < rules.tried.clearer:
                 best = tried[0]
     hopeless = best.cost.left_of(current.cost) > most_left(current, rules) or not matters(
@@ -192,6 +188,31 @@ def add(ground: Ground, state: State) -> State:
     if hopeless or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best)
+
+
+def paired(ground: Ground, state: State, alive: Sequence[Candidate]) -> tuple[list[Refit], State]:
+    """Return the best pairs of candidates beside what was accepted, and the state with these attempts.
+
+    A candidate that makes the best pair nonsense stands for another one, such as an inertia that vanishes for a motor
+    that is stronger: pairs are tried again without it.
+
+    Args:
+        ground: what the search stands on.
+        state: where it stands.
+        alive: candidates, the best first.
+    """
+    tried, current = ground.rules.tried, state.current
+    focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
+    known, excluded = {p.key for p in current.hypothesis.placed}, set[tuple[str, str | None]]()
+    for _ in range(tried.anew):
+        rest = [c.placed for c in alive if c.key not in excluded][: tried.paired]
+        pairs = promising_pairs(focus, screen(focus, rest, tried), tried)
+        found, state = ground.refits(state, current, pairs, "refitting pairs")
+        bad = {p.key for r in found[:1] for p, _ in absurd(ground.part, r, ground.rules.sound)} - known
+        excluded |= bad
+        if not bad:
+            break
+    return sound(ground, found), state
 
 
 def swap(ground: Ground, state: State) -> State:
