@@ -20,7 +20,8 @@ from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
 from dropo_torch.proposal.clock import find_clock
 from dropo_torch.proposal.columns import read_columns
-from dropo_torch.proposal.matching import motion
+from dropo_torch.proposal.matching import match_columns, motion
+from dropo_torch.proposal.places import places_of
 from dropo_torch.proposal.words import read_name
 
 DEG = 180 / math.pi
@@ -98,6 +99,11 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("run", "episode", None, (), ()),
         ("motor_temp_2", "other", None, (), (2,)),
         ("elbow_acceleration", "acceleration", None, ("elbow",), ()),
+        ("J2_spd(rpm)", "velocity", math.pi / 30, ("j",), (2,)),
+        ("current_position_3", "position", None, (), (3,)),
+        ("present_velocity", "velocity", None, (), ()),
+        ("motor_current_1", "effort", None, (), (1,)),
+        ("target_current", "command", None, (), ()),
     ],
 )
 def test_names_say_what_people_mean(
@@ -134,6 +140,84 @@ def test_the_words_of_a_joints_name_say_nothing_else(name: str, role: str, objec
 def test_names_of_poses(name: str, axis: str, quaternion: bool, angular: bool) -> None:
     words = read_name(name)
     assert (words.axis, words.quaternion, words.angular) == (axis, quaternion, angular)
+
+
+# --- columns of an arm ---
+
+ARM = """<mujoco><worldbody><body name="turntable"><joint name="base_yaw" axis="0 0 1"/><geom size=".1"/>
+  <body name="upper_arm"><joint name="shoulder" axis="0 1 0"/><geom size=".1"/>
+    <body name="forearm"><joint name="elbow" axis="0 1 0"/><geom size=".1"/></body></body></body></worldbody>
+  <actuator><position name="servo_1" joint="base_yaw" kp="9"/><position name="servo_2" joint="shoulder" kp="9"/>
+    <position name="servo_3" joint="elbow" kp="9"/></actuator></mujoco>"""
+
+
+def matched(folder: Path, frame: dict[str, np.ndarray], xml: str = ARM) -> dict[str, str]:
+    """The column of each number of a model, by its label."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    pd.DataFrame(frame).to_csv(folder / "log.csv", index=False)
+    columns = read_columns(folder / "log.csv", [model.joint(j).name for j in range(model.njnt)])
+    clock = find_clock(columns, model.opt.timestep)
+    starts = clock.starts(len(columns), columns.parts)
+    taken = [c for c in (clock.column, clock.episode) if c is not None]
+    return {m.place.label: m.column.entry for m in match_columns(columns, places_of(model), starts, taken).matches}
+
+
+def swung(names: Sequence[str], *, of: str = "{}", rates: bool = False) -> dict[str, np.ndarray]:
+    """Motions of joints, each at a frequency of its own, or their rates."""
+    t = 0.02 * np.arange(200)
+    waves = {name: 1.0 + 0.7 * i for i, name in enumerate(names)}
+    return {of.format(name): w * np.cos(w * t) if rates else np.sin(w * t) for name, w in waves.items()}
+
+
+LABELS = ("base_yaw", "shoulder", "elbow")
+
+
+@pytest.mark.parametrize(
+    ("position", "velocity", "command"),
+    [("J{}_pos(rad)", "J{}_spd(rad/s)", "J{}_goal(rad)"), ("dxl{}_present_position", "dxl{}_present_velocity",
+      "dxl{}_goal_position"), ("m{}.current_angle", "m{}.current_speed", "m{}.target_angle")],
+)  # fmt: skip
+def test_three_numbered_joints_are_no_axes(position: str, velocity: str, command: str, tmp_path: Path) -> None:
+    frame = {"time": 0.02 * np.arange(200)} | swung("123", of=position)
+    frame |= swung("123", of=velocity, rates=True) | swung("123", of=command)
+    found = matched(tmp_path, frame)
+    for i, joint in enumerate(LABELS, 1):
+        assert found[f"{joint}.position"] == position.format(i)
+        assert found[f"{joint}.velocity"] == velocity.format(i)
+        assert found[f"servo_{i}"] == command.format(i)
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (("pan", "lift", "flex"), ("pan", "lift", "flex")),  # no name is the model's: in order
+        (("pan", "shoulder_lift", "elbow_flex"), ("pan", "shoulder_lift", "elbow_flex")),
+        (("elbow", "pan", "shoulder"), ("pan", "shoulder", "elbow")),  # a single one is left
+        (("elbow", "pan", "tilt"), None),  # names say that the order is not the model's
+    ],
+)
+def test_names_that_nobody_knows_follow_the_order(
+    names: tuple[str, ...], expected: tuple[str, ...] | None, tmp_path: Path
+) -> None:
+    frame = {"time": 0.02 * np.arange(200)} | swung(names, of="{}.pos") | swung(names, of="{}.cmd")
+    frame["row_number"] = np.arange(200.0)
+    found = matched(tmp_path, frame)
+    if expected is None:
+        assert found.keys().isdisjoint({"servo_1", "servo_2"})
+        assert found["servo_3"] == "elbow.cmd"
+        return
+    assert [found[f"{joint}.position"] for joint in LABELS] == [f"{name}.pos" for name in expected]
+    assert [found[f"servo_{i}"] for i in (1, 2, 3)] == [f"{name}.cmd" for name in expected]
+
+
+def test_a_joints_number_is_not_its_fingers(tmp_path: Path) -> None:
+    xml = ARM
+    for i, joint in enumerate(LABELS, 1):
+        xml = xml.replace(f'"{joint}"', f'"joint{i}"')
+    frame = {"time": 0.02 * np.arange(200), "position[panda_finger_joint1]": np.full(200, 0.04)}
+    frame |= swung("123", of="position[panda_joint{}]")
+    found = matched(tmp_path, frame, xml)
+    assert [found[f"joint{i}.position"] for i in (1, 2, 3)] == [f"position[panda_joint{i}]" for i in (1, 2, 3)]
 
 
 # --- rates and episodes ---
@@ -421,6 +505,39 @@ def test_a_bag_tells_joints_by_name_and_commands_by_receipt(tmp_path: Path, log:
     assert data["stamps"] == {"/push_controller/commands": "received"}
     assert data["preprocess"]["dt"] == pytest.approx(0.02)
     assert len(dropo.make_problem(found.config).trajectories) > 300
+
+
+def test_a_bag_with_a_clock_follows_simulated_time(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """Stamps of a simulator begin at zero, and wall time runs faster; commands come more often than states."""
+    pytest.importorskip("rosbags")
+    import bags
+
+    t, q, v, u = log
+    made = bags.Messages()
+    every = np.arange(0.0, t[-1], 0.005)
+    rows = {float(time): row for row, time in enumerate(t)}
+
+    def wall(simulated: float) -> float:
+        return bags.START + 1.2 * simulated
+
+    sent = [
+        ("/joint_states", "sensor_msgs/msg/JointState", wall(time),
+         made.joint_state(3.0 + time, ["slider", "hinge"], q[row], v[row])) for time, row in rows.items()
+    ]  # fmt: skip
+    sent += [
+        ("/push_controller/commands", "std_msgs/msg/Float64MultiArray", wall(time), made.numbers(u[int(time / 0.02)]))
+        for time in every
+    ]
+    sent += [
+        ("/clock", "rosgraph_msgs/msg/Clock", wall(time), made.new("rosgraph_msgs/msg/Clock", made.time(3.0 + time)))
+        for time in every
+    ]
+    (tmp_path / "robot.xml").write_text(CARTPOLE)
+    columns = read_columns(bags.write(tmp_path / "log", sent))
+    assert columns.apart == pytest.approx(0.02)
+    assert columns.stamps == {"/push_controller/commands": "/clock"}
+    (command,) = (c for c in columns.columns if c.words.role == "command")
+    assert float(np.abs(command.values[5:-5] - u[5 : len(columns) - 5, 0]).max()) < 0.2
 
 
 def test_columns_of_a_dataset_have_names(tmp_path: Path) -> None:

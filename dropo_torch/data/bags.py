@@ -108,11 +108,18 @@ def open_bag(path: Path, stamps: Any) -> list[Table]:
 
 
 def unstamped(path: Path) -> dict[str, str]:
-    """Return the topics of a bag whose messages have no header, as ``stamps`` takes them: by their receipt."""
+    """Return the topics of a bag whose messages have no header, as ``stamps`` takes them.
+
+    They have the time of their receipt, or where the bag has a clock, the simulated time that it showed then, which
+    headers follow.
+    """
     with _opened(path) as reader:
         types = reader.typestore.fielddefs
         fields = {name: types.get(str(info.msgtype), ((), ()))[1] for name, info in reader.topics.items()}
-    return {name: RECEIVED for name, of in fields.items() if of and all(label != "header" for label, _ in of)}
+        clocks = [name for name, info in reader.topics.items() if info.msgtype == _CLOCK and info.msgcount > 1]
+    whence = clocks[0] if clocks else RECEIVED
+    bare = [name for name, of in fields.items() if of and all(label != "header" for label, _ in of)]
+    return {name: whence for name in bare if name not in clocks}
 
 
 def choose(bag: Bag, choice: Choice) -> Table:

@@ -75,8 +75,8 @@ class Columns:
         group: pattern of these, as a config has it.
         separator: of a text file, where it is no comma.
         stamps: of a bag, as a config has them.
-        apart: seconds between samples of the fastest signal, where each has time stamps of its own: columns are then
-            interpolated at that one's.
+        apart: seconds between samples, where each signal has time stamps of its own: those of the fastest that is no
+            command, at whose stamps columns are then interpolated.
     """
 
     path: Path
@@ -104,10 +104,15 @@ class Columns:
     def matrix(self, names: tuple[str, ...]) -> tuple[Column, ...]:
         """Return the columns of the first array of one of these names, by the last part of its path."""
         for name in names:
-            found = tuple(c for c in self.columns if re.split(r"[./]", c.array.lower())[-1] == name)
+            found = tuple(c for c in self.columns if last_part(c.array) == name)
             if (len(found) > 1 or (found and found[0].index is not None)) and not any(c.label for c in found):
                 return found
         return ()
+
+
+def last_part(array: str) -> str:
+    """Return the last part of the path of an array, in small letters."""
+    return re.split(r"[./]", array.lower())[-1]
 
 
 def read_columns(path: str | Path, joints: Sequence[str] = ()) -> Columns:
@@ -121,21 +126,20 @@ def read_columns(path: str | Path, joints: Sequence[str] = ()) -> Columns:
         InputError: a file that cannot be read, or in which nothing has a row a sample.
     """
     path = Path(path)
-    found = _read(path)
-    told = [replace(c, words=read_name(_spoken(c), joints)) for c in found.columns]
-    return replace(found, columns=tuple(told))
-
-
-def _spoken(column: Column) -> str:
-    """What a column is called, in words."""
-    return f"{column.array} {column.label}" if column.label else column.entry
-
-
-def _read(path: Path) -> Columns:
     separator = _separator(path)
     tables = open_tables(path, separator=separator)
     if tables[0].choose is not None:
-        return _of_streams(path)
+        return _of_streams(path, joints)
+    found = _read(path, tables, separator)
+    return replace(found, columns=tuple(_understood(found.columns, joints)))
+
+
+def _understood(columns: Sequence[Column], joints: Sequence[str]) -> list[Column]:
+    """The columns with what their names say."""
+    return [replace(c, words=read_name(f"{c.array} {c.label}" if c.label else c.entry, joints)) for c in columns]
+
+
+def _read(path: Path, tables: list[Table], separator: str | None) -> Columns:
     group = _group(tables[0].names)
     if group is not None:
         tables = open_tables(path, group=group)
@@ -148,8 +152,8 @@ def _read(path: Path) -> Columns:
     return Columns(path, str(path), tuple(joined), tuple(int(s) for s in starts), group, separator)
 
 
-def _of_streams(path: Path) -> Columns:
-    """The columns of a bag, interpolated at the stamps of the fastest signal."""
+def _of_streams(path: Path, joints: Sequence[str]) -> Columns:
+    """The columns of a bag, interpolated at the stamps of the fastest signal that is measured."""
     stamps = unstamped(path)
     (table,) = open_tables(path, stamps=stamps or None)
     assert table.choose is not None
@@ -164,8 +168,9 @@ def _of_streams(path: Path) -> Columns:
     columns = [
         c for name in usable for c in _of_array(name, np.asarray(found.read(name)), len(found.read(TIME)), found)
     ]
-    time = np.asarray(found.read(TIME))
-    fastest = max(columns, key=lambda c: int(np.isfinite(c.values).sum()))
+    columns, time = _understood(columns, joints), np.asarray(found.read(TIME))
+    measured = [c for c in columns if c.words.role in ("position", "velocity", "effort", "")] or columns
+    fastest = max(measured, key=lambda c: int(np.isfinite(c.values).sum()))
     rows = np.isfinite(fastest.values)
     kept = [_interpolated(c, time, time[rows]) for c in columns if np.isfinite(c.values).sum() > 1]
     used = {name: whence for name, whence in stamps.items() if any(c.array.startswith(f"{name}.") for c in kept)}

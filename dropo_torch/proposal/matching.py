@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns
+from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns, last_part
 from dropo_torch.proposal.places import Place
 from dropo_torch.proposal.words import Words
 
@@ -19,6 +19,9 @@ Sureness = Literal["sure", "likely", "guess"]
 
 #: Score below which a column is not taken for a place, and above which its name leaves no doubt.
 LEAST, SURE = 0.3, 0.75
+#: What a name loses by each word that is none of the place's, and a column by never moving: of two with the joint's
+#: number, the arm's is the joint's, and not its finger's.
+FOREIGN, STILL = 0.02, 0.02
 #: Shares of motion that a velocity must explain to be its position's, and to be so whatever it is called.
 LIKE, SAME = 0.5, 0.9
 #: Factors between a sensor's unit and the model's; the second kind are those of lengths.
@@ -28,6 +31,7 @@ LENGTHS = {1.0: "m", 1e-3: "mm", 1e-2: "cm"}
 SPANS = (1, 4, 16)
 #: Relative distance from a factor within which a unit is named.
 UNIT = 0.3
+_AXES = ("x", "y", "z")
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,7 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
     """
     whole = _whole_state(columns, places, starts)
     free = [c for c in columns.numeric if c not in taken and not any(m.column is c for m in whole)]
+    free = [c for c in free if not _counts(c, starts)]
     found = {m.place.label: m for m in whole}
     for kind in ("position", "velocity", "command"):
         wanted = [p for p in places if p.kind == kind and p.label not in found]
@@ -101,11 +106,17 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
             wanted = [p for p in wanted if p.label not in found]
         fits = _assigned(wanted, [c for c in free if not _is_taken(c, found)], found, starts)
         found |= {m.place.label: m for m in fits}
+        found |= {m.place.label: m for m in _by_family(places, kind, free, found)}
     found |= {m.place.label: m for m in _in_order(places, free, found)}
     matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
     used = [m.column for m in matches] + list(taken)
-    unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used))
+    unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used) and not _counts(c, starts))
     return Matching(matches, tuple(p for p in places if p.label not in found), unused)
+
+
+def _counts(column: Column, starts: np.ndarray) -> bool:
+    """Whether a column numbers the rows, of the log or of each episode."""
+    return len(starts) > 1 and bool((np.diff(column.values)[~starts[1:]] == 1).all())
 
 
 def _is_taken(column: Column, found: dict[str, Match]) -> bool:
@@ -159,7 +170,7 @@ def _assigned(
     free = [c for c in free if _may_be(c, wanted)] if wanted else []
     if not free:
         return []
-    words = {c.entry: w for c, w in zip(free, _with_axes(free), strict=True)}
+    words = {c.entry: w for c, w in zip(free, _with_axes(free, wanted), strict=True)}
     ranks = _ranks(free, words, wanted)
     scalar = {p.label: i for i, p in enumerate(p for p in wanted if not p.axis)}
     names = np.array(
@@ -174,6 +185,7 @@ def _assigned(
                 shares[i, j] = motion(partner.values, c.values, starts)[0]
                 scores[i, j] += 0.8 * shares[i, j]
             scores[i, j] += _role_bonus(words[c.entry], p) - 1e-6 * j - 1e-7 * abs(i - j)  # else in order
+            scores[i, j] -= FOREIGN * len(set(words[c.entry].objects) - {*p.words, *p.aliases}) + STILL * (not c.moves)
     rows, columns = linear_sum_assignment(np.where(scores < -1, -10.0, scores), maximize=True)
     matches = []
     for i, j in zip(rows, columns, strict=True):
@@ -231,7 +243,7 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
         return 0.9 if said & others else 0.6 if not said else 0.2
     if words.quaternion or (words.angular and words.axis):
         return -2.0
-    axes = known & set("xyz")
+    axes = known & set(_AXES)
     if axes and words.axis:
         if words.axis not in axes:
             return -2.0
@@ -280,12 +292,13 @@ def _commands(words: Words, place: Place) -> bool:
     return words.commanded in ("", place.takes)
 
 
-def _with_axes(columns: Sequence[Column]) -> list[Words]:
-    """The words of columns, with the axes that numbers stand for in groups of three and four."""
+def _with_axes(columns: Sequence[Column], wanted: Sequence[Place]) -> list[Words]:
+    """The words of columns, with the axes that numbers stand for in groups of three and four of what has axes."""
     groups: dict[tuple, list[int]] = {}
+    known = {word for p in wanted if p.axis or set(p.words) & set(_AXES) for word in (*p.words, *p.aliases)}
     for i, c in enumerate(columns):
         w = c.words
-        if w.numbers and not w.axis and (w.objects or w.quaternion or w.angular):
+        if w.numbers and not w.axis and (set(w.objects) & known or w.quaternion or w.angular):
             groups.setdefault((w.role, w.objects, w.quaternion, w.angular, w.scale, w.numbers[:-1]), []).append(i)
     found = [c.words for c in columns]
     for (_, _, quaternion, *_), members in groups.items():
@@ -318,6 +331,44 @@ def _ranks(columns: Sequence[Column], words: dict[str, Words], wanted: Sequence[
         order = [numbers.index(n) if same else i for i, n in enumerate(sorted(own))]
         found |= {own[n]: place for n, place in zip(sorted(own), order, strict=True)}
     return found
+
+
+def _by_family(places: Sequence[Place], kind: str, free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
+    """Places whose names nobody used, by the order of columns that belong together, one for each place of a kind.
+
+    Such columns are those of one array, or of one kind and unit, in the log's order; where names have told some of
+    them, these must stand in the model's order, too, unless a single one is left.
+    """
+    scalar = [p for p in places if p.kind == kind and not p.axis]
+    matches: list[Match] = []
+    for of in (scalar, [p for p in scalar if not p.optional]):
+        for family in _families(free, of):
+            known = [found.get(p.label) for p in of]
+            lacking = [i for i, match in enumerate(known) if match is None]
+            left = [c for c in family if not _is_taken(c, found)]
+            if len(family) != len(of) or len(left) != len(lacking) or matches or not lacking:
+                continue
+            told = len(lacking) < len(of)
+            if all(match is None or match.column is c for match, c in zip(known, family, strict=True)):
+                sureness: Sureness = "likely" if told else "guess"
+                matches = [Match(of[i], family[i], 1.0, sureness, "the order of columns") for i in lacking]
+            elif len(left) == 1:
+                matches = [Match(of[lacking[0]], left[0], 1.0, "likely", "the only one left")]
+    return matches
+
+
+def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Column]]:
+    """Columns that may be of a kind of places and belong together: by array, kind, unit and what is commanded."""
+    groups: dict[tuple, list[Column]] = {}
+    for c in free:
+        w = c.words
+        bare = not w.role and not (c.label and last_part(c.array) in STATES)
+        if not wanted or not _may_be(c, wanted) or bare or w.axis or w.quaternion:
+            continue
+        if wanted[0].kind == "command" and not _commands(w, wanted[0]):
+            continue
+        groups.setdefault((c.array if c.index is not None else "", w.role, w.commanded, w.scale), []).append(c)
+    return list(groups.values())
 
 
 def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:

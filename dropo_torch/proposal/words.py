@@ -21,10 +21,10 @@ _ROLES: dict[Role, frozenset[str]] = {
         "q qpos pos position positions angle angles theta th phi psi alpha beta enc encoder pose p"
     ),
     "velocity": _set(
-        "dq qd qdot qvel vel velocity velocities speed speeds omega dot rate v twist gyro angvel linvel"
+        "dq qd qdot qvel vel velo velocity velocities spd speed speeds omega dot rate v twist gyro angvel linvel"
     ),
     "acceleration": _set("ddq qdd qddot acc accel acceleration qacc"),
-    "effort": _set("tau torque torques effort efforts force forces moment current load frc"),
+    "effort": _set("tau torque torques effort efforts force forces moment current curr load frc"),
     "command": _set(
         "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
         "target targets des desired ref reference setpoint setp goal sp pwm"
@@ -38,6 +38,8 @@ _ROLES: dict[Role, frozenset[str]] = {
         "temp temperature voltage volt volts error err status mode battery seq frame id std var cov reward rewards next"
     ),
 }  # fmt: skip
+#: A current, unless it stands beside a kind of motion: the one at present.
+_CURRENT = _set("current curr")
 #: Words of commands that are positions to be reached.
 _TARGETS = _set("target targets des desired ref reference setpoint setp goal sp")
 #: Words of units → what the value is multiplied by to be SI.
@@ -58,7 +60,7 @@ TIME_UNITS = {
 _TURNS = _set("angle angles theta th phi psi alpha beta thetadot phidot dtheta dphi")
 #: Words that tell nothing.
 _EMPTY = _set(
-    "joint joints jnt state states data sensor sensors robot measured meas actual value values body link obs "
+    "joint joints jnt state states data sensor sensors robot measured meas actual present value values body link obs "
     "observation observations header log signal motor servo of the"
 )
 #: Words of quaternions, and of linear and angular velocities.
@@ -128,6 +130,8 @@ def read_name(name: str, joints: Sequence[str] = ()) -> Words:
     roles: list[Role] = []
     objects: list[str] = []
     commanded: Role = ""
+    if any(_role(word) in ("position", "velocity", "acceleration") for word in words):
+        words = [word for word in words if word not in _CURRENT]
     for word in words:
         short = _short(word)
         if short is not None:
