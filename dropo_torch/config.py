@@ -56,6 +56,9 @@ class Config(pydantic.BaseModel):
     parameters: dict[str, Entries] | None = _key(
         None, "name: field, name, index, bounds, unit, limits, scale, relative, scale_inertia", "model and log"
     )
+    as_given: bool = _key(
+        False, "gap first takes the model as given, and fits its parameters only if that has no answer", "model and log"
+    )
     effects: list[Entries] = _key(
         [], "physical effects that the model lacks: effect, target and its numbers", "model and log"
     )

@@ -32,7 +32,7 @@ from dropo_torch.effects import VOCABULARY, Placed, Quantity, Setting, find_effe
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, Scene, accept, add, find_gap, outcome, prepare
+from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, outcome, prepare
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
@@ -113,6 +113,42 @@ def true(case: Case) -> Hypothesis:
     """What is hidden, as a hypothesis."""
     placed = [Placed(find_effect(e.name), e.target, tuple(e.parameters.values())) for e in case.effects]
     return Hypothesis(tuple(case.declared.values()), tuple(placed))
+
+
+# --- the model as given ---------------------------------------------------------------------------------------
+
+
+def as_given(case: Case, folder: Path, **changes: Any) -> Problem:
+    config = {**case.config, "threads": 1, "as_given": True, **changes}
+    return make_problem(load_config(dataclasses.replace(case, config=config).write(folder)), general=True)
+
+
+def test_what_a_parameter_would_make_up_for_has_a_name_in_the_model_as_given(tmp_path: Path) -> None:
+    """A log tells the hinge's damping, so that a config lists it; but that the model lacks it is the answer."""
+    case, free = hidden("joint_damping"), {"field": "dof_damping", "name": "hinge", "bounds": [0.0, 0.1]}
+    heavier, model = case.declared["pole_mass"] / 0.5, case.model
+    for kilograms in (0.4, 0.1):  # what the pole weighs is known
+        model = model.replace(f'mass="{kilograms:g}"'.replace("0.", "."), f'mass="{kilograms * heavier}"')
+    parameters = {**case.config["parameters"], "damping": free}
+    problem = as_given(dataclasses.replace(case, model=model), tmp_path, parameters=parameters)
+    few = [VOCABULARY[e] for e in FEW]
+    assert find_gap(problem, effects=few).verdict == "no gap"
+    held, gap = find_gap_as_given(problem, effects=few)
+    (named,) = gap.effects
+    assert (named.effect, named.target) == ("joint_damping", "hinge")
+    assert named.parameters["damping"].low < 0.02 < named.parameters["damping"].high
+    assert (gap.declared, held.config.parameters, held.config.as_given) == ({}, None, False)
+
+
+def test_parameters_are_fitted_where_the_model_as_given_has_no_answer(tmp_path: Path) -> None:
+    """A pole of another mass is none of these effects: without it, nothing explains the log."""
+    problem, store = as_given(hidden(), tmp_path), tmp_path / "gap-progress.bin"
+    few = [VOCABULARY[e] for e in FEW]
+    found, gap = find_gap_as_given(problem, effects=few, checkpoint=store)
+    assert found is problem
+    assert gap.verdict == "no gap"
+    assert gap.declared["pole_mass"][2] == pytest.approx(hidden().declared["pole_mass"], rel=1e-3)
+    assert {"gap-progress.bin", "gap-progress-given.bin"} <= {path.name for path in tmp_path.iterdir()}
 
 
 # --- the whole ------------------------------------------------------------------------------------------------

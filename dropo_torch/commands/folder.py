@@ -19,11 +19,12 @@ from dropo_torch.errors import InputError
 _MARKS = (
     "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.bin",
     "check.json", "gap-progress.bin", "sweep-progress.json", "compare-progress.json", "train-progress.bin",
-    "plan.json", "plan-progress.bin",
+    "plan.json", "plan-progress.bin", "gap-progress-given.bin",
 )  # fmt: skip
 #: What runs write; an earlier run's are moved aside together.
 _RESULTS = (
     *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "gap-progress-rare.bin",
+    "gap-progress-given-shorter.bin", "gap-progress-given-contact.bin", "gap-progress-given-rare.bin",
     "distribution.yaml", "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "picture.png", "tensorboard",
     "commands.csv", "expected.csv", "motion.mp4",
 )  # fmt: skip

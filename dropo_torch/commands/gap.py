@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:
     """Run ``dropo gap``, which writes ``gap.json``, report, picture, and the model and config with what it found."""
-    from dropo_torch.gap import add, find_gap, prepare
+    from dropo_torch.gap import add, as_given, find_gap, find_gap_as_given, prepare
     from dropo_torch.gap.remaining import Remaining
     from dropo_torch.problem import logged_data, make_problem, refuse_sensed
     from dropo_torch.report import write_gap_picture, write_gap_report
@@ -58,10 +58,15 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     store = out / "gap-progress.bin"
     with StageProgress(console, "gap", Remaining(given.time_limit)) as progress:
         progress.show("preparing", 0.0)
-        scene = prepare(problem)  # before an earlier run is moved aside
-        prepare_folder(out, problem.model_path, resume=given.resume and store.exists())
-        options = {"checkpoint": store, "resume": given.resume, "time_limit": given.time_limit}
-        gap = find_gap(problem, report=progress.show, scene=scene, **options)
+        first = config.as_given and bool(problem.space.names)
+        scene = prepare(as_given(problem) if first else problem)  # before an earlier run is moved aside
+        stores = (store, store.with_stem(f"{store.stem}-given"))
+        prepare_folder(out, problem.model_path, resume=given.resume and any(path.exists() for path in stores))
+        options = {"checkpoint": store, "resume": given.resume, "time_limit": given.time_limit, "scene": scene}
+        if first:
+            problem, gap = find_gap_as_given(problem, report=progress.show, **options)
+        else:
+            gap = find_gap(problem, report=progress.show, **options)
     notes = add(problem, gap, out)
     gap = replace(gap, notes=(*gap.notes, *notes))
     write_json(out / "gap.json", gap.document() | {"config": config.portable()})

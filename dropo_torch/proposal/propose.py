@@ -168,7 +168,8 @@ def propose_config(
         raise InputError(
             f"{log}: the log tells none of the model's {len(candidates)} physical parameters; log a motion"
         )
-    document |= {"lag": found.lag, "parameters": {t.candidate.name: t.candidate.spec for t in choice.chosen}}
+    document |= {"lag": found.lag, "as_given": True}
+    document |= {"parameters": {t.candidate.name: t.candidate.spec for t in choice.chosen}}
     return Proposal(
         document, base, matching, clock, draft, noise.columns, choice, found.windows, _rate(clock, document, step),
         _window(found, document["frame_skip"] * step),

@@ -42,6 +42,8 @@ def config_text(proposal: Proposal) -> str:
         _key("lag", document["lag"]),
         *(_key(name, document[name]) for name in ("seed", "threads") if document.get(name)),
         "",
+        "# `dropo gap` first looks for what the model lacks with these parameters as the model has them.",
+        _key("as_given", document["as_given"]),
         *_comment(f"Of {len(choice.told)} physical candidates, {choice.summary}."),
         "# Errors are those to expect of a fit to this log, relative to the model's value.",
         "parameters:" if choice.chosen else "parameters: {}",
