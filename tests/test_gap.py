@@ -33,7 +33,7 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, outcome, prepare
-from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed
+from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
@@ -45,7 +45,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, ref
 from dropo_torch.gap.remaining import Remaining
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
-from dropo_torch.gap.rules import Rules, Sound, accounts, allowance, clears, most_left, significant
+from dropo_torch.gap.rules import Rules, Sound, Tried, accounts, allowance, clears, most_left, significant
 from dropo_torch.gap.scene import outstanding, searched, short_windows
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Ended, Naming, believed, start
@@ -1327,6 +1327,29 @@ def test_so_are_those_of_a_log_that_is_compared_with_a_finer_step(finer: int, mo
     assert np.linalg.norm(easy.slope - full.slope) < 0.05 * np.linalg.norm(full.slope)
     assert np.linalg.norm(easy.residual - full.residual) < 0.05 * np.linalg.norm(full.residual)
     assert not np.array_equal(easy.slope, full.slope)
+
+
+@pytest.mark.parametrize("anew", [1, 3])
+def test_pairs_are_tried_again_without_what_makes_the_best_one_nonsense(
+    anew: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An arm without inertia stands for a motor that is half as strong again: where it promises most, it must go."""
+    gain, damping = Effect("actuator_gain", "drive", {"gain": 1.5}), Effect("joint_damping", "turn", {"damping": 0.009})
+    scene = prepare(load(simulate_truth(FURUTA, [damping, gain], 3, **SIZE)))
+    rules = dataclasses.replace(Rules(), tried=dataclasses.replace(Rules().tried, anew=anew))
+    known = tuple(map(find_effect, ("inertia", "joint_damping", "actuator_gain")))
+    ground = Ground(dataclasses.replace(scene.evidence, rules=rules), known, short=scene.noisy)
+    state = start(ground, scene.begin)
+
+    def misled(focus: Focus, candidates: list[Candidate], tried: Tried) -> list[list[Placed]]:
+        keys = ("inertia", "arm"), ("joint_damping", "turn"), ("actuator_gain", "drive")
+        own = {c.key: c.placed for c in candidates if c.key in keys}
+        return [[own[key] for key in keys if key in own][:2]]
+
+    monkeypatch.setattr(accept, "promising_pairs", misled)
+    found, _ = paired(ground.at(state), state, [c for c in state.first.ranked if not c.dead])
+    keys = [{p.key for p in r.hypothesis.placed} for r in found]
+    assert keys == ([{(e.name, e.target) for e in (gain, damping)}] if anew > 1 else [])
 
 
 # --- outliers -------------------------------------------------------------------------------------------------
