@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import mujoco
@@ -29,6 +30,8 @@ from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_d
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
 from dropo_torch.simulators.warp.varied import varied
 
+#: Arrays that are kept for other models with the same content, and bytes above which none is.
+KEPT, LARGE = 4096, 1 << 16
 _JNT, _GEOM, _DISABLE, _EQ = mujoco.mjtJoint, mujoco.mjtGeom, mujoco.mjtDisableBit, mujoco.mjtEq
 _INTEGRATOR = {
     mujoco.mjtIntegrator.mjINT_EULER: EULER, mujoco.mjtIntegrator.mjINT_RK4: RK4,
@@ -98,11 +101,25 @@ def build_tables(
 
 
 def _to_warp(array: np.ndarray, device: str) -> Any:
-    """A Warp array: integers, reals, or vectors and matrices of three by the shape of a row."""
-    if array.dtype.kind in "iub":
-        return wp.array(array.astype(np.int32), dtype=wp.int32, device=device)
+    """A Warp array: integers, reals, or vectors and matrices of three by the shape of a row; to be read only."""
+    array = np.ascontiguousarray(array, dtype=np.int32 if array.dtype.kind in "iub" else np.float64)
+    if array.nbytes > LARGE:
+        return _array(array, device)
+    return _shared(array.tobytes(), array.dtype, array.shape, device)
+
+
+@lru_cache(maxsize=KEPT)
+def _shared(content: bytes, kind: np.dtype, shape: tuple[int, ...], device: str) -> Any:
+    """The array of some content: variants of a model share most of their tables, and making them takes as long."""
+    return _array(np.frombuffer(content, dtype=kind).reshape(shape).copy(), device)
+
+
+def _array(array: np.ndarray, device: str) -> Any:
+    """A Warp array with the content of another one."""
+    if array.dtype == np.int32:
+        return wp.array(array, dtype=wp.int32, device=device)
     dtype = {(): wp.float64, (3,): wp.vec3d, (3, 3): wp.mat33d}[array.shape[1:]]
-    return wp.array(np.ascontiguousarray(array, dtype=np.float64), dtype=dtype, device=device)
+    return wp.array(array, dtype=dtype, device=device)
 
 
 def _disabled(model: mujoco.MjModel, *bits: Any) -> bool:
