@@ -140,6 +140,21 @@ def test_models_of_one_structure_share_their_tables() -> None:
     assert sum(tables is not None for tables in known.values()) > 0.9 * len(known)
 
 
+def test_variants_share_the_arrays_that_they_have_in_common() -> None:
+    """Tables are only read, so that one array serves all models with its content; others have their own."""
+    model = mujoco.MjModel.from_xml_string(ROUND)
+    longer = copy.copy(model)
+    longer.opt.timestep = 0.5 * model.opt.timestep
+    longer.body_iquat[1] = [0.6, 0.8, 0, 0]
+    longer.body_simple[1] = longer.body_sameframe[1] = 0
+    space = ParameterSpace(model, MASS)
+    first, second = (Variants(space, num_threads=1).worlds([m], 1).engines[0][0].tables for m in (model, longer))
+    assert first.h != second.h
+    assert first.body_parent is second.body_parent
+    assert first.body_imat is not second.body_imat
+    assert not np.array_equal(first.body_imat.numpy(), second.body_imat.numpy())
+
+
 def test_effects_are_written_in_any_order() -> None:
     """Friction's softness is that of the step, whichever is named first."""
     effects, engine = (("joint_friction", "elbow", (0.2,)), ("integration", None, (0.0025,))), engines()[1]
