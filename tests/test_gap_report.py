@@ -291,7 +291,10 @@ def test_double_with_ties(tmp_path: Path) -> None:
 
 def test_null(tmp_path: Path) -> None:
     text = page(tmp_path, null())
-    assert headline(text) == "Nothing is missing: what remains is measurement noise."
+    fitted = "once the parameters of the config are fitted"
+    assert headline(text) == f"Nothing is missing {fitted}: what remains is measurement noise."
+    plain, _ = gap_words.answer(replace(null(), declared={}))
+    assert plain == "Nothing is missing: what remains is measurement noise."
     seen = text_of(text)
     for part in (
         "The open-loop error of your model over 2 s on held-out data is 0.0115 rad (noise floor 0.0113 rad).",
@@ -477,6 +480,17 @@ def test_ties_are_told_in_the_terminal(tmp_path: Path) -> None:
         "This log is explained equally well by a spring between wrist and its parent joint or a constant external "
         "force on hand, in place of a spring at wrist."
     ) in " ".join(text.split())
+
+
+def test_the_terminal_has_all_numbers_of_which_the_sentence_gives_the_first(tmp_path: Path) -> None:
+    console = Console(record=True, width=200, file=io.StringIO())
+    numbers = {"mass": Strength(0.9, 0.89, 0.91, "kg")} | {a: Strength(v, v - 0.01, v + 0.01, "m") for a, v in
+                                                           {"x": 0.01, "y": -0.02, "z": 0.12}.items()}  # fmt: skip
+    payload = NamedEffect("payload", "hand", numbers, 1.0)
+    _show(replace(single(), effects=(payload,)), tmp_path, console)
+    text = console.export_text().replace("\u00a0", " ")
+    assert "more in the table" in text
+    assert all(value in text for value in ("0.900 kg (0.890 to 0.910)", "0.120 m (0.110 to 0.130)"))
 
 
 @pytest.mark.parametrize(

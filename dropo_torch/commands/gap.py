@@ -77,11 +77,16 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
 
 
 def _show(gap: Gap, out: Path, console: Console) -> None:
-    from dropo_torch.report.gap_words import ambiguous, answer
+    from dropo_torch.report.gap_words import ambiguous, answer, tabled
 
     headline, items = answer(gap)
     for line in (headline, *(f"  - {item}" for item in items)):
         console.print(line)
+    if rows_of_numbers := tabled(gap):
+        numbers = Table("what is missing", "number", "value (90 % interval)")
+        for row in rows_of_numbers:
+            numbers.add_row(*row)
+        console.print(numbers)
     for effect in () if gap.forces else gap.effects:
         if effect.indistinguishable_from:
             console.print(ambiguous(effect))

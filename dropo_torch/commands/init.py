@@ -80,7 +80,8 @@ def _show(proposal: Proposal, path: Path, page: Path, took: float, console: Cons
     for finding in proposal.findings:
         console.print(f"log: {finding.confidence}: {told(finding)}", soft_wrap=True)
     console.print(f"{took:.1f} s; config: {path}, explained in {page}", soft_wrap=True)
-    console.print(f"next: dropo fit {path} --out {path.with_suffix('')}-fit, or dropo gap", soft_wrap=True)
+    console.print(f"what the model lacks: dropo gap {path} --out {path.with_suffix('')}-gap", soft_wrap=True)
+    console.print(f"a distribution: dropo fit {path} --out {path.with_suffix('')}-fit", soft_wrap=True)
 
 
 def columns_table(matching: Matching) -> Table:

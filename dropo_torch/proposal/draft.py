@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -52,6 +52,10 @@ class Draft:
     notes: tuple[str, ...]
     smooth: Filter | None = None
 
+    def noted(self, note: str) -> Draft:
+        """Return the draft with one more note, as the first."""
+        return replace(self, notes=(note, *self.notes))
+
 
 @dataclass(frozen=True)
 class Reading:
@@ -73,6 +77,12 @@ class Reading:
     clock: Clock
     timestep: float
     base: Path
+
+
+def is_whole(dt: float, timestep: float) -> bool:
+    """Return whether rows are a whole number of the model's steps apart."""
+    skip = max(1, round(dt / timestep))
+    return abs(dt / timestep - skip) <= WHOLE * skip
 
 
 def make_draft(reading: Reading) -> Draft:
@@ -99,7 +109,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
     lacking = [p for p in matching.lacks("velocity") if p.partner == "" or matching.at(p.partner)]
     derived = derived or bool(lacking)
     skip = max(1, round(dt / timestep))
-    whole = abs(dt / timestep - skip) <= WHOLE * skip
+    whole = is_whole(dt, timestep)
     missing = any(np.isnan(m.column.values).any() for m in matching.matches)
     smooth: Filter | None = None
     resampled = derived or not clock.even or not whole or missing

@@ -22,10 +22,10 @@ from dropo_torch.proposal.candidates import Candidate, all_candidates
 from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
-from dropo_torch.proposal.draft import Draft, Reading, make_draft
+from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
+from dropo_torch.proposal.draft import Draft, Reading, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
-from dropo_torch.proposal.motors import drivable, motor_spec, write_with_motors
 from dropo_torch.proposal.places import Place, places_of
 from dropo_torch.proposal.text import config_text
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
@@ -114,7 +114,8 @@ def propose_config(
 ) -> Proposal:
     """Return a config for a robot's model and log: columns, units, rate, episodes, noise and parameters.
 
-    Nothing is written, except ``…_motors.xml`` beside ``out`` where the log has forces for a model without actuators.
+    Nothing is written, except a copy of the model beside ``out``: ``…_motors.xml`` where the log has forces for a model
+    without actuators, ``…_step.xml`` where its rows are no whole number of the model's steps apart.
 
     Args:
         model: an MJCF or URDF.
@@ -147,15 +148,23 @@ def propose_config(
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
     _check(matching, columns, compiled, clock)
+    own, step = step, _whole_step(path, columns, clock, step)
+    if step != own and path == Path(model):
+        path = out_of(Path(out), path, "step")
     if path != Path(model):
-        driven = [m.place.label for m in matching.of("command")]
-        write_with_motors(Path(model), driven, path)
+        write_copy(Path(model), [] if commanded else [m.place.label for m in matching.of("command")], step, path)
+    if not commanded:
         keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
         places = tuple(p for p in places if p.label in keep)
         matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
     tell("examining the log", 0.1)
     data = _relative(columns.path, base)
     draft = make_draft(Reading(_relative(path, base), data, columns, matching, places, clock, step, base))
+    if step != own:
+        draft = draft.noted(
+            f"rows {clock.dt:.6g} s apart are no whole number of the model's steps of {own:g} s: {path.name} is the "
+            f"model with steps of {step:g} s"
+        )
     document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
     tell("estimating the noise", 0.2)
     noise, candidates, document = _with_noise(document, draft, base)
@@ -190,7 +199,18 @@ def _with_motors(model: mujoco.MjModel, path: Path, columns: Columns, out: Path)
     joints = drivable(model)
     if model.nu or not forces or not joints or path.suffix == ".mjb":
         return model, path, bool(model.nu)
-    return motor_spec(path, joints).compile(), out.resolve().parent / f"{path.stem}_motors.xml", False
+    return motor_spec(path, joints).compile(), out_of(out, path, "motors"), False
+
+
+def _whole_step(path: Path, columns: Columns, clock: Clock, step: float) -> float:
+    """The model's step, or a finer one of which rows are a whole number, in seconds.
+
+    Rows that are even stay as they are logged, and so do the commands that acted in them. Others are resampled anyway.
+    """
+    assert clock.dt is not None
+    if columns.apart is not None or not clock.even or path.suffix == ".mjb" or is_whole(clock.dt, step):
+        return step
+    return float(f"{clock.dt / math.ceil(clock.dt / step):.6g}")  # as MJCF is written
 
 
 def _matched(

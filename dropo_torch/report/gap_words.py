@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.gap.result import Gap, NamedEffect, Place, Remaining, Strength, fallen
+from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Remaining, Strength, fallen
 from dropo_torch.gap.rules import Sound
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
@@ -174,6 +174,12 @@ def numbers(parameters: Mapping[str, Strength], named: Callable[[str], str] = qu
     return ", ".join(f"{named(n)} {with_interval(s)}" for n, s in shown) + more
 
 
+def tabled(gap: Gap) -> list[tuple[str, str, str]]:
+    """Return all numbers of the effects of which sentences give the first of many: effect, number, value."""
+    many = [e for e in gap.effects if len(e.parameters) > MOST_NUMBERS and e.target != FAMILY]
+    return [(noun(e.effect, e.target), quantity(n), with_interval(s)) for e in many for n, s in e.parameters.items()]
+
+
 def ambiguous(effect: NamedEffect) -> str:
     """Return what explains the log as well as an effect, in a sentence."""
     others = joined(rivals(effect), last="or", rest="one of {} more")
@@ -185,7 +191,8 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     named = [e for e in gap.effects if is_named(e)]
     unexplained = f"none of the {len(VOCABULARY)} known effects explains"
     if not gap.found:
-        return "Nothing is missing: what remains is measurement noise.", []
+        fitted = " once the parameters of the config are fitted" if gap.declared else ""
+        return f"Nothing is missing{fitted}: what remains is measurement noise.", []
     if not named:
         if gap.refused:
             return f"Something is missing that has no name yet: {gap.refused}; {shows(gap)}.", []

@@ -1,4 +1,4 @@
-"""A model that has no actuators, given motors for the forces that a log commands."""
+"""Copies of a model that suit a log: with motors for the forces that it commands, with steps that divide its rows."""
 
 from __future__ import annotations
 
@@ -26,8 +26,14 @@ def drivable(model: mujoco.MjModel) -> list[str]:
     return [joint_name(model, j) for j in range(model.njnt) if int(model.jnt_type[j]) in kinds and model.joint(j).name]
 
 
-def write_with_motors(path: Path, joints: Sequence[str], out: Path) -> None:
-    """Write a model with motors at joints as MJCF."""
+def out_of(config: Path, model: Path, what: str) -> Path:
+    """Return where a copy of a model stands: beside the config, called after what it has."""
+    return config.resolve().parent / f"{model.stem}_{what}.xml"
+
+
+def write_copy(path: Path, joints: Sequence[str], timestep: float, out: Path) -> None:
+    """Write a model as MJCF, with motors at joints and with a step of its own, in seconds."""
     spec = motor_spec(path, joints)
+    spec.option.timestep = timestep
     spec.compile()
     write_atomically(out, spec.to_xml().encode())
