@@ -137,7 +137,7 @@ def test_what_a_parameter_would_make_up_for_has_a_name_in_the_model_as_given(tmp
     (named,) = gap.effects
     assert (named.effect, named.target) == ("joint_damping", "hinge")
     assert named.parameters["damping"].low < 0.02 < named.parameters["damping"].high
-    assert (gap.declared, held.config.parameters, held.config.as_given) == ({}, None, False)
+    assert (gap.declared, held.config.parameters, held.config.as_given) == ({}, {}, False)
 
 
 def test_parameters_are_fitted_where_the_model_as_given_has_no_answer(tmp_path: Path) -> None:

@@ -29,7 +29,7 @@ def as_given(problem: Problem) -> Problem:
     """Return a problem in which the model's own parameters are as the model has them; effects keep theirs."""
     config = problem.config
     kept = {name: entry for name, entry in (config.parameters or {}).items() if "effect" in entry}
-    held = config.model_copy(update={"parameters": kept or None, "as_given": False})
+    held = config.model_copy(update={"parameters": kept, "as_given": False})
     made = make_problem(held.model_copy(update={"trajectories": None}), log=problem.trajectories, general=True)
     return replace(made, config=held)
 

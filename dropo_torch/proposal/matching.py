@@ -334,40 +334,42 @@ def _ranks(columns: Sequence[Column], words: dict[str, Words], wanted: Sequence[
 
 
 def _by_family(places: Sequence[Place], kind: str, free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
-    """Places whose names nobody used, by the order of columns that belong together, one for each place of a kind.
-
-    Such columns are those of one array, or of one kind and unit, in the log's order; where names have told some of
-    them, these must stand in the model's order, too, unless a single one is left.
-    """
+    """Places whose names nobody used, by the order of columns that belong together, one for each place of a kind."""
     scalar = [p for p in places if p.kind == kind and not p.axis]
-    matches: list[Match] = []
-    for of in (scalar, [p for p in scalar if not p.optional]):
-        for family in _families(free, of):
-            known = [found.get(p.label) for p in of]
-            lacking = [i for i, match in enumerate(known) if match is None]
-            left = [c for c in family if not _is_taken(c, found)]
-            if len(family) != len(of) or len(left) != len(lacking) or matches or not lacking:
-                continue
-            told = len(lacking) < len(of)
-            if all(match is None or match.column is c for match, c in zip(known, family, strict=True)):
-                sureness: Sureness = "likely" if told else "guess"
-                matches = [Match(of[i], family[i], 1.0, sureness, "the order of columns") for i in lacking]
-            elif len(left) == 1:
-                matches = [Match(of[lacking[0]], left[0], 1.0, "likely", "the only one left")]
-    return matches
+    for wanted in (scalar, [p for p in scalar if not p.optional]):
+        for family in _families(free, wanted):
+            if len(family) == len(wanted) and (matches := _ordered(wanted, family, found)):
+                return matches
+    return []
+
+
+def _ordered(wanted: Sequence[Place], family: Sequence[Column], found: dict[str, Match]) -> list[Match]:
+    """Columns for the places that have none, if those that names have told stand in the model's order, too.
+
+    A single one that is left needs no order.
+    """
+    known = [found.get(p.label) for p in wanted]
+    lacking = [i for i, match in enumerate(known) if match is None]
+    left = [c for c in family if not _is_taken(c, found)]
+    if len(left) != len(lacking):
+        return []
+    if all(match is None or match.column is c for match, c in zip(known, family, strict=True)):
+        sureness: Sureness = "likely" if len(lacking) < len(wanted) else "guess"
+        return [Match(wanted[i], family[i], 1.0, sureness, "the order of columns") for i in lacking]
+    if len(left) == 1:
+        return [Match(wanted[lacking[0]], left[0], 1.0, "likely", "the only one left")]
+    return []
 
 
 def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Column]]:
     """Columns that may be of a kind of places and belong together: by array, kind, unit and what is commanded."""
     groups: dict[tuple, list[Column]] = {}
-    for c in free:
+    for c in (c for c in free if wanted and _may_be(c, wanted)):
         w = c.words
-        bare = not w.role and not (c.label and last_part(c.array) in STATES)
-        if not wanted or not _may_be(c, wanted) or bare or w.axis or w.quaternion:
-            continue
-        if wanted[0].kind == "command" and not _commands(w, wanted[0]):
-            continue
-        groups.setdefault((c.array if c.index is not None else "", w.role, w.commanded, w.scale), []).append(c)
+        is_bare = not w.role and not (c.label and last_part(c.array) in STATES)
+        is_other = wanted[0].kind == "command" and not _commands(w, wanted[0])
+        if not (is_bare or is_other or w.axis or w.quaternion):
+            groups.setdefault((c.array if c.index is not None else "", w.role, w.commanded, w.scale), []).append(c)
     return list(groups.values())
 
 
