@@ -681,7 +681,7 @@ CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
     "effects": list, "forces": (list, type(None)), "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)), "unfinished": (str, type(None)),
-    "ranking": list, "cannot_judge": list, "symbolic": (str, type(None)),
+    "ranking": list, "left_out": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,
 }  # fmt: skip
 
