@@ -76,7 +76,7 @@ def unmark_simple(model: mujoco.MjModel, body: int) -> None:
 
 
 class Payload(BodyEffect):
-    """A mass fixed to a body: a tool, a gripped object, a battery."""
+    """A mass fixed to a body, within its own size of it: a tool, a gripped object, a battery."""
 
     name = "payload"
     sentence = "a mass on {target} that the model lacks, such as a tool or a gripped object"
@@ -87,7 +87,7 @@ class Payload(BodyEffect):
         low, high = self.extent(setting, body)
         size = float(np.linalg.norm(high - low))
         center = setting.model.body_ipos[body]
-        ends = zip("xyz", center.tolist(), (low - 0.5 * size).tolist(), (high + 0.5 * size).tolist(), strict=True)
+        ends = zip("xyz", center.tolist(), (low - size).tolist(), (high + size).tolist(), strict=True)
         places = [Quantity(n, "m", at, least, most, 0.5 * size) for n, at, least, most in ends]
         return (Quantity("mass", "kg", 0.0, 0.0, 5 * own, own), *places)
 
