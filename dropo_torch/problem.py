@@ -5,7 +5,8 @@ from __future__ import annotations
 import hashlib
 import math
 import warnings
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -54,6 +55,8 @@ class Problem:
         effects: the physical effects of the config, or ``None``.
         since: transition of each episode from which on the commands that act are known from the log, ``(E,)``; ``None``
             where all of them are.
+        sensed: the config as given, where states of the log stand in place of its sensors.
+        derived: columns that are derivatives of others, and their errors, where they are known.
     """
 
     config: Config
@@ -66,6 +69,8 @@ class Problem:
     fingerprint: str
     effects: EffectSet | None = None
     since: np.ndarray | None = None
+    sensed: Config | None = None
+    derived: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def left_out(self) -> int:

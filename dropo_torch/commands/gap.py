@@ -41,8 +41,9 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     """Run ``dropo gap``, which writes ``gap.json``, report, picture, and the model and config with what it found."""
     from dropo_torch.gap import add, as_given, find_gap, find_gap_as_given, prepare
     from dropo_torch.gap.remaining import Remaining
-    from dropo_torch.problem import logged_data, make_problem, refuse_sensed
+    from dropo_torch.problem import logged_data, make_problem
     from dropo_torch.report import write_gap_picture, write_gap_report
+    from dropo_torch.shooting.posing import posed
 
     config, out = load_config(given.config, overrides), given.out
     written = out / "config.yaml"
@@ -53,11 +54,11 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if written.exists() and not (out / "gap.json").exists():
         raise InputError(f"--out: {written} is no result of an earlier run; name another folder, or move it")
     problem = make_problem(config, general=True)
-    refuse_sensed(problem, "gap")
     check_first(logged_data(problem), console, force=given.force)
     store = out / "gap-progress.bin"
     with StageProgress(console, "gap", Remaining(given.time_limit)) as progress:
         progress.show("preparing", 0.0)
+        problem = posed(problem)
         first = config.as_given and bool(problem.space.names)
         scene = prepare(as_given(problem) if first else problem)  # before an earlier run is moved aside
         stores = (store, store.with_stem(f"{store.stem}-given"))

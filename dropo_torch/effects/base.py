@@ -78,13 +78,17 @@ class Signals:
 
 @dataclass(frozen=True)
 class Setting:
-    """Where effects are looked for: the model as given, the columns of the log (some masked), and its sizes."""
+    """Where effects are looked for: the model as given, the columns of the log (some masked), and its sizes.
+
+    Of columns that are derived, ``derived`` has the errors, ``(column, error)`` each.
+    """
 
     model: mujoco.MjModel
     observation: Observation
     signals: Signals
     frame_skip: int
     masked: frozenset[int] = frozenset()
+    derived: tuple[tuple[int, float], ...] = ()
 
     @property
     def has_impacts(self) -> bool:

@@ -84,11 +84,13 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     values = problem.space.vector({n: after for n, (_, _, after) in gap.declared.items()})
     before = () if problem.effects is None else problem.effects.at(values)
     model: Path | None = folder / "model.xml"
+    rest: list[Placed] = []
     try:
         rest = write_model(problem.model_path, [*before, *found], folder / "model.xml", problem.space, values)
         if rest:
             names = ", ".join(_place(p) for p in rest)
-            notes.append(f"MJCF cannot express {names}: model.xml lacks it, config.yaml has it.")
+            has = "" if problem.sensed else ", config.yaml has it"
+            notes.append(f"MJCF cannot express {names}: model.xml lacks it{has}.")
         finer = whole_ratio(setting.model.opt.timestep, applied(setting.model, [*before, *found]).opt.timestep)
         if finer != 1 and finer is not None:
             notes.append(f"{setting.frame_skip * finer} steps of model.xml make one logged transition.")
@@ -98,8 +100,11 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     if again := [p for p in found if p.key in {b.key for b in before}]:
         return [*notes, f"No config.yaml was written: the config has {_place(again[0])} already; let its numbers vary."]
     ranges = {placed.key: intervals for placed, intervals in found.items()}
-    config = _with_noise(problem, np.array(gap.noise))
-    write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml")
+    if problem.sensed is not None and (model is None or rest):
+        return [*notes, "No config.yaml was written: effects that MJCF cannot express do not go with a log of sensors."]
+    config = problem.sensed or _with_noise(problem, np.array(gap.noise))
+    options = {"whole": problem.sensed is not None}
+    write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml", **options)
     return notes
 
 
@@ -121,7 +126,7 @@ def _with_noise(problem: Problem, noise: np.ndarray) -> Config:
 
 def write_config(
     config: Config, space: ParameterSpace, setting: Setting, placed: Sequence[Placed], intervals: Intervals,
-    model_path: Path | None, path: Path,
+    model_path: Path | None, path: Path, *, whole: bool = False,
 ) -> None:  # fmt: skip
     """Write the config of a fit of the effects' numbers, together with the parameters that the config had.
 
@@ -138,6 +143,7 @@ def write_config(
         intervals: where a number lies, as ``(low, high)``, by the effect's key and the number's name.
         model_path: the model that :func:`~dropo_torch.effects.export.write_model` wrote, or ``None``.
         path: where to write.
+        whole: name ``model_path``, which has all effects, in any case; only numbers that are its fields then vary.
     """
     document = _document(config, path.parent)
     boxes = {p.key: _boxes(p, setting, intervals.get(p.key, {})) for p in placed}
@@ -157,6 +163,8 @@ def write_config(
         or any(spec.get("relative") for spec in document["parameters"].values())
     ):
         fields = {key: _fields(p, setting, boxes[key]) for key, p in native.items()}
+    if whole:
+        fields = {key: _fields(p, setting, boxes[key]) or {} for key, p in native.items()}
     plain = None not in fields.values()
     if model_path is not None and fields and plain:
         document["model"] = os.path.relpath(model_path.resolve(), path.parent.resolve())

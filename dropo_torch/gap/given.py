@@ -20,6 +20,7 @@ from dropo_torch.gap.result import Gap
 from dropo_torch.gap.run import find_gap
 from dropo_torch.gap.scene import Scene, prepare
 from dropo_torch.problem import Problem, make_problem
+from dropo_torch.shooting.posing import posed
 
 #: Verdicts, the better ones first; two that explain the log are as good as each other.
 _RANKS = {"no gap": 0, "explained": 0, "partly explained": 1, "unnamed": 2}
@@ -31,7 +32,10 @@ def as_given(problem: Problem) -> Problem:
     kept = {name: entry for name, entry in (config.parameters or {}).items() if "effect" in entry}
     held = config.model_copy(update={"parameters": kept, "as_given": False})
     made = make_problem(held.model_copy(update={"trajectories": None}), log=problem.trajectories, general=True)
-    return replace(made, config=held)
+    sensed = problem.sensed
+    if sensed is not None:
+        sensed = sensed.model_copy(update={"parameters": kept or None, "as_given": False})
+    return replace(made, config=held, sensed=sensed, derived=problem.derived)
 
 
 def find_gap_as_given(
@@ -55,6 +59,7 @@ def find_gap_as_given(
     Returns:
         The problem on which it was found, and the gap.
     """
+    problem = posed(problem)
     held, end = as_given(problem) if scene is None else scene.problem, time.monotonic() + time_limit
     path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}-given")
 

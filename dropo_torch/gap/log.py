@@ -145,7 +145,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
         contacts=touches,
     )
     masked = masked_columns(observation, problem.config.mask)
-    return Setting(model, observation, signals, frame_skip, masked)
+    derived = tuple((observation.labels.index(label), error) for label, error in problem.derived.items())
+    return Setting(model, observation, signals, frame_skip, masked, derived)
 
 
 def start_values(problem: Problem) -> np.ndarray:

@@ -76,9 +76,10 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
         return found
     whole = _free_forces(replace(evidence, whole=True), sizes, known=False)
     told = evidence.chart.known(np.ones(twin.setting.observation.size, dtype=bool))
-    return replace(
-        found, noise=np.where(told, found.noise, whole.noise), unsure=np.where(told, found.unsure, whole.unsure)
-    )
+    noise = np.where(told, found.noise, whole.noise)
+    for column, error in twin.setting.derived:  # errors that follow on each other do not show in short windows
+        noise[evidence.chart.plain.index(column)] = error
+    return replace(found, noise=noise, unsure=np.where(told, found.unsure, whole.unsure))
 
 
 def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeForces:

@@ -39,6 +39,7 @@ from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows
 from dropo_torch.gap.verify import constant_velocity, cut_held, score, scores
+from dropo_torch.parameters import ParameterSpace
 
 #: Fits after the last one, at most, each with the weights that the one before suggests.
 ROUNDS = 3
@@ -114,6 +115,7 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         next_experiment=_next_experiment(naming, final, report),
         found=naming.gap,
         declared=dict(zip(problem.space.names, declared, strict=True)),
+        fitted=_fitted(problem.space, evidence, best, last),
         noise=tuple(noise.tolist()),
         labels=evidence.chart.labels,
         units=evidence.chart.units,
@@ -175,6 +177,7 @@ def with_forces(scene: Scene, gap: Gap, view: ForceView) -> Gap:
         own_step=None,
         joints={},
         left_out=_left_out(setting, view.left_out),
+        fitted={},
         next_experiment=None,
         notes=(
             f"Constant velocity has an open-loop error of {constant:.3g} on held-out data, the model with the effects "
@@ -298,6 +301,21 @@ def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffec
         share = float(np.clip(excess / naming.base.cost.above(naming.final.cost), 0, 1))
         found.append(NamedEffect.of(placed, numbers, share, tied))
     return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)
+
+
+def _fitted(
+    space: ParameterSpace, evidence: Evidence, hypothesis: Hypothesis, last: Resolved | None
+) -> Mapping[str, Strength]:
+    """The declared parameters beside what was named, with their intervals."""
+    if not len(space):
+        return {}
+    if last is None:
+        last = Resolved(refit(evidence, hypothesis, iterations=0), evidence, np.zeros(len(hypothesis.vector)))
+    bounds = zip(space.parameters, hypothesis.declared, half_widths(last), space.low, space.high, strict=False)
+    return {
+        p.name: Strength(value, max(value - half, float(low)), min(value + half, float(high)), p.unit)
+        for p, value, half, low, high in bounds
+    }
 
 
 def _left_out(setting: Setting, allowed: Iterable[tuple[Placed, np.ndarray]]) -> tuple[LeftOut, ...]:

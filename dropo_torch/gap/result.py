@@ -207,6 +207,7 @@ class Gap:
         next_experiment: what motion would tell more, or ``None``.
         found: whether anything is missing at all.
         declared: values of the declared parameters: as given, fitted alone, fitted with the effects.
+        fitted: the last of these with their intervals; empty where predictions did not decide.
         noise: estimated (or given) standard deviation of each feature.
         labels, units: the features.
         reduced: χ² per degree of freedom before and after.
@@ -248,6 +249,7 @@ class Gap:
     courses: tuple[Course, ...] = ()
     left_out: tuple[LeftOut, ...] = ()
     cannot_judge: tuple[tuple[str, str | None], ...] = ()
+    fitted: Mapping[str, Strength] = field(default_factory=dict)
     rollout_seconds: float = 0.0
     window: int = 0
     simulated_transitions: int = 0
@@ -292,6 +294,7 @@ class Gap:
             "next_experiment": self.next_experiment,
             "declared": {
                 n: dict(zip(("given", "alone", "with_effects"), values, strict=True))
+                | ({"low": self.fitted[n].low, "high": self.fitted[n].high} if n in self.fitted else {})
                 for n, values in self.declared.items()
             },
             "noise": dict(zip(self.labels, self.noise, strict=True)),

@@ -30,7 +30,8 @@ from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.screen import all_candidates
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
-from dropo_torch.problem import Problem, refuse_sensed
+from dropo_torch.problem import Problem
+from dropo_torch.shooting.posing import posed
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
@@ -87,7 +88,7 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     """Cut the log, estimate its noise, and choose windows.
 
     Args:
-        problem: the model, its declared parameters, and the log.
+        problem: the model, its declared parameters, and the log; of sensors, it is made one of states.
         rules: thresholds.
 
     Raises:
@@ -96,7 +97,7 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     """
     if problem.space.model is None or problem.observation.size == 0:
         raise InputError("gap: this simulator is no MuJoCo model; effects can only be looked for in one")
-    refuse_sensed(problem, "gap")
+    problem = posed(problem)
     if blind := problem.observation.at_rest:
         raise InputError(
             f"gap: the velocity of {blind[0]} is not observed; derive velocities from positions "
@@ -208,7 +209,7 @@ def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, sin
     """The longest windows in whose initial states the simulation is still nearly linear."""
     cut = whole.rules.cut
     longest, touches = longest_episode(train), bool(whole.twin.setting.signals.contacts.any())
-    for length in (length for length in cut.lengths if length <= longest):
+    for length in (length for length in _lengths(whole, train) if length <= longest):
         evidence = _cut(whole, train, since, length, FEW)
         if not len(evidence.windows):
             continue
@@ -216,6 +217,16 @@ def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, sin
         if rough < cut.rough and (not touches or _end_error(evidence, begin) < cut.astray):
             return _cut(whole, train, since, length, rough=rough > cut.bent)
     return _cut(whole, train, since, min(cut.lengths[-1], longest))
+
+
+def _lengths(whole: Evidence, train: Trajectories) -> tuple[int, ...]:
+    """Lengths of windows that are tried: longer ones where velocities are unknown, as long as there are enough."""
+    setting, cut = whole.twin.setting, whole.rules.cut
+    known = setting.observation.index[[c for c in range(setting.observation.size) if c not in setting.masked]]
+    if (known >= setting.model.nq).any():
+        return cut.lengths
+    count = [sum((b - a + 1) // (length + 1) for a, b in episode_bounds(train)) for length in cut.blind]
+    return (*(n for n, windows in zip(cut.blind, count, strict=True) if windows >= cut.enough), *cut.lengths)
 
 
 def _cut(

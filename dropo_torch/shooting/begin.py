@@ -71,21 +71,26 @@ def _tried(
 
 def _candidates(windows: Windows, rows: np.ndarray, seed: int) -> np.ndarray:
     """States of windows ``(R, C, nq + nv)``: as the log and the model have it, then joints anywhere in their ranges."""
-    model, rng = windows.model, np.random.default_rng(seed)
     found = np.repeat(windows.starts[rows][:, None], CANDIDATES, axis=1)
+    scatter(windows.model, found, np.random.default_rng(seed))
+    seen = windows.observation.index[windows.observation.index < windows.starts.shape[1]]
+    found[..., seen] = windows.starts[rows][:, None, seen]
+    return found
+
+
+def scatter(model: mujoco.MjModel, states: np.ndarray, rng: np.random.Generator) -> None:
+    """Turn joints anywhere in their ranges, in place, in all but the first states of each row, ``(R, C, nq + ...)``."""
+    shape = states.shape[0], states.shape[1] - 1
     for j in range(model.njnt):
         first, kind = int(model.jnt_qposadr[j]), int(model.jnt_type[j])
         if kind in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
             low, high = model.jnt_range[j] if model.jnt_limited[j] else model.qpos0[first] + np.array([-np.pi, np.pi])
             if kind == mujoco.mjtJoint.mjJNT_HINGE or model.jnt_limited[j]:
-                found[:, 1:, first] = rng.uniform(low, high, (len(rows), CANDIDATES - 1))
+                states[:, 1:, first] = rng.uniform(low, high, shape)
         else:
             first += 3 * (kind == mujoco.mjtJoint.mjJNT_FREE)
-            turned = rng.standard_normal((len(rows), CANDIDATES - 1, 4))
-            found[:, 1:, first : first + 4] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
-    seen = windows.observation.index[windows.observation.index < windows.starts.shape[1]]
-    found[..., seen] = windows.starts[rows][:, None, seen]
-    return found
+            turned = rng.standard_normal((*shape, 4))
+            states[:, 1:, first : first + 4] = turned / np.linalg.norm(turned, axis=-1, keepdims=True)
 
 
 def _settled(

@@ -16,7 +16,8 @@ import numpy as np
 from dropo_torch.config import Config, load_config, make_config
 from dropo_torch.distribution import Distribution
 from dropo_torch.errors import InputError
-from dropo_torch.problem import Problem, make_problem, refuse_sensed
+from dropo_torch.problem import Problem, make_problem
+from dropo_torch.shooting.posing import posed
 from dropo_torch.support.given import read_text
 
 #: Files by which a folder is known to hold something to see.
@@ -143,8 +144,7 @@ def _problem(config: Config) -> Problem:
     problem = make_problem(
         config.model_copy(update={"backend": "mujoco"}) if config.backend == "warp" else config, general=True
     )
-    refuse_sensed(problem, "view")
-    return problem
+    return posed(problem)
 
 
 def _recorded(folder: Path, document: Mapping[str, Any], name: str, overrides: Mapping[str, Any]) -> Problem:
