@@ -289,6 +289,19 @@ def test_double_with_ties(tmp_path: Path) -> None:
     assert text.count("<svg") == 3 + 4
 
 
+def test_values_that_the_model_has_wrong_are_the_answer_where_nothing_else_is_missing(tmp_path: Path) -> None:
+    fitted = {"damping": Strength(0.341, 0.33, 0.352, "N·m·s/rad"), "mass": Strength(1.21, 1.19, 1.23, "kg")}
+    gap = replace(null(), declared={"damping": (0.1, 0.341, 0.341), "mass": (1.2, 1.21, 1.21)}, fitted=fitted)
+    text = page(tmp_path, gap)
+    assert headline(text).replace("\u00a0", " ") == (
+        "Nothing is missing beside other values of parameters: damping is 0.341 N·m·s/rad (0.330 to 0.352), not 0.1."
+    )
+    assert "0.330 to 0.352" in text_of(text)
+    assert gap.document()["declared"]["mass"] == {
+        "given": 1.2, "alone": 1.21, "with_effects": 1.21, "low": 1.19, "high": 1.23
+    }  # fmt: skip
+
+
 def test_null(tmp_path: Path) -> None:
     text = page(tmp_path, null())
     fitted = "once the parameters of the config are fitted"

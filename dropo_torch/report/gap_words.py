@@ -18,6 +18,8 @@ SHORT = 0.1
 CLOSE = 0.2
 #: Of effects with more numbers than this, the answer gives only the first.
 MOST_NUMBERS = 3
+#: Half-widths of its interval by which a parameter must be off the model's own value to be told.
+SURE = 2.0
 #: What is missing, as it follows on "Your model lacks".
 _NOUNS = {
     "joint_damping": "viscous friction in {0}",
@@ -191,6 +193,8 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     named = [e for e in gap.effects if is_named(e)]
     unexplained = f"none of the {len(VOCABULARY)} known effects explains"
     if not gap.found:
+        if values := corrected(gap):
+            return f"Nothing is missing beside other values of parameters: {joined(values, 6)}.", []
         fitted = " once the parameters of the config are fitted" if gap.declared else ""
         return f"Nothing is missing{fitted}: what remains is measurement noise.", []
     if not named:
@@ -220,6 +224,17 @@ def answer(gap: Gap) -> tuple[str, list[str]]:
     differ = any(_too_much(e) or _mixed(e) or e.effect in _CLAUSES for e in named)
     rest = step if gap.remaining is None else f", which do not explain everything ({left(gap.remaining)})"
     return f"Your model {'and the robot differ in' if differ else 'lacks'} {count} things{rest}:", items
+
+
+def corrected(gap: Gap) -> list[str]:
+    """Return the config's parameters that are surely not what the model has, each with its value and what that is."""
+    found = []
+    for name, given in gap.fitted.items():
+        own = gap.declared[name][0]
+        least, most = (SURE * (end - given.value) for end in (given.low, given.high))
+        if not least <= own - given.value <= most:
+            found.append(f"{name} is {with_interval(given)}, not {plain(own)}")
+    return found
 
 
 def _closest(gap: Gap) -> str:
