@@ -114,6 +114,22 @@ def test_measured_velocities_are_kept_and_may_be_left_out():
     assert preprocess(rec, Preprocess(dt=0.01, positions=["q"], velocities=[])).observations.shape[1] == 1
 
 
+def test_some_velocities_are_derived_beside_those_that_are_measured():
+    """Derivatives alone are filtered, and stand before what was measured."""
+    noisy = SINE + 1e-3 * np.random.default_rng(0).standard_normal(len(TIME))
+    rec = recording(TIME, {"q": noisy, "z": 5 * TIME, "dz": np.full(len(TIME), 7.0)})
+    options = {"dt": 0.01, "velocities": ["dz"], "derive": ["q"]}
+    raw = preprocess(rec, Preprocess(**options)).observations
+    smooth = preprocess(rec, Preprocess(**options, cutoff=10, trim=0)).observations
+    np.testing.assert_allclose(raw[:, 3], 7.0)
+    np.testing.assert_array_equal(raw[:, :2], smooth[:, :2])
+    exact = np.gradient(preprocess(sine_recording(), Preprocess(dt=0.01)).observations[:, 0], 0.01)
+    inside = slice(20, len(raw) - 20)
+    assert np.std((smooth[:, 2] - exact)[inside]) < 0.2 * np.std((raw[:, 2] - exact)[inside])
+    with pytest.raises(InputError, match="derive has no meaning without velocities"):
+        Preprocess(dt=0.01, derive=["q"])
+
+
 def test_columns_are_positions_then_velocities_in_the_order_given():
     rec = recording(TIME, {"q[0]": SINE, "q[1]": 3 * TIME, "z": 5 * TIME})
     out = preprocess(rec, Preprocess(dt=0.01, positions=["z", "q"]))

@@ -52,6 +52,8 @@ class Preprocess:
             ``velocities``.
         velocities: signals that measure velocities, taken as the last columns; by default the velocities
             are derivatives of the positions. ``()`` for none.
+        derive: positions whose velocities are derived although others are measured: ``[positions..., derived...,
+            velocities...]``. Derivatives alone are then filtered.
         quaternions: groups of four of the positions that are a unit quaternion (w, x, y, z); by default those that
             the log itself says, as bags do. Its derived
             velocity is the angular velocity in the body's frame, as in MuJoCo.
@@ -80,6 +82,7 @@ class Preprocess:
     trim: float | None = None
     positions: Sequence[str] | None = None
     velocities: Sequence[str] | None = None
+    derive: Sequence[str] = ()
     quaternions: Sequence[Sequence[str]] = ()
     actions: Actions = "hold"
     controlled: Sequence[str] = ()
@@ -101,7 +104,7 @@ class Preprocess:
             value, bound = getattr(self, name), "least" if name in ("start", "stop", "trim") else "above"
             if value is not None or name in ("dt", "max_delay"):
                 checked[name] = number(value, f"preprocess: {name}", **{bound: 0})
-        for name in ("positions", "velocities", "controlled", "align", "same_clock"):
+        for name in ("positions", "velocities", "derive", "controlled", "align", "same_clock"):
             checked[name] = _names(getattr(self, name), name)
         for name, value in checked.items():
             object.__setattr__(self, name, value)
@@ -111,6 +114,8 @@ class Preprocess:
             raise InputError(
                 f"preprocess: actions: unknown kind {self.actions!r}{choices(self.actions, get_args(Actions))}"
             )
+        if self.derive and self.velocities is None:
+            raise InputError("preprocess: derive has no meaning without velocities, as all are derived; leave it out")
         if self.start is not None and self.stop is not None and self.stop <= self.start:
             raise InputError(f"preprocess: stop is {self.stop:g} s and start {self.start:g} s; stop must be later")
         if bool(self.align) != (self.reference is not None):
@@ -292,12 +297,17 @@ class _Episode:
             signals |= self._continuous(group, signals)
         for name, samples in signals.items():
             self._check_gaps(name, samples)
+        derive, smooth = self._resolve("derive", self.options.derive, positions), signals
         if self.options.cutoff is not None:
-            signals = {name: self._filtered(name, samples, self.options.cutoff) for name, samples in signals.items()}
+            noisy = derive or list(signals)
+            smooth = signals | {name: self._filtered(name, signals[name], self.options.cutoff) for name in noisy}
+            signals = signals if derive else smooth
         grid = self._grid(list(signals.values()))
         position = {name: signals[name].spline(grid, extrapolate=True) for name in positions}
         if self.options.velocities is not None:
-            velocity = {name: signals[name].spline(grid, extrapolate=True) for name in velocities}
+            slope = {name: smooth[name].spline(grid, nu=1, extrapolate=True) for name in derive}
+            velocity = _velocities(position, slope, quaternions)
+            velocity |= {name: signals[name].spline(grid, extrapolate=True) for name in velocities}
         else:
             slope = {name: signals[name].spline(grid, nu=1, extrapolate=True) for name in positions}
             velocity = _velocities(position, slope, quaternions)
