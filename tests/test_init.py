@@ -104,6 +104,10 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("present_velocity", "velocity", None, (), ()),
         ("motor_current_1", "effort", None, (), (1,)),
         ("target_current", "command", None, (), ()),
+        ("FL_knee_qdes", "command", None, ("fl", "knee"), ()),
+        ("taucmd_2", "command", None, (), (2,)),
+        ("address", "", None, ("address",), ()),
+        ("subtarget", "", None, ("subtarget",), ()),
     ],
 )
 def test_names_say_what_people_mean(
@@ -359,6 +363,66 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
     assert found.document["observation"] == ["slider.position", "hinge.position", "slider.velocity", "hinge.velocity"]
     assert not [f for f in found.findings if f.sure]
     assert dropo.make_problem(found.config).trajectories.observations.shape[1] == 4
+
+
+HOVER = """
+<mujoco>
+  <option timestep=".002" gravity="0 0 0"/>
+  <worldbody>
+    <body name="trunk">
+      <freejoint name="root"/>
+      <geom type="box" size=".2 .1 .05" mass="2"/>
+      <site name="imu"{turned}/>
+      <body pos=".2 0 0">
+        <joint name="flap" axis="0 1 0" damping=".1"/>
+        <geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".5" contype="0"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><position name="servo" joint="flap" kp="5"/></actuator>
+  <sensor><gyro name="gyro" site="imu"/></sensor>
+</mujoco>
+"""
+
+
+@pytest.mark.parametrize("turned", ["", ' euler="0 0 90"'])
+def test_the_only_pose_is_that_of_the_only_free_body_and_a_gyroscope_turns_as_it(tmp_path: Path, turned: str) -> None:
+    """Whatever measured them is called. What neither shows is derived, and compared nowhere."""
+    model, rng = mujoco.MjModel.from_xml_string(HOVER.format(turned=turned)), np.random.default_rng(0)
+    data, rows = mujoco.MjData(model), []
+    data.qvel[:6] = [0.1, 0.2, -0.1, 0.5, -0.4, 0.8]
+    for step in range(600):
+        data.ctrl[0] = math.sin(0.16 * step) + 0.6 * math.sin(0.05 * step)
+        mujoco.mj_forward(model, data)
+        rows.append(np.concatenate([[data.time], data.qpos, data.qvel[6:], data.ctrl, data.sensordata / model.nu]))
+        mujoco.mj_step(model, data, 5)
+    table = np.array(rows)
+    table[:, 1:4] += 1e-3 * rng.standard_normal((600, 3))
+    table[:, 8:10] += [2e-4, 5e-3] * rng.standard_normal((600, 2))
+    table[:, 11:] = DEG * (table[:, 11:] + 3e-3 * rng.standard_normal((600, 3)))
+    names = "t,vicon_px,vicon_py,vicon_pz,vicon_qw,vicon_qx,vicon_qy,vicon_qz,flap_q,flap_dq,flap_qdes,imu_gyro_x,"
+    frame = dict(zip((names + "imu_gyro_y,imu_gyro_z").split(","), table.T, strict=True))
+    files = written(tmp_path, frame, HOVER.format(turned=turned))
+    found = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    label = {m.column.entry: m.place.label for m in found.matching.matches}
+    assert (label["vicon_px"], label["vicon_qz"]) == ("root.position[x]", "root.position[qz]")
+    assert label["flap_qdes"] == "servo"
+    options, linear = found.document["data"]["preprocess"], [f"root.velocity[v{axis}]" for axis in "xyz"]
+    assert "flap_dq" in options["velocities"]
+    assert options["derive"][:3] == ["vicon_px", "vicon_py", "vicon_pz"]
+    if turned:  # it is not along the body's axes
+        assert "imu_gyro_x" not in label
+        assert found.document["mask"] == [*linear, *(f"root.velocity[w{axis}]" for axis in "xyz")]
+    else:
+        assert label["imu_gyro_y"] == "root.velocity[wy]"
+        gyro = next(m for m in found.matching.matches if m.column.entry == "imu_gyro_y")
+        assert gyro.scale == pytest.approx(1 / DEG)
+        assert found.document["mask"] == linear
+    log = dropo.make_problem(found.config).trajectories
+    columns = dict(zip(found.labels, log.observations.T, strict=True))
+    moved = np.gradient(columns["root.position[x]"], log.dt)
+    assert np.corrcoef(moved, columns["root.velocity[vx]"])[0, 1] > 0.3
+    assert columns["flap.velocity"].std() == pytest.approx(table[:, 9].std(), rel=0.05)
 
 
 def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:

@@ -104,15 +104,54 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
     columns, matching, clock, timestep = reading.columns, reading.matching, reading.clock, reading.timestep
     dt = clock.dt
     assert dt is not None
+    if matching.of("marker"):
+        return *_of_markers(reading), None
     notes = _lost(matching)
     positions, velocities = list(matching.of("position")), list(matching.of("velocity"))
     lacking = [p for p in matching.lacks("velocity") if p.partner == "" or matching.at(p.partner)]
-    derived = derived or bool(lacking)
+    some = [] if derived or not velocities else _derived(lacking, positions)  # beside those that are measured
+    derived = derived or bool(lacking and not some)
     skip = max(1, round(dt / timestep))
     whole = is_whole(dt, timestep)
     missing = any(np.isnan(m.column.values).any() for m in matching.matches)
     smooth: Filter | None = None
-    resampled = derived or not clock.even or not whole or missing
+    resampled = derived or bool(some) or not clock.even or not whole or missing
+    source = _source(reading)
+    if not resampled and (whole_arrays := _standard(columns, matching)) is not None:
+        source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
+        return {"model": reading.model, "data": source, "frame_skip": skip, "observation": whole_arrays}, notes, None
+    if derived:
+        velocities = []
+    names = ", ".join(dict.fromkeys(p.label for p in lacking))
+    notes += [f"velocities are derived from positions: {names} not logged"] if names else []
+    source["observations"] = [m.column.as_map(m.scale) for m in positions + velocities]
+    commands = matching.of("command")
+    follows = not commands and bool(matching.lacks("command"))
+    if not follows:
+        source["actions"] = [m.column.as_map(m.scale) for m in commands]
+    if resampled or follows:
+        source["preprocess"], more, smooth = _preprocess(
+            columns, matching, clock, positions, velocities, skip * timestep, follows=follows, derive=some
+        )
+        notes += more
+        notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
+        notes += (
+            []
+            if clock.even or columns.apart
+            else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
+        )
+    rates = _rates(positions if derived else some, reading.places)
+    entries = [m.place.entry for m in positions] + rates + [m.place.entry for m in velocities]
+    document = {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}
+    if some:
+        document["mask"] = [p.label for p in reading.places if p.entry in rates]
+        notes += ["they say where windows begin, and are compared nowhere"]
+    return document, notes, smooth
+
+
+def _source(reading: Reading) -> dict[str, Any]:
+    """The keys of ``data`` that find the log, its time and its episodes."""
+    columns, clock = reading.columns, reading.clock
     source: dict[str, Any] = {"path": reading.data}
     source |= {} if columns.group is None else {"group": columns.group}
     source |= {} if columns.separator is None else {"separator": columns.separator}
@@ -120,7 +159,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
     if columns.apart is not None:
         pass  # time stamps are the signals' own
     elif clock.column is None:
-        source["dt"] = float(f"{dt:.6g}")
+        source["dt"] = float(f"{clock.dt:.6g}")
     else:
         unit = clock.unit
         source["time"] = clock.column.entry if unit == 1.0 else {"signal": clock.column.entry, "scale": unit}
@@ -130,33 +169,26 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         source["terminals"] = [c.entry for c in clock.terminals]
     if clock.breaks:
         source["breaks"] = list(clock.breaks)
-    if not resampled and (whole_arrays := _standard(columns, matching)) is not None:
-        source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
-        return {"model": reading.model, "data": source, "frame_skip": skip, "observation": whole_arrays}, notes, None
-    if derived:
-        velocities = []
-        names = ", ".join(dict.fromkeys(p.label for p in lacking))
-        notes += [f"velocities are derived from positions: {names} not logged"] if names else []
-    source["observations"] = [m.column.as_map(m.scale) for m in positions + velocities]
-    commands = matching.of("command")
-    follows = not commands and bool(matching.lacks("command"))
-    if not follows:
-        source["actions"] = [m.column.as_map(m.scale) for m in commands]
-    if resampled or follows:
-        source["preprocess"], more, smooth = _preprocess(
-            columns, matching, clock, positions, velocities, skip * timestep, follows=follows
-        )
-        notes += more
-        notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
-        notes += (
-            []
-            if clock.even or columns.apart
-            else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
-        )
-    entries = [m.place.entry for m in positions + velocities]
-    if derived:
-        entries += _rates(positions, reading.places)
-    return {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}, notes, smooth
+    return source
+
+
+def _of_markers(reading: Reading) -> tuple[dict[str, Any], list[str]]:
+    """The keys of a log of markers, whose states are estimated, and of encoders beside them."""
+    matching, clock, notes = reading.matching, reading.clock, _lost(reading.matching)
+    assert clock.dt is not None
+    skip = max(1, round(clock.dt / reading.timestep))
+    whole = abs(clock.dt / reading.timestep - skip) <= WHOLE * skip
+    shown = [m for m in matching.matches if m.place.kind != "command"]
+    source = _source(reading) | {"observations": [m.column.as_map(m.scale) for m in shown]}
+    source["actions"] = [m.column.as_map(m.scale) for m in matching.of("command")]
+    if not clock.even or not whole or any(np.isnan(m.column.values).any() for m in matching.matches):
+        longest = _longest(clock, len(reading.columns), reading.columns.parts, matching.matches)
+        source["preprocess"] = {"dt": float(f"{skip * reading.timestep:.9g}"), "velocities": []}
+        source["preprocess"] |= {"max_gap": float(f"{min(max(1.05 * longest, 2.5 * clock.dt), GAP * clock.dt):.4g}")}
+        notes.append("time stamps are uneven, or a sample is missing: resampled")
+    entries = [m.place.entry for m in shown]
+    notes.append("states are estimated from the markers' places; velocities are not measured")
+    return {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}, notes
 
 
 def _lost(matching: Matching) -> list[str]:
@@ -188,6 +220,16 @@ def _standard(columns: Columns, matching: Matching) -> list[str] | None:
     return [held.get(c.entry, "skip") for c in columns.columns if c.array == "observations"]
 
 
+def _derived(lacking: Sequence[Place], positions: Sequence[Match]) -> list[Match]:
+    """The positions of which the velocities that lack are derivatives."""
+    turning = {p.joint for p in lacking if p.angular}
+    own = {p.partner for p in lacking}
+    return [
+        m for m in positions
+        if m.place.label in own or (m.place.measure == "quaternion" and m.place.joint in turning)
+    ]  # fmt: skip
+
+
 def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:
     """Entries of the velocities that preprocessing derives, in its order."""
     found: list[str] = []
@@ -201,25 +243,28 @@ def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:
 
 def _preprocess(
     columns: Columns, matching: Matching, clock: Clock, positions: Sequence[Match], velocities: Sequence[Match],
-    step: float, *, follows: bool,
+    step: float, *, follows: bool, derive: Sequence[Match] = (),
 ) -> tuple[dict[str, Any], list[str], Filter | None]:  # fmt: skip
     """Options that resample a log, what they are for, and the filter among them."""
     options: dict[str, Any] = {"dt": float(f"{step:.9g}")}
     notes: list[str] = []
     if velocities:
         options["velocities"] = [m.column.entry for m in velocities]
+    if derive:
+        options["derive"] = [m.column.entry for m in derive]
     groups: dict[int, list[str]] = {}
     for m in positions:
         if m.place.measure == "quaternion":
             groups.setdefault(m.place.joint, []).append(m.column.entry)
     if groups:
         options["quaternions"] = list(groups.values())
-    smooth = None if velocities else make_filter(positions, clock, len(columns), columns.parts)
+    noisy = derive if velocities else positions
+    smooth = make_filter(noisy, clock, len(columns), columns.parts) if noisy else None
     if smooth is not None:
         options["cutoff"] = smooth.cutoff
         notes.append(f"positions are noisy: a filter at {smooth.cutoff:g} Hz, above which the log shows noise alone")
     dt = clock.dt or step
-    longest = _longest(clock, len(columns), columns.parts)
+    longest = _longest(clock, len(columns), columns.parts, matching.matches)
     if any(np.isnan(m.column.values).any() for m in matching.matches) or longest > 2.4 * max(dt, step):
         options["max_gap"] = float(f"{min(max(1.05 * longest, 2.5 * dt), GAP * dt):.4g}")
     if follows:
@@ -234,12 +279,20 @@ def _preprocess(
     return options, notes, smooth
 
 
-def _longest(clock: Clock, rows: int, parts: Sequence[int]) -> float:
-    """Longest time between rows inside episodes, seconds."""
+def _longest(clock: Clock, rows: int, parts: Sequence[int], matches: Sequence[Match] = ()) -> float:
+    """Longest time between rows inside episodes, or between values of columns, seconds."""
+    own = max((_longest_hole(m, clock.starts(rows, parts)) for m in matches), default=1) * (clock.dt or 0.0)
     if clock.column is None or not clock.column.values.size:
-        return clock.dt or 0.0
+        return max(own, clock.dt or 0.0)
     spacing = np.diff(clock.column.values)[~clock.starts(rows, parts)[1:]]
-    return float(spacing.max(initial=0.0)) * clock.unit
+    return max(own, float(spacing.max(initial=0.0)) * clock.unit)
+
+
+def _longest_hole(match: Match, starts: np.ndarray) -> int:
+    """Rows from a value of a column to the next one within an episode, at most."""
+    known = np.flatnonzero(np.isfinite(match.column.values))
+    runs = np.cumsum(starts)[known]
+    return int(np.diff(known)[np.diff(runs) == 0].max(initial=1))
 
 
 @dataclass(frozen=True)

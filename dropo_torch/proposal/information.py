@@ -11,7 +11,7 @@ import torch
 
 from dropo_torch.config import Config
 from dropo_torch.data.features import Features
-from dropo_torch.data.trajectory import make_transitions
+from dropo_torch.data.trajectory import Trajectories, make_transitions
 from dropo_torch.distribution import SearchBox
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant
@@ -48,10 +48,14 @@ class Noise:
     Attributes:
         columns: standard deviation of each observed column, ``(n,)``.
         setting: the model, and the sizes of the log.
+        config: that of the log, with the noise of its states.
+        log: its states, where the log itself shows sensors.
     """
 
     columns: np.ndarray
     setting: Setting
+    config: Config
+    log: Trajectories | None = None
 
 
 @dataclass(frozen=True)
@@ -86,7 +90,7 @@ def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
     columns = Features.of(problem.observation).column_noise(found.noise)
     if smooth is not None:
         columns = np.maximum(columns, [_left(smooth, label) for label in problem.observation.labels])
-    return Noise(np.maximum(columns, FLOOR * np.where(spread > 0, spread, 1.0)), setting)
+    return Noise(np.maximum(columns, FLOOR * np.where(spread > 0, spread, 1.0)), setting, problem.config)
 
 
 def _left(smooth: Filter, label: str) -> float:
@@ -104,7 +108,12 @@ def noise_keys(problem: Problem, noise: np.ndarray) -> dict[str, Any]:
 
 
 def information_of(
-    config: Config, candidates: Sequence[Candidate], *, least: int = 1, report: Report | None = None
+    config: Config,
+    candidates: Sequence[Candidate],
+    *,
+    least: int = 1,
+    report: Report | None = None,
+    log: Trajectories | None = None,
 ) -> Information:
     """Return what a log tells of candidates, by windows of the length that tells most.
 
@@ -113,9 +122,10 @@ def information_of(
         candidates: the candidates.
         least: shortest length of windows, in logged steps.
         report: is told the stage and its share.
+        log: the log, in place of the config's.
     """
     document = config.document() | {"parameters": {c.name: c.spec for c in candidates}, "lag": 1}
-    problem = make_problem(Config(**document, base=config.base))
+    problem = make_problem(Config(**document, base=config.base), log=log)
     simulations = len(candidates) + 2 + 2 * NOISE_DRAWS * problem.observation.size
     cost = _microseconds(problem) * problem.simulator.frame_skip * simulations
     steps = int(np.clip(BUDGET / cost, FEWEST, MOST))

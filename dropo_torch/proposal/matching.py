@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -108,6 +108,7 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
         found |= {m.place.label: m for m in fits}
         found |= {m.place.label: m for m in _by_family(places, kind, free, found)}
     found |= {m.place.label: m for m in _in_order(places, free, found)}
+    found |= {m.place.label: m for m in _gyroscope(places, free, found, starts)}
     matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
     used = [m.column for m in matches] + list(taken)
     unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used) and not _counts(c, starts))
@@ -170,7 +171,7 @@ def _assigned(
     free = [c for c in free if _may_be(c, wanted)] if wanted else []
     if not free:
         return []
-    words = {c.entry: w for c, w in zip(free, _with_axes(free, wanted), strict=True)}
+    words = {c.entry: w for c, w in zip(free, _of_the_body(_with_axes(free, wanted), wanted), strict=True)}
     ranks = _ranks(free, words, wanted)
     scalar = {p.label: i for i, p in enumerate(p for p in wanted if not p.axis)}
     names = np.array(
@@ -310,6 +311,23 @@ def _with_axes(columns: Sequence[Column], wanted: Sequence[Place]) -> list[Words
     return found
 
 
+def _of_the_body(words: Sequence[Words], wanted: Sequence[Place]) -> list[Words]:
+    """The words of columns, without those of what measures it where there is a single pose, of a single free body.
+
+    Such a pose is the body's, whether it is called after the body, a state estimator or a motion capture system.
+    """
+    bodies = {p.joint: {*p.words, *p.aliases} for p in wanted if p.axis}
+    poses: dict[tuple, set[tuple]] = {}
+    for w in words:
+        if w.axis and not w.angular and w.role in ("position", ""):
+            poses.setdefault((w.objects, w.numbers), set()).add((w.quaternion, w.axis))
+    whole = {*((False, axis) for axis in "xyz"), *((True, axis) for axis in "wxyz")}
+    found = [called for called, parts in poses.items() if whole <= parts]
+    if len(bodies) != 1 or len(found) != 1 or not found[0][0] or {*found[0][0]} & next(iter(bodies.values())):
+        return list(words)
+    return [replace(w, objects=()) if w.axis and (w.objects, w.numbers) == found[0] else w for w in words]
+
+
 def _ranks(columns: Sequence[Column], words: dict[str, Words], wanted: Sequence[Place]) -> dict[str, int]:
     """The place that a column's number names, among those of one coordinate, where there is a column for each.
 
@@ -382,7 +400,59 @@ def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, 
     return [Match(p, c, 1.0, "guess", "the order of columns") for p, c in zip(wanted, nameless, strict=True)]
 
 
+def _gyroscope(
+    places: Sequence[Place], free: Sequence[Column], found: dict[str, Match], starts: np.ndarray
+) -> list[Match]:
+    """Angular velocities of a free body by a gyroscope, whatever it is called, that turns as the orientation does."""
+    wanted = [p for p in places if p.kind == "velocity" and p.angular and p.label not in found]
+    for joint in {p.joint for p in wanted}:
+        own = [p for p in wanted if p.joint == joint]
+        quaternion = _quaternion(joint, places, found)
+        groups: dict[tuple, dict[str, Column]] = {}
+        for c in free:
+            if c.words.angular and c.words.role == "velocity" and c.words.axis and not _is_taken(c, found):
+                groups.setdefault((c.words.objects, c.words.numbers), {}).setdefault(c.words.axis, c)
+        for group in groups.values():
+            if len(own) == len(group) == 3 and quaternion is not None:
+                share, _ = turning(quaternion, np.stack([group[p.axis].values for p in own], axis=1), starts)
+                if share > SAME:
+                    why = f"the motion of the orientation (r² {share:.2f})"
+                    return [Match(p, group[p.axis], 1.0, "likely", why) for p in own]
+    return []
+
+
+def _quaternion(joint: int, places: Sequence[Place], found: Mapping[str, Match]) -> np.ndarray | None:
+    """The orientation of a free body as columns show it, ``(N, 4)``; ``None`` without them."""
+    parts = [found.get(p.label) for p in places if p.joint == joint and p.measure == "quaternion"]
+    return np.stack([m.values for m in parts if m], axis=1) if len(parts) == 4 and all(parts) else None
+
+
 # --- motion and units ---
+
+
+def turning(quaternion: np.ndarray, rates: np.ndarray, starts: np.ndarray) -> tuple[float, float]:
+    """Do what :func:`motion` does, of orientations ``(N, 4)`` and angular velocities in the body's frame, ``(N, 3)``.
+
+    Return which share of the turns over some rows the velocities explain, and their factor.
+    """
+    best = (0.0, math.nan)
+    total = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (rates[1:] + rates[:-1]), axis=0)])
+    runs = np.cumsum(starts)
+    for span in SPANS:
+        if len(quaternion) < 4 * span + 8:
+            continue
+        start, end, told = quaternion[:-span], quaternion[span:], total[span:] - total[:-span]
+        w = np.sum(start * end, axis=1)
+        turned = start[:, :1] * end[:, 1:] - end[:, :1] * start[:, 1:] - np.cross(start[:, 1:], end[:, 1:])
+        turned *= 2 * np.where(w < 0, -1.0, 1.0)[:, None]
+        good = (runs[span:] == runs[:-span]) & np.isfinite(turned).all(1) & np.isfinite(told).all(1)
+        turned, told = turned[good].ravel(), told[good].ravel()
+        size = float(told @ told)
+        if size > 0 and (all_of := float(turned @ turned)) > 0:
+            slope = float(turned @ told) / size
+            share = 1 - float(((turned - slope * told) ** 2).sum()) / all_of
+            best = max(best, (share, slope), key=lambda x: x[0])
+    return best
 
 
 def motion(position: np.ndarray, velocity: np.ndarray, starts: np.ndarray) -> tuple[float, float]:
@@ -462,6 +532,8 @@ def with_velocity_units(matching: Matching, starts: np.ndarray, dt: float) -> Ma
     """Return a matching in which velocities have the unit in which they are their positions' derivatives."""
     found = []
     for m in matching.matches:
+        if m.place.angular and m.column.words.scale is None and (unit := _unit_of_turns(matching, m, starts, dt)):
+            m = replace(m, scale=unit)
         partner = matching.at(m.place.partner) if m.place.kind == "velocity" else None
         if partner is not None and m.column.words.scale is None:
             share, slope = motion(partner.values, m.column.values, starts)
@@ -469,6 +541,19 @@ def with_velocity_units(matching: Matching, starts: np.ndarray, dt: float) -> Ma
                 m = replace(m, scale=unit)
         found.append(m)
     return replace(matching, matches=tuple(found))
+
+
+def _unit_of_turns(matching: Matching, match: Match, starts: np.ndarray, dt: float) -> float | None:
+    """The unit of a free body's angular velocity, in which it is the derivative of the orientation."""
+    found = {m.place.label: m for m in matching.matches}
+    places = [m.place for m in matching.matches]
+    quaternion = _quaternion(match.place.joint, places, found)
+    rates = [m.column.values for m in matching.matches if m.place.joint == match.place.joint and m.place.angular]
+    if quaternion is None or len(rates) != 3:
+        return None
+    share, slope = turning(quaternion, np.stack(rates, axis=1), starts)
+    unit = nearest_unit(slope / dt, match.place) if share > LIKE else None
+    return unit if unit is not None and unit > 0 else None
 
 
 def nearest_unit(factor: float, place: Place) -> float | None:

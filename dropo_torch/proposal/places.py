@@ -12,7 +12,7 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.parameters import object_names
 from dropo_torch.proposal.words import object_words
 
-Kind = Literal["position", "velocity", "command"]
+Kind = Literal["position", "velocity", "command", "marker"]
 #: Kinds of a place by what is measured there: an angle, a length, a component of a quaternion.
 Measure = Literal["angle", "length", "quaternion"]
 
@@ -23,10 +23,10 @@ class Place:
 
     Attributes:
         label: what it is called, such as ``shoulder.position``.
-        kind: position, velocity or command.
+        kind: position, velocity or command; or marker, a coordinate of a thing's place.
         measure: what is measured there.
         entry: its entry of a config's ``observation``; empty for a command.
-        number: its column in ``[qpos, qvel]``, or its actuator.
+        number: its column in ``[qpos, qvel]``, its actuator, or a marker's axis.
         joint: the joint's number, -1 for none.
         words, numbers: by which the object is known.
         aliases: words by which it may be known besides: its body's, its axis.

@@ -25,9 +25,11 @@ from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
 from dropo_torch.proposal.draft import Draft, Reading, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
+from dropo_torch.proposal.markers import with_markers
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
 from dropo_torch.proposal.places import Place, places_of
 from dropo_torch.proposal.text import config_text
+from dropo_torch.shooting.posing import column_noise, posed
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
 
 #: Told of the stage, and of its share.
@@ -145,14 +147,25 @@ def propose_config(
     places, step = places_of(compiled), float(compiled.opt.timestep)
     clock = find_clock(columns, step, dt)
     matching, clock = _matched(columns, places, clock, step, commanded)
+    if any(not p.optional for p in matching.lacks("position")):
+        source = Path(model)
+        if not commanded and matching.of("command"):
+            source = path
+            write_copy(Path(model), [m.place.label for m in matching.of("command")], step, source)
+        matching, copy = with_markers(load_model(source), source, Path(out), columns, matching, clock)
+        path = copy if matching.of("marker") else path
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
     _check(matching, columns, compiled, clock)
-    own, step = step, _whole_step(path, columns, clock, step)
-    if step != own and path == Path(model):
-        path = out_of(Path(out), path, "step")
-    if path != Path(model):
-        write_copy(Path(model), [] if commanded else [m.place.label for m in matching.of("command")], step, path)
+    own = step
+    if matching.of("marker"):
+        step = float(load_model(path).opt.timestep)
+    else:
+        step = _whole_step(path, columns, clock, step)
+        if step != own and path == Path(model):
+            path = out_of(Path(out), path, "step")
+        if path != Path(model):
+            write_copy(Path(model), [] if commanded else [m.place.label for m in matching.of("command")], step, path)
     if not commanded:
         keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
         places = tuple(p for p in places if p.label in keep)
@@ -169,7 +182,7 @@ def propose_config(
     tell("estimating the noise", 0.2)
     noise, candidates, document = _with_noise(document, draft, base)
     least = 1 if draft.smooth is None else math.ceil(0.5 / (draft.smooth.cutoff * document["frame_skip"] * step))
-    found = information_of(make_config(document, base=base), candidates, least=least, report=tell)
+    found = information_of(noise.config, candidates, least=least, report=tell, log=noise.log)
     choice = choose(candidates, found.gram)
     if review is not None and (names := review.parameters(choice)) is not None:
         choice = choose(candidates, found.gram, names)
@@ -255,7 +268,7 @@ def _explained(factor: float, matching: Matching) -> bool:
 def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: Clock) -> None:
     """Refuse a log that lacks what is needed, naming what there is instead."""
     free = [c.entry for c in matching.unused]
-    lacking = [p for p in matching.lacks("position") if not p.optional]
+    lacking = [p for p in matching.lacks("position") if not p.optional and not matching.of("marker")]
     lacking += [
         p for p in matching.lacks("velocity")
         if any(o.optional and o.label == p.partner for o in matching.lacks("position"))
@@ -284,11 +297,16 @@ def _with_noise(
     document: dict[str, Any], draft: Draft, base: Path
 ) -> tuple[Noise, tuple[Candidate, ...], dict[str, Any]]:
     """The noise, the candidates as the log sizes them, and the config's keys with the noise."""
-    problem = make_problem(make_config(document, base=base), general=True)
+    given = make_problem(make_config(document, base=base), general=True)
+    problem = posed(given)
     noise = measure_noise(problem, draft.smooth)
     states = problem.observation.states(problem.trajectories.observations, problem.trajectories.unseen)
-    candidates = all_candidates(noise.setting, states)
-    return noise, candidates, document | noise_keys(problem, noise.columns)
+    candidates, keys = all_candidates(noise.setting, states), noise_keys(problem, noise.columns)
+    noise = replace(noise, config=problem.config.model_copy(update=keys))
+    if problem is given:
+        return noise, candidates, document | keys
+    own = column_noise(given.observation, given.trajectories)  # a fit estimates it beside the states
+    return replace(noise, columns=own, log=problem.trajectories), candidates, document
 
 
 def _rate(clock: Clock, document: dict[str, Any], timestep: float) -> str:

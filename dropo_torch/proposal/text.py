@@ -32,11 +32,9 @@ def config_text(proposal: Proposal) -> str:
         *_comment(proposal.rate),
         _key("frame_skip", document["frame_skip"]),
         _key("observation", document["observation"]),
+        *([_key("mask", document["mask"])] if "mask" in document else []),
         "",
-        "# Standard deviation of the noise of each observed column, estimated from the log: what short stretches show",
-        "# although forces are free. ε, a variance, is small beside it.",
-        _key("noise", document["noise"]),
-        _key("epsilon", document["epsilon"]),
+        *_noise(document),
         "",
         *_comment(proposal.window),
         _key("lag", document["lag"]),
@@ -54,6 +52,18 @@ def config_text(proposal: Proposal) -> str:
         lines += ["", "# Left out; each fits in above if its cause is known better or a log shows more:"]
         lines += [f"#   {line}" for t in left for line in (_left(t),)]
     return "\n".join(lines) + "\n"
+
+
+def _noise(document: dict[str, Any]) -> list[str]:
+    """The noise, where a fit does not estimate it."""
+    if "noise" not in document:
+        return ["# A fit estimates the noise of every column, beside the states."]
+    return [
+        "# Standard deviation of the noise of each observed column, estimated from the log: what short stretches show",
+        "# although forces are free. ε, a variance, is small beside it.",
+        _key("noise", document["noise"]),
+        _key("epsilon", document["epsilon"]),
+    ]
 
 
 def _key(name: str, value: Any) -> str:

@@ -125,6 +125,7 @@ def read_name(name: str, joints: Sequence[str] = ()) -> Words:
             known, number = object_words(" ".join(own))
             return replace(rest, objects=known + rest.objects, numbers=number + rest.numbers)
     words, numbers = [w for w in every if not w.isdigit()], tuple(int(w) for w in every if w.isdigit())
+    words = [part for w in words for part in _parts(w)]
     words, scale = _unit(words)
     axis, quaternion, angular = "", False, False
     roles: list[Role] = []
@@ -200,6 +201,17 @@ def _role(word: str) -> Role:
     if word.startswith("d") and (word[1:] in _ROLES["position"] or word[1:] in _AXES):
         return "velocity"
     return ""
+
+
+def _parts(word: str) -> tuple[str, ...]:
+    """A word that is two, such as ``qdes`` and ``taucmd``, as these: what is commanded, and that it is."""
+    if _role(word) or len(word) < 4:
+        return (word,)
+    for end in sorted(_ROLES["command"], key=len, reverse=True):
+        begin = word.removesuffix(end)
+        if len(end) > 2 and begin != word and _role(begin) in ("position", "velocity", "effort"):
+            return begin, end
+    return (word,)
 
 
 def _short(word: str) -> tuple[str, str] | None:
