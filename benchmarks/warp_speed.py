@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import itertools
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,8 +21,10 @@ import mujoco
 import mujoco.batch
 import numpy as np
 import torch
-from warp_models import MODELS
 
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from benchmarks.warp_models import MODELS
 from dropo_torch.parameters import ParameterSpace, object_names
 from dropo_torch.simulators.warp import WarpSimulator
 
