@@ -712,7 +712,7 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
     shares = [place["share"] for place in document["where"]]
     assert shares == sorted(shares, reverse=True)
     assert all(set(r) == {"effect", "target", "values", "left", "round"} for r in document["ranking"])
-    assert set(document["declared"]["pole_mass"]) == {"given", "alone", "with_effects"}
+    assert set(document["declared"]["pole_mass"]) == {"given", "alone", "with_effects", "low", "high"}
     assert list(document["noise"]) == ["rail.position", "hinge.position", "rail.velocity", "hinge.velocity"]
     assert set(document["chi2_per_degree"]) == {"before", "after"}
     assert document["verdict"] == {0: "no gap", 1: "unnamed", 2: "explained"}[len(document["effects"])]
