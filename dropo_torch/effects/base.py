@@ -20,6 +20,11 @@ from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import object_names
 
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
+#: MuJoCo's kinds of the objects at which effects are.
+_KINDS = {
+    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM,
+    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
+}  # fmt: skip
 #: The methods by which an effect acts on a simulation.
 Method = Literal["apply", "force", "wrench", "command", "sense"]
 
@@ -130,7 +135,8 @@ class Setting:
 
 def object_number(model: mujoco.MjModel, prefix: str, name: str | None) -> int:
     """Return the number of an object of a kind by its name, as :func:`~dropo_torch.parameters.object_names` has it."""
-    return object_names(model, prefix).index(str(name))
+    number = mujoco.mj_name2id(model, _KINDS[prefix], str(name))
+    return number if number >= 0 else object_names(model, prefix).index(str(name))
 
 
 #: Every effect that a config may name, by its name: the package's, and a user's own.

@@ -89,7 +89,10 @@ class Forces:
     def __init__(self, setting: Setting) -> None:
         model = setting.model
         simple = np.isin(model.jnt_type, (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE)))
-        self._setting, self._position, self._velocity = setting, model.jnt_qposadr[simple], model.jnt_dofadr[simple]
+        self._setting = setting
+        self._position, self._velocity = model.jnt_qposadr[simple], model.jnt_dofadr[simple]
+        if simple.all():  # views of all columns need no copy
+            self._position = self._velocity = slice(None)
 
     def __call__(
         self, acting: Iterable[Force], position: np.ndarray, velocity: np.ndarray, before: np.ndarray, step: float
@@ -105,13 +108,13 @@ class Forces:
         ahead = position.copy()
         ahead[:, self._position] += 0.5 * step * velocity[:, self._velocity]
         then, out = velocity + 0.5 * (velocity - before), np.zeros_like(velocity)
-        for f in acting:
-            own = self._setting, f.target, f.values
-            with np.errstate(all="ignore"):
+        with np.errstate(all="ignore"):
+            for f in acting:
+                own = self._setting, f.target, f.values
                 if f.memory.now is None:
                     f.memory.now = f.effect.recall(*own, position[f.rows], velocity[f.rows])
                 found, f.memory.now = f.effect.force_after(*own, ahead[f.rows], then[f.rows], f.memory.now)
-            out[f.rows] += np.nan_to_num(found)
+                out[f.rows] += found if np.isfinite(found).all() else np.nan_to_num(found)
         return out
 
 

@@ -42,7 +42,8 @@ def filters_of(
 
 def placed_filters(placed: Iterable[Placed], method: Literal["command", "sense"], setting: Setting) -> list[Filter]:
     """Return the effects that act by a method, with the same numbers in all rows."""
-    acting = ((p.effect, p.target, torch.tensor([p.values], dtype=torch.float64)) for p in placed)
+    own = (p for p in placed if p.effect.has(method))  # most do not, and this is asked of every variant
+    acting = ((p.effect, p.target, torch.tensor([p.values], dtype=torch.float64)) for p in own)
     return filters_of(acting, method, setting)
 
 

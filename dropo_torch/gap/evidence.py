@@ -7,6 +7,7 @@ P = I − QQᵀ from the QR factors of ∂r/∂x₀. What is left, P r, is compa
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -244,8 +245,10 @@ class Evidence:
 def _beside(linear: Linearisation, vectors: np.ndarray) -> np.ndarray:
     """Return the part of weighted vectors ``(..., W, N)`` outside the span of the basis."""
     weighted = vectors * linear.weights
-    along = np.einsum("wnm,...wn->...wm", linear.basis, weighted)
-    return weighted - np.einsum("wnm,...wm->...wn", linear.basis, along)
+    (*others, num_w, size), basis = weighted.shape, linear.basis
+    rows = weighted.reshape(math.prod(others), num_w, size).swapaxes(0, 1)  # by windows, which have a basis each
+    along = (rows @ basis) @ basis.swapaxes(1, 2)
+    return weighted - along.swapaxes(0, 1).reshape(weighted.shape)
 
 
 @dataclass(frozen=True)

@@ -217,9 +217,10 @@ class _Anchors:
     """
 
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace, columns: np.ndarray) -> None:
-        data = mujoco.MjData(model)
-        mujoco.mj_kinematics(model, data)
         written = {t.index // mujoco.mjNEQDATA for p in space.parameters for t in p.targets if t.field == "eq_data"}
+        data = mujoco.MjData(model)
+        if written:
+            mujoco.mj_kinematics(model, data)
         bodies = model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY)
         self._maps = []
         for i in sorted(written):

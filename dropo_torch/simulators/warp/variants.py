@@ -95,7 +95,9 @@ class Stepper:
             run()
             found[rows] = after
         with np.errstate(invalid="ignore"):
-            found[~(np.abs(found) < DIVERGED).all(1)] = np.nan
+            near = np.abs(found) < DIVERGED
+            if not near.all():
+                found[~near.all(1)] = np.nan
         self.states = found
 
 
@@ -180,13 +182,16 @@ def _structure(model: mujoco.MjModel, tabled: Sequence[str], free: Mapping[str, 
         tabled: its :func:`tabled_fields`.
         free: numbers of these that stand in θ for all that.
     """
-    numbers = [np.sign(read_field(model, field)) for field in _SIGNS]
-    numbers += [np.any(read_field(model, field)) for field in _ANY]
-    numbers += list(inertial_frames(model))
-    arrays = [*numbers, *(np.array(read_field(model, field)) for field in tabled)]
-    for field, array in zip(tabled, arrays[len(numbers) :], strict=True):
-        array.reshape(-1)[(free or {}).get(field, [])] = 0
-    return hashlib.blake2b(b"|".join(array.tobytes() for array in arrays)).digest()
+    arrays = [np.sign(read_field(model, field)) for field in _SIGNS]
+    arrays += [np.any(read_field(model, field)) for field in _ANY]
+    arrays += inertial_frames(model)
+    for field in tabled:
+        array = read_field(model, field)
+        if free and field in free:
+            array = array.copy()
+            array.reshape(-1)[free[field]] = 0
+        arrays.append(array)
+    return hashlib.blake2b(b"|".join([array.tobytes() for array in arrays])).digest()
 
 
 #: Fields of θ of which each number's sign matters, and such of which it does whether any is not zero.
