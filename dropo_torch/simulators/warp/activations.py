@@ -30,13 +30,13 @@ from dropo_torch.simulators.warp.types import (
 
 
 @wp.func(inline=True)
-def clamp(w: World, o: int, x: f64) -> f64:
+def clamp(w: wp.ref[World], o: int, x: f64) -> f64:
     """x within the range that stands at ``o`` in θ."""
     return wp.min(wp.max(x, w.th[o]), w.th[o + 1])
 
 
 @wp.func(inline=True)
-def clamp_adjoint(w: World, o: int, x: f64, bar: f64) -> f64:
+def clamp_adjoint(w: wp.ref[World], o: int, x: f64, bar: f64) -> f64:
     """Adjoint of x before :func:`clamp`: where it is clamped its end of the range has it."""
     out = bar
     if x < w.th[o]:
@@ -49,7 +49,7 @@ def clamp_adjoint(w: World, o: int, x: f64, bar: f64) -> f64:
 
 
 @wp.func(inline=True)
-def control(m: Tables, w: World, i: int) -> f64:
+def control(m: wp.ref[Tables], w: wp.ref[World], i: int) -> f64:
     """Control of an actuator, clamped to its range."""
     u = w.ctrl[w.rc, i]
     if m.act_ctrllimited[i] != 0:
@@ -58,7 +58,7 @@ def control(m: Tables, w: World, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def control_adjoint(m: Tables, w: World, i: int, bar: f64):
+def control_adjoint(m: wp.ref[Tables], w: wp.ref[World], i: int, bar: f64):
     """Adjoint of :func:`control`."""
     ubar = bar
     if m.act_ctrllimited[i] != 0:
@@ -92,14 +92,14 @@ def activation_power(dynamics: int, u: f64, act: f64, prm: vec3, bar: f64) -> f6
 
 
 @wp.func(inline=True)
-def activation_rate(m: Tables, w: World, r: int, i: int) -> f64:
+def activation_rate(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """Rate of the activation of actuator ``i`` in row ``r``."""
     act = w.act[r, m.act_state[i]]
     return activation_power(m.act_dyn[i], control(m, w, i), act, theta_vec3(w.th, m.o_dynprm + 3 * i), ONE)
 
 
 @wp.func(inline=True)
-def reach(m: Tables, w: World, i: int) -> f64:
+def reach(m: wp.ref[Tables], w: wp.ref[World], i: int) -> f64:
     """What the rate of an activation is multiplied by over a step."""
     y = m.h
     if m.act_dyn[i] == FILTEREXACT:
@@ -109,7 +109,7 @@ def reach(m: Tables, w: World, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def stepped(m: Tables, w: World, i: int, act: f64, rate: f64) -> f64:
+def stepped(m: wp.ref[Tables], w: wp.ref[World], i: int, act: f64, rate: f64) -> f64:
     """An activation a step later, at a rate."""
     y = act + reach(m, w, i) * rate
     if m.act_statelimited[i] != 0:
@@ -118,7 +118,7 @@ def stepped(m: Tables, w: World, i: int, act: f64, rate: f64) -> f64:
 
 
 @wp.func(inline=True)
-def stepped_adjoint(m: Tables, w: World, i: int, act: f64, rate: f64, bar: f64) -> f64:
+def stepped_adjoint(m: wp.ref[Tables], w: wp.ref[World], i: int, act: f64, rate: f64, bar: f64) -> f64:
     """Adjoint of the activation in :func:`stepped`; times :func:`reach` it is the rate's."""
     y = bar
     if m.act_statelimited[i] != 0:
@@ -132,7 +132,7 @@ def stepped_adjoint(m: Tables, w: World, i: int, act: f64, rate: f64, bar: f64) 
 
 
 @wp.func(inline=True)
-def _activation(m: Tables, w: World, r: int, i: int) -> f64:
+def _activation(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """Activation that acts in row ``r``."""
     y = w.act[r, m.act_state[i]]
     if m.act_early[i] != 0:
@@ -141,7 +141,7 @@ def _activation(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def drive(m: Tables, w: World, r: int, i: int) -> f64:
+def drive(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """What the force of an actuator goes by: its control, its activation, or that at the end of the step."""
     y = control(m, w, i)
     if is_activated(m, i):
@@ -150,7 +150,7 @@ def drive(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def _activation_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
+def _activation_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int, bar: f64):
     """Adjoint of :func:`_activation`."""
     k = m.act_state[i]
     if m.act_early[i] == 0:
@@ -162,7 +162,7 @@ def _activation_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
 
 
 @wp.func(inline=True)
-def drive_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
+def drive_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int, bar: f64):
     """Adjoint of :func:`drive`."""
     if is_activated(m, i):
         _activation_adjoint(m, w, r, i, bar)
@@ -171,14 +171,14 @@ def drive_adjoint(m: Tables, w: World, r: int, i: int, bar: f64):
 
 
 @wp.func(inline=True)
-def move_activations(m: Tables, w: World, r: int, k: int, c: f64):
+def move_activations(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int, c: f64):
     """Activations of stage ``k`` of RK4, ``c`` after those of the start at the rates of the stage before."""
     for j in range(m.na):
         w.act[r + k, j] = w.act[r, j] + c * activation_rate(m, w, r + k - 1, m.state_act[j])
 
 
 @wp.func(inline=True)
-def mean_rate(m: Tables, w: World, r: int, i: int) -> f64:
+def mean_rate(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """Rate of an activation over the step whose stages begin in row ``r``."""
     y = activation_rate(m, w, r, i)
     if m.integrator == RK4:
@@ -188,7 +188,7 @@ def mean_rate(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def step_activations(m: Tables, w: World, r: int, nxt: int):
+def step_activations(m: wp.ref[Tables], w: wp.ref[World], r: int, nxt: int):
     """Activations at the end of a step, in row ``nxt``."""
     for j in range(m.na):
         i = m.state_act[j]
@@ -196,7 +196,7 @@ def step_activations(m: Tables, w: World, r: int, nxt: int):
 
 
 @wp.func(inline=True)
-def step_activations_adjoint(m: Tables, w: World, r: int):
+def step_activations_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Adjoint of :func:`step_activations`: from ``w.act_end_bar`` to the start and the rates of all stages."""
     for j in range(m.na):
         i = m.state_act[j]
@@ -211,7 +211,7 @@ def step_activations_adjoint(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def begin_activations_adjoint(m: Tables, w: World, k: int):
+def begin_activations_adjoint(m: wp.ref[Tables], w: wp.ref[World], k: int):
     """Adjoints of the activations of stage ``k`` and of their rates, before that of what depends on them."""
     for j in range(num_activations(m)):
         w.act_bar[w.t, j] = ZERO
@@ -219,7 +219,7 @@ def begin_activations_adjoint(m: Tables, w: World, k: int):
 
 
 @wp.func(inline=True)
-def end_activations_adjoint(m: Tables, w: World, r: int, k: int, c: f64):
+def end_activations_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int, c: f64):
     """Adjoint of the rates of stage ``k``, row ``r``, and of :func:`move_activations`; of stage 0 ``c`` is zero."""
     _late = wp.grad(late)(ONE)
     for j in range(m.na):

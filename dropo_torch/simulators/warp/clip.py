@@ -86,13 +86,13 @@ def box_corner(s: Shape, i: int) -> vec3:
 
 
 @wp.func
-def _corner(m: Tables, s: Shape, i: int) -> vec3:
+def _corner(m: wp.ref[Tables], s: Shape, i: int) -> vec3:
     """Vertex of a box or a mesh."""
     return box_corner(s, i) if s.kind == BOX else s.rot * m.hull_vert[s.hull + i] + s.pos
 
 
 @wp.func
-def _set_normal(w: World, side: int, k: int, n: vec3, face: int):
+def _set_normal(w: wp.ref[World], side: int, k: int, n: vec3, face: int):
     """Write normal ``k`` of the first or the second shape, and the face that has it."""
     if side == 0:
         w.clip_normal1[w.t, k] = n
@@ -103,7 +103,7 @@ def _set_normal(w: World, side: int, k: int, n: vec3, face: int):
 
 
 @wp.func
-def _box_normals(w: World, side: int, s: Shape, f: Feature, outward: vec3) -> int:
+def _box_normals(w: wp.ref[World], side: int, s: Shape, f: Feature, outward: vec3) -> int:
     """Normals of the faces of a box that a feature is on."""
     n = int(0)
     axes = int(3)  # a variable: the loops are not unrolled
@@ -131,7 +131,7 @@ def _box_normals(w: World, side: int, s: Shape, f: Feature, outward: vec3) -> in
 
 
 @wp.func
-def _has_polygon(m: Tables, s: Shape, v: int, polygon: int) -> bool:
+def _has_polygon(m: wp.ref[Tables], s: Shape, v: int, polygon: int) -> bool:
     """Whether a vertex of a hull is on a polygon."""
     i = m.hull_polyadr[s.hull + v]
     found = bool(False)
@@ -143,7 +143,7 @@ def _has_polygon(m: Tables, s: Shape, v: int, polygon: int) -> bool:
 
 
 @wp.func
-def _mesh_normals(m: Tables, w: World, side: int, s: Shape, f: Feature) -> int:
+def _mesh_normals(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature) -> int:
     """Normals of the polygons of a hull that a feature is on."""
     n = int(0)
     most = wp.where(f.dim == 1, m.nclip_normal, wp.where(f.dim == 2, 2, 1))
@@ -161,7 +161,7 @@ def _mesh_normals(m: Tables, w: World, side: int, s: Shape, f: Feature) -> int:
 
 
 @wp.func
-def _normals(m: Tables, w: World, side: int, s: Shape, f: Feature, outward: vec3) -> int:
+def _normals(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature, outward: vec3) -> int:
     """Normals of the faces that a feature is on; how many."""
     n = int(0)
     if s.kind == BOX:
@@ -176,14 +176,14 @@ def _normals(m: Tables, w: World, side: int, s: Shape, f: Feature, outward: vec3
 
 
 @wp.func
-def _set_edge(w: World, side: int, k: int, start: vec3, end: vec3):
+def _set_edge(w: wp.ref[World], side: int, k: int, start: vec3, end: vec3):
     d = end - start
     _set_normal(w, side, k, wp.normalize(d), 0)
     w.clip_end[w.t, k] = end
 
 
 @wp.func
-def _mesh_edges(m: Tables, w: World, side: int, s: Shape, v: int, start: vec3) -> int:
+def _mesh_edges(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, v: int, start: vec3) -> int:
     """Edges of a hull at a vertex: for each of its polygons to the vertex before."""
     n = int(0)
     i = m.hull_polyadr[s.hull + v]
@@ -201,7 +201,7 @@ def _mesh_edges(m: Tables, w: World, side: int, s: Shape, v: int, start: vec3) -
 
 
 @wp.func
-def _edges(m: Tables, w: World, side: int, s: Shape, f: Feature, witness: vec3):
+def _edges(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature, witness: vec3):
     """Edges that a feature may be part of: how many, and where they start; their ends and directions are written."""
     n = int(0)
     start = f.point
@@ -238,7 +238,7 @@ def _edges(m: Tables, w: World, side: int, s: Shape, f: Feature, witness: vec3):
 
 
 @wp.func
-def _set_corner(w: World, side: int, k: int, x: vec3):
+def _set_corner(w: wp.ref[World], side: int, k: int, x: vec3):
     if side == 0:
         w.clip_face1[w.t, k] = x
     else:
@@ -246,7 +246,7 @@ def _set_corner(w: World, side: int, k: int, x: vec3):
 
 
 @wp.func
-def _face(m: Tables, w: World, side: int, s: Shape, face: int) -> int:
+def _face(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, face: int) -> int:
     """Write the corners of a face, clockwise from outside; how many."""
     n = int(0)
     if s.kind == BOX:
@@ -274,18 +274,18 @@ def _face(m: Tables, w: World, side: int, s: Shape, face: int) -> int:
 
 
 @wp.func
-def _corner_of(w: World, side: int, k: int) -> vec3:
+def _corner_of(w: wp.ref[World], side: int, k: int) -> vec3:
     return wp.where(side == 0, w.clip_face1[w.t, k], w.clip_face2[w.t, k])
 
 
 @wp.func
-def capacity(w: World) -> int:
+def capacity(w: wp.ref[World]) -> int:
     """Corners of which there is room in a polygon."""
     return w.clip_point.shape[1] // 2
 
 
 @wp.func
-def _add_point(w: World, page: int, k: int, x: vec3, line: int):
+def _add_point(w: wp.ref[World], page: int, k: int, x: vec3, line: int):
     """Append a corner to a polygon in one of two pages, with the side that leaves it."""
     if k < capacity(w):
         w.clip_point[w.t, page * capacity(w) + k] = x
@@ -293,7 +293,7 @@ def _add_point(w: World, page: int, k: int, x: vec3, line: int):
 
 
 @wp.func
-def _clip(w: World, clipping: int, nclipping: int, clipped: int, nclipped: int, n: vec3):
+def _clip(w: wp.ref[World], clipping: int, nclipping: int, clipped: int, nclipped: int, n: vec3):
     """Clip a polygon at the sides of a face with normal ``n``; the page where the result is, and its corners."""
     half = capacity(w)
     page = int(0)
@@ -329,17 +329,17 @@ def _clip(w: World, clipping: int, nclipping: int, clipped: int, nclipped: int, 
 
 
 @wp.func
-def _at(w: World, page: int, i: int) -> vec3:
+def _at(w: wp.ref[World], page: int, i: int) -> vec3:
     return w.clip_point[w.t, page * capacity(w) + i]
 
 
 @wp.func
-def _area(w: World, page: int, a: int, b: int, c: int, d: int) -> f64:
+def _area(w: wp.ref[World], page: int, a: int, b: int, c: int, d: int) -> f64:
     return HALF * wp.length(wp.cross(_at(w, page, a) - _at(w, page, c), _at(w, page, b) - _at(w, page, d)))
 
 
 @wp.func
-def _largest_quad(w: World, page: int, n: int) -> vec4i:
+def _largest_quad(w: wp.ref[World], page: int, n: int) -> vec4i:
     """Corners of a quadrilateral of largest area in a polygon, as MuJoCo finds it."""
     b = int(1)
     c = int(2)
@@ -381,7 +381,7 @@ def _largest_quad(w: World, page: int, n: int) -> vec4i:
 
 
 @wp.func
-def _furthest_two(w: World, page: int, n: int) -> vec4i:
+def _furthest_two(w: wp.ref[World], page: int, n: int) -> vec4i:
     best = vec4i(0, 1, 0, 0)
     far = f64(0.0)
     for i in range(n):
@@ -394,7 +394,9 @@ def _furthest_two(w: World, page: int, n: int) -> vec4i:
 
 
 @wp.func
-def _plane_of(w: World, line: int, clipping: int, nclipping: int, nc: vec3, clipped: int, nclipped: int, nd: vec3):
+def _plane_of(
+    w: wp.ref[World], line: int, clipping: int, nclipping: int, nc: vec3, clipped: int, nclipped: int, nd: vec3
+):
     """Normal of the plane of a side, and whether it is one of the clipping face."""
     side = clipped
     i = line
@@ -411,7 +413,7 @@ def _plane_of(w: World, line: int, clipping: int, nclipping: int, nc: vec3, clip
 
 @wp.func
 def _planes_at(
-    w: World, page: int, k: int, clipping: int, nclipping: int, nc: vec3, clipped: int, nclipped: int, nd: vec3
+    w: wp.ref[World], page: int, k: int, clipping: int, nclipping: int, nc: vec3, clipped: int, nclipped: int, nd: vec3
 ):
     """Three planes in whose common point a corner is, and which of them are fixed in the clipped body (bits)."""
     out_line = w.clip_line[w.t, page * capacity(w) + k]
@@ -440,7 +442,7 @@ def _planes_at(
 
 
 @wp.func
-def _best_faces(w: World, n1: int, n2: int, direction: vec3):
+def _best_faces(w: wp.ref[World], n1: int, n2: int, direction: vec3):
     """The two faces that face each other most, if they do; ``direction`` is against the normal of the contact."""
     limit = EDGE_SINE * wp.length(direction)
     best = -FACE_COSINE
@@ -459,7 +461,7 @@ def _best_faces(w: World, n1: int, n2: int, direction: vec3):
 
 
 @wp.func
-def _edge_and_face(w: World, edges: int, nedge: int, nface: int, direction: vec3):
+def _edge_and_face(w: wp.ref[World], edges: int, nedge: int, nface: int, direction: vec3):
     """The first edge that lies in a face's plane, of the shape ``edges``, and the face."""
     edge = int(-1)
     face = int(-1)
@@ -480,7 +482,7 @@ def _three(x: wp.types.matrix((4, 3), wp.float64)) -> mat33:
 
 
 @wp.func
-def multicontact(m: Tables, w: World, a: Shape, b: Shape, s: Simplex, x1: vec3, x2: vec3) -> int:
+def multicontact(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex, x1: vec3, x2: vec3) -> int:
     """Contacts of two shapes whose witnesses and their simplex are known; how many, 0 if only the witnesses touch.
 
     They are written to ``clip_dist`` (of the inflated shapes), ``clip_mid``, ``clip_corner``, ``clip_height``,

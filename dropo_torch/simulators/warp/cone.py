@@ -55,7 +55,7 @@ class Cone:
 
 
 @wp.func(inline=True)
-def cone_of(m: Tables, w: World, k: int, d: f64) -> Cone:
+def cone_of(m: wp.ref[Tables], w: wp.ref[World], k: int, d: f64) -> Cone:
     """The cone of pair ``k``."""
     return Cone(m.pair_dim[k], m.elliptic, m.impratio, d, theta_vec5(w.th, m.o_pair_friction + 5 * k))
 

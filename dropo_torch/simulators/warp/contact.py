@@ -27,7 +27,7 @@ def in_frame(frame: mat33, x: vec6, p: vec3) -> vec6:
 
 
 @wp.func(inline=True)
-def fills_in(m: Tables, w: World, ncon: int) -> int:
+def fills_in(m: wp.ref[Tables], w: wp.ref[World], ncon: int) -> int:
     """1 if H has entries beyond the tree's, because a contact joins two branches."""
     dense = m.always_dense
     for c in range(ncon):
@@ -37,7 +37,7 @@ def fills_in(m: Tables, w: World, ncon: int) -> int:
 
 
 @wp.func(inline=True)
-def contact_softness(m: Tables, w: World, c: int) -> Soft:
+def contact_softness(m: wp.ref[Tables], w: wp.ref[World], c: int) -> Soft:
     """The softness of a contact along its normal."""
     k = w.con_pair[w.t, c]
     x = w.con_dist[w.t, c] - w.th[m.o_pair_margin + k]
@@ -45,7 +45,7 @@ def contact_softness(m: Tables, w: World, c: int) -> Soft:
 
 
 @wp.func(inline=True)
-def make_contacts(m: Tables, w: World, ncon: int):
+def make_contacts(m: wp.ref[Tables], w: wp.ref[World], ncon: int):
     """Jacobian, reference acceleration and D of each contact."""
     for c in range(ncon):
         k = w.con_pair[w.t, c]
@@ -73,7 +73,7 @@ def make_contacts(m: Tables, w: World, ncon: int):
 
 
 @wp.func(inline=True)
-def contacts_adjoint(m: Tables, w: World, ncon: int):
+def contacts_adjoint(m: wp.ref[Tables], w: wp.ref[World], ncon: int):
     """Add the gradient of Σ −f Jλ over the contacts to the bodies' F and Y and to θ."""
     _late = wp.grad(late)(ONE)
     for c in range(ncon):
@@ -101,7 +101,7 @@ def contacts_adjoint(m: Tables, w: World, ncon: int):
 
 
 @wp.func(inline=True)
-def _elliptic_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
+def _elliptic_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, ju: vec6, jv: vec6, jl: vec6):
     """Adjoints of J a, J q̇, Jλ and the distance of a contact with an elliptic cone; adds that of θ."""
     k = w.con_pair[w.t, c]
     o_mu = m.o_pair_friction + 5 * k
@@ -123,7 +123,7 @@ def _elliptic_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6)
 
 
 @wp.func(inline=True)
-def _pyramid_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
+def _pyramid_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, ju: vec6, jv: vec6, jl: vec6):
     """Adjoints of J a, J q̇, Jλ and the distance of a contact with a pyramid, or without friction; adds that of θ.
 
     With the force f and the Hessian C of the cost at jar6 = J a − aref, −f Jλ has the gradient C Jλ in jar6.
@@ -165,7 +165,18 @@ def _pyramid_adjoint(m: Tables, w: World, c: int, ju: vec6, jv: vec6, jl: vec6):
 
 
 @wp.func(inline=True)
-def _hang(m: Tables, w: World, c: int, u: vec6, v: vec6, dual: vec6, ub: vec6, vb: vec6, lb: vec6, distbar: f64):
+def _hang(
+    m: wp.ref[Tables],
+    w: wp.ref[World],
+    c: int,
+    u: vec6,
+    v: vec6,
+    dual: vec6,
+    ub: vec6,
+    vb: vec6,
+    lb: vec6,
+    distbar: f64,
+):
     """Hang the adjoints of J a, J q̇, Jλ and the distance on the two bodies: F_U, F_V, F_Λ and Y."""
     _late = wp.grad(late)(ONE)
     k = w.con_pair[w.t, c]
@@ -192,7 +203,7 @@ def _hang(m: Tables, w: World, c: int, u: vec6, v: vec6, dual: vec6, ub: vec6, v
 
 
 @wp.func(inline=True)
-def _hang_on(w: World, b: int, y: vec6, fu: vec6, fv: vec6, fl: vec6):
+def _hang_on(w: wp.ref[World], b: int, y: vec6, fu: vec6, fv: vec6, fl: vec6):
     """Add to F_U, F_V, F_Λ and Y of a body."""
     if b > 0:
         pose = y + (cross_force(w.total[w.t, b], fu) + cross_force(w.velocity[w.t, b], fv))

@@ -78,7 +78,7 @@ def positive(x: f64) -> f64:
 
 
 @wp.func
-def hull_vertex(m: Tables, s: Shape, d: vec3) -> int:
+def hull_vertex(m: wp.ref[Tables], s: Shape, d: vec3) -> int:
     """Vertex of a hull that is furthest along ``d``, in the hull's frame."""
     best = s.place
     if s.climbs != 0:
@@ -114,7 +114,7 @@ def hull_vertex(m: Tables, s: Shape, d: vec3) -> int:
 
 
 @wp.func
-def support(m: Tables, s: Shape, d: vec3):
+def support(m: wp.ref[Tables], s: Shape, d: vec3):
     """Point of a shape that is furthest along ``d``, which vertex it is (−1: none), and where the search ended."""
     local = wp.transpose(s.rot) * d
     x = vec3()
@@ -371,7 +371,7 @@ def _kept(n: int, w: vec4, s: Simplex):
 
 
 @wp.func
-def gjk(m: Tables, a0: Shape, b0: Shape, tolerance: f64, iterations: int, cutoff: f64) -> Distance:
+def gjk(m: wp.ref[Tables], a0: Shape, b0: Shape, tolerance: f64, iterations: int, cutoff: f64) -> Distance:
     """Distance of two shapes up to a cutoff; with the cutoff zero only whether they overlap."""
     a = a0
     b = b0

@@ -47,7 +47,7 @@ FLAT = wp.constant(wp.float64(-1.0))
 
 
 @wp.func
-def shape_of(m: Tables, w: World, g: int, inflation: f64) -> Shape:
+def shape_of(m: wp.ref[Tables], w: wp.ref[World], g: int, inflation: f64) -> Shape:
     """A geom as a convex shape."""
     b = m.geom_body[g]
     s = Shape()
@@ -119,7 +119,7 @@ def _ellipsoid_curve(s: Shape, n: vec3) -> vec6:
 
 
 @wp.func
-def curve_at(m: Tables, s: Shape, vertices: wp.vec4i, n: int, x: vec3, normal: vec3) -> vec6:
+def curve_at(m: wp.ref[Tables], s: Shape, vertices: wp.vec4i, n: int, x: vec3, normal: vec3) -> vec6:
     """How a shape is curved at a point ``x`` that touches, with outward normal: direction, radii along and across it.
 
     The ``n`` vertices are those that the point lies between; an infinite radius is FLAT.
@@ -161,7 +161,9 @@ def curve_at(m: Tables, s: Shape, vertices: wp.vec4i, n: int, x: vec3, normal: v
 
 
 @wp.func
-def _keep_single(m: Tables, w: World, a: Shape, b: Shape, s: Simplex, x1: vec3, x2: vec3, normal: vec3, dist: f64):
+def _keep_single(
+    m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex, x1: vec3, x2: vec3, normal: vec3, dist: f64
+):
     """Write the one contact of two witnesses, and how the shapes are curved there."""
     w.clip_dist[w.t, 0] = dist
     w.clip_mid[w.t, 0] = (x1 + x2) * HALF
@@ -175,7 +177,7 @@ def _keep_single(m: Tables, w: World, a: Shape, b: Shape, s: Simplex, x1: vec3, 
 
 
 @wp.func
-def convex_contacts(m: Tables, w: World, k: int, reach: f64) -> int:
+def convex_contacts(m: wp.ref[Tables], w: wp.ref[World], k: int, reach: f64) -> int:
     """Find the contacts of a pair nearer than ``reach``; how many: in ``clip_...``, distances less it."""
     a = shape_of(m, w, m.pair_geom1[k], HALF * reach)
     b = shape_of(m, w, m.pair_geom2[k], HALF * reach)
@@ -221,7 +223,7 @@ def convex_contacts(m: Tables, w: World, k: int, reach: f64) -> int:
 
 
 @wp.func
-def keep_contact(w: World, n: int, i: int):
+def keep_contact(w: wp.ref[World], n: int, i: int):
     """Keep what the adjoint of contact ``n``, the ``i``-th found of its pair, needs."""
     w.con_how[w.t, n] = w.clip_how[w.t, i]
     w.con_planes[w.t, n] = w.clip_planes[w.t, i]
@@ -353,7 +355,7 @@ def _rolled(s: Shape, axis: vec3, n: vec3, f: vec3) -> vec3:
 
 
 @wp.func
-def clipped_adjoint(m: Tables, w: World, c: int, dbar: f64, pbar: vec3, nbar0: vec3):
+def clipped_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, dbar: f64, pbar: vec3, nbar0: vec3):
     """From adjoints of distance, point and normal of a clipped corner to spatial forces on the two bodies."""
     k = w.con_pair[w.t, c]
     how = w.con_how[w.t, c]
@@ -416,7 +418,7 @@ def clipped_adjoint(m: Tables, w: World, c: int, dbar: f64, pbar: vec3, nbar0: v
 
 
 @wp.func
-def convex_adjoint(m: Tables, w: World, c: int, dbar: f64, pbar: vec3, nbar: vec3):
+def convex_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, dbar: f64, pbar: vec3, nbar: vec3):
     """From adjoints of distance, point and normal of a contact to spatial forces on the two bodies."""
     y1 = vec6()
     y2 = vec6()

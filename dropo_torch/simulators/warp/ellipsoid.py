@@ -98,19 +98,19 @@ def ellipsoid_power(
 
 
 @wp.func(inline=True)
-def fluid_frame(m: Tables, w: World, b: int, g: int) -> mat33:
+def fluid_frame(m: wp.ref[Tables], w: wp.ref[World], b: int, g: int) -> mat33:
     """Rotation of geom ``g`` of body ``b``."""
     return w.xmat[w.t, b] * m.geom_mat[g]
 
 
 @wp.func(inline=True)
-def fluid_centre(m: Tables, w: World, b: int, g: int) -> vec3:
+def fluid_centre(m: wp.ref[Tables], w: wp.ref[World], b: int, g: int) -> vec3:
     """Centre of geom ``g`` of body ``b``, from the origin of the sweep."""
     return w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
 
 
 @wp.func
-def ellipsoids_wrench(m: Tables, w: World, b: int) -> vec6:
+def ellipsoids_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     """The medium's forces on the geoms of body ``b`` that are taken as ellipsoids, as a spatial force."""
     total = vec6()
     density = w.th[m.o_density]

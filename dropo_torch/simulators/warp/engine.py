@@ -26,7 +26,7 @@ from dropo_torch.simulators.warp.parts import parts_of
 from dropo_torch.simulators.warp.start import LOADING, start_warp
 from dropo_torch.simulators.warp.support import check_support
 from dropo_torch.simulators.warp.tables import build_tables, convex_sizes
-from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJECTORY, Chunk, World, fill
+from dropo_torch.simulators.warp.types import ADJOINT, IMPLICIT, SCRATCH, TRAJECTORY, Chunk, Tables, World, fill
 from dropo_torch.simulators.warp.varied import coinciding
 
 #: Stages kept from the forward for the backward, at most; beyond it the backward simulates again, chunk by chunk.
@@ -127,6 +127,7 @@ class Engine:
                 names = ", ".join(str(d) for d in wp.get_devices())
                 raise InputError(f"device: Warp has no {device!r}; there are: {names}") from None
             m = self.tables = build_tables(model, space, pairs, self.fields.sections, device)
+            self._tables = wp.array([m], dtype=Tables, device=device)
             self.columns = wp.array(self.fields.wanted, dtype=wp.int32, device=device)
         self.num_threads = (num_threads or os.cpu_count() or 1) if self.is_cpu else 1
         self.wanted = torch.from_numpy(self.fields.wanted.astype(np.int64))
@@ -310,7 +311,7 @@ class Engine:
                 "slot_stride": int(not self.is_cpu), "keep": int(keep),
                 "applied": int(batch.applied), "wrenched": int(batch.wrenched),
             })  # fmt: skip
-            inputs = [self.tables, world, chunk, *arguments]
+            inputs = [self._tables, world, chunk, *arguments]
             return partial(wp.launch, kernel, dim=number, inputs=inputs, device=self.device)
 
         work = trace.count * batch.lag * batch.skip * self.tables.nv

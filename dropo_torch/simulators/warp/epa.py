@@ -57,13 +57,13 @@ class Depth:
 
 
 @wp.func
-def _start(w: World):
+def _start(w: wp.ref[World]):
     for i in range(4):
         w.epa_state[w.t, i] = 0
 
 
 @wp.func
-def _add_vertex(w: World, s: Simplex, i: int) -> int:
+def _add_vertex(w: wp.ref[World], s: Simplex, i: int) -> int:
     k = w.epa_state[w.t, VERTICES]
     w.epa_state[w.t, VERTICES] = k + 1
     w.epa_point[w.t, k] = s.one[i] - s.two[i]
@@ -75,7 +75,7 @@ def _add_vertex(w: World, s: Simplex, i: int) -> int:
 
 
 @wp.func
-def _add_support(m: Tables, w: World, a: Shape, b: Shape, d: vec3, length: f64) -> int:
+def _add_support(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, d: vec3, length: f64) -> int:
     """Append the support point along ``d``, of the given length, and return its number."""
     u = vec3(ONE, ZERO, ZERO)
     if length > MINVAL:
@@ -97,7 +97,7 @@ def _add_support(m: Tables, w: World, a: Shape, b: Shape, d: vec3, length: f64) 
 
 
 @wp.func
-def _attach(w: World, v1: int, v2: int, v3: int, n1: int, n2: int, n3: int) -> f64:
+def _attach(w: wp.ref[World], v1: int, v2: int, v3: int, n1: int, n2: int, n3: int) -> f64:
     """Append a face with its neighbours and return its squared distance from the origin, zero without a plane."""
     k = w.epa_state[w.t, FACES]
     w.epa_state[w.t, FACES] = k + 1
@@ -114,7 +114,7 @@ def _attach(w: World, v1: int, v2: int, v3: int, n1: int, n2: int, n3: int) -> f
 
 
 @wp.func
-def _list(w: World, face: int):
+def _list(w: wp.ref[World], face: int):
     k = w.epa_state[w.t, LISTED]
     w.epa_state[w.t, LISTED] = k + 1
     w.epa_list[w.t, k] = face
@@ -122,7 +122,7 @@ def _list(w: World, face: int):
 
 
 @wp.func
-def _delete(w: World, face: int):
+def _delete(w: wp.ref[World], face: int):
     """Take a face off the polytope; the last of the list takes its place there."""
     place = w.epa_place[w.t, face]
     if place >= 0:
@@ -160,7 +160,7 @@ def _pierces(v: vec3) -> bool:
 
 
 @wp.func
-def _picked(w: World, n: int, v1: int, v2: int, v3: int) -> Simplex:
+def _picked(w: wp.ref[World], n: int, v1: int, v2: int, v3: int) -> Simplex:
     """The simplex of two or three of the polytope's vertices."""
     s = Simplex()
     s.n = n
@@ -176,13 +176,13 @@ def _picked(w: World, n: int, v1: int, v2: int, v3: int) -> Simplex:
 
 
 @wp.func
-def _list_all(w: World):
+def _list_all(w: wp.ref[World]):
     for i in range(w.epa_state[w.t, FACES]):
         _list(w, i)
 
 
 @wp.func
-def _around_segment(m: Tables, w: World, a: Shape, b: Shape, s: Simplex):
+def _around_segment(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex):
     """Build a polytope around two points: with three support points beside them."""
     _start(w)
     d = s.point[1] - s.point[0]
@@ -290,7 +290,7 @@ def _origin_on(a: vec3, b: vec3) -> bool:
 
 
 @wp.func
-def _contains_origin(w: World, face: int, v: int, least: f64) -> bool:
+def _contains_origin(w: wp.ref[World], face: int, v: int, least: f64) -> bool:
     """Whether the origin is on the side of a face where vertex ``v`` is, or as good as on it."""
     c = w.epa_corners[w.t, face]
     inside = _same_side(w.epa_point[w.t, c[0]], w.epa_point[w.t, c[1]], w.epa_point[w.t, c[2]], w.epa_point[w.t, v])
@@ -298,7 +298,9 @@ def _contains_origin(w: World, face: int, v: int, least: f64) -> bool:
 
 
 @wp.func
-def _around_triangle(m: Tables, w: World, a: Shape, b: Shape, s: Simplex, tolerance: f64, may_shrink: int):
+def _around_triangle(
+    m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex, tolerance: f64, may_shrink: int
+):
     """Build a polytope around three points: with the support points on both sides."""
     _start(w)
     n = wp.cross(s.point[1] - s.point[0], s.point[2] - s.point[0])
@@ -374,7 +376,7 @@ def _around_triangle(m: Tables, w: World, a: Shape, b: Shape, s: Simplex, tolera
 
 
 @wp.func
-def _around_tetrahedron(w: World, s: Simplex):
+def _around_tetrahedron(w: wp.ref[World], s: Simplex):
     """Take four points as a polytope, unless the origin is on one of its faces."""
     _start(w)
     for i in range(s.n):
@@ -415,14 +417,14 @@ def _around_tetrahedron(w: World, s: Simplex):
 
 
 @wp.func
-def _sees(w: World, face: int, p: vec3) -> bool:
+def _sees(w: wp.ref[World], face: int, p: vec3) -> bool:
     """Whether a point is beyond a face."""
     d2 = w.epa_dist[w.t, face]
     return wp.dot(w.epa_near[w.t, face], p) - d2 > wp.max(wp.sqrt(d2) * MINVAL, MINVAL)
 
 
 @wp.func
-def _horizon(w: World, face: int, p: vec3, capacity: int) -> bool:
+def _horizon(w: wp.ref[World], face: int, p: vec3, capacity: int) -> bool:
     """Delete the faces that a point sees, from one on, and list the edges around them; False if they are too many."""
     _delete(w, face)
     w.epa_walk[w.t, 0] = vec3i(face, 2, 1)
@@ -456,7 +458,7 @@ def _horizon(w: World, face: int, p: vec3, capacity: int) -> bool:
 
 
 @wp.func
-def _closest_face(w: World, previous: int):
+def _closest_face(w: wp.ref[World], previous: int):
     face = previous
     least = f64(FAR)
     for i in range(w.epa_state[w.t, LISTED]):
@@ -468,7 +470,7 @@ def _closest_face(w: World, previous: int):
 
 
 @wp.func
-def _is_old(w: World, k: int) -> bool:
+def _is_old(w: wp.ref[World], k: int) -> bool:
     """Whether a vertex of the polytope is one of those before it."""
     found = bool(False)
     for i in range(k):
@@ -478,7 +480,7 @@ def _is_old(w: World, k: int) -> bool:
 
 
 @wp.func
-def _grow(w: World, v: int, lower2: f64, upper2: f64) -> bool:
+def _grow(w: wp.ref[World], v: int, lower2: f64, upper2: f64) -> bool:
     """Attach a vertex to the horizon; False if one of its faces has no plane."""
     first = w.epa_state[w.t, FACES]
     n = w.epa_state[w.t, EDGES]
@@ -500,7 +502,9 @@ def _grow(w: World, v: int, lower2: f64, upper2: f64) -> bool:
 
 
 @wp.func
-def _expand(m: Tables, w: World, a: Shape, b: Shape, tolerance0: f64, iterations: int, faces: int) -> int:
+def _expand(
+    m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, tolerance0: f64, iterations: int, faces: int
+) -> int:
     """Expand the polytope and return the face that tells the depth, or −1."""
     discrete = is_discrete(a, b)
     tolerance = tolerance0
@@ -548,7 +552,15 @@ def _expand(m: Tables, w: World, a: Shape, b: Shape, tolerance0: f64, iterations
 
 @wp.func
 def epa(
-    m: Tables, w: World, a: Shape, b: Shape, s0: Simplex, place1: int, place2: int, tolerance: f64, iterations: int
+    m: wp.ref[Tables],
+    w: wp.ref[World],
+    a: Shape,
+    b: Shape,
+    s0: Simplex,
+    place1: int,
+    place2: int,
+    tolerance: f64,
+    iterations: int,
 ) -> Depth:
     """Depth of two shapes that overlap, from the simplex that GJK ended with."""
     out = Depth()

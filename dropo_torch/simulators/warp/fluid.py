@@ -66,19 +66,19 @@ def box_power(w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density:
 
 
 @wp.func(inline=True)
-def inertial_frame(m: Tables, w: World, b: int) -> mat33:
+def inertial_frame(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat33:
     """Rotation of the inertial frame of a body."""
     return w.xmat[w.t, b] * m.body_imat[b]
 
 
 @wp.func(inline=True)
-def centre_of_mass(m: Tables, w: World, b: int) -> vec3:
+def centre_of_mass(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec3:
     """Centre of mass of a body, from the origin of the sweep."""
     return w.xpos[w.t, b] + w.xmat[w.t, b] * theta_vec3(w.th, m.o_ipos + 3 * b)
 
 
 @wp.func(inline=True)
-def fluid_wrench(m: Tables, w: World, b: int) -> vec6:
+def fluid_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     """The drag on a body as a spatial force."""
     rot = inertial_frame(m, w, b)
     c = centre_of_mass(m, w, b)

@@ -28,7 +28,7 @@ from dropo_torch.simulators.warp.types import BALL, MINVAL, ONE, THREE, TWO, ZER
 
 
 @wp.func(inline=True)
-def spring_deflection(m: Tables, w: World, r: int, k: int) -> vec3:
+def spring_deflection(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int) -> vec3:
     """Deflection of spring ``k`` (a joint, or a half of a free joint): x, or a vector of three."""
     iq = m.link_qpos[k]
     o = m.o_spring + iq
@@ -42,7 +42,7 @@ def spring_deflection(m: Tables, w: World, r: int, k: int) -> vec3:
 
 
 @wp.func(inline=True)
-def add_springs(m: Tables, w: World, r: int):
+def add_springs(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Load from springs: F = −x (k + p0 |x| + p1 |x|²); a hinge's or slide's |x| is signed."""
     for k in range(m.nlink):
         j = m.link_jnt[k]
@@ -60,7 +60,7 @@ def add_springs(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def springs_adjoint(m: Tables, w: World, r: int):
+def springs_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Adjoint of :func:`add_springs`."""
     for k in range(m.nlink):
         j = m.link_jnt[k]
@@ -97,7 +97,7 @@ def springs_adjoint(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def damping_slope(m: Tables, w: World, v: f64, i: int) -> f64:
+def damping_slope(m: wp.ref[Tables], w: wp.ref[World], v: f64, i: int) -> f64:
     """B = b + 2 p0 |v| + 3 p1 v²: what the implicit integrators take of the damper."""
     n = wp.abs(v)
     ip = m.o_dampingpoly + 2 * i
@@ -105,7 +105,7 @@ def damping_slope(m: Tables, w: World, v: f64, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def actuator_length(m: Tables, w: World, r: int, i: int) -> f64:
+def actuator_length(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """Length of an actuator: gear · q of a hinge or slide; of a free joint it is none, of a ball it is not needed."""
     y = ZERO
     if m.act_ndof[i] == 1:
@@ -116,7 +116,7 @@ def actuator_length(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def actuator_rate(m: Tables, w: World, r: int, i: int) -> f64:
+def actuator_rate(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """Velocity of an actuator, gear · q̇, over all dofs of its joint."""
     y = ZERO
     for k in range(m.act_ndof[i]):
@@ -127,7 +127,7 @@ def actuator_rate(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def actuator_force(m: Tables, w: World, r: int, i: int) -> f64:
+def actuator_force(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """gain(l, l̇) u + bias(l, l̇) with length l, velocity l̇ and drive u, before the force range."""
     og = m.o_gain + 3 * i
     ob = m.o_bias + 3 * i
@@ -141,7 +141,7 @@ def actuator_force(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def ranged_force(m: Tables, w: World, r: int, i: int) -> f64:
+def ranged_force(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """:func:`actuator_force` within the force range; times the gear, it acts on the joint."""
     f = actuator_force(m, w, r, i)
     if m.act_frclimited[i] != 0:
@@ -150,7 +150,7 @@ def ranged_force(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def sum_forces(m: Tables, w: World, r: int):
+def sum_forces(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """What all actuators exert on each dof, before the joints' own ranges, into ``w.work``."""
     for i in range(m.nv):
         w.work[w.t, i] = ZERO
@@ -168,7 +168,7 @@ def sum_forces(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def tendon_actuation(m: Tables, w: World, k: int) -> f64:
+def tendon_actuation(m: wp.ref[Tables], w: wp.ref[World], k: int) -> f64:
     """Force of all actuators of tendon ``k``, scaled so that the sum without gears is within the tendon's range."""
     f = w.ten_force[w.t, k]
     total = w.ten_sum[w.t, k]
@@ -178,7 +178,7 @@ def tendon_actuation(m: Tables, w: World, k: int) -> f64:
 
 
 @wp.func
-def tendon_actuation_adjoint(m: Tables, w: World, k: int, bar: f64):
+def tendon_actuation_adjoint(m: wp.ref[Tables], w: wp.ref[World], k: int, bar: f64):
     """Adjoint of :func:`tendon_actuation`: of the sums with and without gears, in their place."""
     scale = ONE
     sum_bar = ZERO
@@ -194,7 +194,7 @@ def tendon_actuation_adjoint(m: Tables, w: World, k: int, bar: f64):
 
 
 @wp.func(inline=True)
-def add_actuators(m: Tables, w: World, r: int):
+def add_actuators(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Load from actuators, clamped per joint where the joint says so."""
     if m.has_frclimit + num_tendons(m) == 0:
         for i in range(m.nu):
@@ -212,7 +212,7 @@ def add_actuators(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def add_thrust(m: Tables, w: World, r: int):
+def add_thrust(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Subtract from the bodies' forces those of actuators at sites."""
     for i in range(m.nu):
         if is_thrust(m, i):
@@ -221,7 +221,7 @@ def add_thrust(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def actuators_adjoint(m: Tables, w: World, r: int):
+def actuators_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Adjoint of :func:`add_actuators`; ``w.work`` comes to hold ∂(−λτ)/∂τ before the joints' ranges."""
     if m.has_frclimit != 0:
         sum_forces(m, w, r)
@@ -294,7 +294,7 @@ def actuators_adjoint(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def actuator_slope(m: Tables, w: World, r: int, a: int) -> f64:
+def actuator_slope(m: wp.ref[Tables], w: wp.ref[World], r: int, a: int) -> f64:
     """gear² (bias_v + gain_v u): ∂τ/∂q̇ of an actuator on a hinge or slide, or zero where the force is clamped."""
     gear = w.th[m.o_gear + 6 * a]
     y = ZERO
@@ -311,7 +311,7 @@ def actuator_slope(m: Tables, w: World, r: int, a: int) -> f64:
 
 
 @wp.func(inline=True)
-def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
+def actuator_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, a: int, bar: f64):
     """Adjoint of :func:`actuator_slope` (which does not see the position)."""
     slope = actuator_slope(m, w, r, a)
     if slope != ZERO:
@@ -326,7 +326,7 @@ def actuator_slope_adjoint(m: Tables, w: World, r: int, a: int, bar: f64):
 
 
 @wp.func(inline=True)
-def add_forces(m: Tables, w: World, r: int):
+def add_forces(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Load from dampers, F = −v (b + p0 |v| + p1 v²), springs, actuators and what is applied besides."""
     for i in range(m.nv * w.applied):
         w.load[w.t, i] -= w.ctrl[w.rc, w.ctrl.shape[1] - m.nv + i]
@@ -343,7 +343,7 @@ def add_forces(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def forces_adjoint(m: Tables, w: World, r: int):
+def forces_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Adjoint of :func:`add_forces`."""
     for i in range(m.nv * w.applied):
         w.ctrl_bar[w.rb, w.ctrl.shape[1] - m.nv + i] -= w.lam[w.t, i]

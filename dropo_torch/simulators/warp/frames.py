@@ -45,7 +45,7 @@ def theta_vec4(th: Reals, i: int) -> vec4:
 
 
 @wp.func(inline=True)
-def body_position(m: Tables, w: World, b: int) -> vec3:
+def body_position(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec3:
     """Position of a body in its parent."""
     y = m.body_pos[b]
     if has_frames(m) and m.body_frame[b] >= 0:
@@ -54,7 +54,7 @@ def body_position(m: Tables, w: World, b: int) -> vec3:
 
 
 @wp.func(inline=True)
-def body_rotation(m: Tables, w: World, b: int) -> mat33:
+def body_rotation(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat33:
     """Rotation of a body in its parent."""
     y = m.body_mat[b]
     if has_frames(m) and m.body_frame[b] >= 0:
@@ -63,7 +63,7 @@ def body_rotation(m: Tables, w: World, b: int) -> mat33:
 
 
 @wp.func(inline=True)
-def link_axis(m: Tables, w: World, k: int) -> vec3:
+def link_axis(m: wp.ref[Tables], w: wp.ref[World], k: int) -> vec3:
     """Axis of a joint in its body."""
     y = m.link_axis[k]
     if has_frames(m) and m.link_frame[k] >= 0:
@@ -72,7 +72,7 @@ def link_axis(m: Tables, w: World, k: int) -> vec3:
 
 
 @wp.func(inline=True)
-def link_position(m: Tables, w: World, k: int) -> vec3:
+def link_position(m: wp.ref[Tables], w: wp.ref[World], k: int) -> vec3:
     """Position of a joint in its body."""
     y = m.link_pos[k]
     if has_frames(m) and m.link_frame[k] >= 0:
@@ -81,7 +81,7 @@ def link_position(m: Tables, w: World, k: int) -> vec3:
 
 
 @wp.func(inline=True)
-def geom_position(m: Tables, w: World, g: int) -> vec3:
+def geom_position(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     """Position of a geom in its body."""
     y = m.geom_pos[g]
     if has_geoms(m) and m.geom_frame[g] >= 0:
@@ -90,7 +90,7 @@ def geom_position(m: Tables, w: World, g: int) -> vec3:
 
 
 @wp.func(inline=True)
-def geom_turn(m: Tables, w: World, g: int) -> mat33:
+def geom_turn(m: wp.ref[Tables], w: wp.ref[World], g: int) -> mat33:
     """Rotation of a geom in its body."""
     y = m.geom_mat[g]
     if has_geoms(m) and m.geom_frame[g] >= 0:
@@ -99,7 +99,7 @@ def geom_turn(m: Tables, w: World, g: int) -> mat33:
 
 
 @wp.func(inline=True)
-def geom_size(m: Tables, w: World, g: int) -> vec3:
+def geom_size(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     """Size of a geom."""
     y = m.geom_size[g]
     if has_geoms(m) and m.geom_frame[g] >= 0:
@@ -115,7 +115,7 @@ def beyond(v: vec6, a: vec6, u: vec6, dual: vec6, fv: vec6, fa: vec6, fu: vec6, 
 
 
 @wp.func(inline=True)
-def _frame_adjoint(w: World, o: int, outer: mat33, rot: mat33, p: vec3, y: vec6):
+def _frame_adjoint(w: wp.ref[World], o: int, outer: mat33, rot: mat33, p: vec3, y: vec6):
     """Adds of a frame at ``p`` the adjoint of its position in ``outer`` and of its quaternion, to θ from ``o``."""
     add_at(w.grad, w.t, o, wp.transpose(outer) * lin(y))
     g = wp.transpose(rot) * (ang(y) - wp.cross(p, lin(y)))
@@ -124,7 +124,7 @@ def _frame_adjoint(w: World, o: int, outer: mat33, rot: mat33, p: vec3, y: vec6)
 
 
 @wp.func(inline=True)
-def body_frame_adjoint(m: Tables, w: World, b: int, y: vec6):
+def body_frame_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, y: vec6):
     """Adjoint of a body's frame, where ``y`` is :func:`beyond` its place before its joints."""
     if m.body_frame[b] >= 0:
         outer = w.xmat[w.t, m.body_parent[b]]
@@ -134,7 +134,7 @@ def body_frame_adjoint(m: Tables, w: World, b: int, y: vec6):
 
 
 @wp.func(inline=True)
-def geom_frame_adjoint(m: Tables, w: World, g: int, y: vec6):
+def geom_frame_adjoint(m: wp.ref[Tables], w: wp.ref[World], g: int, y: vec6):
     """Adjoint of a geom's frame, where ``y`` is the force on it."""
     if m.geom_frame[g] >= 0:
         outer = w.xmat[w.t, m.geom_body[g]]
@@ -144,14 +144,14 @@ def geom_frame_adjoint(m: Tables, w: World, g: int, y: vec6):
 
 
 @wp.func(inline=True)
-def geom_size_adjoint(m: Tables, w: World, g: int, bar: vec3):
+def geom_size_adjoint(m: wp.ref[Tables], w: wp.ref[World], g: int, bar: vec3):
     """Adds the adjoint of a geom's size."""
     if m.geom_frame[g] >= 0:
         add_at(w.grad, w.t, m.o_geom_frame + GEOM * m.geom_frame[g] + 7, bar)
 
 
 @wp.func(inline=True)
-def before_link(m: Tables, w: World, r: int, k: int, pos: vec3, rot: mat33):
+def before_link(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int, pos: vec3, rot: mat33):
     """Position and rotation of a link's body before the link turned and moved it."""
     p = pos
     inner = rot
@@ -170,7 +170,8 @@ def before_link(m: Tables, w: World, r: int, k: int, pos: vec3, rot: mat33):
 
 @wp.func(inline=True)
 def link_frame_adjoint(
-    m: Tables, w: World, r: int, k: int, p: vec3, inner: mat33, rot: mat33, after: vec6, y: vec6, pull: vec6
+    m: wp.ref[Tables], w: wp.ref[World], r: int, k: int, p: vec3, inner: mat33, rot: mat33, after: vec6, y: vec6,
+    pull: vec6,
 ):  # fmt: skip
     """Adjoint of a joint's axis and position.
 

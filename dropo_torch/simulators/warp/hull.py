@@ -12,7 +12,7 @@ from dropo_torch.simulators.warp.types import Tables, f64, vec3, vec3i
 
 
 @wp.func(inline=True)
-def deepest(m: Tables, g: int, way: vec3) -> int:
+def deepest(m: wp.ref[Tables], g: int, way: vec3) -> int:
     """The vertex of a mesh that is farthest along ``way``; which of several depends on how MuJoCo looks for it."""
     start = m.geom_hull[g]
     best = int(0)
@@ -35,7 +35,7 @@ def deepest(m: Tables, g: int, way: vec3) -> int:
 
 
 @wp.func(inline=True)
-def lowest_face(m: Tables, v: int, normal: vec3) -> int:
+def lowest_face(m: wp.ref[Tables], v: int, normal: vec3) -> int:
     """The flat face at a vertex whose normal is most against ``normal``, −1 without one."""
     face = int(-1)
     least = f64(1.0)
@@ -50,7 +50,7 @@ def lowest_face(m: Tables, v: int, normal: vec3) -> int:
 
 
 @wp.func(inline=True)
-def face_corners(m: Tables, start: int, face: int, vertex: int):
+def face_corners(m: wp.ref[Tables], start: int, face: int, vertex: int):
     """Where a vertex stands in a face, and by how much three others are after it that span much of its area.
 
     The corners turn about the face as calipers do, as long as that makes the quadrilateral larger.
@@ -92,7 +92,7 @@ def face_corners(m: Tables, start: int, face: int, vertex: int):
 
 
 @wp.func(inline=True)
-def _area(m: Tables, start: int, face: int, own: int, b: int, c: int, d: int) -> f64:
+def _area(m: wp.ref[Tables], start: int, face: int, own: int, b: int, c: int, d: int) -> f64:
     """Twice the area of a quadrilateral of corners of a face: its own, and others by how far they are after that."""
     first = m.poly_adr[face]
     n = m.poly_num[face]

@@ -44,7 +44,7 @@ LARGE = wp.constant(wp.float64(1.0e10))  # mjMAXVAL
 
 
 @wp.func(inline=True)
-def move(m: Tables, w: World, r: int, vel: Reals2, rv: int, h: f64, ro: int):
+def move(m: wp.ref[Tables], w: wp.ref[World], r: int, vel: Reals2, rv: int, h: f64, ro: int):
     """qpos[ro] = qpos[r] ⊕ h vel[rv]."""
     for k in range(m.nlink):
         iq = m.link_qpos[k]
@@ -59,7 +59,9 @@ def move(m: Tables, w: World, r: int, vel: Reals2, rv: int, h: f64, ro: int):
 
 
 @wp.func(inline=True)
-def move_adjoint(m: Tables, w: World, vel: Reals2, rv: int, h: f64, bar: Reals2, vel_bar: Reals2, o: int):
+def move_adjoint(
+    m: wp.ref[Tables], w: wp.ref[World], vel: Reals2, rv: int, h: f64, bar: Reals2, vel_bar: Reals2, o: int
+):
     """Adjoint of :func:`move`: adds to ``w.pos_bar0`` and ``vel_bar[w.t, o:]`` from ``bar[w.t]``."""
     for k in range(m.nlink):
         d = m.link_dof[k]
@@ -76,7 +78,7 @@ def move_adjoint(m: Tables, w: World, vel: Reals2, rv: int, h: f64, bar: Reals2,
 
 
 @wp.func(inline=True)
-def chart_rates(m: Tables, w: World, r: int, c: f64):
+def chart_rates(m: wp.ref[Tables], w: wp.ref[World], r: int, c: f64):
     """rate[r] of a stage that is ``c`` rate[r − 1] away from the start of its step."""
     for k in range(m.nlink * m.has_ball):
         d = m.link_dof[k]
@@ -90,7 +92,7 @@ def chart_rates(m: Tables, w: World, r: int, c: f64):
 
 
 @wp.func(inline=True)
-def chart_rates_adjoint(m: Tables, w: World, r: int, c: f64, o: int):
+def chart_rates_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, c: f64, o: int):
     """Adjoint of :func:`chart_rates`: ``w.stage_rate_bar[o:]`` to ``w.vel_bar`` and the stage before."""
     for k in range(m.nlink):
         d = m.link_dof[k]
@@ -116,13 +118,13 @@ def finite(x: Reals2, r: int, n: int) -> int:
 
 
 @wp.func(inline=True)
-def good(m: Tables, w: World, r: int) -> int:
+def good(m: wp.ref[Tables], w: wp.ref[World], r: int) -> int:
     """1 while every number of a state is finite and below MuJoCo's limit."""
     return finite(w.qpos, r, m.nq) * finite(w.qvel, r, m.nv)
 
 
 @wp.func(inline=True)
-def implicit_slope(m: Tables, w: World, r: int, i: int) -> f64:
+def implicit_slope(m: wp.ref[Tables], w: wp.ref[World], r: int, i: int) -> f64:
     """B of dof ``i``: −∂τ/∂q̇ that the integrator takes implicitly."""
     b = ZERO
     if m.has_damper != 0:
@@ -135,7 +137,7 @@ def implicit_slope(m: Tables, w: World, r: int, i: int) -> f64:
 
 
 @wp.func(inline=True)
-def tendon_slope(m: Tables, w: World, r: int, k: int) -> f64:
+def tendon_slope(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int) -> f64:
     """−∂F/∂v of the force F and the velocity v of tendon ``k``."""
     y = ZERO
     if m.ten_damped[k] != 0:
@@ -147,7 +149,7 @@ def tendon_slope(m: Tables, w: World, r: int, k: int) -> f64:
 
 
 @wp.func(inline=True)
-def soften(m: Tables, w: World, r: int):
+def soften(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """soft[r] = (M + h B)⁻¹ M acc[r], with the factor left in ``w.soft_hess[r]``."""
     multiply(m.dof_parent, m.nv, 0, w.mass, w.t, w.acc, r, w.soft, r)
     if has_full_slope(m):
@@ -170,7 +172,7 @@ def soften(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def slope_adjoint(m: Tables, w: World, r: int):
+def slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """The part of B in the adjoint of :func:`soften`: the gradient of −h λᵀ B a', into ``w.stage_vel_bar`` and θ."""
     if m.has_damper != 0:
         for i in range(m.nv):
@@ -193,7 +195,7 @@ def slope_adjoint(m: Tables, w: World, r: int):
 
 
 @wp.func
-def _tendon_slope_adjoint(m: Tables, w: World, r: int, k: int):
+def _tendon_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int):
     """The part of tendon ``k`` in :func:`slope_adjoint`."""
     power = outer_dot(m, w, k, w.lam, w.t, w.soft, r, -m.h * tendon_slope(m, w, r, k))
     if m.ten_damped[k] != 0:
@@ -224,7 +226,7 @@ def stage_time(h: f64, k: int) -> f64:
 
 
 @wp.func(inline=True)
-def step(m: Tables, w: World, r: int, nxt: int) -> int:
+def step(m: wp.ref[Tables], w: wp.ref[World], r: int, nxt: int) -> int:
     """One physics step from row ``r`` (stages in the rows after it) to row ``nxt``; 1 while it is good."""
     h = m.h
     ok = good(m, w, r)
@@ -268,7 +270,7 @@ def step(m: Tables, w: World, r: int, nxt: int) -> int:
 
 
 @wp.func(inline=True)
-def step_adjoint(m: Tables, w: World, r: int, nxt: int):
+def step_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, nxt: int):
     """Adjoint of :func:`step`: ``w.pos_bar`` (tangent) and ``w.rate_bar`` of the end become those of the start."""
     _late = wp.grad(late)(ONE)
     h = m.h
@@ -354,7 +356,7 @@ def step_adjoint(m: Tables, w: World, r: int, nxt: int):
 
 
 @wp.func(inline=True)
-def _end_adjoint(m: Tables, w: World, r: int, nxt: int):
+def _end_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, nxt: int):
     """Adjoint of the last line of a step: what its end gives to start, stages and accelerations."""
     h = m.h
     nv = m.nv
@@ -385,7 +387,7 @@ def _end_adjoint(m: Tables, w: World, r: int, nxt: int):
 
 
 @wp.func(inline=True)
-def to_tangent(m: Tables, w: World, r: int, bar: Reals2, rb: int):
+def to_tangent(m: wp.ref[Tables], w: wp.ref[World], r: int, bar: Reals2, rb: int):
     """Add the adjoint of a raw position to its tangent: ½ (q* ⊗ q̄) of a unit quaternion."""
     for k in range(m.nlink):
         iq = m.link_qpos[k]
@@ -400,7 +402,7 @@ def to_tangent(m: Tables, w: World, r: int, bar: Reals2, rb: int):
 
 
 @wp.func(inline=True)
-def from_tangent(m: Tables, w: World, r: int, out: Reals2, ro: int):
+def from_tangent(m: wp.ref[Tables], w: wp.ref[World], r: int, out: Reals2, ro: int):
     """Write the adjoint of a raw position from its tangent: 2/|q| q̂ ⊗ (0, g)."""
     for k in range(m.nlink):
         iq = m.link_qpos[k]

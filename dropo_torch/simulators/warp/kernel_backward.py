@@ -18,18 +18,31 @@ from dropo_torch.simulators.warp.fluid import box_power, box_slope_power
 from dropo_torch.simulators.warp.integrate import from_tangent, step_adjoint, to_tangent
 from dropo_torch.simulators.warp.parts import make_kernel, num_activations
 from dropo_torch.simulators.warp.rotations import chart_rate_dual
-from dropo_torch.simulators.warp.spatial import theta_vec2, theta_vec3, theta_vec5
-from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals, Reals2, Tables, World, mat33, vec6
+from dropo_torch.simulators.warp.spatial import late, theta_vec2, theta_vec3, theta_vec5
+from dropo_torch.simulators.warp.types import (
+    ONE,
+    ZERO,
+    Chunk,
+    Ints,
+    OneTables,
+    Reals,
+    Reals2,
+    Tables,
+    World,
+    mat33,
+    vec6,
+)
 
 wp.set_module_options({"enable_backward": False})
 
 
-def adjoint(
-    m: Tables, w: World, chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints, out_bar: Reals2,
-    theta_bar: Reals2, state_bar: Reals2, control_bar: Reals2,
+@wp.func(inline=True)
+def _world_adjoint(
+    m: wp.ref[Tables], w: wp.ref[World], chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints,
+    out_bar: Reals2, theta_bar: Reals2, state_bar: Reals2, control_bar: Reals2, tid: int,
 ):  # fmt: skip
-    """Adjoints of initial state, controls and the θ ``columns`` of each world, from that of its output."""
-    tid = wp.tid()
+    """Adjoints of world number ``tid`` of a launch; see :func:`adjoint`."""
+    _late = wp.grad(late)(ONE)
     world = chunk.first + tid
     i = chunk.local + tid
     tr = world // chunk.nparam
@@ -77,6 +90,16 @@ def adjoint(
         state_bar[i, m.nq + m.nv + j] = w.act_end_bar[w.t, j]
     for j in range(columns.shape[0]):
         theta_bar[i, j] = w.grad[w.t, columns[j]]
+
+
+def adjoint(
+    tables: OneTables, w: World, chunk: Chunk, theta: Reals2, controls: Reals2, alive: Ints, columns: Ints,
+    out_bar: Reals2, theta_bar: Reals2, state_bar: Reals2, control_bar: Reals2,
+):  # fmt: skip
+    """Adjoints of initial state, controls and the θ ``columns`` of each world, from that of its output."""
+    _world_adjoint(
+        tables[0], w, chunk, theta, controls, alive, columns, out_bar, theta_bar, state_bar, control_bar, wp.tid()
+    )
 
 
 def leaves(x: wp.array(dtype=vec6), r: wp.array(dtype=mat33), y: Reals):

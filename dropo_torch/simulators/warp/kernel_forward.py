@@ -12,17 +12,15 @@ import warp as wp
 
 from dropo_torch.simulators.warp.integrate import good, step
 from dropo_torch.simulators.warp.parts import make_kernel, num_activations
-from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, Reals2, Tables, World, f64
+from dropo_torch.simulators.warp.types import ZERO, Chunk, Ints, OneTables, Reals2, Tables, World, f64
 
 
-def simulate(
-    m: Tables, w: World, chunk: Chunk, theta: Reals2, states: Reals2, controls: Reals2, alive: Ints, out: Reals2
-):
-    """Simulate the worlds of a chunk; ``out`` has a row per logged step.
-
-    ``alive`` says whether a world stayed finite; −1 is a world that had more contacts than there is memory for.
-    """
-    tid = wp.tid()
+@wp.func(inline=True)
+def _simulate_world(
+    m: wp.ref[Tables], w: wp.ref[World], chunk: Chunk, theta: Reals2, states: Reals2, controls: Reals2, alive: Ints,
+    out: Reals2, tid: int,
+):  # fmt: skip
+    """Simulate world number ``tid`` of a launch; see :func:`simulate`."""
     world = chunk.first + tid
     i = chunk.local + tid
     tr = world // chunk.each
@@ -60,6 +58,16 @@ def simulate(
         for j in range(num_activations(m)):
             out[i * chunk.lag + logged, m.nq + m.nv + j] = w.act[r, j]
     alive[i] = ok - w.full[w.t]
+
+
+def simulate(
+    tables: OneTables, w: World, chunk: Chunk, theta: Reals2, states: Reals2, controls: Reals2, alive: Ints, out: Reals2
+):
+    """Simulate the worlds of a chunk; ``out`` has a row per logged step.
+
+    ``alive`` says whether a world stayed finite; −1 is a world that had more contacts than there is memory for.
+    """
+    _simulate_world(tables[0], w, chunk, theta, states, controls, alive, out, wp.tid())
 
 
 @cache

@@ -37,7 +37,7 @@ def packed(i: int, j: int) -> int:
 
 
 @wp.func(inline=True)
-def sweep_out(m: Tables, w: World, r: int):
+def sweep_out(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Poses, motion axes s, velocities V, bias accelerations A (q̈ = 0, gravity in the root) and inertias I."""
     o = m.origin_base
     for i in range(m.norigin):
@@ -109,7 +109,7 @@ def sweep_out(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def inertial_forces(m: Tables, w: World):
+def inertial_forces(m: wp.ref[Tables], w: wp.ref[World]):
     """F = I A + V ×* I V of each body, less gravity compensation, drag and the wrenches from outside."""
     for b in range(1, m.nb):
         i = w.inertia[w.t, b]
@@ -133,7 +133,7 @@ def inertial_forces(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def sweep_in(m: Tables, w: World):
+def sweep_in(m: wp.ref[Tables], w: wp.ref[World]):
     """Mass matrix M with armature, and the bias force c, from subtree sums of I and F."""
     for i in range(m.nh):
         w.mass[w.t, i] = ZERO

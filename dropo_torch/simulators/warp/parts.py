@@ -66,7 +66,7 @@ def with_frames() -> bool:
 
 
 @wp.func(inline=True)
-def num_tendons(m: Tables) -> int:
+def num_tendons(m: wp.ref[Tables]) -> int:
     """Number of tendons, none where the kernel is made without."""
     n = 0
     if with_couplings():
@@ -75,7 +75,7 @@ def num_tendons(m: Tables) -> int:
 
 
 @wp.func(inline=True)
-def num_welds(m: Tables) -> int:
+def num_welds(m: wp.ref[Tables]) -> int:
     """Number of connect and weld equalities, none where the kernel is made without."""
     n = 0
     if with_couplings():
@@ -84,19 +84,19 @@ def num_welds(m: Tables) -> int:
 
 
 @wp.func(inline=True)
-def has_medium(m: Tables) -> bool:
+def has_medium(m: wp.ref[Tables]) -> bool:
     """Whether a medium acts on the bodies."""
     return with_medium() and m.has_fluid != 0
 
 
 @wp.func(inline=True)
-def has_full_slope(m: Tables) -> bool:
+def has_full_slope(m: wp.ref[Tables]) -> bool:
     """Whether the integrator takes a slope of forces that couples all dofs."""
     return with_medium() and m.full != 0
 
 
 @wp.func(inline=True)
-def num_activations(m: Tables) -> int:
+def num_activations(m: wp.ref[Tables]) -> int:
     """Number of activations, none where the kernel is made without."""
     n = 0
     if with_drives():
@@ -105,31 +105,31 @@ def num_activations(m: Tables) -> int:
 
 
 @wp.func(inline=True)
-def is_activated(m: Tables, i: int) -> bool:
+def is_activated(m: wp.ref[Tables], i: int) -> bool:
     """Whether actuator ``i`` has an activation."""
     return with_drives() and m.act_state[i] >= 0
 
 
 @wp.func(inline=True)
-def has_thrust(m: Tables) -> bool:
+def has_thrust(m: wp.ref[Tables]) -> bool:
     """Whether there are actuators at sites."""
     return with_drives() and m.has_thrust != 0
 
 
 @wp.func(inline=True)
-def is_thrust(m: Tables, i: int) -> bool:
+def is_thrust(m: wp.ref[Tables], i: int) -> bool:
     """Whether actuator ``i`` is at a site."""
     return with_drives() and m.act_body[i] >= 0
 
 
 @wp.func(inline=True)
-def has_frames(m: Tables) -> bool:
+def has_frames(m: wp.ref[Tables]) -> bool:
     """Whether frames of bodies or joints vary."""
     return with_frames() and m.want_frames != 0
 
 
 @wp.func(inline=True)
-def has_geoms(m: Tables) -> bool:
+def has_geoms(m: wp.ref[Tables]) -> bool:
     """Whether frames or sizes of geoms vary."""
     return with_frames() and m.want_geoms != 0
 

@@ -41,7 +41,7 @@ ROW_LIMIT = wp.constant(2)
 
 
 @wp.func(inline=True)
-def row_force(w: World, n: int, jar: f64) -> f64:
+def row_force(w: wp.ref[World], n: int, jar: f64) -> f64:
     """Constraint force of row ``n`` at J a − aref = ``jar``."""
     f = -w.row_d[w.t, n] * jar
     if w.row_kind[w.t, n] == ROW_LIMIT:
@@ -52,7 +52,7 @@ def row_force(w: World, n: int, jar: f64) -> f64:
 
 
 @wp.func(inline=True)
-def row_state(w: World, n: int, jar: f64) -> int:
+def row_state(w: wp.ref[World], n: int, jar: f64) -> int:
     """Which piece of the cost of row ``n`` ``jar`` is on; 1 is the quadratic one."""
     state = int(1)
     if w.row_kind[w.t, n] == ROW_LIMIT:
@@ -66,7 +66,7 @@ def row_state(w: World, n: int, jar: f64) -> int:
 
 
 @wp.func(inline=True)
-def equality_position(m: Tables, w: World, r: int, e: int) -> vec3:
+def equality_position(m: wp.ref[Tables], w: wp.ref[World], r: int, e: int) -> vec3:
     """(q1 − p(q2), p'(q2), p''(q2)) of a joint equality, both measured from their references."""
     c = m.o_eq_data + EQ_WIDTH * m.eq_id[e]
     x = w.qpos[r, m.eq_qpos[2 * e]] - m.eq_ref[2 * e] - w.th[c]
@@ -82,7 +82,7 @@ def equality_position(m: Tables, w: World, r: int, e: int) -> vec3:
 
 
 @wp.func(inline=True)
-def row_dot(m: Tables, w: World, n: int, x: Reals2, r: int) -> f64:
+def row_dot(m: wp.ref[Tables], w: wp.ref[World], n: int, x: Reals2, r: int) -> f64:
     """J x of row ``n``."""
     c = w.row_coef[w.t, n]
     d = w.row_dof[w.t, n]
@@ -100,7 +100,7 @@ def row_dot(m: Tables, w: World, n: int, x: Reals2, r: int) -> f64:
 
 
 @wp.func(inline=True)
-def row_add(m: Tables, w: World, n: int, y: f64, x: Reals2, r: int):
+def row_add(m: wp.ref[Tables], w: wp.ref[World], n: int, y: f64, x: Reals2, r: int):
     """x += Jᵀ y of row ``n``."""
     c = w.row_coef[w.t, n]
     d = w.row_dof[w.t, n]
@@ -117,7 +117,7 @@ def row_add(m: Tables, w: World, n: int, y: f64, x: Reals2, r: int):
 
 
 @wp.func(inline=True)
-def row_softness(m: Tables, w: World, n: int) -> Soft:
+def row_softness(m: wp.ref[Tables], w: wp.ref[World], n: int) -> Soft:
     """The softness of row ``n``; a friction loss has no stiffness."""
     kind = w.row_kind[w.t, n]
     index = w.row_index[w.t, n]
@@ -152,7 +152,7 @@ def row_softness(m: Tables, w: World, n: int) -> Soft:
 
 
 @wp.func(inline=True)
-def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
+def make_rows(m: wp.ref[Tables], w: wp.ref[World], r: int, weighed: int) -> int:
     """List the scalar rows of a state and return their number; ``weighed`` 0 leaves out what resists in them."""
     n = int(0)
     for candidate in range(m.neq + m.nfriction + 2 * m.nlimit):
@@ -209,7 +209,8 @@ def make_rows(m: Tables, w: World, r: int, weighed: int) -> int:
 
 @wp.func(inline=True)
 def _add_row(
-    m: Tables, w: World, r: int, n: int, kind: int, index: int, dofs: vec3i, coef: vec3, x: f64, weighed: int
+    m: wp.ref[Tables], w: wp.ref[World], r: int, n: int, kind: int, index: int, dofs: vec3i, coef: vec3, x: f64,
+    weighed: int,
 ):  # fmt: skip
     """Write row ``n``."""
     w.row_kind[w.t, n] = kind
@@ -224,7 +225,7 @@ def _add_row(
 
 
 @wp.func
-def make_tendon_rows(m: Tables, w: World, r: int, start: int, weighed: int) -> int:
+def make_tendon_rows(m: wp.ref[Tables], w: wp.ref[World], r: int, start: int, weighed: int) -> int:
     """List the rows of tendons after the ``start`` that there are, and return the number of all."""
     n = int(start)
     for candidate in range(m.nteneq + 3 * num_tendons(m)):
@@ -264,7 +265,7 @@ def make_tendon_rows(m: Tables, w: World, r: int, start: int, weighed: int) -> i
 
 
 @wp.func
-def tendon_equality_position(m: Tables, w: World, e: int) -> vec3:
+def tendon_equality_position(m: wp.ref[Tables], w: wp.ref[World], e: int) -> vec3:
     """:func:`equality_position` of the lengths of two tendons, measured from those at the reference position."""
     k1 = m.teneq_tendon[2 * e]
     k2 = m.teneq_tendon[2 * e + 1]
@@ -276,7 +277,7 @@ def tendon_equality_position(m: Tables, w: World, e: int) -> vec3:
 
 
 @wp.func(inline=True)
-def polynomial(w: World, c: int, y: f64) -> vec3:
+def polynomial(w: wp.ref[World], c: int, y: f64) -> vec3:
     """The polynomial of an equality whose numbers stand at ``c`` in θ, without its constant, and two derivatives."""
     value = y * (w.th[c + 1] + y * (w.th[c + 2] + y * (w.th[c + 3] + y * w.th[c + 4])))
     slope = w.th[c + 1] + y * (TWO * w.th[c + 2] + y * (f64(3.0) * w.th[c + 3] + y * FOUR * w.th[c + 4]))
@@ -284,7 +285,7 @@ def polynomial(w: World, c: int, y: f64) -> vec3:
 
 
 @wp.func(inline=True)
-def rows_adjoint(m: Tables, w: World, r: int, nrow: int):
+def rows_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, nrow: int):
     """Adjoint of the rows: the gradient of Σ −f Jλ, with J where it moves."""
     _late = wp.grad(late)(ONE)
     for n in range(nrow):
@@ -322,7 +323,7 @@ def rows_adjoint(m: Tables, w: World, r: int, nrow: int):
 
 
 @wp.func(inline=True)
-def _limit_adjoint(m: Tables, w: World, r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64):
+def _limit_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64):
     """Where a limit's position and axis come from."""
     k = m.limit_link[w.row_index[w.t, n]]
     j = m.link_jnt[k]
@@ -346,7 +347,7 @@ def _limit_adjoint(m: Tables, w: World, r: int, n: int, xbar: f64, ubar: f64, vb
 
 
 @wp.func(inline=True)
-def _equality_adjoint(m: Tables, w: World, r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64):
+def _equality_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64):
     """Where an equality's position and slope come from."""
     e = w.row_index[w.t, n]
     d1 = m.eq_dof[2 * e]
@@ -367,7 +368,7 @@ def _equality_adjoint(m: Tables, w: World, r: int, n: int, xbar: f64, ubar: f64,
 
 @wp.func
 def _tendon_row_adjoint(
-    m: Tables, w: World, r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64, weightbar: f64
+    m: wp.ref[Tables], w: wp.ref[World], r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64, weightbar: f64
 ):  # fmt: skip
     """Where the position and J of a row of tendons come from."""
     kind = w.row_kind[w.t, n]
@@ -399,7 +400,7 @@ def _tendon_row_adjoint(
 
 
 @wp.func
-def _arms_bar(m: Tables, w: World, r: int, k: int, coef: f64, ubar: f64, vbar: f64, lbar: f64):
+def _arms_bar(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int, coef: f64, ubar: f64, vbar: f64, lbar: f64):
     """Adjoint of J of tendon ``k`` through J a, J q̇ and Jλ."""
     tendon_bar(m, w, k, coef * ubar, w.acc, r)
     tendon_bar(m, w, k, coef * vbar, w.qvel, r)

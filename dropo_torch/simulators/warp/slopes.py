@@ -53,7 +53,7 @@ def turning_slope(i: vec10, v: vec6) -> mat66:
 
 
 @wp.func
-def box_slope(m: Tables, w: World, b: int) -> mat66:
+def box_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     """Minus the slope of the drag on the body's inertia box in its velocity V."""
     rot = inertial_frame(m, w, b)
     back = wp.transpose(rot)
@@ -73,7 +73,7 @@ def box_slope(m: Tables, w: World, b: int) -> mat66:
 
 
 @wp.func
-def ellipsoids_slope(m: Tables, w: World, b: int) -> mat66:
+def ellipsoids_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     """Minus the slope of the medium's forces on the body's ellipsoids in its velocity V."""
     out = mat66()
     v = w.velocity[w.t, b]
@@ -105,7 +105,7 @@ def ellipsoids_slope(m: Tables, w: World, b: int) -> mat66:
 
 
 @wp.func
-def body_slopes(m: Tables, w: World):
+def body_slopes(m: wp.ref[Tables], w: wp.ref[World]):
     """Sums over subtrees of the operators that act on s in a column of B, into ``w.slope``."""
     for b in range(1, m.nb):
         out = mat66()
@@ -126,7 +126,7 @@ def body_slopes(m: Tables, w: World):
 
 
 @wp.func
-def swings(m: Tables, w: World, r: int):
+def swings(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Slope of the bodies' acceleration in each velocity, less s × V: V₋ × s + V₊ × s of its joint, in ``w.swing``."""
     for b in range(1, m.nb):
         v = w.velocity[w.t, m.body_parent[b]]
@@ -144,7 +144,7 @@ def swings(m: Tables, w: World, r: int):
 
 
 @wp.func
-def fill_slopes(m: Tables, w: World, r: int):
+def fill_slopes(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """soft_hess[r] = M + h B, all of it, but for the part of B that is diagonal."""
     for i in range(m.nv * m.nv):
         w.soft_hess[r, i] = ZERO
@@ -168,7 +168,7 @@ def fill_slopes(m: Tables, w: World, r: int):
 
 
 @wp.func
-def factor_full(m: Tables, a: Reals2, r: int):
+def factor_full(m: wp.ref[Tables], a: Reals2, r: int):
     """A = U L in place, from the last dof to the first: U has ones on its diagonal, and there is no fill-in."""
     n = m.nv
     for back in range(n):
@@ -186,7 +186,7 @@ def factor_full(m: Tables, a: Reals2, r: int):
 
 
 @wp.func
-def solve_full(m: Tables, a: Reals2, r: int, x: Reals2, rx: int):
+def solve_full(m: wp.ref[Tables], a: Reals2, r: int, x: Reals2, rx: int):
     """x ← A⁻¹ x with the factor of :func:`factor_full`."""
     n = m.nv
     for back in range(n):
@@ -206,7 +206,7 @@ def solve_full(m: Tables, a: Reals2, r: int, x: Reals2, rx: int):
 
 
 @wp.func
-def solve_full_transposed(m: Tables, a: Reals2, r: int, x: Reals2, rx: int):
+def solve_full_transposed(m: wp.ref[Tables], a: Reals2, r: int, x: Reals2, rx: int):
     """x ← A⁻ᵀ x with the factor of :func:`factor_full`."""
     n = m.nv
     for back in range(n):
@@ -227,7 +227,7 @@ def solve_full_transposed(m: Tables, a: Reals2, r: int, x: Reals2, rx: int):
 
 
 @wp.func(inline=True)
-def fluid_slopes_adjoint(m: Tables, w: World):
+def fluid_slopes_adjoint(m: wp.ref[Tables], w: wp.ref[World]):
     """Gradient of Λᵀ G U of each body, G minus the slope of the medium's forces, in Λ, U, V, pose and θ."""
     _late = wp.grad(late)(ONE)
     for b in range(m.nb):
@@ -244,7 +244,7 @@ def fluid_slopes_adjoint(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def _box_slope_adjoint(m: Tables, w: World, b: int):
+def _box_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int):
     rot = inertial_frame(m, w, b)
     back = wp.transpose(rot)
     c = centre_of_mass(m, w, b)
@@ -269,7 +269,7 @@ def _box_slope_adjoint(m: Tables, w: World, b: int):
 
 
 @wp.func(inline=True)
-def _ellipsoids_slope_adjoint(m: Tables, w: World, b: int):
+def _ellipsoids_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int):
     v = w.velocity[w.t, b]
     dual = w.dual[w.t, b]
     u = w.total[w.t, b]
@@ -292,7 +292,7 @@ def _ellipsoids_slope_adjoint(m: Tables, w: World, b: int):
 
 @wp.func(inline=True)
 def _push(
-    m: Tables, w: World, b: int, c: vec3, fv: vec3, fl: vec3, fu: vec3, nv: vec3, nl: vec3, nu: vec3
+    m: wp.ref[Tables], w: wp.ref[World], b: int, c: vec3, fv: vec3, fl: vec3, fu: vec3, nv: vec3, nl: vec3, nu: vec3
 ):  # fmt: skip
     """Add adjoints of V, Λ and U at a point of body ``b``, linear and angular, and of its turning in the wind."""
     zero = vec3()

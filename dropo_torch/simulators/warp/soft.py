@@ -28,7 +28,7 @@ class Soft:
 
 
 @wp.func(inline=True)
-def softness(m: Tables, w: World, o_ref: int, o_imp: int, weight: f64, x: f64) -> Soft:
+def softness(m: wp.ref[Tables], w: wp.ref[World], o_ref: int, o_imp: int, weight: f64, x: f64) -> Soft:
     """The softness that stands at two places in θ, at the position ``x``."""
     solref = theta_vec2(w.th, o_ref)
     solimp = theta_vec5(w.th, o_imp)
@@ -38,7 +38,9 @@ def softness(m: Tables, w: World, o_ref: int, o_imp: int, weight: f64, x: f64) -
 
 
 @wp.func(inline=True)
-def soft_adjoint(m: Tables, w: World, soft: Soft, dim: int, mu: f64, d: f64, dbar: f64, bbar: f64, sbar: f64):
+def soft_adjoint(
+    m: wp.ref[Tables], w: wp.ref[World], soft: Soft, dim: int, mu: f64, d: f64, dbar: f64, bbar: f64, sbar: f64
+):
     """Adjoints of a constraint's position, inverse inertia and first friction; adds those of solref and solimp.
 
     ⟨D, D̄⟩ + ⟨B, B̄⟩ + ⟨K d(x) x, s̄⟩ is the number.

@@ -31,7 +31,7 @@ LINE_STEPS = wp.constant(50)
 
 
 @wp.func(inline=True)
-def contact_dot(m: Tables, w: World, c: int, x: Reals2, r: int) -> vec6:
+def contact_dot(m: wp.ref[Tables], w: wp.ref[World], c: int, x: Reals2, r: int) -> vec6:
     """J x of contact ``c``."""
     k = w.con_pair[w.t, c]
     first = m.pair_dofadr[k]
@@ -39,7 +39,7 @@ def contact_dot(m: Tables, w: World, c: int, x: Reals2, r: int) -> vec6:
 
 
 @wp.func(inline=True)
-def _add_row_hessian(m: Tables, w: World, n: int, r: int):
+def _add_row_hessian(m: wp.ref[Tables], w: wp.ref[World], n: int, r: int):
     """H += Jᵀ D J of one scalar row."""
     if num_tendons(m) != 0 and w.row_tendon[w.t, n] != 0:
         _add_tendon_hessian(m, w, n, r)
@@ -48,7 +48,7 @@ def _add_row_hessian(m: Tables, w: World, n: int, r: int):
 
 
 @wp.func
-def _add_tendon_hessian(m: Tables, w: World, n: int, r: int):
+def _add_tendon_hessian(m: wp.ref[Tables], w: wp.ref[World], n: int, r: int):
     d = w.row_d[w.t, n]
     for a in range(2):
         for b in range(2):
@@ -66,7 +66,7 @@ def _add_tendon_hessian(m: Tables, w: World, n: int, r: int):
 
 
 @wp.func(inline=True)
-def _add_dofs_hessian(m: Tables, w: World, n: int, r: int):
+def _add_dofs_hessian(m: wp.ref[Tables], w: wp.ref[World], n: int, r: int):
     d = w.row_d[w.t, n]
     c = w.row_coef[w.t, n]
     for a in range(3):
@@ -79,7 +79,7 @@ def _add_dofs_hessian(m: Tables, w: World, n: int, r: int):
 
 
 @wp.func(inline=True)
-def assemble(m: Tables, w: World, nrow: int, ncon: int, r: int):
+def assemble(m: wp.ref[Tables], w: wp.ref[World], nrow: int, ncon: int, r: int):
     """H = M + Jᵀ C J and the gradient M a + c − τ − Jᵀ f at the current J a − aref, into ``w.step``."""
     for i in range(m.nh):
         w.hess[r, i] = w.quad[w.t, i]
@@ -106,7 +106,7 @@ def assemble(m: Tables, w: World, nrow: int, ncon: int, r: int):
 
 
 @wp.func(inline=True)
-def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, quad: f64):
+def _slopes(m: wp.ref[Tables], w: wp.ref[World], nrow: int, ncon: int, alpha: f64, linear: f64, quad: f64):
     """φ'(α) and φ''(α) of the cost along the step."""
     d1 = linear + alpha * quad
     d2 = quad
@@ -126,7 +126,7 @@ def _slopes(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, linear: f64, 
 
 
 @wp.func(inline=True)
-def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
+def _line_search(m: wp.ref[Tables], w: wp.ref[World], nrow: int, ncon: int, r: int) -> f64:
     """The root of φ' along the step: Newton's iteration kept in a bracket, roughly where cones are curved."""
     multiply(m.dof_parent, m.nv, m.quad_dense, w.quad, w.t, w.step, w.t, w.work, w.t)
     linear = ZERO
@@ -163,7 +163,7 @@ def _line_search(m: Tables, w: World, nrow: int, ncon: int, r: int) -> f64:
 
 
 @wp.func(inline=True)
-def _unconstrained_gradient(m: Tables, w: World, r: int):
+def _unconstrained_gradient(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """quad · a + load, into ``w.product``."""
     multiply(m.dof_parent, m.nv, m.quad_dense, w.quad, w.t, w.acc, r, w.product, w.t)
     for i in range(m.nv):
@@ -171,7 +171,7 @@ def _unconstrained_gradient(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
+def newton(m: wp.ref[Tables], w: wp.ref[World], nrow: int, ncon: int, dense: int, r: int):
     """Solve for ``w.acc[r]`` from the guess it holds; leave the factor of H at the solution in ``w.hess[r]``."""
     for n in range(nrow):
         w.row_jar[w.t, n] = row_dot(m, w, n, w.acc, r) - w.row_aref[w.t, n]
@@ -223,7 +223,7 @@ def newton(m: Tables, w: World, nrow: int, ncon: int, dense: int, r: int):
 
 
 @wp.func(inline=True)
-def _advance(m: Tables, w: World, nrow: int, ncon: int, alpha: f64, r: int):
+def _advance(m: wp.ref[Tables], w: wp.ref[World], nrow: int, ncon: int, alpha: f64, r: int):
     """Move ``alpha`` steps."""
     for i in range(m.nv):
         w.acc[r, i] += alpha * w.step[w.t, i]

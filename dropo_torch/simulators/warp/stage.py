@@ -61,7 +61,7 @@ from dropo_torch.simulators.warp.wrenches import outer_wrench_adjoint
 
 
 @wp.func(inline=True)
-def accelerate(m: Tables, w: World, r: int):
+def accelerate(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Acceleration of the state in row ``r``, from the guess in ``acc[r]``; leaves the factor of H in ``hess[r]``."""
     sweep_out(m, w, r)
     inertial_forces(m, w)
@@ -89,7 +89,7 @@ def accelerate(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
+def accelerate_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, softening: int):
     """Adjoint of :func:`accelerate`: adds to ``w.tangent``, ``w.vel_bar``, controls and θ.
 
     Poses of row ``r`` are in the scratch memory, minus the adjoint of the acceleration in ``w.lam``, its acceleration
@@ -145,7 +145,7 @@ def accelerate_adjoint(m: Tables, w: World, r: int, softening: int):
 
 
 @wp.func(inline=True)
-def carry_out(m: Tables, w: World):
+def carry_out(m: wp.ref[Tables], w: wp.ref[World]):
     """U = Σ s a and Λ = Σ s λ of each body, and A completed to the acceleration with joint accelerations."""
     w.total[w.t, 0] = vec6()
     w.dual[w.t, 0] = vec6()
@@ -164,7 +164,7 @@ def carry_out(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def bodies_adjoint(m: Tables, w: World, softening: int, posed: int):
+def bodies_adjoint(m: wp.ref[Tables], w: wp.ref[World], softening: int, posed: int):
     """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
 
     ``softening`` 1 leaves out V, and 3 all bodies whose velocity products are not taken implicitly; both leave out
@@ -211,7 +211,7 @@ def bodies_adjoint(m: Tables, w: World, softening: int, posed: int):
 
 
 @wp.func(inline=True)
-def _inertia_adjoint(m: Tables, w: World, b: int, x: vec6, y: vec6, z: vec6, v: vec6):
+def _inertia_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, x: vec6, y: vec6, z: vec6, v: vec6):
     """Gradient of ⟨x, I y⟩ + ⟨z, I v⟩ in mass, moments and centre of mass."""
     rot = w.xmat[w.t, b]
     c = centre_of_mass(m, w, b)
@@ -230,7 +230,7 @@ def _inertia_adjoint(m: Tables, w: World, b: int, x: vec6, y: vec6, z: vec6, v: 
 
 
 @wp.func(inline=True)
-def _fluid_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
+def _fluid_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, dual: vec6, v: vec6):
     """Gradient of −λ · (drag on the body)."""
     rot = inertial_frame(m, w, b)
     back = wp.transpose(rot)
@@ -256,7 +256,7 @@ def _fluid_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
 
 
 @wp.func(inline=True)
-def _ellipsoids_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
+def _ellipsoids_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, dual: vec6, v: vec6):
     """Gradient of −λ · (forces of the medium on the body's ellipsoids)."""
     wind = theta_vec3(w.th, m.o_wind)
     first = m.body_fluid[b]
@@ -280,7 +280,7 @@ def _ellipsoids_adjoint(m: Tables, w: World, b: int, dual: vec6, v: vec6):
 
 
 @wp.func(inline=True)
-def pose_adjoint(m: Tables, w: World, b: int, y: vec6):
+def pose_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, y: vec6):
     """Adjoint of a prescribed pose among the inputs: ``y`` is that of displacing the body, which stands still."""
     i = m.body_pose[b]
     q = vec4_at(w.ctrl, w.rc, i + 3)
@@ -293,7 +293,7 @@ def pose_adjoint(m: Tables, w: World, b: int, y: vec6):
 
 
 @wp.func(inline=True)
-def carry_in(m: Tables, w: World, r: int, posed: int):
+def carry_in(m: wp.ref[Tables], w: wp.ref[World], r: int, posed: int):
     """Adjoints of positions and velocities, from the leaves to the root.
 
     In a frame that is displaced along s with everything beyond the joint, only what comes from before the joint

@@ -20,7 +20,7 @@ from dropo_torch.simulators.warp.types import MINVAL, ONE, THREE, TWO, ZERO, Rea
 
 
 @wp.func(inline=True)
-def tendon_dot(m: Tables, w: World, k: int, x: Reals2, r: int) -> f64:
+def tendon_dot(m: wp.ref[Tables], w: wp.ref[World], k: int, x: Reals2, r: int) -> f64:
     """J x of tendon ``k``."""
     y = f64(0.0)
     for c in range(m.ten_start[k], m.ten_start[k + 1]):
@@ -29,21 +29,21 @@ def tendon_dot(m: Tables, w: World, k: int, x: Reals2, r: int) -> f64:
 
 
 @wp.func(inline=True)
-def tendon_add(m: Tables, w: World, k: int, y: f64, x: Reals2, r: int):
+def tendon_add(m: wp.ref[Tables], w: wp.ref[World], k: int, y: f64, x: Reals2, r: int):
     """x += Jᵀ y of tendon ``k``."""
     for c in range(m.ten_start[k], m.ten_start[k + 1]):
         x[r, m.ten_dof[c]] += w.ten_jac[w.t, c] * y
 
 
 @wp.func(inline=True)
-def tendon_bar(m: Tables, w: World, k: int, y: f64, x: Reals2, r: int):
+def tendon_bar(m: wp.ref[Tables], w: wp.ref[World], k: int, y: f64, x: Reals2, r: int):
     """Adjoint of J of tendon ``k`` in y J x."""
     for c in range(m.ten_start[k], m.ten_start[k + 1]):
         w.ten_jac_bar[w.t, c] += y * x[r, m.ten_dof[c]]
 
 
 @wp.func(inline=True)
-def segment_end(m: Tables, w: World, g: int) -> vec3:
+def segment_end(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     """An end of a segment."""
     b = m.seg_body[g]
     return w.xpos[w.t, b] + w.xmat[w.t, b] * m.seg_pos[g]
@@ -57,7 +57,7 @@ def along(x: vec3) -> vec3:
 
 
 @wp.func(inline=True)
-def make_tendons(m: Tables, w: World, r: int):
+def make_tendons(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Length, J and velocity of every tendon."""
     for k in range(num_tendons(m)):
         length = f64(0.0)
@@ -78,7 +78,7 @@ def make_tendons(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def _pull_along(m: Tables, w: World, k: int, g: int, p: vec3, f: vec3):
+def _pull_along(m: wp.ref[Tables], w: wp.ref[World], k: int, g: int, p: vec3, f: vec3):
     """Add the moment arms of the force ``f`` at a segment's end to those of tendon ``k``."""
     i = m.body_lastdof[m.seg_body[g]]
     while i >= 0:
@@ -88,7 +88,7 @@ def _pull_along(m: Tables, w: World, k: int, g: int, p: vec3, f: vec3):
 
 
 @wp.func(inline=True)
-def clear_tendon_bars(m: Tables, w: World):
+def clear_tendon_bars(m: wp.ref[Tables], w: wp.ref[World]):
     """Adjoints of lengths and of J, empty."""
     for k in range(num_tendons(m)):
         w.ten_length_bar[w.t, k] = ZERO
@@ -97,7 +97,7 @@ def clear_tendon_bars(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def tendons_adjoint(m: Tables, w: World):
+def tendons_adjoint(m: wp.ref[Tables], w: wp.ref[World]):
     """From the adjoints of lengths and J to that of the position."""
     for k in range(num_tendons(m)):
         tendon_add(m, w, k, w.ten_length_bar[w.t, k], w.tangent, w.t)
@@ -115,7 +115,7 @@ def tendons_adjoint(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def _bar_motion(m: Tables, w: World, k: int, g: int) -> vec6:
+def _bar_motion(m: wp.ref[Tables], w: wp.ref[World], k: int, g: int) -> vec6:
     """Motion of a segment's end if the joints move with the adjoint of J."""
     z = vec6()
     i = m.body_lastdof[m.seg_body[g]]
@@ -126,7 +126,7 @@ def _bar_motion(m: Tables, w: World, k: int, g: int) -> vec6:
 
 
 @wp.func
-def _turn_arms(m: Tables, w: World, k: int, g: int, p: vec3, pbar: vec3, f: vec3, z: vec6):
+def _turn_arms(m: wp.ref[Tables], w: wp.ref[World], k: int, g: int, p: vec3, pbar: vec3, f: vec3, z: vec6):
     """Tangent of f · (z at p) with the adjoint ``pbar`` of p: a joint displaces p and turns all of z beyond it."""
     force = pbar + wp.cross(f, ang(z))
     beyond = vec6()
@@ -142,7 +142,7 @@ def _turn_arms(m: Tables, w: World, k: int, g: int, p: vec3, pbar: vec3, f: vec3
 
 
 @wp.func(inline=True)
-def spring_stretch(m: Tables, w: World, k: int) -> f64:
+def spring_stretch(m: wp.ref[Tables], w: wp.ref[World], k: int) -> f64:
     """How far tendon ``k`` is outside the range in which its spring does nothing."""
     length = w.ten_length[w.t, k]
     low = w.th[m.o_ten_lengthspring + 2 * k]
@@ -151,7 +151,7 @@ def spring_stretch(m: Tables, w: World, k: int) -> f64:
 
 
 @wp.func(inline=True)
-def add_tendon_forces(m: Tables, w: World):
+def add_tendon_forces(m: wp.ref[Tables], w: wp.ref[World]):
     """Load from springs, F = −x (k + p0 x + p1 x²), and dampers, F = −v (b + p0 |v| + p1 v²)."""
     for k in range(num_tendons(m)):
         x = ZERO
@@ -169,7 +169,7 @@ def add_tendon_forces(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def tendon_forces_adjoint(m: Tables, w: World, r: int):
+def tendon_forces_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Adjoint of :func:`add_tendon_forces`."""
     for k in range(num_tendons(m)):
         jl = ZERO
@@ -201,14 +201,14 @@ def tendon_forces_adjoint(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def rate_bar(m: Tables, w: World, k: int, bar: f64, vel_bar: Reals2, r: int):
+def rate_bar(m: wp.ref[Tables], w: wp.ref[World], k: int, bar: f64, vel_bar: Reals2, r: int):
     """Adjoint of the velocity of tendon ``k``, in row ``r``: that of the joints' velocities, and of J."""
     tendon_add(m, w, k, bar, vel_bar, w.t)
     tendon_bar(m, w, k, bar, w.qvel, r)
 
 
 @wp.func(inline=True)
-def tendon_damping_slope(m: Tables, w: World, k: int) -> f64:
+def tendon_damping_slope(m: wp.ref[Tables], w: wp.ref[World], k: int) -> f64:
     """b + 2 p0 |v| + 3 p1 v² of tendon ``k``."""
     n = wp.abs(w.ten_rate[w.t, k])
     ip = m.o_ten_dampingpoly + 2 * k
@@ -216,7 +216,7 @@ def tendon_damping_slope(m: Tables, w: World, k: int) -> f64:
 
 
 @wp.func
-def add_outer(m: Tables, w: World, k: int, y: f64, matrix: Reals2, r: int):
+def add_outer(m: wp.ref[Tables], w: wp.ref[World], k: int, y: f64, matrix: Reals2, r: int):
     """Add y JᵀJ of tendon ``k`` to a packed matrix, where MuJoCo's M has room for it.
 
     It has that for dofs of which one is beyond the other, unless M is diagonal there.
@@ -233,7 +233,7 @@ def add_outer(m: Tables, w: World, k: int, y: f64, matrix: Reals2, r: int):
 
 
 @wp.func
-def outer_dot(m: Tables, w: World, k: int, x: Reals2, rx: int, y: Reals2, ry: int, bar: f64) -> f64:
+def outer_dot(m: wp.ref[Tables], w: wp.ref[World], k: int, x: Reals2, rx: int, y: Reals2, ry: int, bar: f64) -> f64:
     """xᵀ (JᵀJ) y with what :func:`add_outer` leaves of JᵀJ; adds ``bar`` times its gradient to the adjoint of J."""
     total = f64(0.0)
     for c in range(m.ten_start[k], m.ten_start[k + 1]):
@@ -255,7 +255,7 @@ def outer_dot(m: Tables, w: World, k: int, x: Reals2, rx: int, y: Reals2, ry: in
 
 
 @wp.func
-def outer_mul(m: Tables, w: World, k: int, scale: f64, x: Reals2, rx: int, y: Reals2, ry: int):
+def outer_mul(m: wp.ref[Tables], w: wp.ref[World], k: int, scale: f64, x: Reals2, rx: int, y: Reals2, ry: int):
     """y += scale (JᵀJ) x with what :func:`add_outer` leaves of JᵀJ."""
     for c in range(m.ten_start[k], m.ten_start[k + 1]):
         i = m.ten_dof[c]
@@ -272,7 +272,7 @@ def outer_mul(m: Tables, w: World, k: int, scale: f64, x: Reals2, rx: int, y: Re
 
 
 @wp.func(inline=True)
-def add_tendon_armature(m: Tables, w: World):
+def add_tendon_armature(m: wp.ref[Tables], w: wp.ref[World]):
     """Add the armature of tendons to M."""
     for k in range(num_tendons(m)):
         armature = w.th[m.o_ten_armature + k]
@@ -281,7 +281,7 @@ def add_tendon_armature(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def tendon_armature_adjoint(m: Tables, w: World):
+def tendon_armature_adjoint(m: wp.ref[Tables], w: wp.ref[World]):
     """Gradient of λᵀ M a in the armature of tendons, whose J is constant."""
     for k in range(num_tendons(m)):
         if m.ten_spatial[k] == 0:

@@ -12,7 +12,7 @@ from dropo_torch.simulators.warp.types import Tables, World, f64, vec6
 
 
 @wp.func(inline=True)
-def thrust(m: Tables, w: World, i: int) -> vec6:
+def thrust(m: wp.ref[Tables], w: wp.ref[World], i: int) -> vec6:
     """The wrench of a unit force of actuator ``i`` as a spatial force."""
     b = m.act_body[i]
     p = w.xpos[w.t, b] + w.xmat[w.t, b] * m.act_pos[i]
@@ -22,7 +22,7 @@ def thrust(m: Tables, w: World, i: int) -> vec6:
 
 
 @wp.func(inline=True)
-def thrust_adjoint(m: Tables, w: World, i: int, f: f64):
+def thrust_adjoint(m: wp.ref[Tables], w: wp.ref[World], i: int, f: f64):
     """Adjoint of −Λ · (wrench of the force ``f``), which turns with its body, in Λ and the gears."""
     b = m.act_body[i]
     dual = w.dual[w.t, b]

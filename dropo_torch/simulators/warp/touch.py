@@ -43,32 +43,32 @@ from dropo_torch.simulators.warp.types import (
 
 
 @wp.func(inline=True)
-def geom_centre(m: Tables, w: World, g: int) -> vec3:
+def geom_centre(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     """Centre of a geom, from the origin of the sweep."""
     b = m.geom_body[g]
     return w.xpos[w.t, b] + w.xmat[w.t, b] * geom_position(m, w, g)
 
 
 @wp.func(inline=True)
-def geom_rotation(m: Tables, w: World, g: int) -> mat33:
+def geom_rotation(m: wp.ref[Tables], w: wp.ref[World], g: int) -> mat33:
     """Rotation of a geom."""
     return w.xmat[w.t, m.geom_body[g]] * geom_turn(m, w, g)
 
 
 @wp.func(inline=True)
-def geom_axis(m: Tables, w: World, g: int) -> vec3:
+def geom_axis(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     """Third axis of a geom: a plane's normal, the axis of a capsule."""
     return w.xmat[w.t, m.geom_body[g]] * geom_turn(m, w, g)[:, 2]
 
 
 @wp.func(inline=True)
-def half_axis(m: Tables, w: World, g: int) -> vec3:
+def half_axis(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     """Half-axis of a capsule, zero for a sphere (whose second size is zero)."""
     return geom_axis(m, w, g) * geom_size(m, w, g)[1]
 
 
 @wp.func(inline=True)
-def _add(w: World, n: int, k: int, which: int, x: collide.vec7, hint: vec3):
+def _add(w: wp.ref[World], n: int, k: int, which: int, x: collide.vec7, hint: vec3):
     """Write contact ``n`` with its frame; the first tangent is along the hint, or along y or z without one."""
     w.con_pair[w.t, n] = k
     w.con_which[w.t, n] = which
@@ -101,7 +101,9 @@ def _towards_plane(kind: int, n: vec3, c: vec3, axis: vec3, rot: mat33, size: ve
 
 
 @wp.func(inline=True)
-def _add_boxes(m: Tables, w: World, n: int, k: int, c1: vec3, r1: mat33, c2: vec3, r2: mat33, margin: f64) -> int:
+def _add_boxes(
+    m: wp.ref[Tables], w: wp.ref[World], n: int, k: int, c1: vec3, r1: mat33, c2: vec3, r2: mat33, margin: f64
+) -> int:
     """Write the contacts of a pair of boxes from number ``n`` on and return the number of the next one."""
     size1 = m.geom_size[m.pair_geom1[k]]
     size2 = m.geom_size[m.pair_geom2[k]]
@@ -116,7 +118,9 @@ def _add_boxes(m: Tables, w: World, n: int, k: int, c1: vec3, r1: mat33, c2: vec
 
 
 @wp.func(inline=True)
-def _add_corners(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2: vec3, rot: mat33, margin: f64) -> int:
+def _add_corners(
+    m: wp.ref[Tables], w: wp.ref[World], n: int, k: int, normal: vec3, c1: vec3, c2: vec3, rot: mat33, margin: f64
+) -> int:
     """Write the contacts of a plane and a mesh from number ``n`` on and return the number of the next one.
 
     They are the deepest vertex of the hull and up to three more of the face there that is turned most to the plane.
@@ -144,7 +148,7 @@ def _add_corners(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2
 
 
 @wp.func(inline=True)
-def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
+def _add_convex(m: wp.ref[Tables], w: wp.ref[World], n: int, k: int, margin: f64) -> int:
     """Write the contacts of a pair of convex geoms from number ``n`` on and return the number of the next one."""
     reach = margin + m.pair_gap[k]
     number = n
@@ -161,7 +165,7 @@ def _add_convex(m: Tables, w: World, n: int, k: int, margin: f64) -> int:
 
 
 @wp.func(inline=True)
-def _extent(m: Tables, w: World, g: int, direction: vec3) -> f64:
+def _extent(m: wp.ref[Tables], w: wp.ref[World], g: int, direction: vec3) -> f64:
     """How far the bounding box of a geom reaches in a direction from the geom's centre."""
     local = wp.transpose(m.geom_mat[g]) * (wp.transpose(w.xmat[w.t, m.geom_body[g]]) * direction)
     half = m.geom_half[g]
@@ -170,7 +174,7 @@ def _extent(m: Tables, w: World, g: int, direction: vec3) -> f64:
 
 
 @wp.func(inline=True)
-def _may_touch(m: Tables, w: World, g1: int, g2: int, apart: vec3, margin: f64) -> bool:
+def _may_touch(m: wp.ref[Tables], w: wp.ref[World], g1: int, g2: int, apart: vec3, margin: f64) -> bool:
     """Whether the bounding boxes of two geoms overlap, or nearly so, as seen along the line of their centres."""
     length = wp.length(apart)
     near = bool(True)
@@ -181,7 +185,9 @@ def _may_touch(m: Tables, w: World, g1: int, g2: int, apart: vec3, margin: f64) 
 
 
 @wp.func(inline=True)
-def _add_formula(m: Tables, w: World, n: int, k: int, normal: vec3, c1: vec3, c2: vec3, margin: f64) -> int:
+def _add_formula(
+    m: wp.ref[Tables], w: wp.ref[World], n: int, k: int, normal: vec3, c1: vec3, c2: vec3, margin: f64
+) -> int:
     """Write the contacts of a pair that has a formula from number ``n`` on and return the number of the next one."""
     kind = m.pair_kind[k]
     g1 = m.pair_geom1[k]
@@ -267,7 +273,7 @@ def _near_pairs(
 
 
 @wp.func(inline=True)
-def find_contacts(m: Tables, w: World) -> int:
+def find_contacts(m: wp.ref[Tables], w: wp.ref[World]) -> int:
     """List the contacts of a configuration and return their number."""
     for i in range(m.ntouching):
         g = m.touching[i]
@@ -336,7 +342,9 @@ def _boxes_adjoint(
 
 
 @wp.func(inline=True)
-def geometry_adjoint(m: Tables, w: World, c: int, distbar: f64, pbar: vec3, nbar0: vec3, t1bar0: vec3, t2bar: vec3):
+def geometry_adjoint(
+    m: wp.ref[Tables], w: wp.ref[World], c: int, distbar: f64, pbar: vec3, nbar0: vec3, t1bar0: vec3, t2bar: vec3
+):
     """From the adjoints of distance, point and frame to spatial forces on the two geoms' bodies."""
     k = w.con_pair[w.t, c]
     which = w.con_which[w.t, c]

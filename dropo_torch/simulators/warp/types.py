@@ -129,6 +129,9 @@ Tables: Any = _struct(
     },
 )
 
+#: One :data:`Tables` in memory of the device, which all threads read in place.
+OneTables: Any = wp.array(dtype=Tables)
+
 #: Memory of a trajectory, one row per stage of a step: name → (type, numbers in a row).
 TRAJECTORY: dict[str, tuple[Any, str]] = {
     "qpos": (f64, "qpos"), "qvel": (f64, "dof"), "acc": (f64, "dof"),

@@ -66,7 +66,7 @@ class Weld:
 
 
 @wp.func(inline=True)
-def weld_anchor(m: Tables, w: World, e: int, side: int) -> vec3:
+def weld_anchor(m: wp.ref[Tables], w: wp.ref[World], e: int, side: int) -> vec3:
     """Place in θ of an anchor in its body's frame; a weld's data has that of the second body first."""
     x = m.weld_pos[2 * e + side]
     if m.weld_sites[e] == 0:
@@ -76,7 +76,7 @@ def weld_anchor(m: Tables, w: World, e: int, side: int) -> vec3:
 
 
 @wp.func(inline=True)
-def weld_pose(m: Tables, w: World, e: int) -> Weld:
+def weld_pose(m: wp.ref[Tables], w: wp.ref[World], e: int) -> Weld:
     """The two frames of weld ``e``."""
     x = Weld()
     x.b1 = m.weld_body[2 * e]
@@ -140,7 +140,7 @@ def _turning_force(x: Weld, y: vec6) -> vec3:
 
 
 @wp.func(inline=True)
-def weld_softness(m: Tables, w: World, e: int, error: vec6, part: int) -> Soft:
+def weld_softness(m: wp.ref[Tables], w: wp.ref[World], e: int, error: vec6, part: int) -> Soft:
     """The softness of the rows that displace (``part`` 0) or turn (1)."""
     o_ref = m.o_eq_solref + 2 * m.weld_id[e]
     o_imp = m.o_eq_solimp + 5 * m.weld_id[e]
@@ -154,7 +154,7 @@ def stiffen(soft: Soft) -> f64:
 
 
 @wp.func(inline=True)
-def make_welds(m: Tables, w: World, r: int):
+def make_welds(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Add the cost of all welds: JᵀD J to the matrix ``w.quad``, −JᵀD aref to the load."""
     if num_welds(m) > 0:
         for i in range(m.nh):
@@ -164,7 +164,7 @@ def make_welds(m: Tables, w: World, r: int):
 
 
 @wp.func(inline=True)
-def _make_weld(m: Tables, w: World, e: int):
+def _make_weld(m: wp.ref[Tables], w: wp.ref[World], e: int):
     """Add the cost of one weld, aref with the acceleration that the rows have without any of the joints."""
     x = weld_pose(m, w, e)
     error = weld_error(x)
@@ -198,7 +198,7 @@ def _make_weld(m: Tables, w: World, e: int):
 
 
 @wp.func(inline=True)
-def welds_adjoint(m: Tables, w: World):
+def welds_adjoint(m: wp.ref[Tables], w: wp.ref[World]):
     """Add the gradient of Σ −f Jλ over the welds to the bodies' F and Y and to θ."""
     _late = wp.grad(late)(ONE)
     for e in range(num_welds(m)):
@@ -206,7 +206,7 @@ def welds_adjoint(m: Tables, w: World):
 
 
 @wp.func(inline=True)
-def _weld_adjoint(m: Tables, w: World, e: int):
+def _weld_adjoint(m: wp.ref[Tables], w: wp.ref[World], e: int):
     """The gradient of one weld's Σ D (ẍ + B ẋ + K d(|x|) x) Jλ."""
     _late = wp.grad(late)(ONE)
     x = weld_pose(m, w, e)
@@ -238,7 +238,7 @@ def _weld_adjoint(m: Tables, w: World, e: int):
 
 
 @wp.func(inline=True)
-def _hang_weld(m: Tables, w: World, e: int, x: Weld, errorbar: vec6, ab: vec6, vb: vec6, lb: vec6):
+def _hang_weld(m: wp.ref[Tables], w: wp.ref[World], e: int, x: Weld, errorbar: vec6, ab: vec6, vb: vec6, lb: vec6):
     """Hang the adjoints of position, acceleration, velocity and Jλ of the rows on bodies and on the equality's data."""
     v1 = w.velocity[w.t, x.b1]
     v2 = w.velocity[w.t, x.b2]
@@ -280,8 +280,8 @@ def _hang_weld(m: Tables, w: World, e: int, x: Weld, errorbar: vec6, ab: vec6, v
 
 @wp.func
 def _hang_anchor(
-    w: World, b: int, p: vec3, pbar: vec3, ab: vec3, vb: vec3, lb: vec3, turn_a: vec3, turn_v: vec3, turn_l: vec3,
-    torque: vec3,
+    w: wp.ref[World], b: int, p: vec3, pbar: vec3, ab: vec3, vb: vec3, lb: vec3, turn_a: vec3, turn_v: vec3,
+    turn_l: vec3, torque: vec3,
 ) -> vec3:  # fmt: skip
     """Hang the adjoints of an anchor's position, acceleration, velocity and Λ, and torques, on its body.
 
@@ -311,7 +311,7 @@ def _rate(x: Weld, turning: vec3) -> vec3:
 
 
 @wp.func
-def _turn_adjoint(w: World, o: int, q: vec4, grow: f64, turn: vec3):
+def _turn_adjoint(w: wp.ref[World], o: int, q: vec4, grow: f64, turn: vec3):
     """Adjoint of the reference quaternion at ``o`` in θ: q ⊗ (grow, turn) / |q|²."""
     bar = quat_mul(q, vec4(grow, turn[0], turn[1], turn[2])) / wp.dot(q, q)
     add_at(w.grad, w.t, o, bar)

@@ -17,20 +17,20 @@ from dropo_torch.simulators.warp.types import Tables, World, vec3, vec6
 
 
 @wp.func(inline=True)
-def wrench_column(m: Tables, w: World, b: int) -> int:
+def wrench_column(m: wp.ref[Tables], w: wp.ref[World], b: int) -> int:
     """Column of the inputs in which a body's force begins; its torque follows."""
     return w.ctrl.shape[1] - m.nv * w.applied - 6 * (m.nb - b)
 
 
 @wp.func(inline=True)
-def outer_wrench(m: Tables, w: World, b: int) -> vec6:
+def outer_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     """The wrench on a body as a spatial force."""
     i = wrench_column(m, w, b)
     return wrench(vec3_at(w.ctrl, w.rc, i), centre_of_mass(m, w, b)) + join(vec3_at(w.ctrl, w.rc, i + 3), vec3())
 
 
 @wp.func(inline=True)
-def outer_wrench_adjoint(m: Tables, w: World, b: int, dual: vec6):
+def outer_wrench_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, dual: vec6):
     """Gradient of −Λ · (wrench on the body), which turns with nothing."""
     i = wrench_column(m, w, b)
     f = vec3_at(w.ctrl, w.rc, i)
