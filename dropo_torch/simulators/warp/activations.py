@@ -66,7 +66,7 @@ def control_adjoint(m: wp.ref[Tables], w: wp.ref[World], i: int, bar: f64):
     w.ctrl_bar[w.rb, i] += ubar
 
 
-@wp.func
+@wp.func(inline=False)
 def _muscle_rate(u: f64, act: f64, prm: vec3) -> f64:
     """Rate of a muscle's activation; ``prm`` are the time constants on and off, and the width of what joins them."""
     x = wp.clamp(act, ZERO, ONE)
@@ -80,7 +80,7 @@ def _muscle_rate(u: f64, act: f64, prm: vec3) -> f64:
     return away / wp.max(off + (on - off) * share, MINVAL)
 
 
-@wp.func
+@wp.func(inline=False)
 def activation_power(dynamics: int, u: f64, act: f64, prm: vec3, bar: f64) -> f64:
     """Leaf: the rate of an activation under a control, times its adjoint."""
     rate = u

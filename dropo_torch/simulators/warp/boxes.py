@@ -53,7 +53,7 @@ FACE_LABEL = wp.constant(128)
 EDGE_CODE = wp.constant(4096)
 
 
-@wp.func
+@wp.func(inline=False)
 def unit(i: int) -> vec3:
     """Unit vector along axis ``i``."""
     e = vec3()
@@ -61,25 +61,25 @@ def unit(i: int) -> vec3:
     return e
 
 
-@wp.func
+@wp.func(inline=False)
 def signed(code: int, bit: int) -> f64:
     """+1 where a bit of a code is set, −1 where it is not."""
     return f64(2 * ((code >> bit) & 1) - 1)
 
 
-@wp.func
+@wp.func(inline=False)
 def _edge_axis(rot: mat33, i: int, j: int) -> vec3:
     """Cross product of axis ``i`` of the first box with axis ``j`` of the second, in the first one's frame."""
     return wp.cross(unit(i), rot * unit(j))
 
 
-@wp.func
+@wp.func(inline=False)
 def _reach(rot: mat33, size: vec3) -> vec3:
     """How far a box reaches along the axes of a frame; ``rot`` has its own axes there."""
     return wp.abs(rot[:, 0]) * size[0] + wp.abs(rot[:, 1]) * size[1] + wp.abs(rot[:, 2]) * size[2]
 
 
-@wp.func
+@wp.func(inline=False)
 def best_axis(rot: mat33, x21: vec3, x12: vec3, size1: vec3, size2: vec3, margin: f64) -> int:
     """The axis of largest separation, −1 where the boxes are apart by more than the margin.
 
@@ -122,7 +122,7 @@ def best_axis(rot: mat33, x21: vec3, x12: vec3, size1: vec3, size2: vec3, margin
     return code
 
 
-@wp.func
+@wp.func(inline=False)
 def _cut_label(line: int, side: int) -> int:
     """Label of the corner where ``side`` cuts a line: an edge of the incident face (0 to 3) or a side (4 + side)."""
     label = CROSSING + 4 * line + side
@@ -133,7 +133,7 @@ def _cut_label(line: int, side: int) -> int:
     return label
 
 
-@wp.func
+@wp.func(inline=False)
 def cut(corners: Corners, labels: Labels, lines: Labels, count: int, side: int, limit: f64):
     """Cut a polygon by a side of the reference face: 0, 1 the upper and lower along x, 2, 3 along y.
 
@@ -162,7 +162,7 @@ def cut(corners: Corners, labels: Labels, lines: Labels, count: int, side: int, 
     return new, new_labels, new_lines, n
 
 
-@wp.func
+@wp.func(inline=False)
 def face_base(axis: int, rot: mat33, x: vec3) -> int:
     """Code of a face contact without its corner: the reference face and the incident one, each an axis and a sign.
 
@@ -178,13 +178,13 @@ def face_base(axis: int, rot: mat33, x: vec3) -> int:
     return a + 4 * up + 8 * b + 32 * against + 64 * (axis // 3)
 
 
-@wp.func
+@wp.func(inline=False)
 def is_second(code: int) -> int:
     """1 if the reference face is the second box's."""
     return wp.where(code < EDGE_CODE, (code >> 6) & 1, 0)
 
 
-@wp.func
+@wp.func(inline=False)
 def _face_corner(rot: mat33, x: vec3, size: vec3, code: int, k: int) -> vec3:
     """Corner ``k`` of the incident face, in the reference frame."""
     b = (code >> 3) & 3
@@ -197,7 +197,7 @@ def _face_corner(rot: mat33, x: vec3, size: vec3, code: int, k: int) -> vec3:
     return x + rot * local
 
 
-@wp.func
+@wp.func(inline=False)
 def cut_face(rot: mat33, x: vec3, size: vec3, inc_size: vec3, base: int, margin: f64):
     """What of the incident face is over the reference face: its distinct corners, their labels, and how many."""
     a = base & 3
@@ -231,7 +231,7 @@ def cut_face(rot: mat33, x: vec3, size: vec3, inc_size: vec3, base: int, margin:
     return corners, labels, kept
 
 
-@wp.func
+@wp.func(inline=False)
 def face_contact(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, code: int) -> vec7:
     """A contact of a reference face (of the first box here) and an incident one; the normal leaves the reference."""
     a = code & 3
@@ -268,7 +268,7 @@ def face_contact(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: v
     return vec7(d, q[0], q[1], q[2], n[0], n[1], n[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def _edge_middle(size: vec3, i: int, code: int) -> vec3:
     """Middle of an edge along ``i``; the two bits of the code are its signs along the next two axes."""
     u = (i + 1) % 3
@@ -279,7 +279,7 @@ def _edge_middle(size: vec3, i: int, code: int) -> vec3:
     return p
 
 
-@wp.func
+@wp.func(inline=False)
 def edge_witnesses(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, code: int) -> vec6:
     """Closest points of an edge of each box, one after the other."""
     i = (code >> 5) & 3
@@ -302,7 +302,7 @@ def edge_witnesses(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2:
     return join(x1 + d1 * s, x2 + d2 * t)
 
 
-@wp.func
+@wp.func(inline=False)
 def edge_contact(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, code: int) -> vec7:
     """Where two edges pass each other closest, half-way between them."""
     n = wp.normalize(wp.cross(r1 * unit((code >> 5) & 3), r2 * unit((code >> 7) & 3))) * signed(code, 4)
@@ -313,7 +313,7 @@ def edge_contact(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: v
     return vec7(wp.dot(n, w2 - w1), q[0], q[1], q[2], n[0], n[1], n[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def edge_code(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, axis: int) -> int:
     """Code of the edges that the boxes touch with, given the axis."""
     i = (axis - EDGES) // 3
@@ -345,7 +345,7 @@ def edge_code(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3
     return code
 
 
-@wp.func
+@wp.func(inline=False)
 def box_contact(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, code: int) -> vec7:
     """The contact that a code names; the reference box, where there is one, stands first."""
     if code < EDGE_CODE:
@@ -353,7 +353,7 @@ def box_contact(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: ve
     return edge_contact(c1, r1, size1, c2, r2, size2, code)
 
 
-@wp.func
+@wp.func(inline=False)
 def box_spots(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, margin: f64):
     """Contacts of two boxes: (distance, point) of each, their codes, their normal, and how many."""
     back = wp.transpose(r1)
@@ -399,7 +399,7 @@ def box_spots(c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3
     return spots, codes, normal, n
 
 
-@wp.func
+@wp.func(inline=False)
 def box_dual(
     c1: vec3, r1: mat33, size1: vec3, c2: vec3, r2: mat33, size2: vec3, code: int, dbar: f64, pbar: vec3, nbar: vec3
 ) -> f64:

@@ -52,7 +52,7 @@ class Feature:
     point: vec3
 
 
-@wp.func
+@wp.func(inline=False)
 def feature_of(v: vec4i, points: mat33, n: int) -> Feature:
     """The feature that the vertices of a simplex with ``n`` points span."""
     out = Feature()
@@ -71,12 +71,12 @@ def feature_of(v: vec4i, points: mat33, n: int) -> Feature:
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def _bit(i: int, k: int) -> int:
     return (i >> k) & 1
 
 
-@wp.func
+@wp.func(inline=False)
 def box_corner(s: Shape, i: int) -> vec3:
     """Corner of a box, its bits the signs."""
     x = vec3()
@@ -85,13 +85,13 @@ def box_corner(s: Shape, i: int) -> vec3:
     return s.rot * x + s.pos
 
 
-@wp.func
+@wp.func(inline=False)
 def _corner(m: wp.ref[Tables], s: Shape, i: int) -> vec3:
     """Vertex of a box or a mesh."""
     return box_corner(s, i) if s.kind == BOX else s.rot * m.hull_vert[s.hull + i] + s.pos
 
 
-@wp.func
+@wp.func(inline=False)
 def _set_normal(w: wp.ref[World], side: int, k: int, n: vec3, face: int):
     """Write normal ``k`` of the first or the second shape, and the face that has it."""
     if side == 0:
@@ -102,7 +102,7 @@ def _set_normal(w: wp.ref[World], side: int, k: int, n: vec3, face: int):
         w.clip_index2[w.t, k] = face
 
 
-@wp.func
+@wp.func(inline=False)
 def _box_normals(w: wp.ref[World], side: int, s: Shape, f: Feature, outward: vec3) -> int:
     """Normals of the faces of a box that a feature is on."""
     n = int(0)
@@ -130,7 +130,7 @@ def _box_normals(w: wp.ref[World], side: int, s: Shape, f: Feature, outward: vec
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def _has_polygon(m: wp.ref[Tables], s: Shape, v: int, polygon: int) -> bool:
     """Whether a vertex of a hull is on a polygon."""
     i = m.hull_polyadr[s.hull + v]
@@ -142,7 +142,7 @@ def _has_polygon(m: wp.ref[Tables], s: Shape, v: int, polygon: int) -> bool:
     return found
 
 
-@wp.func
+@wp.func(inline=False)
 def _mesh_normals(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature) -> int:
     """Normals of the polygons of a hull that a feature is on."""
     n = int(0)
@@ -160,7 +160,7 @@ def _mesh_normals(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: F
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def _normals(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature, outward: vec3) -> int:
     """Normals of the faces that a feature is on; how many."""
     n = int(0)
@@ -175,14 +175,14 @@ def _normals(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Featur
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def _set_edge(w: wp.ref[World], side: int, k: int, start: vec3, end: vec3):
     d = end - start
     _set_normal(w, side, k, wp.normalize(d), 0)
     w.clip_end[w.t, k] = end
 
 
-@wp.func
+@wp.func(inline=False)
 def _mesh_edges(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, v: int, start: vec3) -> int:
     """Edges of a hull at a vertex: for each of its polygons to the vertex before."""
     n = int(0)
@@ -200,7 +200,7 @@ def _mesh_edges(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, v: int
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def _edges(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature, witness: vec3):
     """Edges that a feature may be part of: how many, and where they start; their ends and directions are written."""
     n = int(0)
@@ -237,7 +237,7 @@ def _edges(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, f: Feature,
     return n, start
 
 
-@wp.func
+@wp.func(inline=False)
 def _set_corner(w: wp.ref[World], side: int, k: int, x: vec3):
     if side == 0:
         w.clip_face1[w.t, k] = x
@@ -245,7 +245,7 @@ def _set_corner(w: wp.ref[World], side: int, k: int, x: vec3):
         w.clip_face2[w.t, k] = x
 
 
-@wp.func
+@wp.func(inline=False)
 def _face(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, face: int) -> int:
     """Write the corners of a face, clockwise from outside; how many."""
     n = int(0)
@@ -273,18 +273,18 @@ def _face(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, face: int) -
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def _corner_of(w: wp.ref[World], side: int, k: int) -> vec3:
     return wp.where(side == 0, w.clip_face1[w.t, k], w.clip_face2[w.t, k])
 
 
-@wp.func
+@wp.func(inline=False)
 def capacity(w: wp.ref[World]) -> int:
     """Corners of which there is room in a polygon."""
     return w.clip_point.shape[1] // 2
 
 
-@wp.func
+@wp.func(inline=False)
 def _add_point(w: wp.ref[World], page: int, k: int, x: vec3, line: int):
     """Append a corner to a polygon in one of two pages, with the side that leaves it."""
     if k < capacity(w):
@@ -292,7 +292,7 @@ def _add_point(w: wp.ref[World], page: int, k: int, x: vec3, line: int):
         w.clip_line[w.t, page * capacity(w) + k] = line
 
 
-@wp.func
+@wp.func(inline=False)
 def _clip(w: wp.ref[World], clipping: int, nclipping: int, clipped: int, nclipped: int, n: vec3):
     """Clip a polygon at the sides of a face with normal ``n``; the page where the result is, and its corners."""
     half = capacity(w)
@@ -328,17 +328,17 @@ def _clip(w: wp.ref[World], clipping: int, nclipping: int, clipped: int, nclippe
     return page, count
 
 
-@wp.func
+@wp.func(inline=False)
 def _at(w: wp.ref[World], page: int, i: int) -> vec3:
     return w.clip_point[w.t, page * capacity(w) + i]
 
 
-@wp.func
+@wp.func(inline=False)
 def _area(w: wp.ref[World], page: int, a: int, b: int, c: int, d: int) -> f64:
     return HALF * wp.length(wp.cross(_at(w, page, a) - _at(w, page, c), _at(w, page, b) - _at(w, page, d)))
 
 
-@wp.func
+@wp.func(inline=False)
 def _largest_quad(w: wp.ref[World], page: int, n: int) -> vec4i:
     """Corners of a quadrilateral of largest area in a polygon, as MuJoCo finds it."""
     b = int(1)
@@ -380,7 +380,7 @@ def _largest_quad(w: wp.ref[World], page: int, n: int) -> vec4i:
     return best
 
 
-@wp.func
+@wp.func(inline=False)
 def _furthest_two(w: wp.ref[World], page: int, n: int) -> vec4i:
     best = vec4i(0, 1, 0, 0)
     far = f64(0.0)
@@ -393,7 +393,7 @@ def _furthest_two(w: wp.ref[World], page: int, n: int) -> vec4i:
     return best
 
 
-@wp.func
+@wp.func(inline=False)
 def _plane_of(
     w: wp.ref[World], line: int, clipping: int, nclipping: int, nc: vec3, clipped: int, nclipped: int, nd: vec3
 ):
@@ -411,7 +411,7 @@ def _plane_of(
     return wp.normalize(wp.cross(d, n)), line >= SIDE
 
 
-@wp.func
+@wp.func(inline=False)
 def _planes_at(
     w: wp.ref[World], page: int, k: int, clipping: int, nclipping: int, nc: vec3, clipped: int, nclipped: int, nd: vec3
 ):
@@ -441,7 +441,7 @@ def _planes_at(
     return rows, own
 
 
-@wp.func
+@wp.func(inline=False)
 def _best_faces(w: wp.ref[World], n1: int, n2: int, direction: vec3):
     """The two faces that face each other most, if they do; ``direction`` is against the normal of the contact."""
     limit = EDGE_SINE * wp.length(direction)
@@ -460,7 +460,7 @@ def _best_faces(w: wp.ref[World], n1: int, n2: int, direction: vec3):
     return one, two
 
 
-@wp.func
+@wp.func(inline=False)
 def _edge_and_face(w: wp.ref[World], edges: int, nedge: int, nface: int, direction: vec3):
     """The first edge that lies in a face's plane, of the shape ``edges``, and the face."""
     edge = int(-1)
@@ -476,12 +476,12 @@ def _edge_and_face(w: wp.ref[World], edges: int, nedge: int, nface: int, directi
     return edge, face
 
 
-@wp.func
+@wp.func(inline=False)
 def _three(x: wp.types.matrix((4, 3), wp.float64)) -> mat33:
     return wp.matrix_from_rows(x[0], x[1], x[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def multicontact(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex, x1: vec3, x2: vec3) -> int:
     """Contacts of two shapes whose witnesses and their simplex are known; how many, 0 if only the witnesses touch.
 

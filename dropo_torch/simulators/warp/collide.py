@@ -50,7 +50,7 @@ ALONG = wp.constant(2)
 PLANE = wp.constant(3)
 
 
-@wp.func
+@wp.func(inline=False)
 def corner(which: int, size: vec3) -> vec3:
     """Corner ``which`` of a box: its bits are the signs."""
     x = size
@@ -60,7 +60,7 @@ def corner(which: int, size: vec3) -> vec3:
     return x
 
 
-@wp.func
+@wp.func(inline=False)
 def plane_point(n: vec3, origin: vec3, x: vec3, radius: f64) -> vec7:
     """Contact of a plane with a ball of ``radius`` about ``x``."""
     d = wp.dot(n, x - origin) - radius
@@ -68,7 +68,7 @@ def plane_point(n: vec3, origin: vec3, x: vec3, radius: f64) -> vec7:
     return vec7(d, p[0], p[1], p[2], n[0], n[1], n[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3:
     """Point ``which`` of a cylinder that a plane with normal ``n`` touches: near rim, far rim, two on the near disk."""
     axis = rot[:, 2]
@@ -89,7 +89,7 @@ def cylinder_point(n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3
     return x
 
 
-@wp.func
+@wp.func(inline=False)
 def support_point(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int) -> vec3:
     """The point of a cylinder or an ellipsoid that a plane with normal ``n`` touches."""
     if kind == PLANE_CYLINDER:
@@ -98,7 +98,7 @@ def support_point(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: in
     return c - rot * (wp.cw_mul(y, size) / wp.length(y))
 
 
-@wp.func
+@wp.func(inline=False)
 def closest(c1: vec3, a1: vec3, c2: vec3, a2: vec3, which: int) -> vec2:
     """Places in [−1, 1] along two half-axes a1, a2 where two capsules touch; a sphere has a zero half-axis.
 
@@ -136,7 +136,7 @@ def closest(c1: vec3, a1: vec3, c2: vec3, a2: vec3, which: int) -> vec2:
     return vec2(x1, x2)
 
 
-@wp.func
+@wp.func(inline=False)
 def are_parallel(a1: vec3, a2: vec3) -> bool:
     """Whether two capsules are parallel to MuJoCo's tolerance, an angle; a sphere is parallel to nothing."""
     ma = wp.dot(a1, a1)
@@ -145,7 +145,7 @@ def are_parallel(a1: vec3, a2: vec3) -> bool:
     return ma > ZERO and mc > ZERO and ma * mc - mb * mb < PARALLEL * (ma * mc)
 
 
-@wp.func
+@wp.func(inline=False)
 def overlap_end(c1: vec3, a1: vec3, c2: vec3, a2: vec3, upper: int) -> int:
     """Which end of parallel capsules bounds their overlap, as :func:`closest` numbers it.
 
@@ -163,7 +163,7 @@ def overlap_end(c1: vec3, a1: vec3, c2: vec3, a2: vec3, upper: int) -> int:
     return which
 
 
-@wp.func
+@wp.func(inline=False)
 def balls(x1: vec3, x2: vec3, r1: f64, r2: f64, across: vec3) -> vec7:
     """Contact of two balls about x1 and x2; where these coincide, its normal is along ``across``."""
     v = x2 - x1
@@ -178,20 +178,20 @@ def balls(x1: vec3, x2: vec3, r1: f64, r2: f64, across: vec3) -> vec7:
     return vec7(d, p[0], p[1], p[2], n[0], n[1], n[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def round_contact(c1: vec3, a1: vec3, r1: f64, c2: vec3, a2: vec3, r2: f64, which: int) -> vec7:
     """Contact of two spheres or capsules with half-axes a1, a2 (zero for a sphere)."""
     x = closest(c1, a1, c2, a2, which)
     return balls(c1 + a1 * x[0], c2 + a2 * x[1], r1, r2, wp.cross(a1, a2))  # axes cross where a robot is planar
 
 
-@wp.func
+@wp.func(inline=False)
 def pair7(x: vec7, dbar: f64, pbar: vec3, nbar: vec3) -> f64:
     """⟨x, x̄⟩ of a contact's geometry and its adjoint."""
     return x[0] * dbar + wp.dot(x[1:4], pbar) + wp.dot(x[4:7], nbar)
 
 
-@wp.func
+@wp.func(inline=False)
 def round_dual(
     c1: vec3, a1: vec3, r1: f64, c2: vec3, a2: vec3, r2: f64, which: int, dbar: f64, pbar: vec3, nbar: vec3
 ) -> f64:
@@ -199,13 +199,13 @@ def round_dual(
     return pair7(round_contact(c1, a1, r1, c2, a2, r2, which), dbar, pbar, nbar)
 
 
-@wp.func
+@wp.func(inline=False)
 def support_dual(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int, xbar: vec3) -> f64:
     """Leaf: the adjoint of :func:`support_point` is its gradient."""
     return wp.dot(support_point(kind, n, c, rot, size, which), xbar)
 
 
-@wp.func
+@wp.func(inline=False)
 def cylinder_place(v: vec3, axis: vec3, size: vec3) -> int:
     """Where a cylinder is touched by a sphere whose centre is ``v`` from its own."""
     x = wp.dot(axis, v)
@@ -224,7 +224,7 @@ def cylinder_place(v: vec3, axis: vec3, size: vec3) -> int:
     return place
 
 
-@wp.func
+@wp.func(inline=False)
 def sphere_cylinder(c1: vec3, radius: f64, c2: vec3, axis: vec3, size: vec3, place: int) -> vec7:
     """Contact of a sphere (first geom) and a cylinder (second) at a place of the cylinder."""
     v = c1 - c2
@@ -239,7 +239,7 @@ def sphere_cylinder(c1: vec3, radius: f64, c2: vec3, axis: vec3, size: vec3, pla
     return balls(c1, c2 + up * size[1] + out * (size[0] / wp.length(out)), radius, ZERO, vec3())
 
 
-@wp.func
+@wp.func(inline=False)
 def sphere_cylinder_dual(
     c1: vec3, radius: f64, c2: vec3, axis: vec3, size: vec3, place: int, dbar: f64, pbar: vec3, nbar: vec3
 ) -> f64:
@@ -247,7 +247,7 @@ def sphere_cylinder_dual(
     return pair7(sphere_cylinder(c1, radius, c2, axis, size, place), dbar, pbar, nbar)
 
 
-@wp.func
+@wp.func(inline=False)
 def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
     """Contact of a ball about ``x`` (first geom) with a box (second): MuJoCo's sphere-box."""
     local = wp.transpose(rot) * (x - c)
@@ -274,13 +274,13 @@ def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
     return vec7(d, p[0], p[1], p[2], nw[0], nw[1], nw[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def _place_code(base: int, near: int, edge: int, step: int, axis: int, back: int, less: int) -> int:
     """One number for a place on a capsule's axis; ``near`` is a corner, ``back`` and ``less`` are signs."""
     return base + 4 * near + 32 * edge + 128 * step + 512 * axis + 2048 * back + 4096 * less
 
 
-@wp.func
+@wp.func(inline=False)
 def capsule_place(pos: vec3, half: vec3, size: vec3, code: int) -> f64:
     """Place in [−1, 1] on a capsule's half-axis that a code names, all in the box's frame; differentiable."""
     base = code % 4
@@ -312,12 +312,12 @@ def capsule_place(pos: vec3, half: vec3, size: vec3, code: int) -> f64:
     return t
 
 
-@wp.func
+@wp.func(inline=False)
 def _end(sign: f64) -> int:
     return wp.where(sign > ZERO, 1, 0)
 
 
-@wp.func
+@wp.func(inline=False)
 def capsule_box_first(pos: vec3, half: vec3, size: vec3, limit: f64):
     """Where a capsule is closest to a box: face or −1, edge or −1, corner, whether it is a corner, places on both.
 
@@ -395,7 +395,7 @@ def capsule_box_first(pos: vec3, half: vec3, size: vec3, limit: f64):
     return face, edge, near, at_corner, t, x, code
 
 
-@wp.func
+@wp.func(inline=False)
 def _second_by_face(pos: vec3, half: vec3, size: vec3, face: int, t: f64) -> int:
     """Code of the second point where one end is closest to a face: how far the axis stays above it."""
     code = _end(-t)
@@ -412,7 +412,7 @@ def _second_by_face(pos: vec3, half: vec3, size: vec3, face: int, t: f64) -> int
     return code
 
 
-@wp.func
+@wp.func(inline=False)
 def _second_by_corner(half: vec3, size: vec3, near: int, t: f64, first: int) -> int:
     """Code of the second point where a corner is closest: along an edge or over a face, if the axis goes there."""
     code = int(-1)
@@ -440,7 +440,7 @@ def _second_by_corner(half: vec3, size: vec3, near: int, t: f64, first: int) -> 
     return code
 
 
-@wp.func
+@wp.func(inline=False)
 def _second_by_edge(half: vec3, size: vec3, near: int, edge: int, t: f64, x: f64, first: int) -> int:
     """Code of the second point where the inside of an edge is closest: over the face that the axis is flatter on."""
     code = int(-1)
@@ -470,7 +470,7 @@ def _second_by_edge(half: vec3, size: vec3, near: int, edge: int, t: f64, x: f64
     return code
 
 
-@wp.func
+@wp.func(inline=False)
 def capsule_box_codes(pos: vec3, half: vec3, size: vec3, limit: f64):
     """Codes of the one or two places of a capsule that touch a box, −1 for none: MuJoCo's capsule-box."""
     face, edge, near, at_corner, t, x, first = capsule_box_first(pos, half, size, limit)
@@ -486,7 +486,7 @@ def capsule_box_codes(pos: vec3, half: vec3, size: vec3, limit: f64):
     return first, second
 
 
-@wp.func
+@wp.func(inline=False)
 def capsule_box_contact(c1: vec3, a1: vec3, radius: f64, c2: vec3, rot: mat33, size: vec3, code: int) -> vec7:
     """Contact of a capsule with half-axis a1 (first geom) and a box (second) at the place that a code names."""
     back = wp.transpose(rot)
@@ -494,7 +494,7 @@ def capsule_box_contact(c1: vec3, a1: vec3, radius: f64, c2: vec3, rot: mat33, s
     return box_closest(c2, rot, size, c1 + a1 * t, radius)
 
 
-@wp.func
+@wp.func(inline=False)
 def capsule_box_dual(
     c1: vec3, a1: vec3, radius: f64, c2: vec3, rot: mat33, size: vec3, code: int, dbar: f64, pbar: vec3, nbar: vec3
 ) -> f64:

@@ -33,7 +33,7 @@ from dropo_torch.simulators.warp.types import (
 CURVED = wp.constant(2)
 
 
-@wp.func
+@wp.func(inline=False)
 def normal_d(dim: int, elliptic: int, r: f64, invweight: f64, mu: f64, impratio: f64) -> f64:
     """D of the normal (frictionless, elliptic) or of every edge of the pyramid, with r = (1 − d)/d."""
     d = ONE / wp.max(MINVAL, r * invweight)
@@ -60,7 +60,7 @@ def cone_of(m: wp.ref[Tables], w: wp.ref[World], k: int, d: f64) -> Cone:
     return Cone(m.pair_dim[k], m.elliptic, m.impratio, d, theta_vec5(w.th, m.o_pair_friction + 5 * k))
 
 
-@wp.func
+@wp.func(inline=False)
 def _tangential(cone: Cone, w: vec6) -> f64:
     """T: length of all but the normal, each scaled with its friction."""
     tt = ZERO
@@ -70,7 +70,7 @@ def _tangential(cone: Cone, w: vec6) -> f64:
     return wp.sqrt(tt)
 
 
-@wp.func
+@wp.func(inline=False)
 def cone_piece(cone: Cone, w: vec6) -> int:
     """Which piece of the cost ``w`` is on; equal numbers mean one quadratic, save :data:`CURVED`."""
     piece = int(0)
@@ -97,7 +97,7 @@ def cone_piece(cone: Cone, w: vec6) -> int:
     return piece
 
 
-@wp.func
+@wp.func(inline=False)
 def cone_force(cone: Cone, w: vec6) -> vec6:
     """Contact force −∂s/∂w."""
     f = vec6()
@@ -131,7 +131,7 @@ def cone_force(cone: Cone, w: vec6) -> vec6:
     return f
 
 
-@wp.func
+@wp.func(inline=False)
 def cone_hessian(cone: Cone, w: vec6):
     """Hessian of the cost: blocks (directions, directions), (directions, rotations), (rotations, rotations)."""
     piece = cone_piece(cone, w)
@@ -154,7 +154,7 @@ def cone_hessian(cone: Cone, w: vec6):
     return ll, la, aa
 
 
-@wp.func
+@wp.func(inline=False)
 def _pyramid_hessian(cone: Cone, piece: int):
     """Blocks of the Hessian of a pyramid, from the edges that act."""
     hess = mat66()
@@ -170,7 +170,7 @@ def _pyramid_hessian(cone: Cone, piece: int):
     return hess[0:3, 0:3], hess[0:3, 3:6], hess[3:6, 3:6]
 
 
-@wp.func
+@wp.func(inline=False)
 def _squared(cone: Cone):
     """Squared frictions along the directions, none along the normal, and about them, as far as they act."""
     mu = cone.mu
@@ -179,7 +179,7 @@ def _squared(cone: Cone):
     return vec3(ZERO, mu[0] * mu[0], mu[1] * mu[1]), vec3(third, mu[3] * mu[3] * others, mu[4] * mu[4] * others)
 
 
-@wp.func
+@wp.func(inline=False)
 def _curved_hessian(cone: Cone, w: vec6):
     """Blocks of the Hessian on the curved part of an elliptic cone.
 
@@ -203,7 +203,7 @@ def _curved_hessian(cone: Cone, w: vec6):
     return ll, la, aa
 
 
-@wp.func
+@wp.func(inline=False)
 def cone_slopes(cone: Cone, w: vec6, y: vec6):
     """First and second derivative of the cost at ``w`` along ``y``."""
     d = cone.d
@@ -249,7 +249,7 @@ def cone_slopes(cone: Cone, w: vec6, y: vec6):
     return first, second
 
 
-@wp.func
+@wp.func(inline=False)
 def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f64:
     """f · Jλ of an elliptic cone."""
     reg = mu[0] / wp.sqrt(impratio)
@@ -277,7 +277,7 @@ def _elliptic(dim: int, w: vec6, jl: vec6, mu: vec5, d: f64, impratio: f64) -> f
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def elliptic_power(
     dim: int, u: vec6, v: vec6, jl: vec6, dist: f64, margin: f64, mu: vec5, solref: vec2, friction_ref: vec2,
     solimp: vec5, invweight: f64, impratio: f64, h: f64, refsafe: int,
@@ -295,7 +295,7 @@ def elliptic_power(
     return -_elliptic(dim, w, jl, mu, d, impratio)
 
 
-@wp.func
+@wp.func(inline=False)
 def contact_scalars(
     dim: int, dist: f64, margin: f64, mu: f64, solref: vec2, solimp: vec5, invweight: f64, impratio: f64, h: f64,
     refsafe: int, dbar: f64, bbar: f64, sbar: f64,

@@ -20,7 +20,7 @@ from dropo_torch.simulators.warp.touch import geometry_adjoint
 from dropo_torch.simulators.warp.types import ONE, ZERO, Tables, World, f64, mat33, vec3, vec6
 
 
-@wp.func
+@wp.func(inline=False)
 def in_frame(frame: mat33, x: vec6, p: vec3) -> vec6:
     """The motion ``x`` at ``p`` along the contact's axes, then its rotation about them."""
     return join(frame * at(x, p), frame * ang(x))
@@ -213,7 +213,7 @@ def _hang_on(w: wp.ref[World], b: int, y: vec6, fu: vec6, fv: vec6, fl: vec6):
         w.f_pose[w.t, b] = w.f_pose[w.t, b] + (pose + cross_force(w.dual[w.t, b], fl))
 
 
-@wp.func
+@wp.func(inline=False)
 def _spread(back: mat33, x: vec6, p: vec3) -> vec6:
     """Adjoint of :func:`in_frame` in its motion."""
     return pull(back * wp.spatial_top(x), p, back * wp.spatial_bottom(x))

@@ -71,13 +71,13 @@ class Distance:
     simplex: Simplex
 
 
-@wp.func
+@wp.func(inline=False)
 def positive(x: f64) -> f64:
     """Sign of a number, that of zero being positive."""
     return wp.where(x >= ZERO, ONE, -ONE)
 
 
-@wp.func
+@wp.func(inline=False)
 def hull_vertex(m: wp.ref[Tables], s: Shape, d: vec3) -> int:
     """Vertex of a hull that is furthest along ``d``, in the hull's frame."""
     best = s.place
@@ -113,7 +113,7 @@ def hull_vertex(m: wp.ref[Tables], s: Shape, d: vec3) -> int:
     return wp.max(best, 0)
 
 
-@wp.func
+@wp.func(inline=False)
 def support(m: wp.ref[Tables], s: Shape, d: vec3):
     """Point of a shape that is furthest along ``d``, which vertex it is (−1: none), and where the search ended."""
     local = wp.transpose(s.rot) * d
@@ -150,13 +150,13 @@ def support(m: wp.ref[Tables], s: Shape, d: vec3):
     return s.rot * x + s.pos + d * s.inflation, vertex, place
 
 
-@wp.func
+@wp.func(inline=False)
 def is_discrete(a: Shape, b: Shape) -> bool:
     """Whether both shapes are polytopes."""
     return a.kind >= BOX and b.kind >= BOX and a.inflation == ZERO and b.inflation == ZERO
 
 
-@wp.func
+@wp.func(inline=False)
 def project_on_plane(a: vec3, b: vec3, c: vec3):
     """The origin projected on the plane through three points, and whether there is one."""
     ba = b - a
@@ -182,13 +182,13 @@ def project_on_plane(a: vec3, b: vec3, c: vec3):
     return x, ok
 
 
-@wp.func
+@wp.func(inline=False)
 def agree(a: f64, b: f64) -> bool:
     """Whether two numbers have the same sign, none being zero."""
     return (a > ZERO and b > ZERO) or (a < ZERO and b < ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def weights_on_line(a: vec3, b: vec3) -> vec2:
     """Weights of two points in the point of their segment that is closest to the origin."""
     d = b - a
@@ -209,7 +209,7 @@ def weights_on_line(a: vec3, b: vec3) -> vec2:
     return w
 
 
-@wp.func
+@wp.func(inline=False)
 def areas(a: vec3, b: vec3, c: vec3, p: vec3) -> vec3:
     """Twice the areas of the three triangles of a, b, c with p, and the sign of all in the fourth: see the callers."""
     n = wp.cross(b - a, c - a)
@@ -226,12 +226,12 @@ def areas(a: vec3, b: vec3, c: vec3, p: vec3) -> vec3:
     return vec3(b[i] * c[j] - c[i] * b[j], c[i] * a[j] - a[i] * c[j], a[i] * b[j] - b[i] * a[j])
 
 
-@wp.func
+@wp.func(inline=False)
 def _sum3(w: vec3, a: vec3, b: vec3, c: vec3) -> vec3:
     return a * w[0] + b * w[1] + c * w[2]
 
 
-@wp.func
+@wp.func(inline=False)
 def weights_on_triangle(a: vec3, b: vec3, c: vec3) -> vec3:
     """Weights of three points in the point of their triangle that is closest to the origin."""
     p, ok = project_on_plane(a, b, c)
@@ -274,12 +274,12 @@ def weights_on_triangle(a: vec3, b: vec3, c: vec3) -> vec3:
     return w
 
 
-@wp.func
+@wp.func(inline=False)
 def _volume(a: vec3, b: vec3, c: vec3) -> f64:
     return wp.dot(a, wp.cross(b, c))
 
 
-@wp.func
+@wp.func(inline=False)
 def weights_in_tetrahedron(s: mat43) -> vec4:
     """Weights of four points in the point of their tetrahedron that is closest to the origin."""
     v1 = -_volume(s[1], s[2], s[3])
@@ -310,7 +310,7 @@ def weights_in_tetrahedron(s: mat43) -> vec4:
     return w
 
 
-@wp.func
+@wp.func(inline=False)
 def simplex_weights(n: int, s: mat43) -> vec4:
     """Weights of the ``n`` points of a simplex in its point that is closest to the origin."""
     w = vec4(ONE, ZERO, ZERO, ZERO)
@@ -325,7 +325,7 @@ def simplex_weights(n: int, s: mat43) -> vec4:
     return w
 
 
-@wp.func
+@wp.func(inline=False)
 def combine(n: int, w: vec4, s: mat43) -> vec3:
     """Weighted sum of the first ``n`` points."""
     x = s[0] * w[0]
@@ -335,7 +335,7 @@ def combine(n: int, w: vec4, s: mat43) -> vec3:
     return x
 
 
-@wp.func
+@wp.func(inline=False)
 def _next_point(n: int, w: vec4, s: mat43) -> vec3:
     """The point of a simplex that is closest to the origin, projected anew where it can be."""
     x = combine(n, w, s)
@@ -351,7 +351,7 @@ def _next_point(n: int, w: vec4, s: mat43) -> vec3:
     return x
 
 
-@wp.func
+@wp.func(inline=False)
 def _kept(n: int, w: vec4, s: Simplex):
     """The points of a simplex with weights, their number, and their weights."""
     out = Simplex()
@@ -370,7 +370,7 @@ def _kept(n: int, w: vec4, s: Simplex):
     return out, v
 
 
-@wp.func
+@wp.func(inline=False)
 def gjk(m: wp.ref[Tables], a0: Shape, b0: Shape, tolerance: f64, iterations: int, cutoff: f64) -> Distance:
     """Distance of two shapes up to a cutoff; with the cutoff zero only whether they overlap."""
     a = a0

@@ -46,7 +46,7 @@ from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, ZERO, Tables, W
 FLAT = wp.constant(wp.float64(-1.0))
 
 
-@wp.func
+@wp.func(inline=False)
 def shape_of(m: wp.ref[Tables], w: wp.ref[World], g: int, inflation: f64) -> Shape:
     """A geom as a convex shape."""
     b = m.geom_body[g]
@@ -63,12 +63,12 @@ def shape_of(m: wp.ref[Tables], w: wp.ref[World], g: int, inflation: f64) -> Sha
     return s
 
 
-@wp.func
+@wp.func(inline=False)
 def _is_round(s: Shape) -> bool:
     return s.kind == SPHERE or s.kind == CAPSULE
 
 
-@wp.func
+@wp.func(inline=False)
 def _core(s0: Shape) -> Shape:
     """A shape without what it is inflated by, a sphere or a capsule without its radius."""
     s = s0
@@ -78,19 +78,19 @@ def _core(s0: Shape) -> Shape:
     return s
 
 
-@wp.func
+@wp.func(inline=False)
 def _inflated(s: Shape) -> f64:
     """How far a shape reaches beyond its core."""
     return s.inflation + wp.where(_is_round(s), s.size[0], ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def _perpendicular(n: vec3) -> vec3:
     t = wp.where(wp.abs(n[0]) < HALF, vec3(ONE, ZERO, ZERO), vec3(ZERO, ONE, ZERO))
     return wp.normalize(t - n * wp.dot(n, t))
 
 
-@wp.func
+@wp.func(inline=False)
 def _curve(t0: vec3, n: vec3, along: f64, across: f64) -> vec6:
     """A direction tangent to a surface with normal ``n``, and the radii along and across it."""
     t = t0 - n * wp.dot(n, t0)
@@ -99,7 +99,7 @@ def _curve(t0: vec3, n: vec3, along: f64, across: f64) -> vec6:
     return vec6(t[0], t[1], t[2], along, across, ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def _ellipsoid_curve(s: Shape, n: vec3) -> vec6:
     """Principal directions and radii of an ellipsoid where its normal is ``n``."""
     local = wp.transpose(s.rot) * n
@@ -118,7 +118,7 @@ def _ellipsoid_curve(s: Shape, n: vec3) -> vec6:
     return _curve(s.rot * (e1 * co + e2 * si), n, one, a + c - one)
 
 
-@wp.func
+@wp.func(inline=False)
 def curve_at(m: wp.ref[Tables], s: Shape, vertices: wp.vec4i, n: int, x: vec3, normal: vec3) -> vec6:
     """How a shape is curved at a point ``x`` that touches, with outward normal: direction, radii along and across it.
 
@@ -160,7 +160,7 @@ def curve_at(m: wp.ref[Tables], s: Shape, vertices: wp.vec4i, n: int, x: vec3, n
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def _keep_single(
     m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex, x1: vec3, x2: vec3, normal: vec3, dist: f64
 ):
@@ -176,7 +176,7 @@ def _keep_single(
     w.clip_curve[w.t, 1] = curve_at(m, b, s.vertex2, s.n, x2, -normal)
 
 
-@wp.func
+@wp.func(inline=False)
 def convex_contacts(m: wp.ref[Tables], w: wp.ref[World], k: int, reach: f64) -> int:
     """Find the contacts of a pair nearer than ``reach``; how many: in ``clip_...``, distances less it."""
     a = shape_of(m, w, m.pair_geom1[k], HALF * reach)
@@ -222,7 +222,7 @@ def convex_contacts(m: wp.ref[Tables], w: wp.ref[World], k: int, reach: f64) -> 
     return found
 
 
-@wp.func
+@wp.func(inline=False)
 def keep_contact(w: wp.ref[World], n: int, i: int):
     """Keep what the adjoint of contact ``n``, the ``i``-th found of its pair, needs."""
     w.con_how[w.t, n] = w.clip_how[w.t, i]
@@ -236,42 +236,42 @@ def keep_contact(w: wp.ref[World], n: int, i: int):
         w.con_curve[w.t, 2 * n + j] = w.clip_curve[w.t, j]
 
 
-@wp.func
+@wp.func(inline=False)
 def _radii(c: vec6) -> vec2:
     return vec2(c[3], c[4])
 
 
-@wp.func
+@wp.func(inline=False)
 def _tangent(c: vec6) -> vec3:
     return vec3(c[0], c[1], c[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def _slack(r: f64) -> f64:
     """Change of the normal with a unit step: one, or none where it is flat."""
     return wp.where(r < ZERO, ZERO, ONE)
 
 
-@wp.func
+@wp.func(inline=False)
 def _stride(r: f64) -> f64:
     """Displacement with a unit step: the radius, or one where it is flat."""
     return wp.where(r < ZERO, ONE, r)
 
 
-@wp.func
+@wp.func(inline=False)
 def _flats(c: vec6) -> int:
     """In how many directions a surface is flat."""
     r = _radii(c)
     return wp.where(r[0] < ZERO, 1, 0) + wp.where(r[1] < ZERO, 1, 0)
 
 
-@wp.func
+@wp.func(inline=False)
 def _held(c: vec6) -> vec6:
     """A surface whose point is held where it is in the directions in which it is flat."""
     return vec6(c[0], c[1], c[2], wp.max(c[3], ZERO), wp.max(c[4], ZERO), ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def _settled(c1: vec6, c2: vec6):
     """The two curves, the less flat one held where both leave a direction free: any point of it may be the one."""
     free1 = _flats(c1)
@@ -287,7 +287,7 @@ def _settled(c1: vec6, c2: vec6):
     return one, two
 
 
-@wp.func
+@wp.func(inline=False)
 def single_adjoint(n: vec3, d: f64, mid: vec3, c1a: vec6, c2a: vec6, dbar: f64, pbar: vec3, nbar0: vec3):
     """From adjoints of distance, midpoint and normal of two witnesses to spatial forces on the two bodies."""
     nbar = nbar0 + pbar * (HALF * d)
@@ -338,7 +338,7 @@ def single_adjoint(n: vec3, d: f64, mid: vec3, c1a: vec6, c2a: vec6, dbar: f64, 
     return y1, y2
 
 
-@wp.func
+@wp.func(inline=False)
 def _rolled(s: Shape, axis: vec3, n: vec3, f: vec3) -> vec3:
     """Adjoint of an outward normal in the place of a capsule's or a cylinder's line, from the force on the line."""
     across = f - axis * wp.dot(axis, f)
@@ -354,7 +354,7 @@ def _rolled(s: Shape, axis: vec3, n: vec3, f: vec3) -> vec3:
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def clipped_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, dbar: f64, pbar: vec3, nbar0: vec3):
     """From adjoints of distance, point and normal of a clipped corner to spatial forces on the two bodies."""
     k = w.con_pair[w.t, c]
@@ -417,7 +417,7 @@ def clipped_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, dbar: f64, pbar
     return y1, y2
 
 
-@wp.func
+@wp.func(inline=False)
 def convex_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, dbar: f64, pbar: vec3, nbar: vec3):
     """From adjoints of distance, point and normal of a contact to spatial forces on the two bodies."""
     y1 = vec6()

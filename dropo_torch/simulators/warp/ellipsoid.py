@@ -14,13 +14,13 @@ PI = wp.constant(wp.float64(wp.pi))
 TINY = wp.constant(wp.float64(1.0e-30))  # keeps the slope of a root finite at rest
 
 
-@wp.func
+@wp.func(inline=False)
 def _middle(size: vec3) -> f64:
     """The semi-axis between the largest and the smallest."""
     return size[0] + size[1] + size[2] - wp.max(size) - wp.min(size)
 
 
-@wp.func
+@wp.func(inline=False)
 def _section(size: vec3) -> vec3:
     """(b c)², (c a)², (a b)²: squares of the areas that the semi-axes see, over π²."""
     return vec3(
@@ -30,14 +30,14 @@ def _section(size: vec3) -> vec3:
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def _moment(along: f64, one: f64, other: f64) -> f64:
     """Moment of the largest spheroid that turns about a semi-axis."""
     wide = wp.max(one, other)
     return f64(8.0) / f64(15.0) * PI * along * wide * wide * wide * wide
 
 
-@wp.func
+@wp.func(inline=False)
 def _turning_drag(size: vec3, drag: vec3) -> vec3:
     """Coefficients of the quadratic drag on each component of the angular velocity."""
     long = wp.max(size)
@@ -48,7 +48,7 @@ def _turning_drag(size: vec3, drag: vec3) -> vec3:
     return own * drag[2] + (vec3(largest, largest, largest) - own) * drag[1]
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoid_force(w: vec3, v: vec3, size: vec3, drag: vec3, lift: vec3, mass: vec3, density: f64, viscosity: f64):
     """Force in the geom's frame as it moves at ``v`` through the medium and turns at ``w``.
 
@@ -72,7 +72,7 @@ def ellipsoid_force(w: vec3, v: vec3, size: vec3, drag: vec3, lift: vec3, mass: 
     return magnus + wp.cross(circulation, v) - v * k + added
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoid_torque(
     w: vec3, v: vec3, size: vec3, drag: vec3, mass: vec3, inertia: vec3, density: f64, viscosity: f64
 ) -> vec3:
@@ -84,7 +84,7 @@ def ellipsoid_torque(
     return added * density - w * k
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoid_power(
     w: vec3, v: vec3, lw: vec3, lv: vec3, size: vec3, drag: vec3, lift: vec3, mass: vec3, inertia: vec3, density: f64,
     viscosity: f64,
@@ -109,7 +109,7 @@ def fluid_centre(m: wp.ref[Tables], w: wp.ref[World], b: int, g: int) -> vec3:
     return w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoids_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     """The medium's forces on the geoms of body ``b`` that are taken as ellipsoids, as a spatial force."""
     total = vec6()
@@ -133,7 +133,7 @@ def ellipsoids_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     return total
 
 
-@wp.func
+@wp.func(inline=False)
 def _force_slope(
     w: vec3, v: vec3, uw: vec3, uv: vec3, size: vec3, drag: vec3, lift: vec3, mass: vec3, density: f64, viscosity: f64
 ) -> vec3:
@@ -165,7 +165,7 @@ def _force_slope(
     return magnus + (dq * num + q * turned) * g - uv * k - v * dk + added
 
 
-@wp.func
+@wp.func(inline=False)
 def _torque_slope(
     w: vec3,
     v: vec3,
@@ -194,7 +194,7 @@ def _torque_slope(
     return added * density - uw * k - w * dk
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoid_slope(
     w: vec3, v: vec3, uw: vec3, uv: vec3, size: vec3, drag: vec3, lift: vec3, mass: vec3, inertia: vec3, density: f64,
     viscosity: f64,
@@ -206,7 +206,7 @@ def ellipsoid_slope(
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoid_slope_power(
     w: vec3, v: vec3, lw: vec3, lv: vec3, uw: vec3, uv: vec3, size: vec3, drag: vec3, lift: vec3, mass: vec3,
     inertia: vec3, density: f64, viscosity: f64, symmetric: int,

@@ -56,13 +56,13 @@ class Depth:
     simplex: Simplex
 
 
-@wp.func
+@wp.func(inline=False)
 def _start(w: wp.ref[World]):
     for i in range(4):
         w.epa_state[w.t, i] = 0
 
 
-@wp.func
+@wp.func(inline=False)
 def _add_vertex(w: wp.ref[World], s: Simplex, i: int) -> int:
     k = w.epa_state[w.t, VERTICES]
     w.epa_state[w.t, VERTICES] = k + 1
@@ -74,7 +74,7 @@ def _add_vertex(w: wp.ref[World], s: Simplex, i: int) -> int:
     return k
 
 
-@wp.func
+@wp.func(inline=False)
 def _add_support(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, d: vec3, length: f64) -> int:
     """Append the support point along ``d``, of the given length, and return its number."""
     u = vec3(ONE, ZERO, ZERO)
@@ -96,7 +96,7 @@ def _add_support(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, d: vec
     return k
 
 
-@wp.func
+@wp.func(inline=False)
 def _attach(w: wp.ref[World], v1: int, v2: int, v3: int, n1: int, n2: int, n3: int) -> f64:
     """Append a face with its neighbours and return its squared distance from the origin, zero without a plane."""
     k = w.epa_state[w.t, FACES]
@@ -113,7 +113,7 @@ def _attach(w: wp.ref[World], v1: int, v2: int, v3: int, n1: int, n2: int, n3: i
     return wp.where(ok, wp.dot(x, x), ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def _list(w: wp.ref[World], face: int):
     k = w.epa_state[w.t, LISTED]
     w.epa_state[w.t, LISTED] = k + 1
@@ -121,7 +121,7 @@ def _list(w: wp.ref[World], face: int):
     w.epa_place[w.t, face] = k
 
 
-@wp.func
+@wp.func(inline=False)
 def _delete(w: wp.ref[World], face: int):
     """Take a face off the polytope; the last of the list takes its place there."""
     place = w.epa_place[w.t, face]
@@ -134,7 +134,7 @@ def _delete(w: wp.ref[World], face: int):
     w.epa_place[w.t, face] = GONE
 
 
-@wp.func
+@wp.func(inline=False)
 def _same_side(p0: vec3, p1: vec3, p2: vec3, p3: vec3) -> bool:
     """Whether the origin and p3 are on the same side of the plane through the others."""
     n = wp.cross(p1 - p0, p2 - p0)
@@ -143,7 +143,7 @@ def _same_side(p0: vec3, p1: vec3, p2: vec3, p3: vec3) -> bool:
     return (one > ZERO and two > ZERO) or (one < ZERO and two < ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def _volumes(v1: vec3, v2: vec3, v3: vec3, v4: vec3, v5: vec3) -> vec3:
     """Volumes beside the segment v1 v2 towards the edges of a triangle: of one sign where it goes through."""
     d = v2 - v1
@@ -154,12 +154,12 @@ def _volumes(v1: vec3, v2: vec3, v3: vec3, v4: vec3, v5: vec3) -> vec3:
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def _pierces(v: vec3) -> bool:
     return (v[0] >= ZERO and v[1] >= ZERO and v[2] >= ZERO) or (v[0] <= ZERO and v[1] <= ZERO and v[2] <= ZERO)
 
 
-@wp.func
+@wp.func(inline=False)
 def _picked(w: wp.ref[World], n: int, v1: int, v2: int, v3: int) -> Simplex:
     """The simplex of two or three of the polytope's vertices."""
     s = Simplex()
@@ -175,13 +175,13 @@ def _picked(w: wp.ref[World], n: int, v1: int, v2: int, v3: int) -> Simplex:
     return s
 
 
-@wp.func
+@wp.func(inline=False)
 def _list_all(w: wp.ref[World]):
     for i in range(w.epa_state[w.t, FACES]):
         _list(w, i)
 
 
-@wp.func
+@wp.func(inline=False)
 def _around_segment(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex):
     """Build a polytope around two points: with three support points beside them."""
     _start(w)
@@ -245,7 +245,7 @@ def _around_segment(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: 
     return status, out
 
 
-@wp.func
+@wp.func(inline=False)
 def _on_face(a: vec3, b: vec3, c: vec3, p: vec3) -> bool:
     """Whether a point is in a triangle, to rounding."""
     area = areas(a, b, c, p)
@@ -254,7 +254,7 @@ def _on_face(a: vec3, b: vec3, c: vec3, p: vec3) -> bool:
     return u[0] >= ZERO and u[1] >= ZERO and u[2] >= ZERO and near
 
 
-@wp.func
+@wp.func(inline=False)
 def _hexahedron(v: vec3, k: vec5i):
     """The five vertices in an order in which they span a hexahedron; or 0 if four of them contain the fifth."""
     low = -MINVAL
@@ -276,7 +276,7 @@ def _hexahedron(v: vec3, k: vec5i):
     return whole, out
 
 
-@wp.func
+@wp.func(inline=False)
 def _origin_on(a: vec3, b: vec3) -> bool:
     """Whether the origin is on a segment, to rounding."""
     on = bool(False)
@@ -289,7 +289,7 @@ def _origin_on(a: vec3, b: vec3) -> bool:
     return on
 
 
-@wp.func
+@wp.func(inline=False)
 def _contains_origin(w: wp.ref[World], face: int, v: int, least: f64) -> bool:
     """Whether the origin is on the side of a face where vertex ``v`` is, or as good as on it."""
     c = w.epa_corners[w.t, face]
@@ -297,7 +297,7 @@ def _contains_origin(w: wp.ref[World], face: int, v: int, least: f64) -> bool:
     return inside or w.epa_dist[w.t, face] < least
 
 
-@wp.func
+@wp.func(inline=False)
 def _around_triangle(
     m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: Simplex, tolerance: f64, may_shrink: int
 ):
@@ -375,7 +375,7 @@ def _around_triangle(
     return status, out
 
 
-@wp.func
+@wp.func(inline=False)
 def _around_tetrahedron(w: wp.ref[World], s: Simplex):
     """Take four points as a polytope, unless the origin is on one of its faces."""
     _start(w)
@@ -416,14 +416,14 @@ def _around_tetrahedron(w: wp.ref[World], s: Simplex):
     return status, out
 
 
-@wp.func
+@wp.func(inline=False)
 def _sees(w: wp.ref[World], face: int, p: vec3) -> bool:
     """Whether a point is beyond a face."""
     d2 = w.epa_dist[w.t, face]
     return wp.dot(w.epa_near[w.t, face], p) - d2 > wp.max(wp.sqrt(d2) * MINVAL, MINVAL)
 
 
-@wp.func
+@wp.func(inline=False)
 def _horizon(w: wp.ref[World], face: int, p: vec3, capacity: int) -> bool:
     """Delete the faces that a point sees, from one on, and list the edges around them; False if they are too many."""
     _delete(w, face)
@@ -457,7 +457,7 @@ def _horizon(w: wp.ref[World], face: int, p: vec3, capacity: int) -> bool:
     return True
 
 
-@wp.func
+@wp.func(inline=False)
 def _closest_face(w: wp.ref[World], previous: int):
     face = previous
     least = f64(FAR)
@@ -469,7 +469,7 @@ def _closest_face(w: wp.ref[World], previous: int):
     return face, least
 
 
-@wp.func
+@wp.func(inline=False)
 def _is_old(w: wp.ref[World], k: int) -> bool:
     """Whether a vertex of the polytope is one of those before it."""
     found = bool(False)
@@ -479,7 +479,7 @@ def _is_old(w: wp.ref[World], k: int) -> bool:
     return found
 
 
-@wp.func
+@wp.func(inline=False)
 def _grow(w: wp.ref[World], v: int, lower2: f64, upper2: f64) -> bool:
     """Attach a vertex to the horizon; False if one of its faces has no plane."""
     first = w.epa_state[w.t, FACES]
@@ -501,7 +501,7 @@ def _grow(w: wp.ref[World], v: int, lower2: f64, upper2: f64) -> bool:
     return True
 
 
-@wp.func
+@wp.func(inline=False)
 def _expand(
     m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, tolerance0: f64, iterations: int, faces: int
 ) -> int:
@@ -550,7 +550,7 @@ def _expand(
     return face
 
 
-@wp.func
+@wp.func(inline=False)
 def epa(
     m: wp.ref[Tables],
     w: wp.ref[World],

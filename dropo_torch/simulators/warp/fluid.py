@@ -13,19 +13,19 @@ from dropo_torch.simulators.warp.types import HALF, MINVAL, THREE, ZERO, Tables,
 PI = wp.constant(wp.float64(wp.pi))
 
 
-@wp.func
+@wp.func(inline=False)
 def _edge(a: f64, b: f64, c: f64, mass: f64) -> f64:
     """Edge of the box with the body's inertia, along the axis of moment ``c``."""
     return wp.sqrt(wp.max(MINVAL, a + b - c) / mass * f64(6.0))
 
 
-@wp.func
+@wp.func(inline=False)
 def _edges(x: vec3, mass: f64):
     """Edges of the box with moments ``x``."""
     return _edge(x[1], x[2], x[0], mass), _edge(x[0], x[2], x[1], mass), _edge(x[0], x[1], x[2], mass)
 
 
-@wp.func
+@wp.func(inline=False)
 def box_force(v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3:
     """Force in the inertial frame of a box with moments ``x`` that moves at ``v`` through the medium."""
     b0, b1, b2 = _edges(x, mass)
@@ -38,7 +38,7 @@ def box_force(v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def box_torque(w: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec3:
     """Torque in the inertial frame of a box with moments ``x`` that turns at ``w``."""
     b0, b1, b2 = _edges(x, mass)
@@ -55,7 +55,7 @@ def box_torque(w: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> vec
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def box_power(w: vec3, v: vec3, lw: vec3, lv: vec3, x: vec3, mass: f64, density: f64, viscosity: f64) -> f64:
     """−(force · lv + torque · lw): what drag adds to λᵀR, all in the inertial frame."""
     return (
@@ -92,7 +92,7 @@ def fluid_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     return pull(f, c, n)
 
 
-@wp.func
+@wp.func(inline=False)
 def box_slopes(w: vec3, v: vec3, x: vec3, mass: f64, density: f64, viscosity: f64):
     """Minus the slopes of :func:`box_torque` and :func:`box_force`, each component in its own velocity."""
     b0, b1, b2 = _edges(x, mass)
@@ -116,7 +116,7 @@ def box_slopes(w: vec3, v: vec3, x: vec3, mass: f64, density: f64, viscosity: f6
     return turn, move
 
 
-@wp.func
+@wp.func(inline=False)
 def box_slope_power(
     w: vec3, v: vec3, lw: vec3, lv: vec3, uw: vec3, uv: vec3, x: vec3, mass: f64, density: f64, viscosity: f64
 ) -> f64:

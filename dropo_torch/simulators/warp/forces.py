@@ -177,7 +177,7 @@ def tendon_actuation(m: wp.ref[Tables], w: wp.ref[World], k: int) -> f64:
     return f
 
 
-@wp.func
+@wp.func(inline=False)
 def tendon_actuation_adjoint(m: wp.ref[Tables], w: wp.ref[World], k: int, bar: f64):
     """Adjoint of :func:`tendon_actuation`: of the sums with and without gears, in their place."""
     scale = ONE

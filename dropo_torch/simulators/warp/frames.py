@@ -38,7 +38,7 @@ JOINT = wp.constant(6)
 GEOM = wp.constant(10)
 
 
-@wp.func
+@wp.func(inline=False)
 def theta_vec4(th: Reals, i: int) -> vec4:
     """Four consecutive numbers of θ."""
     return vec4(th[i], th[i + 1], th[i + 2], th[i + 3])
@@ -107,7 +107,7 @@ def geom_size(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     return y
 
 
-@wp.func
+@wp.func(inline=False)
 def beyond(v: vec6, a: vec6, u: vec6, dual: vec6, fv: vec6, fa: vec6, fu: vec6, fl: vec6, fy: vec6) -> vec6:
     """What everything beyond a place is displaced along, as a force: Y − Σ X ×* F_X with the place's own X."""
     y = fy - wp.spatial_cross_dual(v, fv) - wp.spatial_cross_dual(a, fa)

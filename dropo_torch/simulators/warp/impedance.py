@@ -13,12 +13,12 @@ MINIMP = wp.constant(wp.float64(0.0001))
 MAXIMP = wp.constant(wp.float64(0.9999))
 
 
-@wp.func
+@wp.func(inline=False)
 def _limit(x: f64) -> f64:
     return wp.min(MAXIMP, wp.max(MINIMP, x))
 
 
-@wp.func
+@wp.func(inline=False)
 def _power(x: f64, p: f64) -> f64:
     """x to the power p, x > 0; at p = 2 and 1 without ``pow``, and with the slope in p, which is x^p log x."""
     if p == TWO:
@@ -28,7 +28,7 @@ def _power(x: f64, p: f64) -> f64:
     return wp.pow(x, p)
 
 
-@wp.func
+@wp.func(inline=False)
 def impedance(x: f64, solimp: vec5) -> f64:
     """d(x) of a constraint whose position less margin is ``x``; solimp = (d0, dwidth, width, midpoint, power)."""
     d0 = _limit(solimp[0])
@@ -54,7 +54,7 @@ def impedance(x: f64, solimp: vec5) -> f64:
     return d
 
 
-@wp.func
+@wp.func(inline=False)
 def _plain_power(x: f64, p: f64) -> f64:
     """x to the power p without the logarithm that a derivative in p would want."""
     if p == ONE:
@@ -62,7 +62,7 @@ def _plain_power(x: f64, p: f64) -> f64:
     return wp.pow(x, p)
 
 
-@wp.func
+@wp.func(inline=False)
 def impedance_slope(x: f64, solimp: vec5) -> vec2:
     """d(x) of :func:`impedance` and d'(x)."""
     d0 = _limit(solimp[0])
@@ -94,7 +94,7 @@ def impedance_slope(x: f64, solimp: vec5) -> vec2:
     return vec2(d, slope)
 
 
-@wp.func
+@wp.func(inline=False)
 def _solref(solref: vec2, h: f64, refsafe: int) -> vec2:
     """solref made safe: no mixed signs, and a time constant of at least two steps."""
     a = solref[0]
@@ -107,7 +107,7 @@ def _solref(solref: vec2, h: f64, refsafe: int) -> vec2:
     return vec2(a, b)
 
 
-@wp.func
+@wp.func(inline=False)
 def stiffness(solref: vec2, solimp: vec5, h: f64, refsafe: int) -> f64:
     """K of aref = −B v − K d(x) x."""
     ref = _solref(solref, h, refsafe)
@@ -118,7 +118,7 @@ def stiffness(solref: vec2, solimp: vec5, h: f64, refsafe: int) -> f64:
     return k
 
 
-@wp.func
+@wp.func(inline=False)
 def damping(solref: vec2, solimp: vec5, h: f64, refsafe: int) -> f64:
     """B of aref = −B v − K d(x) x."""
     ref = _solref(solref, h, refsafe)
@@ -129,7 +129,7 @@ def damping(solref: vec2, solimp: vec5, h: f64, refsafe: int) -> f64:
     return b
 
 
-@wp.func
+@wp.func(inline=False)
 def regularisation(d: f64, invweight: f64) -> f64:
     """R = (1 − d) / d · A, with A the approximate inverse inertia."""
     return wp.max(MINVAL, (ONE - d) * invweight / d)

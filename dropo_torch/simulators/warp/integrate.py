@@ -194,7 +194,7 @@ def slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int):
         tendons_adjoint(m, w)
 
 
-@wp.func
+@wp.func(inline=False)
 def _tendon_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int):
     """The part of tendon ``k`` in :func:`slope_adjoint`."""
     power = outer_dot(m, w, k, w.lam, w.t, w.soft, r, -m.h * tendon_slope(m, w, r, k))

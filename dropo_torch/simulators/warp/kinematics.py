@@ -30,7 +30,7 @@ from dropo_torch.simulators.warp.types import HINGE, MINVAL, SLIDE, TRANSLATION,
 from dropo_torch.simulators.warp.wrenches import outer_wrench
 
 
-@wp.func
+@wp.func(inline=False)
 def packed(i: int, j: int) -> int:
     """Place of (i, j), j ≤ i, in a packed lower triangle."""
     return (i * (i + 1)) // 2 + j

@@ -27,6 +27,11 @@ DRIVES = 8
 #: Frames and sizes that vary.
 FRAMES = 16
 
+_LEFT_TO_LLVM = """
+#undef WP_NOINLINE
+#define WP_NOINLINE
+"""
+
 
 def _part(bit: int) -> str:
     """Native code of a function that says whether this kernel is made with a part."""
@@ -144,8 +149,9 @@ def make_kernel(function: Callable[..., None], parts: int, *, differentiated: bo
     """
     module = f"{function.__module__}.parts{parts}"
     told = f"#define DROPO_PARTS {parts}\n"
-    build = wp.ModuleBuildOptions(extra_cpu_preamble=told, extra_cuda_preamble=told)
-    # LLVM's own thresholds: what must be inlined says so, and more makes kernels slower
+    # what says inline=False is called on a GPU, where NVIDIA's compiler would inline everything and never finish; on a
+    # CPU it is left to LLVM's own thresholds, as calls cost more there than the compiling that they save
+    build = wp.ModuleBuildOptions(extra_cpu_preamble=told + _LEFT_TO_LLVM, extra_cuda_preamble=told)
     options = {"enable_backward": False, "extra_build_options": build, "cpu_compiler_flags": "-march=native"}
     wp.set_module_options(options, module=module)
     return wp.kernel(function, enable_backward=differentiated, module=module)

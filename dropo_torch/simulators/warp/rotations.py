@@ -10,7 +10,7 @@ import warp as wp
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, TWO, ZERO, f64, mat33, vec3, vec4
 
 
-@wp.func
+@wp.func(inline=False)
 def rotation(axis: vec3, angle: f64) -> mat33:
     """Rodrigues' rotation by ``angle`` about the unit ``axis``."""
     s = wp.sin(angle)
@@ -26,7 +26,7 @@ def rotation(axis: vec3, angle: f64) -> mat33:
     )  # fmt: skip
 
 
-@wp.func
+@wp.func(inline=False)
 def quat_matrix(q: vec4) -> mat33:
     """Rotation of the quaternion (w, x, y, z), which need not be normalised; the zero quaternion is identity."""
     n = wp.length(q)
@@ -44,7 +44,7 @@ def quat_matrix(q: vec4) -> mat33:
     )  # fmt: skip
 
 
-@wp.func
+@wp.func(inline=False)
 def quat_mul(a: vec4, b: vec4) -> vec4:
     """Product of two quaternions."""
     return vec4(
@@ -55,7 +55,7 @@ def quat_mul(a: vec4, b: vec4) -> vec4:
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def quat_integrate(q: vec4, r: vec3) -> vec4:
     """q turned by the local rotation vector ``r``, normalised."""
     angle = wp.length(r)
@@ -66,7 +66,7 @@ def quat_integrate(q: vec4, r: vec3) -> vec4:
     return out / wp.length(out)
 
 
-@wp.func
+@wp.func(inline=False)
 def quat_log(q: vec4) -> vec3:
     """Rotation vector of q, the short way round (mju_quat2Vel over one second)."""
     v = vec3(q[1], q[2], q[3])
@@ -80,7 +80,7 @@ def quat_log(q: vec4) -> vec3:
     return v * k
 
 
-@wp.func
+@wp.func(inline=False)
 def turn(r: vec3, x: vec3) -> vec3:
     """exp([r]) x: the vector ``x`` rotated by the rotation vector ``r``."""
     a2 = wp.dot(r, r)
@@ -94,7 +94,7 @@ def turn(r: vec3, x: vec3) -> vec3:
     return x + s * u + c * wp.cross(r, u)
 
 
-@wp.func
+@wp.func(inline=False)
 def right_jacobian_t(r: vec3, x: vec3) -> vec3:
     """J_r(r)ᵀ x, with exp([r + d]) ≈ exp([r]) exp([J_r(r) d]); J_rᵀ = I + (1−cos a)/a² [r] + (a−sin a)/a³ [r]²."""
     a2 = wp.dot(r, r)
@@ -108,7 +108,7 @@ def right_jacobian_t(r: vec3, x: vec3) -> vec3:
     return x + c * u + e * wp.cross(r, u)
 
 
-@wp.func
+@wp.func(inline=False)
 def _curl(a2: f64) -> f64:
     """1/a² − (1 + cos a) / (2 a sin a), the coefficient of [r]² in J_r(r)⁻¹."""
     k = ONE / f64(12.0) + a2 / f64(720.0) + a2 * a2 / f64(30240.0)
@@ -118,7 +118,7 @@ def _curl(a2: f64) -> f64:
     return k
 
 
-@wp.func
+@wp.func(inline=False)
 def chart_rate(r: vec3, w: vec3) -> vec3:
     """J_r(r)⁻¹ w: how fast the rotation vector r of q₀⁻¹q changes while q turns at the local rate w.
 
@@ -128,7 +128,7 @@ def chart_rate(r: vec3, w: vec3) -> vec3:
     return w + HALF * u + _curl(wp.dot(r, r)) * wp.cross(r, u)
 
 
-@wp.func
+@wp.func(inline=False)
 def chart_rate_dual(r: vec3, w: vec3, bar: vec3) -> f64:
     """Leaf: the adjoint of :func:`chart_rate` is its gradient."""
     return wp.dot(chart_rate(r, w), bar)

@@ -224,7 +224,7 @@ def _add_row(
         w.row_d[w.t, n] = ONE / regularisation(soft.imp, soft.weight)
 
 
-@wp.func
+@wp.func(inline=False)
 def make_tendon_rows(m: wp.ref[Tables], w: wp.ref[World], r: int, start: int, weighed: int) -> int:
     """List the rows of tendons after the ``start`` that there are, and return the number of all."""
     n = int(start)
@@ -264,7 +264,7 @@ def make_tendon_rows(m: wp.ref[Tables], w: wp.ref[World], r: int, start: int, we
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def tendon_equality_position(m: wp.ref[Tables], w: wp.ref[World], e: int) -> vec3:
     """:func:`equality_position` of the lengths of two tendons, measured from those at the reference position."""
     k1 = m.teneq_tendon[2 * e]
@@ -366,7 +366,7 @@ def _equality_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, n: int, xbar:
             power = power * y
 
 
-@wp.func
+@wp.func(inline=False)
 def _tendon_row_adjoint(
     m: wp.ref[Tables], w: wp.ref[World], r: int, n: int, xbar: f64, ubar: f64, vbar: f64, lbar: f64, weightbar: f64
 ):  # fmt: skip
@@ -399,7 +399,7 @@ def _tendon_row_adjoint(
                 power = power * y
 
 
-@wp.func
+@wp.func(inline=False)
 def _arms_bar(m: wp.ref[Tables], w: wp.ref[World], r: int, k: int, coef: f64, ubar: f64, vbar: f64, lbar: f64):
     """Adjoint of J of tendon ``k`` through J a, J q̇ and Jλ."""
     tendon_bar(m, w, k, coef * ubar, w.acc, r)

@@ -31,7 +31,7 @@ from dropo_torch.simulators.warp.spatial import (
 from dropo_torch.simulators.warp.types import HALF, MINVAL, ONE, ZERO, Reals2, Tables, World, mat66, vec3, vec6, vec10
 
 
-@wp.func
+@wp.func(inline=False)
 def unit(k: int) -> vec6:
     """The k-th unit vector."""
     x = vec6()
@@ -39,7 +39,7 @@ def unit(k: int) -> vec6:
     return x
 
 
-@wp.func
+@wp.func(inline=False)
 def turning_slope(i: vec10, v: vec6) -> mat66:
     """The operator x → I (x × V) + x ×* I V + V ×* I x of a body."""
     out = mat66()
@@ -52,7 +52,7 @@ def turning_slope(i: vec10, v: vec6) -> mat66:
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def box_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     """Minus the slope of the drag on the body's inertia box in its velocity V."""
     rot = inertial_frame(m, w, b)
@@ -72,7 +72,7 @@ def box_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def ellipsoids_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     """Minus the slope of the medium's forces on the body's ellipsoids in its velocity V."""
     out = mat66()
@@ -104,7 +104,7 @@ def ellipsoids_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     return out
 
 
-@wp.func
+@wp.func(inline=False)
 def body_slopes(m: wp.ref[Tables], w: wp.ref[World]):
     """Sums over subtrees of the operators that act on s in a column of B, into ``w.slope``."""
     for b in range(1, m.nb):
@@ -125,7 +125,7 @@ def body_slopes(m: wp.ref[Tables], w: wp.ref[World]):
             w.slope[w.t, p] = w.slope[w.t, p] + w.slope[w.t, b]
 
 
-@wp.func
+@wp.func(inline=False)
 def swings(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """Slope of the bodies' acceleration in each velocity, less s × V: V₋ × s + V₊ × s of its joint, in ``w.swing``."""
     for b in range(1, m.nb):
@@ -143,7 +143,7 @@ def swings(m: wp.ref[Tables], w: wp.ref[World], r: int):
             v = after
 
 
-@wp.func
+@wp.func(inline=False)
 def fill_slopes(m: wp.ref[Tables], w: wp.ref[World], r: int):
     """soft_hess[r] = M + h B, all of it, but for the part of B that is diagonal."""
     for i in range(m.nv * m.nv):
@@ -167,7 +167,7 @@ def fill_slopes(m: wp.ref[Tables], w: wp.ref[World], r: int):
             j = m.dof_parent[0, j]
 
 
-@wp.func
+@wp.func(inline=False)
 def factor_full(m: wp.ref[Tables], a: Reals2, r: int):
     """A = U L in place, from the last dof to the first: U has ones on its diagonal, and there is no fill-in."""
     n = m.nv
@@ -185,7 +185,7 @@ def factor_full(m: wp.ref[Tables], a: Reals2, r: int):
             i = m.dof_parent[0, i]
 
 
-@wp.func
+@wp.func(inline=False)
 def solve_full(m: wp.ref[Tables], a: Reals2, r: int, x: Reals2, rx: int):
     """x ← A⁻¹ x with the factor of :func:`factor_full`."""
     n = m.nv
@@ -205,7 +205,7 @@ def solve_full(m: wp.ref[Tables], a: Reals2, r: int, x: Reals2, rx: int):
         x[rx, k] = xk / a[r, k * n + k]
 
 
-@wp.func
+@wp.func(inline=False)
 def solve_full_transposed(m: wp.ref[Tables], a: Reals2, r: int, x: Reals2, rx: int):
     """x ← A⁻ᵀ x with the factor of :func:`factor_full`."""
     n = m.nv

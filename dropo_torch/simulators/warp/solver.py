@@ -47,7 +47,7 @@ def _add_row_hessian(m: wp.ref[Tables], w: wp.ref[World], n: int, r: int):
         _add_dofs_hessian(m, w, n, r)
 
 
-@wp.func
+@wp.func(inline=False)
 def _add_tendon_hessian(m: wp.ref[Tables], w: wp.ref[World], n: int, r: int):
     d = w.row_d[w.t, n]
     for a in range(2):

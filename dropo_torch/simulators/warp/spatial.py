@@ -16,25 +16,25 @@ from dropo_torch.simulators.warp.types import Reals, Reals2, f64, mat33, vec2, v
 ang, lin, cross_motion, cross_force = wp.spatial_top, wp.spatial_bottom, wp.spatial_cross, wp.spatial_cross_dual
 
 
-@wp.func
+@wp.func(inline=False)
 def theta_vec2(th: Reals, i: int) -> vec2:
     """Two consecutive numbers of θ."""
     return vec2(th[i], th[i + 1])
 
 
-@wp.func
+@wp.func(inline=False)
 def theta_vec3(th: Reals, i: int) -> vec3:
     """Three consecutive numbers of θ."""
     return vec3(th[i], th[i + 1], th[i + 2])
 
 
-@wp.func
+@wp.func(inline=False)
 def theta_vec4(th: Reals, i: int) -> vec4:
     """Four consecutive numbers of θ."""
     return vec4(th[i], th[i + 1], th[i + 2], th[i + 3])
 
 
-@wp.func
+@wp.func(inline=False)
 def theta_vec5(th: Reals, i: int) -> vec5:
     """Five consecutive numbers of θ."""
     return vec5(th[i], th[i + 1], th[i + 2], th[i + 3], th[i + 4])
@@ -59,31 +59,31 @@ def add_at(x: Reals2, r: int, i: int, y: Any):
         x[r, i + k] += y[k]
 
 
-@wp.func
+@wp.func(inline=False)
 def join(w: vec3, v: vec3) -> vec6:
     """The spatial vector of an angular and a linear part."""
     return vec6(w[0], w[1], w[2], v[0], v[1], v[2])
 
 
-@wp.func
+@wp.func(inline=False)
 def at(x: vec6, p: vec3) -> vec3:
     """Linear part of the motion ``x`` at the point ``p``: v + ω × p."""
     return lin(x) + wp.cross(ang(x), p)
 
 
-@wp.func
+@wp.func(inline=False)
 def wrench(f: vec3, p: vec3) -> vec6:
     """The spatial force of ``f`` acting at ``p``."""
     return join(wp.cross(p, f), f)
 
 
-@wp.func
+@wp.func(inline=False)
 def pull(f: vec3, p: vec3, torque: vec3) -> vec6:
     """The spatial force of ``f`` at ``p`` and a torque."""
     return wrench(f, p) + join(torque, vec3())
 
 
-@wp.func
+@wp.func(inline=False)
 def inertia_about_origin(mass: f64, c: vec3, rot: mat33, moments: vec3) -> vec10:
     """Spatial inertia of a body with principal ``moments`` along the columns of ``rot``, centred at ``c``."""
     r0 = rot[:, 0]
@@ -107,7 +107,7 @@ def inertia_about_origin(mass: f64, c: vec3, rot: mat33, moments: vec3) -> vec10
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def inertia_mul(i: vec10, x: vec6) -> vec6:
     """I x: the momentum of a body moving with ``x``."""
     h = vec3(i[1], i[2], i[3])
@@ -123,7 +123,7 @@ def inertia_mul(i: vec10, x: vec6) -> vec6:
     )
 
 
-@wp.func
+@wp.func(inline=False)
 def late(x: f64) -> f64:
     """The identity. Warp emits a function that takes a gradient after those that take none, so whatever calls such a
     function takes the gradient of this one, to be emitted after it."""

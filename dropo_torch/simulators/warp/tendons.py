@@ -49,7 +49,7 @@ def segment_end(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
     return w.xpos[w.t, b] + w.xmat[w.t, b] * m.seg_pos[g]
 
 
-@wp.func
+@wp.func(inline=False)
 def along(x: vec3) -> vec3:
     """Direction of a segment."""
     n = wp.length(x)
@@ -125,7 +125,7 @@ def _bar_motion(m: wp.ref[Tables], w: wp.ref[World], k: int, g: int) -> vec6:
     return z
 
 
-@wp.func
+@wp.func(inline=False)
 def _turn_arms(m: wp.ref[Tables], w: wp.ref[World], k: int, g: int, p: vec3, pbar: vec3, f: vec3, z: vec6):
     """Tangent of f · (z at p) with the adjoint ``pbar`` of p: a joint displaces p and turns all of z beyond it."""
     force = pbar + wp.cross(f, ang(z))
@@ -215,7 +215,7 @@ def tendon_damping_slope(m: wp.ref[Tables], w: wp.ref[World], k: int) -> f64:
     return w.th[m.o_ten_damping + k] + n * (TWO * w.th[ip] + THREE * n * w.th[ip + 1])
 
 
-@wp.func
+@wp.func(inline=False)
 def add_outer(m: wp.ref[Tables], w: wp.ref[World], k: int, y: f64, matrix: Reals2, r: int):
     """Add y JᵀJ of tendon ``k`` to a packed matrix, where MuJoCo's M has room for it.
 
@@ -232,7 +232,7 @@ def add_outer(m: wp.ref[Tables], w: wp.ref[World], k: int, y: f64, matrix: Reals
             j = wp.where(m.dof_alone[i] != 0, -1, m.dof_parent[0, j])
 
 
-@wp.func
+@wp.func(inline=False)
 def outer_dot(m: wp.ref[Tables], w: wp.ref[World], k: int, x: Reals2, rx: int, y: Reals2, ry: int, bar: f64) -> f64:
     """xᵀ (JᵀJ) y with what :func:`add_outer` leaves of JᵀJ; adds ``bar`` times its gradient to the adjoint of J."""
     total = f64(0.0)
@@ -254,7 +254,7 @@ def outer_dot(m: wp.ref[Tables], w: wp.ref[World], k: int, x: Reals2, rx: int, y
     return total
 
 
-@wp.func
+@wp.func(inline=False)
 def outer_mul(m: wp.ref[Tables], w: wp.ref[World], k: int, scale: f64, x: Reals2, rx: int, y: Reals2, ry: int):
     """y += scale (JᵀJ) x with what :func:`add_outer` leaves of JᵀJ."""
     for c in range(m.ten_start[k], m.ten_start[k + 1]):

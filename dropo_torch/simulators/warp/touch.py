@@ -313,7 +313,7 @@ def find_contacts(m: wp.ref[Tables], w: wp.ref[World]) -> int:
     return n
 
 
-@wp.func
+@wp.func(inline=False)
 def _turned(r: mat33, rbar: mat33) -> vec3:
     """Torque that a rotation's adjoint is: Σ columns r × r̄."""
     return wp.cross(r[:, 0], rbar[:, 0]) + wp.cross(r[:, 1], rbar[:, 1]) + wp.cross(r[:, 2], rbar[:, 2])

@@ -101,13 +101,13 @@ def weld_pose(m: wp.ref[Tables], w: wp.ref[World], e: int) -> Weld:
     return x
 
 
-@wp.func
+@wp.func(inline=False)
 def weld_error(x: Weld) -> vec6:
     """Position of the six rows."""
     return join(x.p1 - x.p2, x.v * x.scale)
 
 
-@wp.func
+@wp.func(inline=False)
 def weld_motion(x: Weld, x1: vec6, x2: vec6) -> vec6:
     """How fast the rows change while the bodies move with ``x1`` and ``x2``: v' = ½ (s ω + ω × v)."""
     turning = wp.transpose(x.r2) * (ang(x1) - ang(x2))
@@ -115,7 +115,7 @@ def weld_motion(x: Weld, x1: vec6, x2: vec6) -> vec6:
     return join(at(x1, x.p1) - at(x2, x.p2), rate * (HALF * x.scale))
 
 
-@wp.func
+@wp.func(inline=False)
 def weld_acceleration(x: Weld, v1: vec6, v2: vec6, a1: vec6, a2: vec6) -> vec6:
     """Second derivative of the rows: the accelerations of the anchors, and ½ (s α + α × v) − ¼ |ω|² v."""
     turning = ang(v1) - ang(v2)
@@ -126,13 +126,13 @@ def weld_acceleration(x: Weld, v1: vec6, v2: vec6, a1: vec6, a2: vec6) -> vec6:
     return join(move1 - move2, rate * x.scale)
 
 
-@wp.func
+@wp.func(inline=False)
 def _relative_twist(v1: vec6, v2: vec6, a1: vec6, a2: vec6) -> vec3:
     """Angular acceleration of the first body seen from the second."""
     return ang(a1) - ang(a2) - wp.cross(ang(v2), ang(v1))
 
 
-@wp.func
+@wp.func(inline=False)
 def _turning_force(x: Weld, y: vec6) -> vec3:
     """Transpose of :func:`weld_motion` in the difference of the angular velocities."""
     y_rot = lin(y)
@@ -147,7 +147,7 @@ def weld_softness(m: wp.ref[Tables], w: wp.ref[World], e: int, error: vec6, part
     return softness(m, w, o_ref, o_imp, w.th[m.o_weld_invweight + 2 * e + part], wp.length(error))
 
 
-@wp.func
+@wp.func(inline=False)
 def stiffen(soft: Soft) -> f64:
     """D of rows of this softness."""
     return ONE / regularisation(soft.imp, soft.weight)
@@ -278,7 +278,7 @@ def _hang_weld(m: wp.ref[Tables], w: wp.ref[World], e: int, x: Weld, errorbar: v
             _turn_adjoint(w, data + QUAT, q, x.s * sbar + wp.dot(x.v, vbar), turn)
 
 
-@wp.func
+@wp.func(inline=False)
 def _hang_anchor(
     w: wp.ref[World], b: int, p: vec3, pbar: vec3, ab: vec3, vb: vec3, lb: vec3, turn_a: vec3, turn_v: vec3,
     turn_l: vec3, torque: vec3,
@@ -304,13 +304,13 @@ def _hang_anchor(
     return y
 
 
-@wp.func
+@wp.func(inline=False)
 def _rate(x: Weld, turning: vec3) -> vec3:
     """Rate of the quaternion's vector part."""
     return (turning * x.s + wp.cross(turning, x.v)) * HALF
 
 
-@wp.func
+@wp.func(inline=False)
 def _turn_adjoint(w: wp.ref[World], o: int, q: vec4, grow: f64, turn: vec3):
     """Adjoint of the reference quaternion at ``o`` in θ: q ⊗ (grow, turn) / |q|²."""
     bar = quat_mul(q, vec4(grow, turn[0], turn[1], turn[2])) / wp.dot(q, q)
