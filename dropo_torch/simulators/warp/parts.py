@@ -27,6 +27,7 @@ DRIVES = 8
 #: Frames and sizes that vary.
 FRAMES = 16
 
+#: Warp's hint against inlining, of which a CPU takes no notice.
 _LEFT_TO_LLVM = """
 #undef WP_NOINLINE
 #define WP_NOINLINE
@@ -149,8 +150,8 @@ def make_kernel(function: Callable[..., None], parts: int, *, differentiated: bo
     """
     module = f"{function.__module__}.parts{parts}"
     told = f"#define DROPO_PARTS {parts}\n"
-    # what says inline=False is called on a GPU, where NVIDIA's compiler would inline everything and never finish; on a
-    # CPU it is left to LLVM's own thresholds, as calls cost more there than the compiling that they save
+    # what says inline=False is called on a GPU, where NVIDIA's compiler would otherwise inline it everywhere; on a CPU
+    # LLVM's own thresholds decide
     build = wp.ModuleBuildOptions(extra_cpu_preamble=told + _LEFT_TO_LLVM, extra_cuda_preamble=told)
     options = {"enable_backward": False, "extra_build_options": build, "cpu_compiler_flags": "-march=native"}
     wp.set_module_options(options, module=module)
