@@ -476,6 +476,20 @@ def test_the_past_reaches_into_a_window(effects: list) -> None:
         np.testing.assert_allclose(path[0, 0].numpy(), whole[at : at + 5], atol=tolerance)
 
 
+@pytest.mark.parametrize("backend", ["mujoco", "warp"])
+def test_a_limit_of_force_takes_the_place_of_the_models(backend: str) -> None:
+    """A real limit may be below the model's or above it; a range of one side stays one."""
+    limited = SLIDE.replace("/></actuator>", ' forcelimited="true" forcerange="-0.3 0.6"/></actuator>')
+    effect, setting = find_effect("actuator_saturation"), setting_of(general(limited))
+    (limit,) = effect.quantities(setting, "push")
+    assert effect.targets(setting) == ["push"]
+    assert (limit.neutral, limit.low < 0.6 < limit.high) == (0.6, True)
+    for value, expected in ((0.6, [0.6, -0.3]), (0.2, [0.2, -0.1]), (1.2, [1.0, -0.6])):
+        entry = {"effect": effect.name, "target": "push", "limit": value}
+        path = driven([entry], np.array([1.0, -1.0]), xml=limited, backend=backend)
+        np.testing.assert_allclose(forces(path), expected, atol=1e-9)
+
+
 def test_saturation_and_gain_and_back_emf() -> None:
     path = driven([{"effect": "actuator_saturation", "target": "push", "limit": 0.4}], np.array([1.0, -1, 0.2]))
     np.testing.assert_allclose(forces(path), [0.4, -0.4, 0.2], atol=1e-9)

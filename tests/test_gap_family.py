@@ -279,5 +279,25 @@ def test_members_are_judged_once_after_what_refines_them(
     monkeypatch.setattr(members, "without_steps", lambda _, fit: fit)
     monkeypatch.setattr(members, "spread_out", lambda *_: True)
     ground: Any = SimpleNamespace(setting=None, rules=Rules())
-    assert members.whole_family(ground, Hypothesis(())) is (soft if softer else sloped)
+    assert members.whole_family(ground, members.fitted_family(ground, Hypothesis(()))) is (soft if softer else sloped)
     assert len(found) == judged
+
+
+@pytest.mark.parametrize(("left", "looked"), [(0.9, False), (0.2, True)])
+def test_members_are_not_judged_where_all_of_them_leave_too_much(
+    left: float, looked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    judged: list[object] = []
+    whole: Any = SimpleNamespace(cost=SimpleNamespace(left_of=lambda _: left))
+    monkeypatch.setattr(members, "has_family", lambda _: True)
+    monkeypatch.setattr(members, "significant", lambda *_: True)
+    monkeypatch.setattr(members, "one_kind", lambda _: False)
+    monkeypatch.setattr(members, "extend", lambda _, found: found)
+    monkeypatch.setattr(members, "fitted_family", lambda *_: whole)
+    monkeypatch.setattr(members, "whole_family", lambda _, fit: judged.append(fit))
+    few: Any = SimpleNamespace(
+        current=SimpleNamespace(cost=SimpleNamespace(left_of=lambda _: 0.5), hypothesis=None), done=False
+    )
+    before: Any = SimpleNamespace(base=SimpleNamespace(cost=None, hypothesis=None))
+    assert members.with_family(SimpleNamespace(rules=Rules()), before, few) is few  # type: ignore[arg-type]
+    assert bool(judged) == looked

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 
 import mujoco
 import numpy as np
@@ -272,7 +273,10 @@ class ActuatorBacklash(ActuatorEffect):
 
 
 class ActuatorSaturation(ActuatorEffect):
-    """A force that an actuator cannot exceed."""
+    """A force that an actuator cannot exceed; where the model has such a limit, another one than that.
+
+    Of a model's range of forces the larger end is the limit; the other one changes in proportion.
+    """
 
     name = "actuator_saturation"
     sentence = "actuator {target} cannot give more than a certain force"
@@ -280,7 +284,12 @@ class ActuatorSaturation(ActuatorEffect):
 
     def targets(self, setting: Setting) -> list[str | None]:
         m = setting.model
-        return [t for t in super().targets(setting) if not m.actuator_forcelimited[object_number(m, "actuator", t)]]
+        return [t for t in super().targets(setting) if self.own(m, object_number(m, "actuator", t)) > 0]
+
+    @staticmethod
+    def own(model: mujoco.MjModel, i: int) -> float:
+        """Return the largest force that a model allows an actuator."""
+        return float(np.abs(model.actuator_forcerange[i]).max()) if model.actuator_forcelimited[i] else math.inf
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m, i = setting.model, object_number(setting.model, "actuator", target)
@@ -288,9 +297,13 @@ class ActuatorSaturation(ActuatorEffect):
         if m.actuator_biasprm[i, 1] != 0:  # of a servo, roughly
             largest = 3 * self.force_scale(setting, target)
         unit = unit_of(setting, target, "N·m", "N")
-        return (Quantity("limit", unit, 4 * largest, 0.02 * largest, 4 * largest, largest),)
+        own = self.own(m, i)
+        absent = own if own < math.inf else 4 * largest
+        return (Quantity("limit", unit, absent, 0.02 * min(largest, absent), max(4 * largest, absent), largest),)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         i = object_number(model, "actuator", target)
+        own = self.own(model, i)
+        ends = model.actuator_forcerange[i] / own if own < math.inf else np.array([-1.0, 1.0])
         model.actuator_forcelimited[i] = 1
-        model.actuator_forcerange[i] = (-values[0], values[0])
+        model.actuator_forcerange[i] = values[0] * ends

@@ -64,7 +64,10 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
         return found
-    whole = whole_family(ground, state.base.hypothesis)
+    fitted = fitted_family(ground, state.base.hypothesis)
+    if fitted.cost.left_of(cost) > rules.hopeless * rules.clearer[int(kind)]:
+        return found
+    whole = whole_family(ground, fitted)
     if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)]:
         return found
     return replace(found, current=whole, family=True, done=True, refused="")
@@ -76,9 +79,9 @@ def has_family(ground: Ground) -> bool:
     return not ground.setting.signals.contacts.any() and len(joints) >= ground.rules.family.joints
 
 
-def whole_family(ground: Ground, begin: Hypothesis) -> Refit | None:
-    """Return the base family with the members that are needed, if several are at several joints."""
-    whole = needed(ground, fitted_family(ground, begin))
+def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
+    """Return the fitted base family with the members that are needed, if several are at several joints."""
+    whole = needed(ground, fitted)
     for refined in (softened, with_slopes, softened):
         whole = None if whole is None else refined(ground, whole)
     whole = None if whole is None else without_steps(ground, whole)

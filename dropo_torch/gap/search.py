@@ -13,7 +13,7 @@ from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.absent import Allowed, family_ties, left_out, with_absent
 from dropo_torch.gap.accept import accounts_finely, add, everywhere, extend, imitates, is_done, nonsense, prune, swap
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.family import has_family, shares_of, whole_family, with_family
+from dropo_torch.gap.family import fitted_family, has_family, shares_of, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -288,7 +288,7 @@ def resort(ground: Ground, naming: Naming) -> Naming:
         return naming
     evidence = replace(naming.evidence, caps=1.0)
     here, base = with_base(replace(ground, evidence=evidence), naming.base.hypothesis)
-    if (whole := whole_family(here, base.hypothesis)) is None:
+    if (whole := whole_family(here, fitted_family(here, base.hypothesis))) is None:
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
     state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.few)
