@@ -32,7 +32,7 @@ from dropo_torch.effects import VOCABULARY, Placed, Quantity, Setting, find_effe
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, outcome, prepare
+from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, given, outcome, prepare
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
@@ -149,6 +149,26 @@ def test_parameters_are_fitted_where_the_model_as_given_has_no_answer(tmp_path: 
     assert gap.verdict == "no gap"
     assert gap.declared["pole_mass"][2] == pytest.approx(hidden().declared["pole_mass"], rel=1e-3)
     assert {"gap-progress.bin", "gap-progress-given.bin"} <= {path.name for path in tmp_path.iterdir()}
+
+
+@pytest.mark.parametrize(("after", "answered"), [(0.02, True), (0.5, False)])
+def test_names_that_close_most_of_a_gap_are_an_answer_in_the_model_as_given(
+    after: float, answered: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """What then remains is not worth a second search, which a person would wait for; the notes say how to have it."""
+    problem, gap = as_given(hidden("joint_damping"), tmp_path), found(("joint_damping",))
+    left = dataclasses.replace(
+        gap, remaining=gap.reduced[1], effects=gap.effects,
+        before=dataclasses.replace(gap.before, rollout_rmse=1.0),
+        after=dataclasses.replace(gap.after, rollout_rmse=after),
+        noise_floor=dataclasses.replace(gap.noise_floor, rollout_rmse=0.0),
+    )  # fmt: skip
+    searched: list[Problem] = []
+    monkeypatch.setattr(given, "find_gap", lambda own, **_: searched.append(own) or left)
+    _, answer = find_gap_as_given(problem)
+    assert answer.verdict == "partly explained"
+    assert len(searched) == (1 if answered else 2)
+    assert any("--as_given false" in note for note in answer.notes) == answered
 
 
 # --- the whole ------------------------------------------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
@@ -274,6 +275,13 @@ class Gap:
         if all(e.effect == "unnamed" for e in self.effects):
             return "unnamed"
         return "explained" if self.remaining is None and not self.forces else "partly explained"
+
+    @property
+    def closed(self) -> float:
+        """Share of the open-loop error above the noise floor that is gone; NaN where that says nothing."""
+        before, after, floor = (s.rollout_rmse for s in (self.before, self.after, self.noise_floor))
+        sound = all(map(math.isfinite, (before, after, floor))) and before > floor
+        return min((before - after) / (before - floor), 1.0) if sound else math.nan
 
     def document(self) -> dict[str, Any]:
         """Return the content of ``gap.json``."""

@@ -316,16 +316,9 @@ def change(gap: Gap) -> str:
         return f"{start} goes from {before} to {after} {bottom}."
     if values[1] == values[0]:
         return f"{start} stays at {before} {bottom}."
-    shrunk = shrinkage(gap)
+    shrunk = gap.closed
     end = f": the gap shrank by {percent(shrunk)}" if shrunk > 0 else ""
     return f"{start} {'falls' if values[1] < values[0] else 'rises'} from {before} to {after} {bottom}{end}."
-
-
-def shrinkage(gap: Gap) -> float:
-    """Return the share of the open-loop error above the noise floor that is gone; NaN where that says nothing."""
-    before, after, floor = (s.rollout_rmse for s in (gap.before, gap.after, gap.noise_floor))
-    sound = np.isfinite([before, after, floor]).all() and before > floor
-    return float(min((before - after) / (before - floor), 1.0)) if sound else float("nan")
 
 
 def span(gap: Gap) -> str:
