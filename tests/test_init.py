@@ -214,6 +214,30 @@ def test_names_that_nobody_knows_follow_the_order(
     assert [found[f"servo_{i}"] for i in (1, 2, 3)] == [f"{name}.cmd" for name in expected]
 
 
+def test_a_grippers_position_is_told_in_hundredths_of_its_range(tmp_path: Path) -> None:
+    """As LeRobot logs arms: joints in degrees, the gripper from 0 to 100; its command, too, and no other joint."""
+    xml = """<mujoco><worldbody><body><joint name="elbow" range="-2 2"/><geom size=".1"/>
+      <body pos="0 0 .3"><joint name="gripper" range="-0.2 1.8"/><geom size=".05"/></body></body></worldbody>
+      <actuator><position name="elbow" joint="elbow"/><position name="gripper" joint="gripper"/></actuator>
+    </mujoco>""".replace("<mujoco>", '<mujoco><compiler angle="radian"/>')
+    time, names = 0.02 * np.arange(200), ("elbow", "gripper")
+    turns = {"elbow": 90 * np.sin(time), "gripper": 50 + 45 * np.sin(3 * time)}
+    frame = {f"observation.state[{n}.pos]": turns[n] for n in names}
+    frame |= {f"action[{n}.pos]": turns[n] + 1 for n in names}
+    pd.DataFrame({"timestamp": time, **frame}).to_csv(tmp_path / "log.csv", index=False)
+    columns = read_columns(tmp_path / "log.csv")
+    starts = np.arange(200) == 0
+    taken = [c for c in columns.columns if c.entry == "timestamp"]
+    found = match_columns(columns, places_of(mujoco.MjModel.from_xml_string(xml)), starts, taken)
+    told = {m.place.label: m for m in found.matches}
+    np.testing.assert_allclose(told["gripper.position"].values, -0.2 + 0.02 * turns["gripper"])
+    np.testing.assert_allclose(told["gripper"].values, -0.2 + 0.02 * (turns["gripper"] + 1))
+    np.testing.assert_allclose(told["elbow.position"].values, np.radians(turns["elbow"]))
+    assert [told[f"{n}.position"].unit for n in names] == ["degrees", "% of the joint's range"]
+    entry = {"signal": told["gripper"].column.entry, "scale": pytest.approx(0.02), "offset": -0.2}
+    assert told["gripper"].entry == entry
+
+
 def test_a_joints_number_is_not_its_fingers(tmp_path: Path) -> None:
     xml = ARM
     for i, joint in enumerate(LABELS, 1):

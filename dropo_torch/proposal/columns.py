@@ -57,9 +57,10 @@ class Column:
         finite = self.values[np.isfinite(self.values)]
         return bool(finite.size and np.ptp(finite) > 0)
 
-    def as_map(self, scale: float = 1.0) -> str | dict[str, Any]:
+    def as_map(self, scale: float = 1.0, offset: float = 0.0) -> str | dict[str, Any]:
         """Return it as an entry of a column map, in units of the model."""
-        options = ({"scale": scale} if scale != 1.0 else {}) | ({"transpose": True} if self.transposed else {})
+        options: dict[str, Any] = {"scale": scale} if scale != 1.0 else {}
+        options |= ({"offset": offset} if offset else {}) | ({"transpose": True} if self.transposed else {})
         return {"signal": self.entry, **options} if options else self.entry
 
 

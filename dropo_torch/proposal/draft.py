@@ -124,11 +124,11 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         velocities = []
     names = ", ".join(dict.fromkeys(p.label for p in lacking))
     notes += [f"velocities are derived from positions: {names} not logged"] if names else []
-    source["observations"] = [m.column.as_map(m.scale) for m in positions + velocities]
+    source["observations"] = [m.entry for m in positions + velocities]
     commands = matching.of("command")
     follows = not commands and bool(matching.lacks("command"))
     if not follows:
-        source["actions"] = [m.column.as_map(m.scale) for m in commands]
+        source["actions"] = [m.entry for m in commands]
     if resampled or follows:
         source["preprocess"], more, smooth = _preprocess(
             columns, matching, clock, positions, velocities, skip * timestep, follows=follows, derive=some
@@ -179,8 +179,8 @@ def _of_markers(reading: Reading) -> tuple[dict[str, Any], list[str]]:
     skip = max(1, round(clock.dt / reading.timestep))
     whole = abs(clock.dt / reading.timestep - skip) <= WHOLE * skip
     shown = [m for m in matching.matches if m.place.kind != "command"]
-    source = _source(reading) | {"observations": [m.column.as_map(m.scale) for m in shown]}
-    source["actions"] = [m.column.as_map(m.scale) for m in matching.of("command")]
+    source = _source(reading) | {"observations": [m.entry for m in shown]}
+    source["actions"] = [m.entry for m in matching.of("command")]
     if not clock.even or not whole or any(np.isnan(m.column.values).any() for m in matching.matches):
         longest = _longest(clock, len(reading.columns), reading.columns.parts, matching.matches)
         source["preprocess"] = {"dt": float(f"{skip * reading.timestep:.9g}"), "velocities": []}
@@ -212,7 +212,7 @@ def _standard(columns: Columns, matching: Matching) -> list[str] | None:
     names = {c.array for c in columns.columns}
     actions = [m.column.entry for m in matching.of("command")]
     arrays = {m.column.array for m in matching.matches if m.place.kind != "command"}
-    plain = all(m.scale == 1.0 for m in matching.matches)
+    plain = all(m.scale == 1.0 and not m.offset for m in matching.matches)
     own = [c.entry for c in columns.columns if c.array == "actions"]
     if "next_observations" not in names or arrays != {"observations"} or own != actions or not plain:
         return None

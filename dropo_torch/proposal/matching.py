@@ -6,7 +6,7 @@ import difflib
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -32,6 +32,8 @@ SPANS = (1, 4, 16)
 #: Relative distance from a factor within which a unit is named.
 UNIT = 0.3
 _AXES = ("x", "y", "z")
+#: What LeRobot calls a gripper's position, which it has in hundredths of the range, and by how many these may pass it.
+GRIPPER, OF_RANGE, PAST = "gripper.pos", "% of the joint's range", 5.0
 
 
 @dataclass(frozen=True)
@@ -44,6 +46,8 @@ class Match:
         scale: by which its values are multiplied.
         sureness: how sure that is.
         why: by what it was found, in words.
+        offset: what is then added.
+        told_in: the unit of the values, where it is none of the usual.
     """
 
     place: Place
@@ -51,11 +55,23 @@ class Match:
     scale: float
     sureness: Sureness
     why: str
+    offset: float = 0.0
+    told_in: str = ""
 
     @property
     def values(self) -> np.ndarray:
         """The values in the model's unit, ``(N,)``."""
-        return self.scale * self.column.values
+        return self.scale * self.column.values + self.offset
+
+    @property
+    def entry(self) -> str | dict[str, Any]:
+        """The entry of a column map, which makes them so."""
+        return self.column.as_map(self.scale, self.offset)
+
+    @property
+    def unit(self) -> str:
+        """The unit of the column's values, for people."""
+        return self.told_in or unit_name(self.scale, self.place)
 
 
 @dataclass(frozen=True)
@@ -491,6 +507,8 @@ def with_unit(match: Match, found: dict[str, Match]) -> Match:
         return match if named in (None, 1.0) or (place.takes == "effort" and named != 1e-3) else _scaled(match, named)
     if named is not None:
         return _scaled(match, named)
+    if (limits := _calibrated(match, found)) is not None:
+        return replace(match, scale=(limits[1] - limits[0]) / 100, offset=limits[0], told_in=OF_RANGE)
     if place.kind == "position":
         return _scaled(match, _by_range(place, column.values))
     if place.kind == "command":
@@ -499,6 +517,15 @@ def with_unit(match: Match, found: dict[str, Match]) -> Match:
             own = with_unit(partner, found).scale
             return _scaled(match, own if _alike(column.values, partner.column.values) else 1.0)
     return match
+
+
+def _calibrated(match: Match, found: dict[str, Match]) -> tuple[float, float] | None:
+    """The range of which a gripper's position, or its target, is told in hundredths; ``None`` where it is not."""
+    place, values = match.place, match.column.values
+    of = found[place.partner].place if place.kind == "command" and place.partner in found else place
+    inside = np.isfinite(values) & (values > -PAST) & (values < 100 + PAST)
+    name = match.column.entry.rstrip("]").rpartition("[")[2]
+    return of.limits if place.kind != "velocity" and name.endswith(GRIPPER) and inside.mean() > 0.99 else None
 
 
 def _scaled(match: Match, scale: float | None) -> Match:

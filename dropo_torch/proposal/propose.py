@@ -147,25 +147,13 @@ def propose_config(
     places, step = places_of(compiled), float(compiled.opt.timestep)
     clock = find_clock(columns, step, dt)
     matching, clock = _matched(columns, places, clock, step, commanded)
-    if any(not p.optional for p in matching.lacks("position")):
-        source = Path(model)
-        if not commanded and matching.of("command"):
-            source = path
-            write_copy(Path(model), [m.place.label for m in matching.of("command")], step, source)
-        matching, copy = with_markers(load_model(source), source, Path(out), columns, matching, clock)
-        path = copy if matching.of("marker") else path
+    given, config = Path(model), Path(out)
+    matching, path = _marked(given, path, config, columns, matching, clock, commanded)
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
     _check(matching, columns, compiled, clock)
     own = step
-    if matching.of("marker"):
-        step = float(load_model(path).opt.timestep)
-    else:
-        step = _whole_step(path, columns, clock, step)
-        if step != own and path == Path(model):
-            path = out_of(Path(out), path, "step")
-        if path != Path(model):
-            write_copy(Path(model), [] if commanded else [m.place.label for m in matching.of("command")], step, path)
+    path, step = _with_whole_steps(given, path, config, columns, matching, clock, commanded)
     if not commanded:
         keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
         places = tuple(p for p in places if p.label in keep)
@@ -213,6 +201,40 @@ def _with_motors(model: mujoco.MjModel, path: Path, columns: Columns, out: Path)
     if model.nu or not forces or not joints or path.suffix == ".mjb":
         return model, path, bool(model.nu)
     return motor_spec(path, joints).compile(), out_of(out, path, "motors"), False
+
+
+def _driven(matching: Matching, commanded: bool) -> list[str]:
+    """The joints at which a model that has no actuators gets motors."""
+    return [] if commanded else [m.place.label for m in matching.of("command")]
+
+
+def _marked(
+    given: Path, path: Path, out: Path, columns: Columns, matching: Matching, clock: Clock, commanded: bool
+) -> tuple[Matching, Path]:
+    """What columns are where markers show the positions that no column is, and the model that has sensors for them."""
+    if all(p.optional for p in matching.lacks("position")):
+        return matching, path
+    source = given
+    if driven := _driven(matching, commanded):
+        source = path
+        write_copy(given, driven, float(load_model(given).opt.timestep), source)
+    matching, copy = with_markers(load_model(source), source, out, columns, matching, clock)
+    return matching, copy if matching.of("marker") else path
+
+
+def _with_whole_steps(
+    given: Path, path: Path, out: Path, columns: Columns, matching: Matching, clock: Clock, commanded: bool
+) -> tuple[Path, float]:
+    """The model that the config names, written where it is a copy, and its step in seconds."""
+    own = float(load_model(path if matching.of("marker") else given).opt.timestep)
+    if matching.of("marker"):
+        return path, own
+    step = _whole_step(path, columns, clock, own)
+    if step != own and path == given:
+        path = out_of(out, path, "step")
+    if path != given:
+        write_copy(given, _driven(matching, commanded), step, path)
+    return path, step
 
 
 def _whole_step(path: Path, columns: Columns, clock: Clock, step: float) -> float:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from dropo_torch.proposal.choice import Told
-from dropo_torch.proposal.matching import Match, unit_name
+from dropo_torch.proposal.matching import Match
 
 if TYPE_CHECKING:
     from dropo_torch.proposal.propose import Proposal
@@ -88,7 +88,7 @@ def _comment(text: str) -> list[str]:
 def _columns(proposal: Proposal) -> Sequence[str]:
     found = []
     for m in proposal.matching.matches:
-        found.append(f"{m.column.entry} is {m.place.label} in {unit_name(m.scale, m.place)}: {m.sureness}, by {m.why}")
+        found.append(f"{m.column.entry} is {m.place.label} in {m.unit}: {m.sureness}, by {m.why}")
     width = max((line.index(":") for line in found), default=0)
     return [line.replace(":", ":" + " " * (min(width, 60) - min(line.index(":"), 60)), 1) for line in found]
 
@@ -122,4 +122,4 @@ def error_text(told: Told) -> str:
 
 def described(match: Match) -> tuple[str, ...]:
     """Return a match as a row of a table: column, place, unit, how sure, by what."""
-    return match.column.entry, match.place.label, unit_name(match.scale, match.place), match.sureness, match.why
+    return match.column.entry, match.place.label, match.unit, match.sureness, match.why

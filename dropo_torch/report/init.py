@@ -9,7 +9,7 @@ import numpy as np
 
 from dropo_torch.proposal import Proposal, Told
 from dropo_torch.proposal.choice import TOLD
-from dropo_torch.proposal.matching import Match, unit_name
+from dropo_torch.proposal.matching import Match
 from dropo_torch.report.figures import init as figures
 from dropo_torch.report.formatting import joined, plain, score
 from dropo_torch.report.page import Frame, write_page
@@ -77,7 +77,7 @@ def _model(proposal: Proposal) -> Any:
 
 def _column(match: Match) -> dict[str, Any]:
     return {
-        "column": match.column.entry, "place": match.place.label, "unit": unit_name(match.scale, match.place),
+        "column": match.column.entry, "place": match.place.label, "unit": match.unit,
         "sureness": match.sureness, "why": match.why,
     }  # fmt: skip
 
