@@ -476,6 +476,19 @@ def test_the_past_reaches_into_a_window(effects: list) -> None:
         np.testing.assert_allclose(path[0, 0].numpy(), whole[at : at + 5], atol=tolerance)
 
 
+def test_only_a_first_number_is_absent_at_a_bound() -> None:
+    """At any other bound a number is as far as physics goes, and no name: half a wave over the range is no ripple."""
+    setting = setting_of(general())
+    shapes = [
+        (effect.name, q.name)
+        for effect in VOCABULARY.values()
+        for target in effect.targets(setting)
+        for q in effect.quantities(setting, target)[1:]
+        if q.neutral in (q.low, q.high)
+    ]
+    assert {*shapes} <= {("joint_stribeck", "static")}  # friction at rest, as at speed
+
+
 @pytest.mark.parametrize("backend", ["mujoco", "warp"])
 def test_a_limit_of_force_takes_the_place_of_the_models(backend: str) -> None:
     """A real limit may be below the model's or above it; a range of one side stays one."""

@@ -277,7 +277,7 @@ class JointCogging(JointEffect):
         fewest = float(np.pi / max(high - low, 1e-3))  # half a wave over the measured range: less is no ripple
         return (
             Quantity("amplitude", unit(setting, target, "N·m", "N"), 0.0, -10 * scale, 10 * scale, scale),
-            Quantity("poles", unit(setting, target, "1/rad", "1/m"), max(1.0, fewest), fewest, 1e4, 1.0),
+            Quantity("poles", unit(setting, target, "1/rad", "1/m"), max(1.0, 2 * fewest), fewest, 1e4, 1.0),
             Quantity("phase", "rad", 0.0, -20.0, 20.0, 1.0),
         )
 
