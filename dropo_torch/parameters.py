@@ -330,6 +330,12 @@ def object_names(model: mujoco.MjModel, prefix: str) -> list[str]:
     return names
 
 
+def object_number(model: mujoco.MjModel, prefix: str, name: str | None) -> int:
+    """Return the number of an object of a kind by its own name, or else by that of :func:`object_names`."""
+    number = mujoco.mj_name2id(model, getattr(mujoco.mjtObj, f"mjOBJ_{_OBJECTS[prefix].upper()}"), str(name))
+    return number if number >= 0 else object_names(model, prefix).index(str(name))
+
+
 def _parse(model: mujoco.MjModel | None, name: str, spec: Mapping[str, Any]) -> Parameter:
     """One entry of ``parameters``."""
     where = f"parameters.{name}"

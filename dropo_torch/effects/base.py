@@ -17,14 +17,9 @@ import torch
 from dropo_torch.data.observation import Observation
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.errors import InputError, choices
-from dropo_torch.parameters import object_names
+from dropo_torch.parameters import object_names, object_number
 
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
-#: MuJoCo's kinds of the objects at which effects are.
-_KINDS = {
-    "actuator": mujoco.mjtObj.mjOBJ_ACTUATOR, "body": mujoco.mjtObj.mjOBJ_BODY, "geom": mujoco.mjtObj.mjOBJ_GEOM,
-    "jnt": mujoco.mjtObj.mjOBJ_JOINT,
-}  # fmt: skip
 #: The methods by which an effect acts on a simulation.
 Method = Literal["apply", "force", "wrench", "command", "sense"]
 
@@ -131,12 +126,6 @@ class Setting:
     def names(self, prefix: str) -> list[str]:
         """Return the names of all objects of a kind, in order; unnamed ones are called ``geom0``."""
         return object_names(self.model, prefix)
-
-
-def object_number(model: mujoco.MjModel, prefix: str, name: str | None) -> int:
-    """Return the number of an object of a kind by its name, as :func:`~dropo_torch.parameters.object_names` has it."""
-    number = mujoco.mj_name2id(model, _KINDS[prefix], str(name))
-    return number if number >= 0 else object_names(model, prefix).index(str(name))
 
 
 #: Every effect that a config may name, by its name: the package's, and a user's own.

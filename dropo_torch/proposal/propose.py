@@ -153,7 +153,7 @@ def propose_config(
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
     _check(matching, columns, compiled, clock)
     own = step
-    path, step = _with_whole_steps(given, path, config, columns, matching, clock, commanded)
+    path, step = _with_whole_steps(given, path, config, columns, matching, clock, commanded, own)
     if not commanded:
         keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
         places = tuple(p for p in places if p.label in keep)
@@ -223,12 +223,11 @@ def _marked(
 
 
 def _with_whole_steps(
-    given: Path, path: Path, out: Path, columns: Columns, matching: Matching, clock: Clock, commanded: bool
+    given: Path, path: Path, out: Path, columns: Columns, matching: Matching, clock: Clock, commanded: bool, own: float
 ) -> tuple[Path, float]:
-    """The model that the config names, written where it is a copy, and its step in seconds."""
-    own = float(load_model(path if matching.of("marker") else given).opt.timestep)
+    """The model that the config names, written where it is a copy, and its step in seconds; ``own`` is the given's."""
     if matching.of("marker"):
-        return path, own
+        return path, float(load_model(path).opt.timestep)
     step = _whole_step(path, columns, clock, own)
     if step != own and path == given:
         path = out_of(out, path, "step")

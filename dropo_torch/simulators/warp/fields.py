@@ -218,11 +218,12 @@ class _Anchors:
 
     def __init__(self, model: mujoco.MjModel, space: ParameterSpace, columns: np.ndarray) -> None:
         written = {t.index // mujoco.mjNEQDATA for p in space.parameters for t in p.targets if t.field == "eq_data"}
+        self._maps, self.derived = [], np.array([], dtype=int)
+        if not written:
+            return
         data = mujoco.MjData(model)
-        if written:
-            mujoco.mj_kinematics(model, data)
+        mujoco.mj_kinematics(model, data)
         bodies = model.eq_objtype == int(mujoco.mjtObj.mjOBJ_BODY)
-        self._maps = []
         for i in sorted(written):
             if bodies[i] and model.eq_type[i] == int(mujoco.mjtEq.mjEQ_CONNECT):
                 own = torch.from_numpy(columns.reshape(model.neq, -1)[i]).long()
