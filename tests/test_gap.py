@@ -731,7 +731,7 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
         assert 0 <= place["share"] <= 1
     shares = [place["share"] for place in document["where"]]
     assert shares == sorted(shares, reverse=True)
-    assert all(set(r) == {"effect", "target", "values", "left", "round"} for r in document["ranking"])
+    assert all(set(r) == {"effect", "target", "values", "left", "round", "together"} for r in document["ranking"])
     assert set(document["declared"]["pole_mass"]) == {"given", "alone", "with_effects", "low", "high"}
     assert list(document["noise"]) == ["rail.position", "hinge.position", "rail.velocity", "hinge.velocity"]
     assert set(document["chi2_per_degree"]) == {"before", "after"}

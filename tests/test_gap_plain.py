@@ -19,7 +19,7 @@ from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
-from dropo_torch.gap.accept import undone
+from dropo_torch.gap.accept import nonsense, undone
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.family import needed, not_needed
 from dropo_torch.gap.ground import Ground
@@ -29,7 +29,7 @@ from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import NamedEffect, Strength
 from dropo_torch.gap.search import Ended, Naming, start, start_anywhere, with_ties
-from dropo_torch.gap.ties import _one_for_two, rivals_of_all, size
+from dropo_torch.gap.ties import _one_for_two, canonical, rivals_of_all, size
 from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem
 
@@ -432,6 +432,38 @@ def test_what_fades_beside_a_tie_is_dropped() -> None:
         fewer = _one_for_two(ground, replace(state, current=two), [(), (tied,)])
         assert (fewer is not None) == fades
         assert fewer is None or [p.key for p in fewer.hypothesis.placed] == [payload.key]
+
+
+def test_a_tie_at_a_bound_of_physics_or_that_leaves_more_takes_no_name() -> None:
+    def rub(model: mujoco.MjModel) -> None:
+        model.dof_damping[:] = 0.15, 0.02
+
+    scene = scene_of(PENDULUM, rub, lambda time, phases: np.zeros((len(time), 0)), shape=(6, 150))
+    named, plain, worse, absurd = (
+        Placed(VOCABULARY[n], "a", values)
+        for n, values in (
+            ("joint_quadratic_damping", (0.05,)), ("joint_damping", (0.1,)), ("armature", (0.0,)),
+            ("joint_damping", (-0.05,)),
+        )
+    )  # fmt: skip
+    ground = Ground(scene.evidence, (plain.effect, worse.effect, named.effect))
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    own = ground.refit(state.base.hypothesis.with_effects([named]))
+    alike = replace(own, cost=ground.refit(state.base.hypothesis.with_effects([plain])).cost)  # as if it were as good
+    for rival, takes in ((plain, True), (worse, False)):
+        found, told = canonical(ground, replace(state, current=alike), [(rival,)])
+        assert [p.key for p in found.current.hypothesis.placed] == [rival.key if takes else named.key]
+        assert [p.key for p in told[0]] == [named.key if takes else rival.key]
+    faster = scene_of(PENDULUM, lambda m: m.dof_damping.__setitem__(0, -0.1), lambda t, p: np.zeros((len(t), 0)))
+    ground = Ground(faster.evidence, (plain.effect, named.effect))
+    state = start(ground, faster.begin)
+    ground = ground.at(state)
+    pushed = ground.refit(state.base.hypothesis.with_effects([absurd]))
+    assert nonsense(ground, pushed)
+    alike = replace(ground.refit(state.base.hypothesis.with_effects([named])), cost=pushed.cost)
+    found, _ = canonical(ground, replace(state, current=alike), [(absurd,)])
+    assert [p.key for p in found.current.hypothesis.placed] == [named.key]
 
 
 def test_a_wave_longer_than_the_motion_is_no_ripple() -> None:

@@ -183,11 +183,17 @@ def test_a_position_that_rests_but_for_rounding_is_drawn(tmp_path: Path) -> None
     assert "as measured and as predicted" in page(tmp_path, replace(double(), courses=(resting,)))
 
 
-def test_what_comes_closest_to_a_gap_without_a_name_is_told() -> None:
+def test_what_comes_closest_to_a_gap_without_a_name_is_told(tmp_path: Path) -> None:
     gap = unnamed()
     assert "closest" not in gap_words.answer(gap)[0]
-    near = replace(gap, ranking=(*gap.ranking, Ranked("integration", None, {"step": 5e-4}, 0.052, 1)))
+    later = Ranked("armature", "elbow", {"armature": 0.1}, 0.01, 1)  # of what another effect has left
+    near = replace(gap, ranking=(*gap.ranking, Ranked("integration", None, {"step": 5e-4}, 0.052), later))
     assert "(the closest, a finer integration step, leaves 5.2\N{NO-BREAK SPACE}% of it)" in gap_words.answer(near)[0]
+    pair = Ranked("armature", "elbow", {"armature": 0.1}, 0.04, together=(("joint_friction", "elbow"),))
+    names = "rotor or gear inertia (armature) at elbow and dry (Coulomb) friction in elbow"
+    with_pair = replace(near, ranking=(*near.ranking, pair))
+    assert f"(the closest, {names}, leave 4\N{NO-BREAK SPACE}% of it)" in gap_words.answer(with_pair)[0]
+    assert "with dry (Coulomb) friction in elbow" in text_of(page(tmp_path, with_pair))
 
 
 CASES = {"single": single, "double": double, "null": null, "unnamed": unnamed}

@@ -16,8 +16,7 @@ from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.gap import Hypothesis, Scene, prepare
 from dropo_torch.gap.refit import refit
-from dropo_torch.gap.suggest import COMMANDS, STARTS, Advice, excite, motions, separation, suggest
-from dropo_torch.gap.twin import Windows
+from dropo_torch.gap.suggest import COMMANDS, IN_A_ROW, STARTS, Advice, excite, motions, separation, suggest
 from dropo_torch.problem import make_problem
 
 PENDULUM = """
@@ -92,7 +91,7 @@ def test_no_motion_is_proposed_between_two_names_of_one_thing() -> None:
 def test_a_rival_adapts_to_a_motion_as_far_as_the_log_lets_it() -> None:
     evidence = scene().evidence
     truth, rival = Hypothesis((), (placed(LINEAR, "pivot", 0.2),)), Hypothesis((), (placed(LINEAR, "pivot", 0.1),))
-    motion = evidence.on(dict(motions(evidence.windows, evidence.twin.setting))["the same motion again"])
+    motion = evidence.on(dict(motions(evidence, truth))["the same motion again"])
     wrong = refit(evidence, rival, iterations=0)
     free, tied = separation(motion, truth, wrong, share=0.0), separation(motion, truth, wrong, share=1e6)
     assert free is not None
@@ -107,21 +106,39 @@ def test_a_rival_without_numbers_is_compared_as_it_is() -> None:
 
 def test_commands_stay_within_their_range() -> None:
     model = scene().setting.model
-    strong = replace(scene().evidence.windows, commands=np.full((4, 151, model.nu), 0.8))
-    found = dict(motions(strong, scene().setting))
+    evidence = scene().evidence
+    strong = evidence.on(replace(evidence.windows, commands=np.full((4, 151, model.nu), 0.8)))
+    found = dict(motions(strong, Hypothesis(())))
     assert set(found) == set(COMMANDS)
-    assert np.unique(found["the same motion with commands twice as large"].commands) == pytest.approx([1.0])
+    windows = found["the same motion with commands twice as large"]
+    for episode, step in zip(windows.episodes, windows.steps, strict=True):
+        assert np.unique(windows.commands[episode, step:]) == pytest.approx([1.0])
 
 
 def test_where_nothing_is_commanded_motions_start_faster() -> None:
     passive = recorded(actuators="")
-    windows: Windows = passive.evidence.windows
-    found = dict(motions(windows, passive.setting))
+    found = dict(motions(passive.evidence, Hypothesis(())))
     assert set(found) == set(STARTS)
-    same, fast = (found[w].measured[:, 0] for w in ("the same motion again", "motions that start twice as fast"))
-    np.testing.assert_allclose(fast, same * [1, 2])
+    fast, logged = found["motions that start twice as fast"], passive.evidence.windows
+    for i in range(0, len(fast), IN_A_ROW):
+        (own,) = np.flatnonzero((logged.episodes == fast.episodes[i]) & (logged.steps == fast.steps[i]))
+        np.testing.assert_allclose(fast.measured[i, 0], logged.measured[own, 0] * [1, 2])
     idle = recorded(size=0.0)  # a motor that is off
-    assert set(dict(motions(idle.evidence.windows, idle.setting))) == set(STARTS)
+    assert set(dict(motions(idle.evidence, Hypothesis(())))) == set(STARTS)
+
+
+def test_a_motion_goes_on_as_it_would_be() -> None:
+    """Each of its windows starts where the one before has led, under the commands that are told."""
+    evidence, damped = scene().evidence, Hypothesis((), (placed(LINEAR, "pivot", 0.2),))
+    found = dict(motions(evidence, damped))
+    for words in set(COMMANDS) - {"the same motion again"}:
+        windows = found[words]
+        np.testing.assert_array_equal(windows.measured[1::IN_A_ROW, 0], windows.measured[::IN_A_ROW, -1])
+        there = evidence.twin.predict([damped.variant], windows)[0][0]
+        np.testing.assert_allclose(there, windows.measured, rtol=0, atol=1e-9)
+    slow, step = found["the same motion at half the speed"], evidence.windows.steps[0]
+    own = evidence.windows.commands[slow.episodes[0], step:]
+    np.testing.assert_array_equal(slow.commands[0, step : step + 40 : 2], own[:20])
 
 
 @pytest.mark.parametrize(

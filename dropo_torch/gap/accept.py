@@ -234,7 +234,7 @@ def swap(ground: Ground, state: State) -> State:
             rivals = [
                 (c.placed,) for c in alive[: tried.rivals] if c.chi2 < tried.promises * here
             ]  # that promise to explain more
-            found, state = ground.refits(state, without, rivals, "swapping")
+            found, _ = ground.refits(state, without, rivals, "swapping")
             better = [r for r in sound(ground, found[:1]) if r.cost.excess < state.current.cost.excess]
             if better and beats(ground, better[0], state.current):
                 state = replace(state, current=better[0])

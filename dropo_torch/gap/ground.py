@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -208,6 +208,7 @@ class Ground:
     def refits(
         self, state: State, beside: Refit, groups: Sequence[Sequence[Placed]], stage: str,
         origin: Hypothesis | None = None, most: int = 3, iterations: tuple[int, int] = (2, 5),
+        known: Hypothesis | None = None,
     ) -> tuple[list[Refit], State]:  # fmt: skip
         """Refit a hypothesis with each group of effects more; the best first, and the state with these attempts.
 
@@ -221,11 +222,12 @@ class Ground:
             origin: the hypothesis from which the fits begin; by default the fitted one.
             most: how many are fitted in full.
             iterations: of the fits on few windows: of all, and of the best ones.
+            known: a fitted hypothesis that they must come near, too.
         """
         if not groups:
             return [], state
         focus = self.focus(beside, 2 * FEWER)
-        before, known = focus.cost, len(beside.hypothesis.placed)
+        before, first = focus.cost, len(beside.hypothesis.placed)
 
         def rough(hypothesis: Hypothesis, most: int) -> Refit:
             return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=most, slopes=False)
@@ -237,9 +239,9 @@ class Ground:
         found.sort(key=lambda r: r.cost.excess)
         found[: most + 1] = [rough(r.hypothesis, iterations[1]) for r in found[: most + 1]]
         found.sort(key=lambda r: r.cost.excess)
-        left = [(p, r.cost.left_of(before)) for r in found for p in r.hypothesis.placed[known:]]
-        attempts = [Ranked(*p.key, p.summary(self.setting), share, state.number) for p, share in left]
-        best = found[0].cost
+        attempts = [a for r in found for a in self._ranked(r.hypothesis.placed[first:], r.cost.left_of(before), state)]
+        reached = [found[0].cost] if known is None else [found[0].cost, rough(known, iterations[0]).cost]
+        best = min(reached, key=lambda cost: cost.excess)
         tried = self.rules.tried
         near = best.excess + (tried.worse - 1) * max(best.misfit, 0.0)
         near += self.rules.least * before.above(best) + tried.sigmas * best.sigma
@@ -249,3 +251,9 @@ class Ground:
             full.append(self.refit(fitted.hypothesis))
         full.sort(key=lambda r: r.cost.excess)
         return full, replace(state, attempts=(*state.attempts, *attempts))
+
+    def _ranked(self, placed: Sequence[Placed], left: float, state: State) -> Iterator[Ranked]:
+        """Each of the effects that were tried together, with what they left together."""
+        for p in placed:
+            together = tuple(other.key for other in placed if other is not p)
+            yield Ranked(*p.key, p.summary(self.setting), left, state.number, together)

@@ -370,9 +370,9 @@ def _next_experiment(naming: Naming, final: Refit, report: Report) -> str | None
 
 
 def _ranking(attempts: Iterable[Ranked]) -> tuple[Ranked, ...]:
-    """The best attempt of every candidate in every round."""
-    best: dict[tuple[int, str, str | None], Ranked] = {}
+    """The best attempt of every candidate in every round, alone and together with others."""
+    best: dict[tuple[int, str, str | None, tuple[tuple[str, str | None], ...]], Ranked] = {}
     for tried in attempts:
-        key = (tried.round, tried.effect, tried.target)
+        key = (tried.round, tried.effect, tried.target, tried.together)
         best[key] = min(best.get(key, tried), tried, key=lambda r: r.left)
     return tuple(sorted(best.values(), key=lambda r: (r.round, r.left)))

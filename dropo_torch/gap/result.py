@@ -111,13 +111,22 @@ class Score:
 
 @dataclass(frozen=True)
 class Ranked:
-    """A candidate that was tried, for the report: the share of the excess that it left, and its numbers."""
+    """A candidate that was tried, for the report.
+
+    Attributes:
+        effect, target: the candidate.
+        values: its numbers.
+        left: share of the excess that was left with it, and with what it was tried together, of what there was without.
+        round: of the search; each begins from what the ones before have found.
+        together: effects and targets that were added along with it.
+    """
 
     effect: str
     target: str | None
     values: Mapping[str, float]
     left: float
     round: int = 0
+    together: tuple[tuple[str, str | None], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -307,7 +316,7 @@ class Gap:
             },
             "noise": dict(zip(self.labels, self.noise, strict=True)),
             "chi2_per_degree": dict(zip(("before", "after"), self.reduced, strict=True)),
-            "ranking": [asdict(r) for r in self.ranking],
+            "ranking": [asdict(r) | {"together": [_pair(p) for p in r.together]} for r in self.ranking],
             "left_out": [
                 {**_pair((e.effect, e.target)), "parameters": {n: asdict(s) for n, s in e.parameters.items()}}
                 for e in self.left_out

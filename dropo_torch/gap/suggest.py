@@ -12,27 +12,29 @@ from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import spread
 from dropo_torch.gap.refit import LEAST_DAMPING, RIDGE, STEP, Hypothesis, Refit, beside, limits_of, refit
 from dropo_torch.gap.rules import near
-from dropo_torch.gap.twin import Windows
+from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.optimizers.least_squares import bounded_step
 
-#: Windows of a motion that is tried, and of the log to which a rival is fitted.
-WINDOWS, LOGGED = 16, 40
+#: Windows of a motion that is tried, of these in a row, and of the log to which a rival is fitted.
+WINDOWS, IN_A_ROW, LOGGED = 16, 4, 40
 #: χ² that a motion must show, in units of what hypotheses may differ by and still explain a log alike.
 SURELY = 2.0
 #: Steps in which a rival adapts to the log, and to a motion.
 ADAPTED = 4
-#: Other commands ``(E, N, nu)`` for the motions of a log, by what they are called.
+#: The motion of the log.
+AGAIN = "the same motion again"
+#: Commands ``(N, nu)`` for motions like that of a log, by what they are called.
 COMMANDS: Mapping[str, Callable[[np.ndarray], np.ndarray]] = {
-    "the same motion again": lambda u: u,
+    AGAIN: lambda u: u,
     "the same motion with commands half as large": lambda u: 0.5 * u,
     "the same motion with commands twice as large": lambda u: 2 * u,
-    "the same motion at half the speed": lambda u: np.repeat(u, 2, axis=1)[:, : u.shape[1]],
-    "the same motion at twice the speed": lambda u: np.concatenate([u[:, ::2], u[:, 1::2]], axis=1),
+    "the same motion at half the speed": lambda u: np.repeat(u, 2, axis=0)[: len(u)],
+    "the same motion at twice the speed": lambda u: np.concatenate([u[::2], u[1::2]]),
     "a motion without commands": np.zeros_like,
 }
 #: Factors of the velocities at the start, where nothing is commanded.
 STARTS: Mapping[str, float] = {
-    "the same motion again": 1.0,
+    AGAIN: 1.0,
     "motions that start half as fast": 0.5,
     "motions that start twice as fast": 2.0,
 }
@@ -67,8 +69,8 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     """Return advice: of several motions the one that separates two hypotheses most, and by how many σ.
 
     The motions are those of the log with other commands, or with other velocities at the start where nothing is
-    commanded. The first hypothesis is taken for the truth there; the second may adapt all of its numbers to the
-    motion, as far as the log lets it, so that what is the same thing stays so.
+    commanded. The first hypothesis is taken for the truth there, so that windows lie along the motion as it would be;
+    the second may adapt all of its numbers to it, as far as the log lets it, so that what is the same thing stays so.
 
     Args:
         evidence: the windows of the log.
@@ -81,20 +83,19 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     rival, own = refit(log, second, iterations=ADAPTED), refit(log, first, iterations=0, slopes=False).cost
     share = len(evidence.windows) / max(len(log.windows), 1)
     found = []
-    for words, windows in motions(evidence.windows, evidence.twin.setting):
+    for words, windows in motions(evidence, first):
         apart = separation(evidence.on(windows), first, rival, share)
         if apart is not None:
-            found.append((apart, words))
+            found.append((apart, words, len(windows)))
     if not found:
         return Advice(f"No motion that was tried tells {names}.", tells=False)
-    most, words = max(found)
+    most, words, count = max(found)
     if most < max(evidence.rules.shown.apart, float(np.sqrt(SURELY * near(own, evidence.rules)))):
         return Advice(
             f"None of {len(found)} motions that were tried would tell {names} (at best {most:.1f} σ): "
             "on this robot they may be the same thing.",
             tells=False,
         )
-    count = min(WINDOWS, len(evidence.windows))
     sentence = f"To tell {names}, record {words}: over {count} windows it would separate them by {most:.0f} σ."
     return Advice(sentence, tells=True)
 
@@ -152,23 +153,61 @@ def _called(placed: Placed) -> str:
     return placed.effect.name + ("" if placed.target is None else f" of {placed.target}")
 
 
-def motions(windows: Windows, setting: Setting) -> list[tuple[str, Windows]]:
-    """Return motions to try, in words and as windows, from those of a log."""
-    base, model = spread(windows, WINDOWS), setting.model
-    if base.commands.any():
-        ranges = model.actuator_ctrlrange.T if model.nactuator == model.nu else None
+def motions(evidence: Evidence, true: Hypothesis) -> list[tuple[str, Windows]]:
+    """Return motions to try, in words and as windows: the log's own, and others as they would be by a hypothesis.
+
+    These go on from a few states of the log, with other commands, or with other velocities where nothing is commanded.
+
+    Args:
+        evidence: the windows of the log.
+        true: what is taken for the truth.
+    """
+    windows, twin = evidence.windows, evidence.twin
+    row = IN_A_ROW if windows.unseen is None else 1  # a position that no column has is known at a window's start only
+    room = windows.commands.shape[1] - windows.steps
+    if not (long := room >= row * windows.length).any():
+        row, long = 1, room >= windows.length
+    begins = spread(windows.select(long), WINDOWS // row)
+    if windows.commands.any():
+        others = [(words, _commanded(begins, twin.setting, vary)) for words, vary in COMMANDS.items()]
+    else:
+        others = [(words, _faster(begins, twin.setting, factor)) for words, factor in STARTS.items()]
+    played = [(words, _played(twin, true, other, row)) for words, other in others if words != AGAIN]
+    return [(AGAIN, spread(windows, WINDOWS)), *((words, motion) for words, motion in played if len(motion))]
+
+
+def _commanded(begins: Windows, setting: Setting, vary: Callable[[np.ndarray], np.ndarray]) -> Windows:
+    """The same starts, each with an episode of its own, in which commands change from there on, within their ranges."""
+    model, commands = setting.model, begins.commands[begins.episodes].copy()
+    for own, step in zip(commands, begins.steps, strict=True):
+        own[step:] = vary(own[step:])
+    if model.nactuator == model.nu:
         limited = model.actuator_ctrllimited.astype(bool)
-        found = []
-        for words, vary in COMMANDS.items():
-            commands = vary(base.commands)
-            if ranges is not None:
-                commands = np.where(limited, np.clip(commands, *ranges), commands)
-            found.append((words, replace(base, commands=np.ascontiguousarray(commands))))
-        return found
-    fast = setting.observation.index >= model.nq
-    found = []
-    for words, factor in STARTS.items():
-        measured = base.measured.copy()
-        measured[:, 0, fast] *= factor
-        found.append((words, replace(base, measured=measured, rates=factor * base.rates)))
-    return found
+        commands = np.where(limited, np.clip(commands, *model.actuator_ctrlrange.T), commands)
+    return replace(begins, commands=np.ascontiguousarray(commands), episodes=np.arange(len(begins)))
+
+
+def _faster(begins: Windows, setting: Setting, factor: float) -> Windows:
+    """The same starts with velocities so many times as large."""
+    measured = begins.measured.copy()
+    measured[:, 0, setting.observation.index >= setting.model.nq] *= factor
+    return replace(begins, measured=measured, rates=factor * begins.rates)
+
+
+def _played(twin: Twin, true: Hypothesis, begins: Windows, row: int) -> Windows:
+    """Windows of motions that go on from the starts of others, so many of each in a row; none of one that diverges."""
+    length = begins.length
+    path = np.repeat(begins.measured[:, :1], row * length + 1, axis=1)
+    shown = twin.predict([true.variant], replace(begins, measured=path))[0][0]
+    rates = np.gradient(shown, twin.setting.signals.timestep, axis=1)
+    rates[:, 0] = begins.rates
+    at = length * np.arange(row)
+    cut = Windows(
+        measured=shown[:, at[:, None] + np.arange(length + 1)].reshape(-1, length + 1, shown.shape[-1]),
+        rates=rates[:, at].reshape(-1, shown.shape[-1]),
+        episodes=np.repeat(begins.episodes, row),
+        steps=(begins.steps[:, None] + at).ravel(),
+        commands=begins.commands,
+        unseen=begins.unseen,
+    )
+    return cut.select(np.isfinite(shown).all((1, 2)).repeat(row))

@@ -48,8 +48,9 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Refit, ...], f
     others = [(p,) for p in (*near, *varieties(ground, near, own))]
     looking = replace(state, number=ROUND)
     rivals, found = ground.refits(
-        looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully, iterations=ITERATIONS
-    )
+        looking, without, others, "looking for ties", origin, most=ground.rules.alike.fully, iterations=ITERATIONS,
+        known=current.hypothesis,
+    )  # fmt: skip
     tied = tuple(r for r in rivals if as_good(ground, state, r))
     best = next((r for r in rivals if surpasses(ground, r, current) and not nonsense(ground, r)), current)
     return tied, without.cost.excess - current.cost.excess, replace(state, current=best, attempts=found.attempts)
@@ -162,13 +163,16 @@ def as_good(ground: Ground, state: State, rival: Refit) -> bool:
 def canonical(
     ground: Ground, state: State, tied: Sequence[tuple[Placed, ...]]
 ) -> tuple[State, tuple[tuple[Placed, ...], ...]]:
-    """Among exact ties name the one with the fewest numbers that the vocabulary lists first."""
+    """Among ties name the one with the fewest numbers that the vocabulary lists first, if it may have a name."""
     order = {effect.name: i for i, effect in enumerate(ground.effects)}
     listed = list(tied)
     for index, rivals in enumerate(listed):
         own = state.current.hypothesis.placed[index]
         first = min((own, *rivals), key=lambda p: (len(p.values), order[p.effect.name]))
-        if first is not own:
-            state = replace(state, current=ground.refit(state.current.hypothesis.instead(index, first)))
+        if first is own:
+            continue
+        instead = ground.refit(state.current.hypothesis.instead(index, first))
+        if as_good(ground, state, instead) and not nonsense(ground, instead):
+            state = replace(state, current=instead)
             listed[index] = tuple(own if p is first else p for p in rivals)
     return state, tuple(listed)

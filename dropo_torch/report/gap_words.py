@@ -108,6 +108,11 @@ def noun(effect: str, target: str | None) -> str:
     return f"{name} at {_at(effect, target)}" if target else name
 
 
+def group(places: Sequence[tuple[str, str | None]]) -> str:
+    """Return several effects and their places, the first few by name."""
+    return joined([noun(*place) for place in places], 3)
+
+
 def rivals(effect: NamedEffect) -> list[str]:
     """Return the effects that explain the log as well, each as a noun phrase."""
     return [noun(*rival) for rival in effect.indistinguishable_from]
@@ -239,10 +244,12 @@ def corrected(gap: Gap) -> list[str]:
 
 def _closest(gap: Gap) -> str:
     """What would explain most of a gap that has no name, if it is most, as it goes on from "explains"."""
-    best = min(gap.ranking, key=lambda r: r.left if np.isfinite(r.left) else np.inf, default=None)
+    whole = (r for r in gap.ranking if r.round == 0)  # later rounds tell what is left of what the ones before have left
+    best = min(whole, key=lambda r: r.left if np.isfinite(r.left) else np.inf, default=None)
     if best is None or not best.left < CLOSE:
         return ""
-    return f" (the closest, {noun(best.effect, best.target)}, leaves {percent(best.left)} of it)"
+    names = group(((best.effect, best.target), *best.together))
+    return f" (the closest, {names}, leave{'' if best.together else 's'} {percent(best.left)} of it)"
 
 
 def by_force(named: Sequence[NamedEffect]) -> list[str]:
