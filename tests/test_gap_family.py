@@ -24,8 +24,9 @@ from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap import family as members
 from dropo_torch.gap.evidence import Cost, Linearisation
-from dropo_torch.gap.family import base_family, joint_of, not_needed, pushing, shares_of, without_steps
+from dropo_torch.gap.family import base_family, not_needed, pushing, shares_of, without_steps
 from dropo_torch.gap.ground import Ground
+from dropo_torch.gap.limbs import alike, by_limbs, joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.rules import Rules, family_accounts
 from dropo_torch.gap.scene import prepare
@@ -301,3 +302,41 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     before: Any = SimpleNamespace(base=SimpleNamespace(cost=None, hypothesis=None))
     assert members.with_family(SimpleNamespace(rules=Rules()), before, few) is few  # type: ignore[arg-type]
     assert bool(judged) == looked
+
+
+LEG = """
+<body name="{n}_thigh" pos="{x} 0 0"><joint name="{n}_hip" axis="0 {s} 0" damping=".1" range="-{r} 1"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.2" mass=".5"/>
+  <body pos="0 0 -.2"><joint name="{n}_knee" axis="0 1 0" damping=".1"/>
+    <geom type="capsule" size=".01" fromto="0 0 0 0 0 -.2" mass="{m}"/></body></body>"""
+
+
+def legs(*masses: float) -> mujoco.MjModel:
+    text = "".join(LEG.format(n=n, x=0.2 * n, s=(-1) ** n, r=1 + n, m=m) for n, m in enumerate(masses))
+    servos = "".join(f'<motor name="{n}_servo" joint="{n}_knee"/>' for n in range(len(masses)))
+    return mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><body><freejoint/><geom size=".1" mass="4"/>{text}</body></worldbody>
+        <actuator>{servos}</actuator></mujoco>"""
+    )
+
+
+def test_joints_of_mirrored_legs_are_alike_and_those_of_another_leg_are_not() -> None:
+    names = [[legs(0.2, 0.2, 0.2).joint(j).name for j in group] for group in alike(legs(0.2, 0.2, 0.2))]
+    assert names == [["0_hip", "1_hip", "2_hip"], ["0_knee", "1_knee", "2_knee"]]
+    model = legs(0.2, 0.3, 0.2)  # the middle leg has a heavier shank
+    assert [[model.joint(j).name for j in group] for group in alike(model)] == [
+        ["0_hip", "2_hip"],
+        ["0_knee", "2_knee"],
+    ]
+    assert alike(legs(0.2)) == []
+
+
+def test_effects_are_tried_at_one_joint_of_each_leg() -> None:
+    model = legs(0.2, 0.2)
+    setting: Any = SimpleNamespace(model=model, joint=lambda target: model.joint(target).id)
+    friction = [Placed(VOCABULARY["joint_friction"], j, (0.1,)) for j in ("0_hip", "0_knee", "1_hip", "1_knee")]
+    assert by_limbs(setting, friction) == [[0, 2], [1, 3]]
+    assert by_limbs(setting, friction[:3]) == [[0, 2]]
+    gains = [Placed(VOCABULARY["actuator_gain"], f"{n}_servo", (0.9,)) for n in range(2)]
+    assert by_limbs(setting, gains) == []  # they are at all actuators
+    assert by_limbs(setting, [Placed(VOCABULARY["gravity_tilt"], None, (0.0, 0.0))]) == []

@@ -19,7 +19,7 @@ from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
-from dropo_torch.gap.accept import nonsense, undone
+from dropo_torch.gap.accept import add, nonsense, undone
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.family import needed, not_needed
 from dropo_torch.gap.ground import Ground
@@ -77,6 +77,17 @@ SPINNING = """
   </body></worldbody>
   <actuator><motor name="shoulder_motor" joint="shoulder" gear="12"/>
     <motor name="elbow_motor" joint="elbow" gear="4"/></actuator>
+</mujoco>"""
+LEG = """
+<body pos="{n} 0 1"><joint name="hip{n}" axis="0 1 0" damping=".1"/>
+  <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.2" mass=".5"/>
+  <body pos="0 0 -.2"><joint name="knee{n}" axis="0 1 0" damping=".1"/>
+    <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.2" mass=".3"/></body></body>"""
+LEGS = f"""
+<mujoco><option timestep="0.002" integrator="implicitfast"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>{"".join(LEG.format(n=n) for n in range(3))}</worldbody>
+  <actuator>{"".join(f'<motor joint="{joint}{n}"/>' for n in range(3) for joint in ("hip", "knee"))}</actuator>
 </mujoco>"""
 NOISE = {"position": 1e-4, "velocity": 1e-3}
 Change = Callable[[mujoco.MjModel], None]
@@ -464,6 +475,21 @@ def test_a_tie_at_a_bound_of_physics_or_that_leaves_more_takes_no_name() -> None
     alike = replace(ground.refit(state.base.hypothesis.with_effects([named])), cost=pushed.cost)
     found, _ = canonical(ground, replace(state, current=alike), [(absurd,)])
     assert [p.key for p in found.current.hypothesis.placed] == [named.key]
+
+
+def test_what_sits_in_one_joint_of_each_leg_is_found_at_once() -> None:
+    def rub(model: mujoco.MjModel) -> None:
+        model.dof_damping[1::2] += 0.15, 0.2, 0.25
+
+    def sway_apart(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
+        return np.stack([np.sin(4 * time + phases[i % 4] + i) * (0.6, 0.3)[i % 2] for i in range(6)], 1)
+
+    scene = scene_of(LEGS, rub, sway_apart, shape=(5, 150))
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in ("joint_damping", "armature")))
+    state = start(ground, scene.begin)
+    found = add(ground.at(state), state).current.hypothesis.placed
+    assert {p.key for p in found} == {("joint_damping", f"knee{n}") for n in range(3)}
+    assert sorted(p.values[0] for p in found) == pytest.approx([0.15, 0.2, 0.25], abs=0.01)
 
 
 def test_a_wave_longer_than_the_motion_is_no_ripple() -> None:

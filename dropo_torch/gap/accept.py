@@ -15,7 +15,17 @@ from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
 from dropo_torch.gap.renew import with_base
-from dropo_torch.gap.rules import accounts, allowance, beyond_free, may_leave, most_left, remains, significant, simplest
+from dropo_torch.gap.rules import (
+    accounts,
+    allowance,
+    beyond_free,
+    is_hopeless,
+    may_leave,
+    most_left,
+    remains,
+    significant,
+    simplest,
+)
 from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
@@ -157,15 +167,17 @@ def is_done(ground: Ground, state: State) -> bool:
 
 
 def add(ground: Ground, state: State) -> State:
-    """Accept the one or two effects that remove the most; where nothing does, the search is done.
+    """Accept the one or two effects, or the family, that remove the most; where nothing does, the search is done.
 
     Pairs and families are tried where no single effect removes most of what is left, unless what was accepted before
-    accounts for the gap: of the little that it leaves, not several more are found at once.
+    accounts for the gap: of the little that it leaves, not several more are found at once. One of them takes the place
+    of the best single effect where it leaves much less, or where that alone would end the search.
     """
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
     alive = [c for c in ranked if not c.dead]
-    singles, state = ground.refits(state, current, [(c.placed,) for c in alive[: rules.tried.refits]], "refitting")
+    hopeless, groups = most_left(current, rules) + rules.tried.slack, [(c.placed,) for c in alive[: rules.tried.refits]]
+    singles, state = ground.refits(state, current, groups, "refitting", hopeless=hopeless)
     state = replace(state, refused=next((why for r in singles[:1] for why in nonsense(ground, r)), state.refused))
     promising, singles = singles, sound(ground, singles)
     if promising and not singles:  # what contains them may explain as much within the bounds of physics
@@ -176,18 +188,25 @@ def add(ground: Ground, state: State) -> State:
         return replace(state, done=True)
     best = simplest(singles, rules)
     if best.cost.left_of(current.cost) > 1 - rules.most and not accounts(current, state.base, rules):
-        pairs, state = paired(ground, state, alive)
-        families = promising_families(ground.focus(current), alive, rules.tried)
-        several, state = ground.refits(state, current, families, "refitting families")
-        for tried in (pairs, sound(ground, several)):
-            if tried and tried[0].cost.left_of(best.cost) < rules.tried.clearer:
-                best = tried[0]
-    hopeless = best.cost.left_of(current.cost) > most_left(current, rules) or not matters(
-        ground, state.base, best, current
-    )
-    if hopeless or not beats(ground, best, current):
+        best, state = _among_several(ground, state, alive, best)
+    worse = is_hopeless(best, current, rules) or not matters(ground, state.base, best, current)
+    if worse or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best)
+
+
+def _among_several(ground: Ground, state: State, alive: Sequence[Candidate], best: Refit) -> tuple[Refit, State]:
+    """The best pair or family where it leaves much less than the best single effect, or where that is hopeless."""
+    rules, current = ground.rules, state.current
+    pairs, state = paired(ground, state, alive)
+    families = promising_families(ground.focus(current), alive, rules.tried)
+    found, state = ground.refits(state, current, families, "refitting families")
+    several = sound(ground, found)
+    for tried in (*pairs[:1], *([simplest(several, rules)] if several else [])):
+        clearer = tried.cost.left_of(best.cost) < rules.tried.clearer
+        if clearer or (is_hopeless(best, current, rules) and not is_hopeless(tried, current, rules)):
+            best = tried
+    return best, state
 
 
 def paired(ground: Ground, state: State, alive: Sequence[Candidate]) -> tuple[list[Refit], State]:

@@ -96,6 +96,10 @@ class Evidence:
         """Return the same over some of the windows."""
         return replace(self.on(self.windows.select(rows)), caps=np.broadcast_to(self.caps, len(self.windows))[rows])
 
+    def few(self, most: int) -> Evidence:
+        """Return the same over at most so many windows, evenly spread."""
+        return self.select(np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int)))
+
     @cached_property
     def chart(self) -> Features:
         """The features that are compared."""

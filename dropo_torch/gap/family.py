@@ -13,12 +13,13 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.effects import find_effect
-from dropo_torch.effects.actuator import driven_joint
-from dropo_torch.effects.base import Effect, Placed, Setting, object_number
+from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
 from dropo_torch.gap.accept import SOFT, extend, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, State
+from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
 from dropo_torch.gap.sound import absurd
@@ -27,6 +28,8 @@ from dropo_torch.gap.sound import absurd
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
 #: One more of them, where what these leave is more than noise; and those on top of which it is.
 SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
+#: Windows of the first fit.
+ROUGHLY = 12
 
 #: What is reported.
 STAGE = "fitting friction, inertia, offset and delay of all joints"
@@ -64,8 +67,9 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
         return found
-    fitted = fitted_family(ground, state.base.hypothesis)
-    if fitted.cost.left_of(cost) > rules.hopeless * rules.clearer[int(kind)]:
+    most = rules.hopeless * rules.clearer[int(kind)]
+    fitted = fitted_family(ground, state.base.hypothesis, (best.current.hypothesis, most))
+    if fitted is None or fitted.cost.left_of(cost) > most:
         return found
     whole = whole_family(ground, fitted)
     if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)]:
@@ -90,15 +94,32 @@ def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
     return whole
 
 
-def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
-    """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest."""
-    family, iterations = base_family(ground.setting, ground.effects), ground.rules.family.iterations
+def fitted_family(ground: Ground, begin: Hypothesis, rival: tuple[Hypothesis, float] | None = None) -> Refit | None:
+    """Return the base family fitted at every joint, first on few windows.
+
+    Args:
+        ground: what the search stands on.
+        begin: to what its members are added.
+        rival: a fitted hypothesis, and the share of what it leaves that the family may leave on few windows; where it
+            leaves more, it is not fitted on all, and none is returned.
+    """
     ground.report(STAGE, 0.0)
-    prompt = ground.refit(begin.with_effects([p for p in family if not p.effect.is_filter]), iterations=iterations)
-    late = ground.refit(
-        prompt.hypothesis.with_effects([p for p in family if p.effect.is_filter]), iterations=iterations
-    )
-    return late if late.loss < prompt.loss else prompt
+    few, iterations = ground.part.few(ROUGHLY), ground.rules.family.iterations
+    rough = _roughly(few, begin, base_family(ground.setting, ground.effects), iterations)
+    if rival is not None:
+        own = refit(few, rival[0], iterations=0, slopes=False).cost
+        if rough.cost.left_of(own) > rival[1]:
+            return None
+    ground.report(STAGE, 0.25)
+    return ground.refit(rough.hypothesis, iterations=iterations)
+
+
+def _roughly(few: Evidence, begin: Hypothesis, family: Sequence[Placed], iterations: int) -> Refit:
+    """The family fitted on few windows: first without delays, which otherwise stand for the rest."""
+    prompt, late = ([p for p in family if p.effect.is_filter == wanted] for wanted in (False, True))
+    fitted = refit(few, begin.with_effects(prompt), iterations=iterations, slopes=False)
+    later = refit(few, fitted.hypothesis.with_effects(late), iterations=iterations, slopes=False)
+    return later if later.loss < fitted.loss else fitted
 
 
 def softened(ground: Ground, whole: Refit) -> Refit | None:
@@ -261,13 +282,6 @@ def spread_out(setting: Setting, hypothesis: Hypothesis, members: int) -> bool:
 def one_kind(hypothesis: Hypothesis) -> bool:
     """Return whether the effects are one effect at three or more places."""
     return len(hypothesis.placed) > 2 and len({p.effect.name for p in hypothesis.placed}) == 1
-
-
-def joint_of(setting: Setting, placed: Placed) -> int | None:
-    """Return the joint at which a member of the family sits; ``None`` for what drives none."""
-    if placed.effect.kind == "joint":
-        return setting.joint(placed.target)
-    return driven_joint(setting.model, object_number(setting.model, "actuator", placed.target))
 
 
 def joint_names(setting: Setting) -> dict[str, str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -208,7 +209,7 @@ class Ground:
     def refits(
         self, state: State, beside: Refit, groups: Sequence[Sequence[Placed]], stage: str,
         origin: Hypothesis | None = None, most: int = 3, iterations: tuple[int, int] = (2, 5),
-        known: Hypothesis | None = None,
+        known: Hypothesis | None = None, hopeless: float = math.inf,
     ) -> tuple[list[Refit], State]:  # fmt: skip
         """Refit a hypothesis with each group of effects more; the best first, and the state with these attempts.
 
@@ -223,6 +224,7 @@ class Ground:
             most: how many are fitted in full.
             iterations: of the fits on few windows: of all, and of the best ones.
             known: a fitted hypothesis that they must come near, too.
+            hopeless: share of the excess that none but the best may leave roughly.
         """
         if not groups:
             return [], state
@@ -246,7 +248,9 @@ class Ground:
         near = best.excess + (tried.worse - 1) * max(best.misfit, 0.0)
         near += self.rules.least * before.above(best) + tried.sigmas * best.sigma
         full = []
-        for number, fitted in enumerate(r for r in found[:most] if r.cost.excess <= near):
+        chosen = [r for r in found[:most] if r.cost.excess <= near]
+        chosen[1:] = [r for r in chosen[1:] if r.cost.left_of(before) <= hopeless]
+        for number, fitted in enumerate(chosen):
             self.report(stage, (len(groups) + number / (most + 1)) / (len(groups) + 2))
             full.append(self.refit(fitted.hypothesis))
         full.sort(key=lambda r: r.cost.excess)

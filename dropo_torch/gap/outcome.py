@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -38,7 +38,7 @@ from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows
-from dropo_torch.gap.verify import constant_velocity, cut_held, score, scores
+from dropo_torch.gap.verify import Held, constant_velocity, cut_held, score, scores
 from dropo_torch.parameters import ParameterSpace
 
 #: Fits after the last one, at most, each with the weights that the one before suggests.
@@ -61,6 +61,51 @@ WORSE = "the model predicts unseen data worse than without them"
 MEDIAN = 0.455
 
 
+@dataclass(frozen=True)
+class _Fitted:
+    """What was named, fitted on all windows.
+
+    Attributes:
+        evidence: all windows, with the noise that they show.
+        final: the last fit.
+        last: the same as the step of the simulation leaves it; ``None`` where nothing is named.
+        rest: the fit as noise alone weighs the residuals.
+        alone: the declared parameters alone, weighed alike.
+        own_step: χ² per degree of freedom with the model's own step and a finer one, where that is all that remains.
+    """
+
+    evidence: Evidence
+    final: Refit
+    last: Resolved | None
+    rest: Refit
+    alone: Refit
+    own_step: tuple[float, float] | None
+
+
+@dataclass(frozen=True)
+class _Checked:
+    """What unseen data say.
+
+    Attributes:
+        held: the unseen data.
+        given: the declared parameters alone.
+        after: with what was named.
+        floor: what noise alone would leave.
+        constant: the open-loop error of constant velocity.
+    """
+
+    held: Held
+    given: Score
+    after: Score
+    floor: Score
+    constant: float
+
+    @property
+    def astray(self) -> float:
+        """The open-loop error in units of what noise alone makes."""
+        return self.after.rollout_rmse / max(self.floor.rollout_rmse, 1e-300)
+
+
 def make_result(scene: Scene, naming: Naming, started: float, report: Report = lambda stage, share: None) -> Gap:
     """Fit what was named on all windows, score it on held-out data, and put everything together.
 
@@ -70,61 +115,88 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         started: when it began, by ``time.perf_counter``.
         report: called with a stage and its share done.
     """
-    problem, twin, setting, evidence = scene.problem, scene.twin, scene.setting, naming.evidence
-    rules, noise, base = scene.rules, evidence.noise, naming.base.hypothesis
-    last, rest, alone, own_step = None, naming.final, naming.base, None
-    if naming.named:
-        report("fitting on all windows", 0.0)
-        last, rest, own = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
-        own_step = _own_step(own, rest.cost, rules)
-        if not np.array_equal(last.evidence.noise, noise):
-            evidence, noise = replace(evidence, noise=last.evidence.noise), last.evidence.noise
-            alone = refit(evidence, base, iterations=0, slopes=False)
-    final = naming.final if last is None else last.fit
+    fitted = _fitted_on_all(scene, naming, report)
+    checked = _checked(scene, naming, fitted, report)
+    if not naming.gap and checked.astray > scene.rules.sound.astray:
+        naming = replace(naming, gap=True, refused=UNSEEN.format(checked.astray))
+    if (unnamed := _refuted(naming, fitted, checked, scene.rules)) is not None:
+        return make_result(scene, unnamed, started, report)
+    return _put_together(scene, naming, fitted, checked, started, report)
+
+
+def _fitted_on_all(scene: Scene, naming: Naming, report: Report) -> _Fitted:
+    """The last fit, and the declared parameters alone."""
+    evidence, alone = naming.evidence, naming.base
+    if not naming.named:
+        return _Fitted(evidence, naming.final, None, naming.final, alone, None)
+    report("fitting on all windows", 0.0)
+    last, rest, own = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
+    if not np.array_equal(last.evidence.noise, evidence.noise):
+        evidence = replace(evidence, noise=last.evidence.noise)
+        alone = refit(evidence, alone.hypothesis, iterations=0, slopes=False)
+    return _Fitted(evidence, last.fit, last, rest, alone, _own_step(own, rest.cost, scene.rules))
+
+
+def _checked(scene: Scene, naming: Naming, fitted: _Fitted, report: Report) -> _Checked:
+    """The scores on unseen data."""
+    evidence, best = fitted.evidence, fitted.final.hypothesis
     report("verifying", 0.0)
-    held = cut_held(evidence, scene.held, final.hypothesis)
+    held = cut_held(evidence, scene.held, best)
     report("verifying", 0.4)
-    after_score, floor = scores(evidence, held, final.hypothesis)
+    after, floor = scores(evidence, held, best)
     report("verifying", 0.7)
-    given = score(evidence, held, base) if naming.named else after_score
-    constant = constant_velocity(evidence, held.rollouts)
-    astray = after_score.rollout_rmse / max(floor.rollout_rmse, 1e-300)
-    if not naming.gap and astray > rules.sound.astray:
-        naming = replace(naming, gap=True, refused=UNSEEN.format(astray))
-    if naming.named and not has_skill(after_score, floor, constant, rules.sound):
-        return make_result(scene, _without_names(naming, UNSKILLED, after_score, constant), started, report)
-    if naming.named and remains(rest.cost, rules) and after_score.rollout_rmse > given.rollout_rmse:
-        return make_result(scene, _without_names(naming, WORSE, after_score, given.rollout_rmse), started, report)
-    skill = has_skill(given, floor, constant, rules.sound)
+    given = score(evidence, held, naming.base.hypothesis) if naming.named else after
+    return _Checked(held, given, after, floor, constant_velocity(evidence, held.rollouts))
+
+
+def _refuted(naming: Naming, fitted: _Fitted, checked: _Checked, rules: Rules) -> Naming | None:
+    """What was found, without names, where unseen data refute these; else ``None``."""
+    after, given, constant = checked.after, checked.given, checked.constant
+    if not naming.named:
+        return None
+    if not has_skill(after, checked.floor, constant, rules.sound):
+        return _without_names(naming, UNSKILLED, after, constant)
+    if remains(fitted.rest.cost, rules) and after.rollout_rmse > given.rollout_rmse:
+        return _without_names(naming, WORSE, after, given.rollout_rmse)
+    return None
+
+
+def _put_together(
+    scene: Scene, naming: Naming, fitted: _Fitted, checked: _Checked, started: float, report: Report
+) -> Gap:
+    """The result that people and programs read."""
+    problem, twin, setting, rules = scene.problem, scene.twin, scene.setting, scene.rules
+    evidence, noise, best = fitted.evidence, fitted.evidence.noise, fitted.final.hypothesis
+    base, skill = naming.base.hypothesis, has_skill(checked.given, checked.floor, checked.constant, rules.sound)
     report("verifying", 0.8)
-    short, best = scene.short, final.hypothesis
-    before = free_forces(twin, short, base.variant, noise)
-    after = free_forces(twin, short, best.variant, noise) if naming.named else before
+    before = free_forces(twin, scene.short, base.variant, noise)
+    after = free_forces(twin, scene.short, best.variant, noise) if naming.named else before
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
-        shown = (_unnamed(setting, before),) if last is None else _named(setting, naming, last)
-    untold = naming.named and (own_step is None or naming.partial)
-    remaining = _remaining(setting, naming, alone.cost, rest, after, astray, rules) if untold else None
+        shown = (_unnamed(setting, before),) if fitted.last is None else _named(setting, naming, fitted.last)
+    remaining = None
+    if naming.named and (fitted.own_step is None or naming.partial):
+        remaining = _remaining(setting, naming, fitted.alone.cost, fitted.rest, after, checked.astray, rules)
     declared = zip(scene.begin.declared, base.declared, best.declared, strict=True)
     return Gap(
         where=places(setting, before, naming.first, rules.shown) if naming.gap else (),
         effects=shown,
-        before=given,
-        after=after_score,
-        noise_floor=floor,
-        next_experiment=_next_experiment(naming, final, report),
+        before=checked.given,
+        after=checked.after,
+        noise_floor=checked.floor,
+        next_experiment=_next_experiment(naming, fitted.final, report),
         found=naming.gap,
         declared=dict(zip(problem.space.names, declared, strict=True)),
-        fitted=_fitted(problem.space, evidence, best, last),
+        fitted=_fitted(problem.space, evidence, best, fitted.last),
         noise=tuple(noise.tolist()),
         labels=evidence.chart.labels,
         units=evidence.chart.units,
-        reduced=(alone.cost.reduced, rest.cost.reduced),
+        reduced=(fitted.alone.cost.reduced, fitted.rest.cost.reduced),
         ranking=_ranking(naming.attempts),
         residuals=residual_pictures(setting, before, after, 2 if naming.gap else 0),
-        courses=courses(evidence, held, base, best),
+        courses=courses(evidence, checked.held, base, best),
         cannot_judge=tuple(p.key for p in naming.first.silent),
-        rollout_seconds=held.seconds,
+        rollout_seconds=checked.held.seconds,
         window=evidence.windows.length,
         simulated_transitions=twin.simulated_transitions,
         seconds=time.perf_counter() - started,
@@ -135,7 +207,7 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         remaining=remaining,
         refused=naming.refused,
         unfinished=naming.unfinished,
-        own_step=own_step,
+        own_step=fitted.own_step,
         joints=joint_names(setting) if naming.family else {},
         left_out=_left_out(setting, naming.left_out),
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",

@@ -71,13 +71,14 @@ class Tried:
     Attributes:
         refits: candidates that are refitted in a round.
         paired: candidates of which pairs are tried, where no single one removes most.
-        pairs, families: of these, how many are refitted.
+        pairs, families: of these, how many are refitted; as many families at all places, and at one joint of each limb.
         anew: times that pairs are chosen, each without candidates that make the best of the ones before nonsense.
         clearer: share of what the best single one leaves below which a pair or a family takes its place.
         promises: share of the misfit that a rival for an accepted effect promises to leave, to be refitted;
         rivals: how many are.
         worse: excess of a rough fit, relative to the best one's, up to which it is fitted in full, and
         sigmas: standard deviations of χ² that it may have besides.
+        slack: by how much a rough fit may leave more than lets the search go on, to be fitted in full beside the best.
         dead: standard deviations of the noise by which a candidate must move the screened windows to be judged.
     """
 
@@ -91,6 +92,7 @@ class Tried:
     rivals: int = 3
     worse: float = 3.0
     sigmas: float = 10.0
+    slack: float = 0.05
     dead: float = 1.5
 
 
@@ -342,6 +344,11 @@ def most_left(current: Refit, rules: Rules) -> float:
     """Return the share of its excess that the best candidate beside a hypothesis may leave, or the search ends."""
     imitates = beyond_free(current.hypothesis, rules) and current.cost.reduced > rules.sound.wrong
     return rules.imitating if imitates else rules.hopeless
+
+
+def is_hopeless(better: Refit, current: Refit, rules: Rules) -> bool:
+    """Return whether what would be added to a hypothesis removes too little for the search to go on with it."""
+    return better.cost.left_of(current.cost) > most_left(current, rules)
 
 
 def accounts(named: Refit, base: Refit, rules: Rules) -> bool:

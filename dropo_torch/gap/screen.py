@@ -18,6 +18,7 @@ import numpy as np
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant, parts
 from dropo_torch.gap.evidence import Cost, Evidence
+from dropo_torch.gap.limbs import by_limbs
 from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
 from dropo_torch.gap.rules import Tried
 
@@ -198,18 +199,23 @@ def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.
 
 
 def promising_families(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:
-    """Return the effects of one number that, at all their targets together, predict the least χ².
+    """Return the effects of one number that, at several of their targets together, predict the least χ².
 
-    Friction or damping is seldom missing in one joint only. A family is offered where it promises much less than
-    what its best single member leaves.
+    Friction or damping is seldom missing in one joint only: it is at all of them, or at the same joint of each limb. A
+    family is offered where it promises much less than what its best single member leaves.
     """
     families: dict[str, list[Candidate]] = {}
     for c in candidates:
         if not c.dead and len(c.placed.values) == 1:
             families.setdefault(c.placed.effect.name, []).append(c)
-    best = _best(focus, [members for members in families.values() if len(members) > 1])
-    clear = (members for left, members in best if left < tried.clearer * min(c.chi2 for c in members))
-    return [[c.placed for c in members] for members in clear][: tried.families]
+    setting, whole = focus.evidence.twin.setting, list(families.values())
+    parts = [[m[i] for i in rows] for m in whole for rows in by_limbs(setting, [c.placed for c in m])]
+    found = list[list[Placed]]()
+    for groups in (whole, parts):
+        best = _best(focus, [members for members in groups if len(members) > 1])
+        clear = (members for left, members in best if left < tried.clearer * min(c.chi2 for c in members))
+        found += [[c.placed for c in members] for members in clear][: tried.families]
+    return found
 
 
 def promising_pairs(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:

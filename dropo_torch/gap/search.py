@@ -288,7 +288,8 @@ def resort(ground: Ground, naming: Naming) -> Naming:
         return naming
     evidence = replace(naming.evidence, caps=1.0)
     here, base = with_base(replace(ground, evidence=evidence), naming.base.hypothesis)
-    if (whole := whole_family(here, fitted_family(here, base.hypothesis))) is None:
+    fitted = fitted_family(here, base.hypothesis)
+    if fitted is None or (whole := whole_family(here, fitted)) is None:
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
     state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.few)
