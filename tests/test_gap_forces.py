@@ -287,7 +287,8 @@ def test_a_joint_that_rests_leaves_the_names_of_others(tmp_path: Path) -> None:
     config.write_text(config.read_text().replace("[:3]", "[:4]"))
     found = view_of(dropo.make_problem(dropo.load_config(config), general=True))
     expected = view_of(plain)
-    assert found is not None and expected is not None
+    assert found is not None
+    assert expected is not None
     assert [p.key for p in found.placed] == [p.key for p in expected.placed] != []
     assert found.shares == pytest.approx(expected.shares, rel=0.05)
     assert found.share(found.left) == pytest.approx(expected.share(expected.left), rel=0.05)
