@@ -74,8 +74,9 @@ def has_forces(setting: Setting) -> bool:
 def highest_frequency(log: Trajectories, setting: Setting) -> float:
     """Return the frequency in Hz below which the joints move, by the power of their velocities; 0 if none does.
 
-    Episodes of one transition show none. White noise of the positions is no motion: over a short stretch, where a slow motion is a steady one, it would be
-    most of what there is besides. The frequency of a steady motion is the lowest that a stretch can show.
+    Episodes of one transition show none. White noise of the positions is no motion: over a short stretch, where a slow
+    motion is a steady one, it would be most of what there is besides. The frequency of a steady motion is the lowest
+    that a stretch can show.
     """
     frequencies, powers, turning = [], [], []
     for path, _ in _paths(log, setting):
