@@ -12,7 +12,6 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Method, Placed, Setting, apply_all
-from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED
