@@ -75,7 +75,7 @@ WRONG_CONFIGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "observation": ({"observation": ["shouldr.position"]}, ("no joint 'shouldr'", "did you mean 'shoulder'")),
     "observation of another width": ({"observation": ["qpos"]}, ("[qpos] has 2 columns and the log has 4",)),
     "mask": ({"mask": ["elbow.velocty"]}, ("elbow.velocty", "did you mean 'elbow.velocity'")),
-    "everything masked": ({"mask": [0, 1, 2, 3]}, ("every column is masked",)),
+    "everything masked": ({"mask": [0, 1, 2, 3]}, ("every column is masked; leave at least one column unmasked",)),
     "trajectories": ({"trajectories": 3}, ("trajectories: 3 asked for", "has 2")),
     "trajectory outside": ({"trajectories": [5]}, ("episode 5", "2 episodes")),
     "trajectory of text": ({"trajectories": [1.5]}, ("trajectories.0 is 1.5", "whole number")),
@@ -523,5 +523,23 @@ def test_ctrl_c_ends_with_130_and_one_line(folder: Folder, tmp_path: Path) -> No
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert error == "dropo: interrupted; the same command with --resume goes on where it stopped\n"
+    assert error == "dropo: interrupted; the same command with --resume continues from there\n"
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]
+
+
+def test_resuming_is_offered_where_it_is_possible(
+    folder: Folder, tmp_path: Path, refused: Callable, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    """``certify`` and ``check`` begin anew each time: they have no ``--resume``, and Ctrl-C advises none."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dropo_torch.problem.make_problem", interrupted)
+    monkeypatch.setattr("dropo_torch.commands.fit.make_problem", interrupted, raising=False)
+    for command in ("certify", "fit"):
+        arguments = (command, str(folder.config()), "--out", str(tmp_path / command))
+        assert main(arguments) == 130
+        offered = capfd.readouterr().err == "dropo: interrupted; the same command with --resume continues from there\n"
+        assert offered == (command == "fit")
+    assert "resume" in refused("certify", folder.config(), "--out", tmp_path / "certify", "--resume")
