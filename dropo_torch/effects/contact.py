@@ -10,7 +10,6 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, object_number
 
-
 #: Sliding friction of slippery things, from which a search begins where the model has less, or none.
 LEAST = 0.1
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY, Effect, Placed
+from dropo_torch.errors import InputError
 from dropo_torch.gap.forces.motion import has_forces
 from dropo_torch.gap.forces.view import ForceView, force_view
 from dropo_torch.gap.ground import Ground, Report
@@ -223,5 +224,12 @@ def _ruled(scene: Scene, rules: Rules | None) -> Scene:
 
 
 def _ground(scene: Scene, effects: Sequence[Effect] | None) -> Ground:
-    """What a search stands on, by default with the whole vocabulary."""
-    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), short=scene.noisy)
+    """What a search stands on, by default with the whole vocabulary.
+
+    Raises:
+        InputError: an empty vocabulary.
+    """
+    known = tuple(VOCABULARY.values() if effects is None else effects)
+    if not known:
+        raise InputError("effects: none given; name at least one, or leave effects out to look for all there are")
+    return Ground(scene.evidence, known, short=scene.noisy)

@@ -93,8 +93,8 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
         rules: thresholds.
 
     Raises:
-        InputError: a simulator without a MuJoCo model; a model in which mocap bodies act; a log too short to judge anything, or one with a position whose
-            velocity is not observed: a window needs its initial state.
+        InputError: a simulator without a MuJoCo model; a model in which mocap bodies act; a log too short to judge
+            anything, or one with a position whose velocity is not observed: a window needs its initial state.
     """
     if problem.space.model is None or problem.observation.size == 0:
         raise InputError("gap: this simulator is no MuJoCo model; effects can only be looked for in one")
