@@ -22,6 +22,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+import torch
 import yaml
 from dropo_sims.push.guided import record_guided, write_model
 
@@ -32,6 +33,7 @@ from dropo_torch.data.readers import read_trajectories
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
 from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.task import load_task
 from dropo_torch.support.yaml_text import load_yaml
 
 ROOT = Path(__file__).parents[1]
@@ -401,6 +403,23 @@ def test_crane(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert friction.value == pytest.approx(example.FRICTION, rel=2e-3)
     assert delay.value == pytest.approx(5e-3 * example.LATE, rel=2e-3)
     assert gap.after.mse < 1.1 * gap.noise_floor.mse < 0.1 * gap.before.mse
+
+
+def test_crane_task(tmp_path: Path) -> None:
+    """Nothing is better than rest at the target, and the command that pages name trains on it."""
+    load_example(ROOT / "examples" / "crane.py").main(["--out", str(tmp_path)])
+    name = f"{ROOT / 'examples' / 'crane_task.py'}:Deliver"
+    task, still = load_task(name), torch.zeros(4, dtype=torch.float64)
+    still[0] = load_example(ROOT / "examples" / "crane_task.py").TARGET
+    states = torch.cat([still[None], still + task.initial_states(50, torch.Generator().manual_seed(0))])
+    rewards = task.reward(states, torch.zeros(51, 1), states)
+    assert rewards[0] == 1
+    assert ((rewards[1:] > 0) & (rewards[1:] < 1)).all()
+    small = {"num_envs": 2, "steps": 32, "horizon": 8, "minibatch": 16, "epochs": 1, "evaluations": 1, "episodes": 1}
+    options = [word for key, value in small.items() for word in (f"--train.{key}", str(value))]
+    command = ["train", str(tmp_path / "crane.yaml"), "--out", str(tmp_path / "policy"), "--task", name, *options]
+    assert cli.main([*command, "--threads", "1"]) == 0
+    assert (tmp_path / "policy" / "policy.pt").is_file()
 
 
 def test_every_effect_is_documented() -> None:
