@@ -368,9 +368,16 @@ def test_a_run_touches_nothing_of_the_users_in_its_folder(
 
 
 def test_an_interrupted_run_is_moved_aside_by_a_fresh_one(folder: Folder, tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.bin").write_bytes(b"hours of work")
+    """The state of every search of a gap among what it left, whatever the search is called."""
+    left = ("checkpoint.bin", "gap-progress.bin", "gap-progress-given.bin", "gap-progress-given-other.bin")
+    for name in left:
+        (tmp_path / name).write_bytes(b"hours of work")
+    (tmp_path / "progress.bin").write_bytes(b"mine")
     assert main(["fit", str(folder.config()), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "previous-1" / "checkpoint.bin").read_bytes() == b"hours of work"
+    assert {p.name: p.read_bytes() for p in (tmp_path / "previous-1").iterdir()} == dict.fromkeys(
+        left, b"hours of work"
+    )
+    assert (tmp_path / "progress.bin").read_bytes() == b"mine"
 
 
 def test_the_config_of_a_result_gives_the_same_result_from_any_folder(folder: Folder, tmp_path: Path) -> None:
