@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import os
 import re
@@ -26,6 +27,7 @@ import torch
 import yaml
 from dropo_sims.push.guided import record_guided, write_model
 
+import dropo_torch as dropo
 from benchmarks.sensed_logs import PENDULUM
 from dropo_torch.commands import cli
 from dropo_torch.config import make_config, parse_overrides
@@ -38,6 +40,7 @@ from dropo_torch.support.yaml_text import load_yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+API = ROOT / "docs" / "api.md"
 ROWS = 120
 
 #: The robot that the pages speak of: a two-joint arm whose fingers slide over the floor.
@@ -420,6 +423,17 @@ def test_crane_task(tmp_path: Path) -> None:
     command = ["train", str(tmp_path / "crane.yaml"), "--out", str(tmp_path / "policy"), "--task", name, *options]
     assert cli.main([*command, "--threads", "1"]) == 0
     assert (tmp_path / "policy" / "policy.pt").is_file()
+
+
+def test_functions_that_fit_and_search_say_what_they_take_and_raise() -> None:
+    """Every argument, and in which cases they raise an InputError."""
+    searches = [getattr(dropo.gap, name) for name in re.findall(r"^   gap\.([a-z_]+)$", API.read_text(), re.MULTILINE)]
+    functions = [dropo.fit_problem, dropo.fit, dropo.make_problem, dropo.gap.find_gap_as_given, *searches]
+    for function in filter(inspect.isfunction, functions):
+        told, _, raised = (inspect.getdoc(function) or "").partition("Raises:")
+        given = {name.strip() for line in re.findall(r"^ *([\w, ]+): ", told, re.MULTILINE) for name in line.split(",")}
+        assert set(inspect.signature(function).parameters) <= given, function.__name__
+        assert "InputError: " in raised or function is dropo.gap.add, function.__name__
 
 
 def test_every_effect_is_documented() -> None:
