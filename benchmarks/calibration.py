@@ -3,7 +3,7 @@
     python benchmarks/calibration.py --logs 100 --out out/calibration --workers 2     # --resume goes on
 
 Writes ``cells/``, a file a fit, and ``calibration.md``. Mass and damping are searched for; the
-log has 60 transitions and noise on their ends, whose variance is ε. :mod:`dropo_torch.studies.calibration` has the
+log has 60 transitions and noise on their ends, whose variance is ε. ``intervals.py`` has the
 two kinds of log.
 """
 
@@ -20,8 +20,8 @@ from typing import Any
 import numpy as np
 
 import dropo_torch as dropo
+from benchmarks.intervals import KINDS, CalibrationCell, CalibrationRun, Coverage, calibrate, coverages
 from dropo_torch.commands.options import workers
-from dropo_torch.studies.calibration import KINDS, CalibrationCell, CalibrationRun, Coverage, calibrate, coverages
 from dropo_torch.studies.study import run_cells
 
 MODEL = """

@@ -24,10 +24,10 @@ import dropo_sims.push.record
 import numpy as np
 
 import dropo_torch as dropo
+from benchmarks.intervals import CalibrationCell, wilson
 from dropo_torch.commands.options import workers
 from dropo_torch.gap.refit import Z90
 from dropo_torch.models.bundled import BundledSim
-from dropo_torch.studies.calibration import CalibrationCell, wilson
 from dropo_torch.studies.study import grouped
 
 RECORDERS: dict[str, ModuleType] = {"push": dropo_sims.push.record, "puck": dropo_sims.puck.record}

@@ -21,9 +21,9 @@ import calibration
 import numpy as np
 
 import dropo_torch as dropo
+from benchmarks.intervals import KINDS, CalibrationCell, draw_truths, synthesise, wilson, with_log
 from dropo_torch.distribution import SearchBox, to_values
 from dropo_torch.gap.refit import Z90
-from dropo_torch.studies.calibration import KINDS, CalibrationCell, draw_truths, synthesise, wilson, with_log
 from dropo_torch.studies.study import grouped
 
 #: Where the noise is, in the place of a cell's method → what the config says of it.

@@ -32,6 +32,8 @@ _YAML = (".yaml", ".yml")
 SCHEMA = "dropo-torch/distribution/1"
 #: A truncated normal reaches this many σ from its mean.
 TRUNCATION = 2.0
+#: Eigenvalue of a correlation up to which it counts as zero.
+SINGULAR = 1e-9
 _LOG_SQRT_2PI = 0.5 * math.log(2 * math.pi)
 
 
@@ -160,25 +162,35 @@ class Distribution:
         return self.rsample(base_uniforms(num_samples, len(self), generator))
 
     def log_prob(self, values: torch.Tensor) -> torch.Tensor:
-        """Return the log-density of values ``(..., d)``, in units; ``(...)``, -inf outside the support."""
+        """Return the log-density of values ``(..., d)``, in units; ``(...)``, -inf outside the support.
+
+        Raises:
+            InputError: a singular correlation, such as that of two parameters which always move together: draws fill no
+                volume, so that there is no density.
+        """
+        density, share = self._marginals(values)
+        total = density.sum(-1)
+        if self.correlation is None:
+            return total
+        within = torch.where(torch.isfinite(total)[..., None], share, 0.5).clamp(1e-12, 1 - 1e-12)
+        return total + copula_log_density(torch.special.ndtri(within), torch.as_tensor(self.correlation))
+
+    def _marginals(self, values: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Log-density of each value by itself, -inf outside its support, and the probability below it, ``(..., d)``."""
         is_log = torch.as_tensor(self.is_log)
         x = torch.where(is_log, torch.log(values), values)
         stretch = torch.where(is_log, x, 0.0)  # d(log v)/dv = 1/v
         if self.is_uniform:
             low, high = (torch.as_tensor(e) for e in self.ends)
-            density = -torch.log(high - low) - stretch
-            return torch.where((x >= low) & (x <= high), density, -torch.inf).sum(-1)
+            density, share = -torch.log(high - low) - stretch, (x - low) / (high - low)
+            return torch.where((x >= low) & (x <= high), density, -torch.inf), share
         mean, std, *_ = self._normals
         a, b = truncated_interval(*self._normals)
         z = (x - mean) / std
         below = torch.special.ndtr(a)
         mass = torch.special.ndtr(b) - below
         density = -0.5 * z * z - _LOG_SQRT_2PI - torch.log(std) - torch.log(mass) - stretch
-        total = torch.where((z >= a) & (z <= b), density, -torch.inf).sum(-1)
-        if self.correlation is None:
-            return total
-        share = ((torch.special.ndtr(z) - below) / mass).clamp(1e-12, 1 - 1e-12)
-        return total + copula_log_density(torch.special.ndtri(share), torch.as_tensor(self.correlation))
+        return torch.where((z >= a) & (z <= b), density, -torch.inf), (torch.special.ndtr(z) - below) / mass
 
     def summary(self) -> dict[str, dict[str, Any]]:
         """Return name → mean, std, low, high, unit, limits (and ``log_mean``, ``log_std`` where log-scaled)."""
@@ -269,7 +281,7 @@ def _correlation(given: Any, size: int, path: Path) -> np.ndarray | None:
     except (TypeError, ValueError):
         matrix = np.empty(0)
     fits = matrix.shape == (size, size) and np.allclose(matrix, matrix.T) and np.allclose(np.diag(matrix), 1)
-    if not fits or np.linalg.eigvalsh(matrix).min() < -1e-9:
+    if not fits or np.linalg.eigvalsh(matrix).min() < -SINGULAR:
         raise InputError(f"distribution: {path}: correlation is no correlation matrix of {size} parameters")
     return matrix
 
@@ -282,7 +294,13 @@ def correlate(uniforms: torch.Tensor, correlation: torch.Tensor) -> torch.Tensor
 
 
 def copula_log_density(scores: torch.Tensor, correlation: torch.Tensor) -> torch.Tensor:
-    """Return the log-density of a Gaussian copula at normal scores ``(..., d)``, ``(...)``."""
+    """Return the log-density of a Gaussian copula at normal scores ``(..., d)``, ``(...)``.
+
+    Raises:
+        InputError: a singular correlation.
+    """
+    if float(torch.linalg.eigvalsh(correlation).min()) <= SINGULAR:
+        raise InputError("distribution: its correlation is singular, so that it has no density; it can be drawn from")
     inverse, log_det = torch.linalg.inv(correlation), torch.linalg.slogdet(correlation)[1]
     pull = inverse - torch.eye(len(correlation), dtype=correlation.dtype)
     return -0.5 * log_det - 0.5 * torch.einsum("...i,ij,...j->...", scores, pull, scores)

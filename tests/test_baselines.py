@@ -16,6 +16,17 @@ import yaml
 from conftest import LinearSimulator, generic_observation, linear_objective, space_of
 from dropo_sims.hopper.study import REDUCED, Plan, all_cells, run_study
 
+from benchmarks.intervals import (
+    KINDS,
+    CalibrationCell,
+    CalibrationRun,
+    calibrate,
+    coverages,
+    draw_truths,
+    interval,
+    synthesise,
+    wilson,
+)
 from dropo_torch.baselines import Mixture, fit_problem, make_search
 from dropo_torch.baselines.bayessim import summaries, summary_sums
 from dropo_torch.baselines.laplace import LaplaceOptimizer
@@ -35,17 +46,6 @@ from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.report import write_fit_report
 from dropo_torch.report.words import findings
-from dropo_torch.studies.calibration import (
-    KINDS,
-    CalibrationCell,
-    CalibrationRun,
-    calibrate,
-    coverages,
-    draw_truths,
-    interval,
-    synthesise,
-    wilson,
-)
 from dropo_torch.support.random import draw_uniforms
 
 #: A driven pendulum; the rod has no mass, the bob's is to be found.

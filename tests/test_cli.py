@@ -75,7 +75,7 @@ WRONG_CONFIGS: dict[str, tuple[dict[str, Any], tuple[str, ...]]] = {
     "observation": ({"observation": ["shouldr.position"]}, ("no joint 'shouldr'", "did you mean 'shoulder'")),
     "observation of another width": ({"observation": ["qpos"]}, ("[qpos] has 2 columns and the log has 4",)),
     "mask": ({"mask": ["elbow.velocty"]}, ("elbow.velocty", "did you mean 'elbow.velocity'")),
-    "everything masked": ({"mask": [0, 1, 2, 3]}, ("every column is masked",)),
+    "everything masked": ({"mask": [0, 1, 2, 3]}, ("every column is masked; leave at least one column unmasked",)),
     "trajectories": ({"trajectories": 3}, ("trajectories: 3 asked for", "has 2")),
     "trajectory outside": ({"trajectories": [5]}, ("episode 5", "2 episodes")),
     "trajectory of text": ({"trajectories": [1.5]}, ("trajectories.0 is 1.5", "whole number")),
@@ -368,9 +368,16 @@ def test_a_run_touches_nothing_of_the_users_in_its_folder(
 
 
 def test_an_interrupted_run_is_moved_aside_by_a_fresh_one(folder: Folder, tmp_path: Path) -> None:
-    (tmp_path / "checkpoint.bin").write_bytes(b"hours of work")
+    """The state of every search of a gap among what it left, whatever the search is called."""
+    left = ("checkpoint.bin", "gap-progress.bin", "gap-progress-given.bin", "gap-progress-given-other.bin")
+    for name in left:
+        (tmp_path / name).write_bytes(b"hours of work")
+    (tmp_path / "progress.bin").write_bytes(b"mine")
     assert main(["fit", str(folder.config()), "--out", str(tmp_path)]) == 0
-    assert (tmp_path / "previous-1" / "checkpoint.bin").read_bytes() == b"hours of work"
+    assert {p.name: p.read_bytes() for p in (tmp_path / "previous-1").iterdir()} == dict.fromkeys(
+        left, b"hours of work"
+    )
+    assert (tmp_path / "progress.bin").read_bytes() == b"mine"
 
 
 def test_the_config_of_a_result_gives_the_same_result_from_any_folder(folder: Folder, tmp_path: Path) -> None:
@@ -523,5 +530,23 @@ def test_ctrl_c_ends_with_130_and_one_line(folder: Folder, tmp_path: Path) -> No
     process.send_signal(signal.SIGINT)
     error = process.communicate(timeout=60)[1]
     assert process.returncode == 130
-    assert error == "dropo: interrupted; the same command with --resume goes on where it stopped\n"
+    assert error == "dropo: interrupted; the same command with --resume continues from there\n"
     assert [p.name for p in tmp_path.iterdir()] == ["checkpoint.bin"]
+
+
+def test_resuming_is_offered_where_it_is_possible(
+    folder: Folder, tmp_path: Path, refused: Callable, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture
+) -> None:
+    """``certify`` and ``check`` begin anew each time: they have no ``--resume``, and Ctrl-C advises none."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dropo_torch.problem.make_problem", interrupted)
+    monkeypatch.setattr("dropo_torch.commands.fit.make_problem", interrupted, raising=False)
+    for command in ("certify", "fit"):
+        arguments = (command, str(folder.config()), "--out", str(tmp_path / command))
+        assert main(arguments) == 130
+        offered = capfd.readouterr().err == "dropo: interrupted; the same command with --resume continues from there\n"
+        assert offered == (command == "fit")
+    assert "resume" in refused("certify", folder.config(), "--out", tmp_path / "certify", "--resume")

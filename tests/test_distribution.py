@@ -158,6 +158,40 @@ def test_parameters_are_independent():
     torch.testing.assert_close(p.log_prob(values), expected, rtol=1e-12, atol=1e-12)
 
 
+CORRELATION = np.array([[1.0, 0.5], [0.5, 1.0]])
+
+
+def correlated(*, is_uniform: bool = False, correlation: np.ndarray = CORRELATION) -> Distribution:
+    space = space_of(a=[0, 2], b={"bounds": [1, 10], "scale": "log"})
+    mean, std = np.array([1.0, 1.0]), np.array([0.3, 0.2])
+    return Distribution.over(space, mean, std, correlation=correlation, is_uniform=is_uniform)
+
+
+@pytest.mark.parametrize("is_uniform", [False, True])
+def test_a_correlated_density_is_that_of_its_draws(is_uniform):
+    """It integrates to one and gives the draws' moments, and is zero outside the support."""
+    p = correlated(is_uniform=is_uniform)
+    low, high = (np.where(p.is_log, np.exp(end), end) for end in p.ends)
+    axes = [torch.linspace(*ends, 801, dtype=torch.float64)[1:] - (ends[1] - ends[0]) / 1600
+            for ends in zip(low, high, strict=True)]  # fmt: skip
+    grid = torch.cartesian_prod(*axes)
+    density = p.log_prob(grid).exp() * np.prod(high - low) / len(grid)
+    assert float(density.sum()) == pytest.approx(1, abs=2e-3)
+    draws = p.sample(200_000, torch.Generator().manual_seed(0))
+    product = (grid - draws.mean(0)).prod(-1)
+    assert float((density * product).sum()) == pytest.approx(float((draws - draws.mean(0)).prod(-1).mean()), rel=0.05)
+    outside = torch.tensor([[1.0, 0.0], [1.0, -1.0], [5.0, 3.0], [-9.0, -9.0], [1.0, 90.0]], dtype=torch.float64)
+    assert (p.log_prob(outside) == -torch.inf).all()
+
+
+def test_a_singular_correlation_can_be_drawn_from_and_has_no_density():
+    p = correlated(correlation=np.ones((2, 2)))
+    draws = p.sample(100, torch.Generator().manual_seed(0))
+    assert np.corrcoef(draws[:, 0], draws[:, 1].log())[0, 1] == pytest.approx(1, abs=1e-6)
+    with pytest.raises(InputError, match="correlation is singular, so that it has no density"):
+        p.log_prob(draws)
+
+
 def mixed() -> Distribution:
     space = space_of(
         friction={"bounds": [0, 2], "limits": [0, 5], "unit": "N m"},

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import inspect
 import json
 import os
 import re
@@ -22,9 +23,11 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+import torch
 import yaml
 from dropo_sims.push.guided import record_guided, write_model
 
+import dropo_torch as dropo
 from benchmarks.sensed_logs import PENDULUM
 from dropo_torch.commands import cli
 from dropo_torch.config import make_config, parse_overrides
@@ -32,10 +35,12 @@ from dropo_torch.data.readers import read_trajectories
 from dropo_torch.fit import refuse_dead_parameters
 from dropo_torch.problem import make_problem
 from dropo_torch.rl.policy import Policy
+from dropo_torch.rl.task import load_task
 from dropo_torch.support.yaml_text import load_yaml
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+API = ROOT / "docs" / "api.md"
 ROWS = 120
 
 #: The robot that the pages speak of: a two-joint arm whose fingers slide over the floor.
@@ -401,6 +406,34 @@ def test_crane(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
     assert friction.value == pytest.approx(example.FRICTION, rel=2e-3)
     assert delay.value == pytest.approx(5e-3 * example.LATE, rel=2e-3)
     assert gap.after.mse < 1.1 * gap.noise_floor.mse < 0.1 * gap.before.mse
+
+
+def test_crane_task(tmp_path: Path) -> None:
+    """Nothing is better than rest at the target, and the command that pages name trains on it."""
+    load_example(ROOT / "examples" / "crane.py").main(["--out", str(tmp_path)])
+    name = f"{ROOT / 'examples' / 'crane_task.py'}:Deliver"
+    task, still = load_task(name), torch.zeros(4, dtype=torch.float64)
+    still[0] = load_example(ROOT / "examples" / "crane_task.py").TARGET
+    states = torch.cat([still[None], still + task.initial_states(50, torch.Generator().manual_seed(0))])
+    rewards = task.reward(states, torch.zeros(51, 1), states)
+    assert rewards[0] == 1
+    assert ((rewards[1:] > 0) & (rewards[1:] < 1)).all()
+    small = {"num_envs": 2, "steps": 32, "horizon": 8, "minibatch": 16, "epochs": 1, "evaluations": 1, "episodes": 1}
+    options = [word for key, value in small.items() for word in (f"--train.{key}", str(value))]
+    command = ["train", str(tmp_path / "crane.yaml"), "--out", str(tmp_path / "policy"), "--task", name, *options]
+    assert cli.main([*command, "--threads", "1"]) == 0
+    assert (tmp_path / "policy" / "policy.pt").is_file()
+
+
+def test_functions_that_fit_and_search_say_what_they_take_and_raise() -> None:
+    """Every argument, and in which cases they raise an InputError."""
+    searches = [getattr(dropo.gap, name) for name in re.findall(r"^   gap\.([a-z_]+)$", API.read_text(), re.MULTILINE)]
+    functions = [dropo.fit_problem, dropo.fit, dropo.make_problem, dropo.gap.find_gap_as_given, *searches]
+    for function in filter(inspect.isfunction, functions):
+        told, _, raised = (inspect.getdoc(function) or "").partition("Raises:")
+        given = {name.strip() for line in re.findall(r"^ *([\w, ]+): ", told, re.MULTILINE) for name in line.split(",")}
+        assert set(inspect.signature(function).parameters) <= given, function.__name__
+        assert "InputError: " in raised or function is dropo.gap.add, function.__name__
 
 
 def test_every_effect_is_documented() -> None:

@@ -143,6 +143,23 @@ def test_every_number_of_every_candidate_is_one(unseen: tuple[str, ...]) -> None
         assert lacking >= set(unseen) & set(effect.targets(setting))
 
 
+@pytest.mark.parametrize("friction", [0.0, 1e-4, 0.8])
+def test_friction_can_be_found_however_little_the_model_has(friction: float) -> None:
+    """It has a size, and searches begin near what slippery things have, or near what the model has."""
+    model = mujoco.MjModel.from_xml_string(
+        f"""<mujoco><worldbody><geom name="floor" type="plane" size="9 9 1" friction="{friction}"/>
+        <body pos="0 0 .1"><freejoint/><geom name="box" size=".1" friction="{friction}"/></body></worldbody></mujoco>"""
+    )
+    effect, setting = find_effect("contact_friction"), setting_of(model)
+    for target in ("floor", "box"):
+        (number,) = effect.quantities(setting, target)
+        assert number.neutral == pytest.approx(friction)
+        assert number.scale >= 0.03
+        starts = np.concatenate(effect.starts(setting, target))
+        assert (np.abs(starts - friction) >= 0.3 * number.scale).all()
+        assert (starts <= number.high).all()
+
+
 @pytest.mark.parametrize("name", VOCABULARY)
 def test_every_effect_keeps_its_laws(name: str) -> None:
     check_effect(VOCABULARY[name], idle=IDLE.get(name, ()), numbers=NUMBERS.get(name))

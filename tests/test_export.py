@@ -99,6 +99,13 @@ def test_several_parameters_are_exported_together(source: Path, tmp_path: Path) 
         np.testing.assert_allclose(read_field(written, field), read_field(wanted, field), rtol=1e-4, atol=1e-6)
 
 
+def test_a_direction_is_exported_with_length_one(source: Path, tmp_path: Path) -> None:
+    space = ParameterSpace(source, {"a": {"field": "jnt_axis[0]", "name": "hinge", "bounds": [0.1, 0.9]}})
+    export_model(source, space, np.array([0.5]), tmp_path / "model.xml")
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    np.testing.assert_allclose(written.jnt_axis, space.apply([0.5]).jnt_axis, atol=1e-6)
+
+
 def test_a_model_with_meshes_and_includes_loads_from_another_folder(tmp_path: Path) -> None:
     robot = tmp_path / "robot"
     (robot / "meshes").mkdir(parents=True)

@@ -37,9 +37,9 @@ from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, i
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
-from dropo_torch.gap.locate import guilty, regime
+from dropo_torch.gap.locate import guilty, middles, regime, slopes
 from dropo_torch.gap.log import cut_windows
-from dropo_torch.gap.noise import Diverges, _relative_noise, free_forces
+from dropo_torch.gap.noise import Diverges, FreeForces, _relative_noise, free_forces
 from dropo_torch.gap.outcome import _notes
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
 from dropo_torch.gap.remaining import Remaining
@@ -50,6 +50,7 @@ from dropo_torch.gap.scene import outstanding, searched, short_windows
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Ended, Naming, believed, start
 from dropo_torch.gap.sound import absurd, has_skill
+from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows, secants
 from dropo_torch.gap.verify import cut_held, hold_out, rollout_floor, score, scores
 from dropo_torch.problem import Problem, make_problem
@@ -1567,6 +1568,23 @@ def test_regime_is_told(name: str, dof: int, words: str) -> None:
     assert regime(scene.setting, free, dof).words == words
 
 
+def test_the_slope_of_a_line_is_the_same_over_however_many_windows() -> None:
+    values, blocks = np.random.default_rng(0).normal(size=40), np.repeat([0, 1, 2], [3, 7, 30])
+    assert slopes(values, 2.0 * values - 1.0, blocks) == pytest.approx([2.0, 2.0, 2.0], rel=1e-12)
+
+
+def test_a_formula_says_of_what_it_is_a_share() -> None:
+    """Of the mean square, a constant force being something to explain; which is a number by itself."""
+    scene = scene_of()
+    windows = cut_windows(scene.train, scene.setting.observation, 6, stride=2)
+    draw = np.random.default_rng(0)
+    velocity = middles(scene.setting, windows)[1][:, 0]
+    for force, words in ((np.full(len(windows), 5.0), "≈ 5 (100 % "), (5 + 3 * velocity, "≈ 5 + 3·v(rail) (100 % ")):
+        forces = np.stack([force + 1e-3 * draw.normal(size=len(force)), force], 1)
+        free = FreeForces(scene.noise, scene.noise, forces, forces, windows)
+        assert describe(scene.setting, free, 0, Rules().shown) == f"force at rail {words}of its mean square)"
+
+
 def test_place_is_told() -> None:
     place = found(("joint_damping",)).where[0]
     assert (place.kind, place.name, place.when) == ("joint", "hinge", "in proportion to the velocity of hinge")
@@ -1855,6 +1873,22 @@ def test_the_steps_one_by_one_say_what_the_whole_says() -> None:
     after, _ = gap_package.verify(scene, naming.final.hypothesis)
     assert before.mse > 10 * floor.mse
     assert after.mse < 2 * floor.mse
+
+
+def test_no_effects_are_not_all_effects() -> None:
+    scene = scene_of()
+    for step in (gap_package.locate, gap_package.name):
+        with pytest.raises(InputError, match=r"^effects: none given; name at least one"):
+            step(scene, effects=[])
+    with pytest.raises(InputError, match=r"^effects: none given"):
+        find_gap(scene.problem, effects=(), scene=scene)
+
+
+def test_a_log_of_one_transition_is_told_what_is_needed() -> None:
+    log = scene_of().train
+    with pytest.raises(InputError, match=r"^data: .* has one transition; expected enough of them"):
+        hold_out(log.select(slice(0, 1)))
+    assert [len(part) for part in hold_out(log.select(slice(0, 2)))] == [1, 1]
 
 
 @pytest.mark.slow

@@ -260,6 +260,40 @@ def test_a_joint_that_turns_steadily_is_slow(tmp_path: Path) -> None:
     assert 1.9 < turned(3 * time - 0.02 * np.cos(4 * np.pi * time)) < 2.6  # and what it does besides is a motion
 
 
+def test_an_episode_of_one_transition_changes_nothing(tmp_path: Path) -> None:
+    """It was aborted: it has no frequency, whether other episodes have one or not."""
+    problem = problem_of(tmp_path, 0, seconds=8.0)
+    log, setting = problem.trajectories, make_setting(problem, problem.trajectories)
+    aborted = log.terminals.copy()
+    aborted[-2] = True
+    found = [highest_frequency(x, setting) for x in (log, replace(log, terminals=aborted))]
+    assert 0 < found[0] == pytest.approx(found[1], rel=0.05)
+    assert highest_frequency(replace(log, terminals=np.ones_like(aborted)), setting) == 0
+
+
+def test_a_joint_that_rests_leaves_the_names_of_others(tmp_path: Path) -> None:
+    """Nothing at all is missing there, which is neither a reason for an effect elsewhere nor against it."""
+    rest = '<body><joint name="rest" type="slide" axis="1 0 0"/><geom size=".02" mass="1" pos="0 9 0"/></body>'
+    model = ARM.replace("</worldbody>", f"{rest}</worldbody>").replace(
+        "</actuator>", '<motor joint="rest"/></actuator>'
+    )
+    plain = problem_of(tmp_path, 0, friction=(0.5, 0.8, 0.3))
+    held = np.load(tmp_path / "log.npz")
+    rows = np.insert(held["observations"], [3, 6], 0.0, axis=1)
+    arrays = {**held, "observations": rows, "actions": np.insert(held["actions"], 3, 0.0, axis=1)}
+    (tmp_path / "arm.xml").write_text(model)
+    np.savez(tmp_path / "log.npz", **arrays)
+    config = plain.config.path("arm.yaml")
+    config.write_text(config.read_text().replace("[:3]", "[:4]"))
+    found = view_of(dropo.make_problem(dropo.load_config(config), general=True))
+    expected = view_of(plain)
+    assert found is not None
+    assert expected is not None
+    assert [p.key for p in found.placed] == [p.key for p in expected.placed] != []
+    assert found.shares == pytest.approx(expected.shares, rel=0.05)
+    assert found.share(found.left) == pytest.approx(expected.share(expected.left), rel=0.05)
+
+
 def test_only_logs_with_all_forces_are_judged(tmp_path: Path) -> None:
     def holds(old: str, new: str) -> bool:
         assert old in ARM
@@ -319,6 +353,21 @@ def test_a_prior_holds_what_the_signal_does_not_show(linear: Callable) -> None:
     told[5] = 1e-3
     found = regression.fit(replace(problem, columns=columns, prior=told), np.ones(6, dtype=bool))
     assert abs(found[5]) < 3e-3
+
+
+def test_an_output_without_a_signal_has_no_say(linear: Callable) -> None:
+    """Chances and shares are those of the other outputs."""
+    problem, chosen = linear(4), np.arange(6) < 2
+    none = np.zeros((6, len(problem.signal), 1))
+    more = replace(problem, signal=np.insert(problem.signal, 2, 0.0, axis=1),
+                   columns=np.concatenate([problem.columns, none], 2))  # fmt: skip
+    parts = [np.arange(6) == p for p in range(2)]
+    assert regression.chances(more, chosen, parts) == pytest.approx(regression.chances(problem, chosen, parts))
+    whole = [regression.unseen(p, chosen).mean(0) for p in (problem, more)]
+    first = [regression.unseen(p, ~chosen & chosen).mean(0) for p in (problem, more)]
+    found = [regression.share_left(*pair) for pair in zip(whole, first, strict=True)]
+    assert 0 < found[0] == pytest.approx(found[1])
+    assert regression.share_left(np.zeros(2), np.zeros(2)) == 0
 
 
 def test_chance_chooses_rarely(linear: Callable) -> None:

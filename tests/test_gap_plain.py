@@ -16,7 +16,7 @@ import yaml
 
 from dropo_torch.config import load_config
 from dropo_torch.data.observation import parse_observation
-from dropo_torch.effects import VOCABULARY, Placed
+from dropo_torch.effects import VOCABULARY, Placed, find_effect
 from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
 from dropo_torch.gap.accept import add, nonsense, undone
@@ -27,11 +27,12 @@ from dropo_torch.gap.locate import regressors
 from dropo_torch.gap.log import cut_windows, spread
 from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
-from dropo_torch.gap.result import NamedEffect, Strength
+from dropo_torch.gap.result import NamedEffect, Place, Strength
 from dropo_torch.gap.search import Ended, Naming, start, start_anywhere, with_ties
 from dropo_torch.gap.ties import _one_for_two, canonical, rivals_of_all, size
 from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem
+from dropo_torch.report import gap_words
 
 RAIL = """
 <mujoco><option timestep="0.005" integrator="implicitfast"/>
@@ -311,6 +312,16 @@ def test_what_ties_with_members_of_a_family_ties_with_it() -> None:
     (whole,) = merge_families(members, setting)
     assert whole.target == "*"
     assert whole.indistinguishable_from == (("actuator_damping", "motor one"), ("actuator_damping", "motor three"))
+
+
+def test_bodies_are_called_so() -> None:
+    setting = scene_of(TRIPLE, lambda model: None, lambda t, phases: np.zeros((len(t), 0)), shape=(4, 60)).setting
+    number = {"factor": Strength(1.3, 1.2, 1.4, "-")}
+    names = [t for t in find_effect("inertia").targets(setting) if t is not None]
+    members = tuple(NamedEffect("inertia", name, number, 0.3) for name in names)
+    (whole,) = merge_families(members, setting)
+    assert whole.sentence == find_effect("inertia").sentence.format(target="all bodies")
+    assert gap_words.place_name(Place("body", "*", 0.5, "")) == "all bodies" == gap_words.target_name("*", "inertia")
 
 
 DRIVES = """

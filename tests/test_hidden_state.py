@@ -12,6 +12,8 @@ from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects.engine import Variant, VariantEngine
 from dropo_torch.effects.placing import plain_setting
 from dropo_torch.errors import InputError
+from dropo_torch.gap.log import make_setting
+from dropo_torch.gap.scene import prepare
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.problem import make_problem
 from dropo_torch.simulators import make_simulator
@@ -143,4 +145,26 @@ def test_a_log_without_the_mocap_poses_is_refused_by_name(tmp_path) -> None:
         "parameters: {mass: {field: body_mass, name: tool, bounds: [0.1, 1.0]}}\n"
     )
     with pytest.raises(InputError, match=r"2 action columns, but .* 0 actuators and 7 numbers of mocap poses \(hand"):
+        make_problem(load_config(tmp_path / "robot.yaml"))
+
+
+def test_effects_are_refused_where_mocap_bodies_act(tmp_path) -> None:
+    """By the search for them, too, in one line; a setting is made of the commands alone."""
+    (tmp_path / "gripper.xml").write_text(GRIPPER)
+    rows, ends, poses = np.zeros((60, 13)), np.arange(60) == 59, np.zeros((60, 7))
+    rows[:, 2], rows[:, 3], poses[:, 3] = 0.5 + 0.1 * np.sin(np.arange(60)), 1.0, 1.0
+    np.savez(tmp_path / "log.npz", observations=rows, next_observations=rows, actions=poses, terminals=ends)
+    text = (
+        "model: gripper.xml\ndata: log.npz\nframe_skip: 4\n"
+        "parameters: {mass: {field: body_mass, name: tool, bounds: [0.1, 1.0]}}\n"
+    )
+    (tmp_path / "robot.yaml").write_text(text)
+    problem = make_problem(load_config(tmp_path / "robot.yaml"), general=True)
+    with pytest.raises(InputError, match=r"^gap: mocap bodies \(hand\) cannot be had together with effects$"):
+        prepare(problem)
+    assert make_setting(problem, problem.trajectories).signals.command.shape == (0,)
+    (tmp_path / "robot.yaml").write_text(
+        text + "effects: [{effect: external_force, target: tool, x: 0.5, y: 0, z: 0}]\n"
+    )
+    with pytest.raises(InputError, match=r"^effects: mocap bodies \(hand\) cannot be had together with effects$"):
         make_problem(load_config(tmp_path / "robot.yaml"))

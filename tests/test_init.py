@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from types import SimpleNamespace
 
 import mujoco
 import numpy as np
@@ -16,10 +18,12 @@ import yaml
 import dropo_torch as dropo
 from benchmarks.init.systems import ROBOTS
 from dropo_torch.commands.cli import main
+from dropo_torch.parameters import ParameterSpace
 from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
 from dropo_torch.proposal.clock import find_clock
 from dropo_torch.proposal.columns import read_columns
+from dropo_torch.proposal.information import nominal_point
 from dropo_torch.proposal.matching import match_columns, motion
 from dropo_torch.proposal.places import places_of
 from dropo_torch.proposal.words import read_name
@@ -646,3 +650,15 @@ def test_columns_of_a_dataset_have_names(tmp_path: Path) -> None:
     assert clock.column.entry == "timestamp"
     assert clock.episode is not None
     assert clock.episode.entry == "episode_index"
+
+
+def test_the_point_at_which_a_log_is_asked_is_the_models() -> None:
+    """Values of logarithmic parameters by their logarithms; within the search box, where the model is outside of it."""
+    entries = {"field": "body_mass", "name": "cart"}
+    model = cartpole()
+    boxes = {"inside": [0.5, 5.0], "above": [0.5, 1.2], "below": [2.0, 5.0]}
+    for (where, bounds), scale in itertools.product(boxes.items(), ("linear", "log")):
+        space = ParameterSpace(model, {"mass": {**entries, "bounds": bounds, "scale": scale}})
+        found = nominal_point(SimpleNamespace(simulator=SimpleNamespace(parameters=space)))  # type: ignore[arg-type]
+        expected = {"inside": 1.3, "above": 1.2, "below": 2.0}[where]
+        assert found == pytest.approx(np.log(expected) if scale == "log" else expected)

@@ -19,7 +19,7 @@ import scipy.io
 import torch
 from pyarrow import feather, parquet
 
-from dropo_torch.data.readers import read_recording, read_trajectories
+from dropo_torch.data.readers import ReadOptions, read_recording, read_trajectories
 from dropo_torch.data.recording import Recording
 from dropo_torch.errors import InputError
 
@@ -252,6 +252,19 @@ def minari_dataset(tmp_path, monkeypatch, *, dictionary: bool = False):
             observation_space=spaces.Dict({"state": box, "goal": box}) if dictionary else box,
             action_space=spaces.Box(-np.inf, np.inf, (1,), dtype=np.float64),
         )
+
+
+def test_options_without_a_meaning_for_minari_are_refused():
+    """All that say how rows become transitions."""
+    given = {
+        "next_observations": ["q"], "time": "t", "episode": "e", "terminals": "t", "tolerance": 0.5, "group": "g",
+        "separator": ";", "preprocess": {"dt": 0.1}, "scale": {"q": 2.0}, "unwrap": ["q"], "shift": 1, "breaks": [3],
+        "pause": 0.5, "joints": ["q"], "stamps": {"q": "t"},
+    }  # fmt: skip
+    assert set(given) == {*ReadOptions.__dataclass_fields__} - {"observations", "actions", "dt"}
+    for name, value in given.items():
+        with pytest.raises(InputError, match=rf"log-v0: {name} has no meaning for a Minari dataset"):
+            read_trajectories("minari:arm/log-v0", **{name: value})
 
 
 def test_minari_by_id_and_by_folder(tmp_path, monkeypatch):

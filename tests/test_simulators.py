@@ -374,6 +374,42 @@ def test_an_adapter_that_returns_nan_has_diverged_for_that_value_only():
     assert torch.isfinite(ours[:, 0]).all()
 
 
+def test_a_direction_that_varies_keeps_length_one_in_an_environment() -> None:
+    """As it does in the other backends, whichever values came before."""
+    entries = {
+        "axis": {"field": "jnt_axis", "name": "hinge", "index": 0, "bounds": [0.2, 1.0]},
+        "turn": {"field": "geom_quat", "name": "stop", "index": 3, "bounds": [0.1, 0.9]},
+    }
+    space = ParameterSpace(mujoco.MjModel.from_xml_string(COINCIDING_XML), entries)
+    case = case_of(space, 5, random_states(space.model, 4))
+    expected = MujocoSimulator(space.model, parameters=space, frame_skip=5).rollout(
+        case.states, case.controls, case.values
+    )
+    found = plain_gymnasium(space, 5).rollout(case.states, case.controls, case.values)
+    torch.testing.assert_close(found, expected, rtol=0, atol=1e-13)
+    assert found.std(1).max() > 1e-3
+
+
+@pytest.mark.parametrize("where", ["mj_setConst", "mj_forward", "mj_step"])
+def test_what_mujoco_refuses_in_an_environment_is_nan_for_that_value_only(
+    where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    case, plain = box_case(), getattr(mujoco, where)
+    simulator = plain_gymnasium(case.space, 5)
+    expected = simulator.rollout(case.states, case.controls, case.values)
+    refused = case.values[:, 0] == case.values[0, 0]
+
+    def refusing(model: mujoco.MjModel, *arguments: object) -> None:
+        if model.body_mass[1] == float(case.values[0, 0]):
+            raise mujoco.FatalError("refused")
+        plain(model, *arguments)
+
+    monkeypatch.setattr(mujoco, where, refusing)
+    found = simulator.rollout(case.states, case.controls, case.values)
+    assert torch.isnan(found[:, refused]).all()
+    torch.testing.assert_close(found[:, ~refused], expected[:, ~refused], rtol=0, atol=0)
+
+
 def test_an_environment_that_is_none_of_mujocos_is_refused():
     with pytest.raises(InputError, match="no Gymnasium MuJoCo environment; write an adapter"):
         MujocoEnvAdapter(gymnasium.make("CartPole-v1"), pendulum_space())
@@ -453,8 +489,9 @@ def test_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
     model = mujoco.MjModel.from_xml_string(COINCIDING_XML)
     model.body_simple[1] = 1
     space = ParameterSpace(model, {"x": {"field": "body_ipos[0]", "name": "link", "bounds": [-0.4, 0.4]}})
-    with pytest.raises(InputError, match=r"'x': body 1 \(link\) is compiled as simple"):
-        MujocoSimulator(model, parameters=space)
+    for make in (lambda: MujocoSimulator(model, parameters=space), lambda: plain_gymnasium(space, 1)):
+        with pytest.raises(InputError, match=r"'x': body 1 \(link\) is compiled as simple"):
+            make()
 
 
 def test_moving_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:

@@ -109,6 +109,9 @@ def test_logs_of_other_columns_or_sampling_times_are_not_joined():
         concatenate([numbered_log([2]), wide])
     with pytest.raises(InputError, match=r"sampled every 0\.02 s"):
         concatenate([numbered_log([2], dt=0.01), numbered_log([2], dt=0.02)])
+    with pytest.raises(InputError, match=r"c: sampled every 0\.02 s, but b every 0\.01 s"):
+        concatenate([numbered_log([2], dt=dt, source=name) for name, dt in (("a", None), ("b", 0.01), ("c", 0.02))])
+    assert concatenate([numbered_log([2]), numbered_log([2], dt=0.02)]).dt == 0.02
 
 
 def test_the_last_transition_always_ends_an_episode():

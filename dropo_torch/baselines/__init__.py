@@ -74,6 +74,16 @@ def fit_problem(
     """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`.
 
     Where the log does not show the states, they are estimated, too: :func:`dropo_torch.shooting.fit_sensed`.
+
+    Args:
+        problem: the config, its model and its log, of :func:`dropo_torch.make_problem`.
+        checkpoint: file in which the fit's state is kept after every batch.
+        resume: go on from ``checkpoint`` where it exists; the result is that of a run never interrupted.
+        on_progress: called after every batch with its entry of the history and how far the search is.
+
+    Raises:
+        InputError: options that the method does not have, a parameter without effect on this log, a checkpoint of
+            another fit, or ``resume`` without one; of sensors, a model that diverges in every window.
     """
     if problem.observation.is_sensed:
         make_search(problem)  # refuses options

@@ -10,11 +10,14 @@ from rich.console import Console
 from rich.table import Table
 
 from dropo_torch.commands.folder import prepare_folder
-from dropo_torch.commands.options import add_config as add_arguments
+from dropo_torch.commands.options import add_config
 from dropo_torch.config import load_config
 from dropo_torch.support.files import write_json
 
-__all__ = ["add_arguments", "run"]
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``dropo certify``."""
+    add_config(parser, resumes=False)
 
 
 def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Console) -> None:

@@ -103,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _fail(str(error), 2)
     except KeyboardInterrupt:
-        return _fail("interrupted; the same command with --resume goes on where it stopped", 130)
+        return _fail("interrupted", 130)
     except BrokenPipeError:  # the reader of help or results has seen enough
         _silence()
     except OSError as error:
@@ -158,7 +158,11 @@ def _dispatch(given: list[str]) -> int:
         console = Console(highlight=False, markup=False, emoji=False)  # names are the user's, and no markup
         console.on_broken_pipe = _silence  # type: ignore[method-assign]
         with claimed(parsed.out) if parsed.out is not None else contextlib.nullcontext():
-            return parsed.run(parsed, overrides, console) or 0
+            try:
+                return parsed.run(parsed, overrides, console) or 0
+            except KeyboardInterrupt:
+                advice = "; the same command with --resume continues from there" if hasattr(parsed, "resume") else ""
+                return _fail(f"interrupted{advice}", 130)
     return 0
 
 

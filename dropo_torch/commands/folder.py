@@ -7,7 +7,7 @@ import os
 import platform
 import shutil
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,18 +15,16 @@ from typing import Any
 from dropo_torch.config import Config
 from dropo_torch.errors import InputError
 
-#: Files by which a folder is known to hold a run.
+#: Files by which a folder is known to hold a run, as patterns.
 _MARKS = (
     "fit.json", "sweep.json", "compare.json", "certificate.json", "gap.json", "train.json", "checkpoint.bin",
-    "check.json", "gap-progress.bin", "sweep-progress.json", "compare-progress.json", "train-progress.bin",
-    "plan.json", "plan-progress.bin", "gap-progress-given.bin",
+    "check.json", "gap-progress*.bin", "sweep-progress.json", "compare-progress.json", "train-progress.bin",
+    "plan.json", "plan-progress.bin",
 )  # fmt: skip
-#: What runs write; an earlier run's are moved aside together.
+#: What runs write, as patterns; an earlier run's are moved aside together.
 _RESULTS = (
-    *_MARKS, "policy.pt", "gap-progress-shorter.bin", "gap-progress-contact.bin", "gap-progress-rare.bin",
-    "gap-progress-given-shorter.bin", "gap-progress-given-contact.bin", "gap-progress-given-rare.bin",
-    "distribution.yaml", "fitted_config.yaml", "config.yaml", "model.xml", "report.html", "picture.png", "tensorboard",
-    "commands.csv", "expected.csv", "motion.mp4",
+    *_MARKS, "policy.pt", "distribution.yaml", "fitted_config.yaml", "config.yaml", "model.xml", "report.html",
+    "picture.png", "tensorboard", "commands.csv", "expected.csv", "motion.mp4",
 )  # fmt: skip
 #: What ``dropo view`` writes beside a run's results, and goes with them.
 _VIEWS = ("view.html", "view.mp4")
@@ -85,7 +83,7 @@ def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:
     for name in _RESULTS:
         for stale in out.glob(f".{name}.*.tmp"):  # a write that kill -9 cut short
             stale.unlink()
-    present = [name for name in _RESULTS if (out / name).exists()]
+    present = _present(out, _RESULTS)
     if not (out / "gap.json").exists() and "config.yaml" in present:
         present.remove("config.yaml")  # one of the user's own
     if model_path is not None and model_path.resolve() in [(out / name).resolve() for name in present]:
@@ -94,14 +92,19 @@ def prepare_folder(out: Path, model_path: Path | None, *, resume: bool) -> None:
         )
     if resume or not present:
         return
-    if present[0] not in _MARKS:
+    if not _present(out, _MARKS):
         raise InputError(f"--out: {out / present[0]} is no result of an earlier run; name another folder, or move it")
     number = next(i for i in range(1, 10_000) if not (out / f"previous-{i}").exists())
     aside = out / f"previous-{number}"
     aside.mkdir()
-    beside = [name for name in _VIEWS if (out / name).exists()]
+    beside = _present(out, _VIEWS)
     for name in (*beside, *reversed(present)):  # the marks last: what is cut short here is still known as a run
         shutil.move(str(out / name), aside / name)
+
+
+def _present(folder: Path, patterns: Sequence[str]) -> list[str]:
+    """Names in a folder that match patterns, in the patterns' order."""
+    return [path.name for pattern in patterns for path in sorted(folder.glob(pattern))]
 
 
 def provenance(config: Config) -> dict[str, Any]:

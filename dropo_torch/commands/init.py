@@ -42,7 +42,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     """Run ``dropo init``, which writes the config and its page.
 
     Raises:
-        InputError: a config that is there already, options that are keys of a config, or what the log lacks.
+        InputError: a config that already exists, options that are keys of a config, or what the log lacks.
     """
     if overrides:
         raise InputError(f"--{next(iter(overrides))}: init proposes all keys; change them in the file that it writes")
@@ -50,7 +50,7 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if path.suffix not in (".yaml", ".yml"):
         raise InputError(f"--out: {path} is no YAML file; expected a name such as robot.yaml")
     if path.exists() and not given.overwrite:
-        raise InputError(f"--out: {path} is there already; name another file, or give --overwrite")
+        raise InputError(f"--out: {path} already exists; choose another name or pass --overwrite")
     from dropo_torch.proposal import propose_config
     from dropo_torch.report import write_init_report
 
@@ -98,7 +98,7 @@ def parameters_table(choice: Choice) -> Table:
     """Return what is fitted, as a table."""
     from dropo_torch.proposal.text import error_text
 
-    table = Table("parameter", "model's own", "error to expect", "bounds", "stands for, too")
+    table = Table("parameter", "model's own", "expected error", "bounds", "also stands for")
     for column in table.columns:
         column.overflow = "fold"
     for t in choice.chosen:

@@ -23,19 +23,20 @@ class Parser(argparse.ArgumentParser):
         raise InputError(f"{message}; usage: {usage}")
 
 
-def add_config(parser: argparse.ArgumentParser, *about: str, out_required: bool = True) -> None:
+def add_config(parser: argparse.ArgumentParser, *about: str, out_required: bool = True, resumes: bool = True) -> None:
     """Add the config, the folder of the results, and to the help the keys of the config that matter to the command.
 
     Args:
         parser: of the command.
         about: which groups of keys these are, besides those of model and log and of the machine.
         out_required: whether there must be a folder.
+        resumes: whether an interrupted run in it can be continued.
     """
     from dropo_torch.config import GROUPS, Config
 
     parser.add_argument("config", type=Path, metavar="CONFIG", help="YAML file")
     if out_required:
-        add_folder(parser)
+        add_folder(parser, resumes=resumes)
     else:
         add_out(parser, "folder of the results")
     lines = ["each key of the config is an option too, such as --epsilon 1e-4 or --parameters.mass.bounds '[1, 2]':"]
@@ -60,12 +61,13 @@ def add_out(parser: argparse.ArgumentParser, purpose: str) -> None:
     parser.add_argument("--out", type=_folder, metavar="DIR", help=purpose)
 
 
-def add_folder(parser: argparse.ArgumentParser, default: Path | None = None) -> None:
-    """Add the folder of the results, which must be given where there is no default, and ``--resume``."""
+def add_folder(parser: argparse.ArgumentParser, default: Path | None = None, *, resumes: bool = True) -> None:
+    """Add the folder of the results, which must be given where there is no default, and ``--resume`` if it resumes."""
     parser.add_argument(
         "--out", type=_folder, required=default is None, default=default, metavar="DIR", help="folder of the results"
     )
-    parser.add_argument("--resume", action="store_true", help="go on with an interrupted run in DIR")
+    if resumes:
+        parser.add_argument("--resume", action="store_true", help="continue an interrupted run in DIR")
 
 
 def add_log(parser: argparse.ArgumentParser, curves: str) -> None:

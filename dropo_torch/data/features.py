@@ -66,7 +66,7 @@ class Features:
         columns = [{c} for c in self.plain] + [set(q) for q in self.quaternions for _ in range(3)]
         kept = [i for i, own in enumerate(columns) if not own & self.masked]
         if not kept:
-            raise InputError("mask: every column is masked; leave at least one")
+            raise InputError("mask: every column is masked; leave at least one column unmasked")
         return Features(
             plain=tuple(c for c in self.plain if c not in self.masked),
             quaternions=tuple(q for q in self.quaternions if not self.masked & set(q)),

@@ -396,25 +396,11 @@ def are_dates(stamps: np.ndarray) -> bool:
 
 
 def _read_minari(dataset: str | Path, options: ReadOptions) -> Trajectories:
-    for name in (
-        "next_observations",
-        "time",
-        "episode",
-        "terminals",
-        "group",
-        "separator",
-        "preprocess",
-        "scale",
-        "unwrap",
-        "shift",
-        "breaks",
-        "pause",
-        "joints",
-        "stamps",
-    ):
-        if getattr(options, name):
+    for option in fields(ReadOptions):
+        given = getattr(options, option.name)
+        if given and given != option.default and option.name not in ("observations", "actions", "dt"):
             source = f"{PREFIX}{dataset}" if isinstance(dataset, str) else dataset
             raise InputError(
-                f"{source}: {name} has no meaning for a Minari dataset, which holds transitions; leave it out"
+                f"{source}: {option.name} has no meaning for a Minari dataset, which holds transitions; leave it out"
             )
     return read_minari(dataset, observations=options.observations, actions=options.actions, dt=options.dt)

@@ -185,18 +185,18 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
     """
     if not logs:
         raise InputError("data: no log given; expected at least one")
-    first = logs[0]
+    first, timed = logs[0], next((log for log in logs if log.dt is not None), logs[0])
     for log in logs[1:]:
         for name in ("observations", "actions"):
             ours, theirs = getattr(first, name).shape[1], getattr(log, name).shape[1]
             if ours != theirs:
                 raise InputError(f"{log.source}: {theirs} columns of {name}, but {first.source} has {ours}")
-        if log.dt is not None and first.dt is not None and not np.isclose(log.dt, first.dt, rtol=1e-3):
-            raise InputError(f"{log.source}: sampled every {log.dt:g} s, but {first.source} every {first.dt:g} s")
+        if log.dt is not None and timed.dt is not None and not np.isclose(log.dt, timed.dt, rtol=1e-3):
+            raise InputError(f"{log.source}: sampled every {log.dt:g} s, but {timed.source} every {timed.dt:g} s")
     names = ("observations", "next_observations", "actions", "terminals")
     return Trajectories(
         **{name: np.concatenate([getattr(log, name) for log in logs]) for name in names},
-        dt=next((log.dt for log in logs if log.dt is not None), None),
+        dt=timed.dt,
         source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
         origin=Origin.joined([log.origin for log in logs]),
     )

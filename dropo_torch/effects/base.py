@@ -143,6 +143,11 @@ def find_effect(name: str) -> Effect:
     return VOCABULARY[name]
 
 
+def all_of(kind: str) -> str:
+    """Return all targets of a kind of effects in words, such as ``all bodies``."""
+    return "all bodies" if kind == "body" else f"all {kind}s"
+
+
 class Effect(abc.ABC):
     """A kind of physical effect that a model may lack. It holds no state.
 

@@ -10,6 +10,9 @@ import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, object_number
 
+#: Sliding friction of slippery things, from which a search begins where the model has less, or none.
+LEAST = 0.1
+
 
 class ContactEffect(Effect):
     """An effect of every contact of one geom that touches something in the log."""
@@ -56,7 +59,7 @@ class ContactFriction(ContactEffect):
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         own = self.own(setting.model, target)
-        return (Quantity("friction", "-", own, 0.01 * own, max(5.0, 5 * own), 0.3 * own),)
+        return (Quantity("friction", "-", own, 0.01 * own, max(5.0, 5 * own), 0.3 * max(own, LEAST)),)
 
     def own(self, model: mujoco.MjModel, target: str | None) -> float:
         """Return the friction that the model's contacts of this geom have."""
@@ -66,7 +69,8 @@ class ContactFriction(ContactEffect):
         return float(max(model.geom_friction[g, 0] for g in same if model.geom_priority[g] == top))
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        return [np.array([share * self.own(setting.model, target)]) for share in (0.9, 0.6, 1.4)]
+        size = max(self.own(setting.model, target), LEAST)
+        return [np.array([share * size]) for share in (0.9, 0.6, 1.4)]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         geom = object_number(model, "geom", target)

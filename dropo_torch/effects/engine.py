@@ -12,11 +12,10 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Method, Placed, Setting, apply_all
-from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED
-from dropo_torch.simulators.hidden import filter_memory, filters_of, prescribed_bodies, prescribed_names
+from dropo_torch.simulators.hidden import filter_memory, filters_of, refuse_prescribed
 from dropo_torch.simulators.mujoco import default_row
 
 Models = Sequence[mujoco.MjModel | None]
@@ -144,8 +143,7 @@ class VariantEngine:
             self._warp = Variants(space, num_threads=num_threads)
         self._base = copy.copy(setting.model)
         self._base.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-        if prescribed_bodies(self._base):
-            raise InputError(f"effects: mocap bodies ({prescribed_names(self._base)}) cannot be had together with them")
+        refuse_prescribed(self._base, "effects")
         self._filters = filters_of(self._base)
         self.lead = filter_memory(space.on(self._base))
         self._data = mujoco.MjData(self._base)

@@ -66,6 +66,9 @@ def find_gap_as_given(
 
     Returns:
         The problem on which it was found, and the gap.
+
+    Raises:
+        InputError: as :func:`~dropo_torch.gap.run.find_gap` raises it.
     """
     problem = posed(problem)
     held, end = as_given(problem) if scene is None else scene.problem, time.monotonic() + time_limit

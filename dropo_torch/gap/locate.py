@@ -127,13 +127,18 @@ def regime(setting: Setting, free: FreeForces, dof: int, rules: Shown = SHOWN) -
 
 def _p_value(values: np.ndarray, force: np.ndarray, episodes: np.ndarray) -> float:
     """p-value that the slope has no sign, over trajectories (or tenths of a single one)."""
-    blocks = blocks_of(episodes, 4)
-    slopes = []
+    found = slopes(values, force, blocks_of(episodes, 4))
+    return float(stats.ttest_1samp(found, 0.0).pvalue) if len(found) > 2 else 1.0
+
+
+def slopes(values: np.ndarray, force: np.ndarray, blocks: np.ndarray) -> list[float]:
+    """Return the slope of a force over values in each block that has one, all ``(W,)``."""
+    found = []
     for block in np.unique(blocks):
         x, y = values[blocks == block], force[blocks == block]
         if len(x) > 2 and np.std(x) > 0:
-            slopes.append(float(np.cov(x, y)[0, 1] / np.var(x)))
-    return float(stats.ttest_1samp(slopes, 0.0).pvalue) if len(slopes) > 2 else 1.0
+            found.append(float(np.cov(x, y)[0, 1] / np.var(x, ddof=1)))
+    return found
 
 
 def places(setting: Setting, free: FreeForces, screening: Screening, rules: Shown = SHOWN) -> tuple[Place, ...]:

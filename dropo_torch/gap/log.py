@@ -119,7 +119,7 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     data, dense, velocity = mujoco.MjData(model), np.zeros((nv, nv)), np.empty(6)
     for row in rows:
         data.qpos[:], data.qvel[:] = states[row, :nq], states[row, nq:]
-        data.ctrl[:] = log.actions[row]
+        data.ctrl[:] = log.actions[row, : model.nu]
         mujoco.mj_forward(model, data)
         mujoco.mj_fullM(model, data, dense)
         inertia += np.diag(dense)
@@ -138,7 +138,7 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
         speed=np.sqrt(np.mean(states[:, nq:] ** 2, axis=0)),
         force=np.maximum(force / len(rows), 1e-12),
         inertia=inertia / len(rows),
-        command=np.abs(log.actions).max(0),
+        command=np.abs(log.actions[:, : model.nu]).max(0),
         column=observation.observed(log.observations).std(0),
         linear_speed=speeds[:, 1],
         angular_speed=speeds[:, 0],

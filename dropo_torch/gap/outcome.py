@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY
-from dropo_torch.effects.base import Placed, Quantity, Setting
+from dropo_torch.effects.base import Placed, Quantity, Setting, all_of
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.family import joint_names
@@ -418,7 +418,7 @@ def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[
             continue
         numbers = {str(e.target): next(iter(e.parameters.values())) for e in members}
         share = min(1.0, sum(e.share_of_gap for e in members))
-        sentence = effect.sentence.format(target=f"all {effect.kind}s")
+        sentence = effect.sentence.format(target=all_of(effect.kind))
         ties = tuple(dict.fromkeys(tie for e in members for tie in e.indistinguishable_from))
         whole = NamedEffect(name, FAMILY, numbers, share, ties, sentence, variant)
         kept = [whole if e is members[0] else e for e in kept if e not in members[1:]]

@@ -97,10 +97,11 @@ class Score:
     """How far a model is from held-out data.
 
     Attributes:
-        mse: mean squared error of one-step predictions, over features.
+        mse: mean squared error of one-step predictions, over features; it averages rad², m² and squares of velocities.
         log_likelihood: of the one-step predictions, with the noise of start and end, in nats.
-        rollout_rmse: root mean square error of open-loop positions over :attr:`Gap.rollout_seconds`.
-        rollout: root mean square error of each feature in open loop, ``(m,)``.
+        rollout_rmse: root mean square error of open-loop positions over :attr:`Gap.rollout_seconds`; angles in rad and
+            lengths in m, averaged as they are.
+        rollout: root mean square error of each feature in open loop, ``(m,)``, in the feature's unit.
     """
 
     mse: float

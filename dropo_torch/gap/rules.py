@@ -222,7 +222,7 @@ class Shown:
         constant: share of the force's mean square in its mean, and
         sure: standard errors of the mean, from which on the force is always the same.
         term: share of an unnamed force's root mean square below which its formula has no such term.
-        formula: share of its variance below which no formula is offered, and
+        formula: share of its mean square below which no formula is offered, and
         terms: the most terms that one may have.
         apart: standard deviations of the noise by which a motion must separate two hypotheses to be proposed.
     """

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY, Effect, Placed
+from dropo_torch.errors import InputError
 from dropo_torch.gap.forces.motion import has_forces
 from dropo_torch.gap.forces.view import ForceView, force_view
 from dropo_torch.gap.ground import Ground, Report
@@ -37,6 +38,9 @@ def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rule
         scene: of :func:`prepare`.
         effects: the vocabulary; all of the package's by default.
         rules: thresholds; the scene's by default.
+
+    Raises:
+        InputError: an empty vocabulary, a log with too few short windows, or a simulation that diverges in all of them.
     """
     scene = _ruled(scene, rules)
     state = start(_ground(scene, effects), scene.begin)
@@ -57,6 +61,9 @@ def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules 
         scene: of :func:`prepare`.
         effects: the vocabulary; all of the package's by default.
         rules: thresholds; the scene's by default.
+
+    Raises:
+        InputError: an empty vocabulary, or a simulation that diverges in all windows.
     """
     scene = _ruled(scene, rules)
     return _name(scene, _ground(scene, effects))
@@ -65,15 +72,23 @@ def name(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules 
 def verify(scene: Scene, hypothesis: Hypothesis) -> tuple[Score, Score]:
     """Return how far a hypothesis is from held-out data, and how far noise alone would leave a perfect one.
 
+    The units of the errors are those of :class:`Score`.
+
     Args:
         scene: of :func:`prepare`.
         hypothesis: such as ``name(scene).base.hypothesis`` and ``.final.hypothesis``.
+
+    Raises:
+        InputError: effects with values that MuJoCo refuses.
     """
     return scores(scene.evidence, cut_held(scene.evidence, scene.held, hypothesis), hypothesis)
 
 
 def open_loop(scene: Scene, hypothesis: Hypothesis, seconds: float) -> tuple[float, float]:
     """Return the root mean square error of open-loop positions on held-out data, and that of constant velocity.
+
+    Angles count in rad and lengths in m, and their squares are averaged as they are: of a robot with both, errors
+    compare with each other, and mean neither.
 
     Args:
         scene: of :func:`prepare`.
@@ -111,7 +126,8 @@ def find_gap(
             ``unfinished`` says what was not tried; it depends on how fast the machine is.
 
     Raises:
-        InputError: a log or simulator in which nothing can be looked for.
+        InputError: a log or simulator in which nothing can be looked for (see :func:`prepare`), an empty vocabulary, or
+            a checkpoint of another search.
     """
     started = time.perf_counter()
     report("preparing", 0.0)
@@ -223,5 +239,12 @@ def _ruled(scene: Scene, rules: Rules | None) -> Scene:
 
 
 def _ground(scene: Scene, effects: Sequence[Effect] | None) -> Ground:
-    """What a search stands on, by default with the whole vocabulary."""
-    return Ground(scene.evidence, tuple(effects or VOCABULARY.values()), short=scene.noisy)
+    """What a search stands on, by default with the whole vocabulary.
+
+    Raises:
+        InputError: an empty vocabulary.
+    """
+    known = tuple(VOCABULARY.values() if effects is None else effects)
+    if not known:
+        raise InputError("effects: none given; name at least one, or leave effects out to look for all there are")
+    return Ground(scene.evidence, known, short=scene.noisy)

@@ -32,6 +32,7 @@ from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
 from dropo_torch.shooting.posing import posed
+from dropo_torch.simulators.hidden import refuse_prescribed
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
@@ -92,11 +93,12 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
         rules: thresholds.
 
     Raises:
-        InputError: a simulator without a MuJoCo model; a log too short to judge anything, or one with a position whose
-            velocity is not observed: a window needs its initial state.
+        InputError: a simulator without a MuJoCo model; a model in which mocap bodies act; a log too short to judge
+            anything, or one with a position whose velocity is not observed: a window needs its initial state.
     """
     if problem.space.model is None or problem.observation.size == 0:
         raise InputError("gap: this simulator is no MuJoCo model; effects can only be looked for in one")
+    refuse_prescribed(problem.space.model, "gap")
     problem = posed(problem)
     if blind := problem.observation.at_rest:
         raise InputError(

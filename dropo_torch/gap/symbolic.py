@@ -12,6 +12,8 @@ from dropo_torch.gap.rules import Shown
 
 #: Ridge of the fits that drop terms.
 RIDGE = 1e-6
+#: Name of the term that is 1.
+CONSTANT = ""
 
 
 def describe(setting: Setting, free: FreeForces, dof: int, shown: Shown) -> str:
@@ -41,9 +43,13 @@ def describe(setting: Setting, free: FreeForces, dof: int, shown: Shown) -> str:
     if explained < shown.formula or not 0 < len(chosen) <= shown.terms:
         return ""
     names, order = list(library), chosen[np.argsort(-np.abs(weights[chosen]))]
-    terms = [f"{'+' if weights[i] > 0 else '−'} {abs(coefficients[i]):.3g}·{names[i]}" for i in order]
+    terms = [f"{'+' if weights[i] > 0 else '−'} {_term(abs(coefficients[i]), names[i])}" for i in order]
     formula = " ".join(terms).removeprefix("+ ")
-    return f"force at {dof_names(setting.model)[dof]} ≈ {formula} ({100 * explained:.0f} % of its variance)"
+    return f"force at {dof_names(setting.model)[dof]} ≈ {formula} ({100 * explained:.0f} % of its mean square)"
+
+
+def _term(coefficient: float, name: str) -> str:
+    return f"{coefficient:.3g}" if name == CONSTANT else f"{coefficient:.3g}·{name}"
 
 
 def sparse_regression(table: np.ndarray, force: np.ndarray, threshold: float) -> np.ndarray:
@@ -74,7 +80,7 @@ def _library(setting: Setting, free: FreeForces, dof: int) -> dict[str, np.ndarr
     """Terms of the formula by name, ``(W,)`` each."""
     model, names = setting.model, dof_names(setting.model)
     position, velocity, command = middles(setting, free.windows)
-    found = {"1": np.ones(len(velocity))}
+    found = {CONSTANT: np.ones(len(velocity))}
     for d in range(model.nv):
         v, speed = velocity[:, d], f"v({names[d]})"
         found[speed] = v

@@ -59,7 +59,16 @@ class Held:
 
 
 def hold_out(log: Trajectories) -> tuple[Trajectories, Trajectories]:
-    """Return a log's training and held-out parts: its last quarter, in whole episodes where there are four or more."""
+    """Return a log's training and held-out parts: its last quarter, in whole episodes where there are four or more.
+
+    Raises:
+        InputError: a log of one transition.
+    """
+    if len(log) < 2:
+        raise InputError(
+            f"data: {log.source} has one transition; expected enough of them to learn from three quarters and to "
+            "verify on the rest, some seconds of motion at least"
+        )
     if log.num_episodes >= 4:
         first = log.num_episodes - max(1, log.num_episodes // 4)
         return log.select_episodes(range(first)), log.select_episodes(range(first, log.num_episodes))

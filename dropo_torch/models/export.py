@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.errors import InputError
-from dropo_torch.parameters import ParameterSpace, read_field, write_field
+from dropo_torch.parameters import ParameterSpace, read_field
 
 #: MJCF is written with six significant digits.
 PRECISION = 2e-5
@@ -28,9 +28,8 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     if any(f in ("body_mass", "body_inertia", "body_ipos", "body_iquat") for f in space.fields):
         write_inertials(spec)
     model = spec.compile()
-    wanted = [(p.name, t, t.factor * v) for p, v in zip(space.parameters, values, strict=True) for t in p.targets]
-    for _, target, value in wanted:
-        write_field(model, target.field, target.index, value)
+    space.write_into(model, values)
+    wanted = [(space.names[column], target, target.read(model)) for column, target in space.targets]
     try:
         mujoco.mj_setConst(model, mujoco.MjData(model))
         spec.copy_back(model)

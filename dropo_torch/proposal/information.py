@@ -12,7 +12,7 @@ import torch
 from dropo_torch.config import Config
 from dropo_torch.data.features import Features
 from dropo_torch.data.trajectory import Trajectories, make_transitions
-from dropo_torch.distribution import SearchBox
+from dropo_torch.distribution import to_coordinates
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.log import make_setting, start_values
@@ -199,5 +199,5 @@ def sensitivities(objective: Objective) -> tuple[torch.Tensor, torch.Tensor]:
 
 def nominal_point(objective: Objective) -> np.ndarray:
     """Return the model's own values in coordinates, within the search box, ``(d,)``."""
-    space, box = objective.simulator.parameters, SearchBox.of(objective.simulator.parameters)
-    return np.clip(np.nan_to_num(space.nominal, nan=1.0), box.low, box.high)
+    space = objective.simulator.parameters
+    return to_coordinates(np.clip(np.nan_to_num(space.nominal, nan=1.0), space.low, space.high), space.is_log)

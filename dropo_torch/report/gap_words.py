@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY
+from dropo_torch.effects.base import all_of
 from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Remaining, Strength, fallen
 from dropo_torch.gap.rules import Sound
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
@@ -139,7 +140,7 @@ def place_name(place: Place) -> str:
     """Return a place in words."""
     if place.name is None:
         return place.kind
-    return f"all {place.kind}s" if place.name == "*" else f"{place.kind} {place.name}"
+    return all_of(place.kind) if place.name == "*" else f"{place.kind} {place.name}"
 
 
 def places(values: Iterable[tuple[str, str | None]]) -> list[tuple[str, str]]:
@@ -396,8 +397,7 @@ def _at(effect: str, target: str | None) -> str:
 
 
 def _all(effect: str) -> str:
-    kind = VOCABULARY[effect].kind if effect in VOCABULARY else "joint"
-    return "all bodies" if kind == "body" else f"all {kind}s"
+    return all_of(VOCABULARY[effect].kind if effect in VOCABULARY else "joint")
 
 
 def _digits(value: float, half: float) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import copy
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, Protocol
@@ -12,7 +13,7 @@ import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.models.load import quiet_mujoco, show_divergence
-from dropo_torch.parameters import ParameterSpace, write_field
+from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
 from dropo_torch.simulators.hidden import filters_of, prescribed_bodies
 from dropo_torch.support.usercode import user_code
@@ -51,7 +52,7 @@ class MujocoEnvAdapter:
     environment's treatment of actions counts, and its rewards and terminations do not.
 
     Raises:
-        InputError: an environment that is none of MuJoCo's.
+        InputError: an environment that is none of MuJoCo's, or a parameter that its model cannot vary.
     """
 
     def __init__(self, environment: gymnasium.Env, parameters: ParameterSpace) -> None:
@@ -68,8 +69,9 @@ class MujocoEnvAdapter:
                 "cannot be put into; simulate its model with backend: mujoco"
             )
         self._env.reset(seed=0)
-        show_divergence(self._env.model)
+        unmark_frames(show_divergence(own), parameters)
         self._parameters = parameters
+        self._own = copy.copy(own)
         self._data = mujoco.MjData(self._env.model)
         self.num_states = int(self._env.model.nq + self._env.model.nv)
         self.num_controls = int(self._env.model.nu)
@@ -78,14 +80,21 @@ class MujocoEnvAdapter:
     def use_model(self, model: mujoco.MjModel) -> None:
         """Let the environment simulate another model of the same robot."""
         self._env.model = show_divergence(copy.copy(model))
+        self._own = copy.copy(self._env.model)
 
     def set_parameters(self, values: Mapping[str, float]) -> None:
-        """Write the parameters into the environment's model, and everything derived from them."""
-        for parameter in self._parameters.parameters:
-            for target in parameter.targets:
-                write_field(self._env.model, target.field, target.index, target.factor * values[parameter.name])
+        """Write the parameters into the environment's model, and everything derived from them.
+
+        Raises:
+            mujoco.FatalError: values that MuJoCo refuses.
+        """
+        model = self._env.model
+        for field in self._parameters.fields:  # directions of length 1 depend on the components that do not vary
+            read_field(model, field)[...] = read_field(self._own, field)
+        self._parameters.write_into(model, self._parameters.vector(values))
+        mujoco.mj_resetData(model, self._data)
         with quiet_mujoco():
-            mujoco.mj_setConst(self._env.model, self._data)
+            mujoco.mj_setConst(model, self._data)
 
     def set_state(self, state: np.ndarray) -> None:
         """Reset the physics and set positions and velocities."""
@@ -184,18 +193,20 @@ class GymnasiumSimulator(Simulator):
     def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition; see :meth:`Simulator.rollout`."""
         start, control, vectors = self.arrays(states, controls, values)
-        out = np.empty((len(start), len(vectors), control.shape[1], self.num_states))
+        out = np.full((len(start), len(vectors), control.shape[1], self.num_states), np.nan)
         for k, vector in enumerate(vectors):
-            self._adapter.set_parameters(self.parameters.named(vector))
-            for t in range(len(start)):
-                out[t, k] = self._transition(start[t], control[t])
+            with contextlib.suppress(mujoco.FatalError):
+                self._adapter.set_parameters(self.parameters.named(vector))
+                for t in range(len(start)):
+                    out[t, k] = self._transition(start[t], control[t])
         return torch.from_numpy(out)
 
     def _transition(self, state: np.ndarray, controls: np.ndarray) -> np.ndarray:
         """States of one transition, ``(lag, num_states)``; NaN where the simulator fails."""
         after = np.full((len(controls), self.num_states), np.nan)
-        self._adapter.set_state(state)
-        for step, control in enumerate(controls):
-            for _ in range(self.frame_skip):
-                after[step] = self._adapter.step(control)
+        with contextlib.suppress(mujoco.FatalError):
+            self._adapter.set_state(state)
+            for step, control in enumerate(controls):
+                for _ in range(self.frame_skip):
+                    after[step] = self._adapter.step(control)
         return after if np.isfinite(after).all() else np.full_like(after, np.nan)

@@ -168,6 +168,12 @@ def prescribed_bodies(model: mujoco.MjModel) -> list[int]:
     return sorted(int(b) for b in acting - {-1})
 
 
+def refuse_prescribed(model: mujoco.MjModel, where: str) -> None:
+    """Raise an :class:`InputError` for a model with :func:`prescribed_bodies`, where effects are to be added to it."""
+    if prescribed_bodies(model):
+        raise InputError(f"{where}: mocap bodies ({prescribed_names(model)}) cannot be had together with effects")
+
+
 def prescribed_names(model: mujoco.MjModel) -> str:
     """Return the names of :func:`prescribed_bodies`, for messages."""
     return ", ".join(model.body(b).name or f"body{b}" for b in prescribed_bodies(model))

@@ -1,1 +1,1 @@
-"""Many fits side by side: sweeps of ε, comparisons of methods, calibration."""
+"""Many fits side by side: sweeps of ε, comparisons of methods, published studies."""

@@ -24,6 +24,8 @@ ABOVE = 10.0
 POWER = 0.99
 #: Cut-off of forces by that frequency, and of positions by the former.
 FORCES, POSITIONS = 6.0, 4.0
+#: Positions of a path that has a frequency.
+SHORTEST = 3
 #: Rows by cut-off: of what is filtered, and of what is kept.
 ROWS, KEPT = 16.0, 4.0
 #: Order of the filters, which run both ways, and the highest cut-off by the sampling frequency.
@@ -72,11 +74,14 @@ def has_forces(setting: Setting) -> bool:
 def highest_frequency(log: Trajectories, setting: Setting) -> float:
     """Return the frequency in Hz below which the joints move, by the power of their velocities; 0 if none does.
 
-    White noise of the positions is no motion: over a short stretch, where a slow motion is a steady one, it would be
-    most of what there is besides. The frequency of a steady motion is the lowest that a stretch can show.
+    Episodes of one transition show none. White noise of the positions is no motion: over a short stretch, where a slow
+    motion is a steady one, it would be most of what there is besides. The frequency of a steady motion is the lowest
+    that a stretch can show.
     """
     frequencies, powers, turning = [], [], []
     for path, _ in _paths(log, setting):
+        if len(path) < SHORTEST:
+            continue
         speed, rate = np.diff(path, axis=0), 1 / setting.signals.timestep
         frequency, power = signal.periodogram(speed, rate, window="hann", axis=0)
         shape = np.sin(np.pi * frequency / rate)[:, None] ** 2  # of the velocities, where positions are noisy
@@ -86,6 +91,8 @@ def highest_frequency(log: Trajectories, setting: Setting) -> float:
         power[0] = 0.0  # a mean that was taken out
         powers.append(np.where(power > ABOVE * noise, power, 0.0) * len(path))
         turning += [frequency[1]] * bool(speed.any())
+    if not powers:
+        return 0.0
     at, power = np.concatenate(frequencies), np.concatenate(powers)
     order = np.argsort(at)
     below = np.cumsum(power[order], axis=0) / np.maximum(power.sum(0), 1e-300)

@@ -177,13 +177,27 @@ def chances(regression: Regression, chosen: np.ndarray, parts: Iterable[np.ndarr
     """
     whole = unseen(regression, chosen)
     size, found = whole.mean(0), []
+    left = size > 0  # an output of which nothing is left, such as a joint that rests, has no say
     for part in parts:
-        found.append(chance_of(((unseen(regression, chosen & ~part) - whole) / size).sum(1)))
+        lost = unseen(regression, chosen & ~part) - whole
+        found.append(chance_of((lost[:, left] / size[left]).sum(1)))
     return found
+
+
+def share_left(left: np.ndarray, first: np.ndarray) -> float:
+    """Return the share of the outputs' mean squares that is left, averaged over those that have any; 0 if none has.
+
+    Args:
+        left: mean squares that are left, ``(J,)``.
+        first: those that there were, ``(J,)``.
+    """
+    there = first > 0
+    return float((left[there] / first[there]).mean()) if there.any() else 0.0
 
 
 def chance_of(gains: np.ndarray) -> float:
     """Return how likely chance alone makes the blocks gain as much, ``(B,)``, in the mean or in ranks."""
+    assert np.isfinite(gains).all()
     spread = max(float(gains.std(ddof=1)), 1e-300) / np.sqrt(len(gains))
     by_size = float(stats.t.sf(gains.mean() / spread, len(gains) - 1))
     return min(1.0, 2 * min(by_size, p_of_ranks(gains)))

@@ -25,6 +25,7 @@ from dropo_torch.gap.forces.regression import (
     refusal,
     score,
     select,
+    share_left,
     unseen,
     widest,
 )
@@ -73,8 +74,8 @@ class ForceView:
         return _rms(self.left)
 
     def share(self, left: np.ndarray) -> float:
-        """Return the share of the forces' mean squares that is left ``(N, nv)``, averaged over the joints."""
-        return float(np.mean((_rms(left) / np.maximum(self.before, 1e-300)) ** 2))
+        """Return the share of the forces' mean squares that is left ``(N, nv)``, averaged over joints that lack any."""
+        return share_left(_rms(left) ** 2, self.before**2)
 
     def beats_rival(self, rules: Forces) -> bool:
         """Return whether the effects leave clearly less than those that predictions named."""
@@ -237,7 +238,7 @@ def _shares(regression: Regression, chosen: np.ndarray, owner: np.ndarray) -> tu
     first = unseen(regression, np.zeros_like(chosen)).mean(0)
 
     def share(columns: np.ndarray) -> float:
-        return float((unseen(regression, columns).mean(0) / first).mean())
+        return share_left(unseen(regression, columns).mean(0), first)
 
     whole = share(chosen)
     gone = [share(chosen & (owner != member)) - whole for member in np.unique(owner[chosen])]
