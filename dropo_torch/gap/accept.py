@@ -202,7 +202,7 @@ def _among_several(ground: Ground, state: State, alive: Sequence[Candidate], bes
     families = promising_families(ground.focus(current), alive, rules.tried)
     found, state = ground.refits(state, current, families, "refitting families")
     several = sound(ground, found)
-    for tried in (*pairs[:1], *([simplest(several, rules)] if several else [])):
+    for tried in (simplest(r, rules) for r in (pairs, several) if r):
         clearer = tried.cost.left_of(best.cost) < rules.tried.clearer
         if clearer or (is_hopeless(best, current, rules) and not is_hopeless(tried, current, rules)):
             best = tried
