@@ -42,7 +42,6 @@ from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import Diverges, FreeForces, _relative_noise, free_forces
 from dropo_torch.gap.outcome import _notes
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
-from dropo_torch.gap.remaining import Remaining
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, Sound, Tried, accounts, allowance, clears, most_left, significant
@@ -51,6 +50,7 @@ from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, s
 from dropo_torch.gap.search import Ended, Naming, believed, start
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.symbolic import describe
+from dropo_torch.gap.time_left import TimeLeft
 from dropo_torch.gap.twin import Windows, secants
 from dropo_torch.gap.verify import cut_held, hold_out, rollout_floor, score, scores
 from dropo_torch.problem import Problem, make_problem
@@ -1616,7 +1616,7 @@ def test_interrupted_search_goes_on_to_the_same_result(tmp_path: Path) -> None:
     assert lasting(gap) == lasting(found(TWO))
     assert gap.simulated_transitions == found(TWO).simulated_transitions
     assert "fitting the declared parameters" not in stages
-    assert all(Remaining().told(stage, 0.0, 0.0).visits for stage in stages)  # each has a plan
+    assert all(TimeLeft().told(stage, 0.0, 0.0).visits for stage in stages)  # each has a plan
 
 
 def test_second_search_over_shorter_windows_goes_on_too(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from rich.text import Text
 
 if TYPE_CHECKING:
     from dropo_torch.fit import Fit, HistoryEntry
-    from dropo_torch.gap.remaining import Remaining
+    from dropo_torch.gap.time_left import TimeLeft
     from dropo_torch.optimizers import Progress as OptimizerProgress
     from dropo_torch.problem import Problem
     from dropo_torch.support.parallel import Workers
@@ -70,7 +70,7 @@ class _LeftColumn(ProgressColumn):
 class StageProgress(_Live):
     """The stage of a run, and the time left if stages have a plan; elsewhere than on a terminal a line a stage."""
 
-    def __init__(self, console: Console, label: str, remaining: Remaining | None = None) -> None:
+    def __init__(self, console: Console, label: str, remaining: TimeLeft | None = None) -> None:
         super().__init__(console, label, _LeftColumn(self._left))
         self._stage, self._remaining = "", remaining
 

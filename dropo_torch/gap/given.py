@@ -14,13 +14,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import Effect
-from dropo_torch.gap.ground import Report
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.result import Gap
 from dropo_torch.gap.run import find_gap
 from dropo_torch.gap.scene import Scene, prepare
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.shooting.posing import posed
+from dropo_torch.support.report import Report
 
 #: Verdicts, the better ones first; two that explain the log are as good as each other.
 _RANKS = {"no gap": 0, "explained": 0, "partly explained": 1, "unnamed": 2}

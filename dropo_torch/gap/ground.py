@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -17,12 +17,10 @@ from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import Alike, Rules, as_good, chance_of, clears
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, left_by, screen
 from dropo_torch.gap.twin import Windows
+from dropo_torch.support.report import Report
 
 #: Windows that refits use, and that the screening uses; all if there are fewer.
 FEW, FEWER = 40, 10
-
-#: ``report(stage, share)`` as the work goes on.
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

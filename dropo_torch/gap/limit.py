@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from dropo_torch.gap.ground import Report
+from dropo_torch.support.report import Report
 
 #: Share of the time left that a search may take while others wait.
 SHARE = 0.6

@@ -14,7 +14,6 @@ from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
-from dropo_torch.gap.ground import Report
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
@@ -40,6 +39,7 @@ from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows
 from dropo_torch.gap.verify import Held, constant_velocity, cut_held, score, scores
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.report import Report
 
 #: Fits after the last one, at most, each with the weights that the one before suggests.
 ROUNDS = 3

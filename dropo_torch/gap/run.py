@@ -14,7 +14,7 @@ from dropo_torch.effects import VOCABULARY, Effect, Placed
 from dropo_torch.errors import InputError
 from dropo_torch.gap.forces.motion import has_forces
 from dropo_torch.gap.forces.view import ForceView, force_view
-from dropo_torch.gap.ground import Ground, Report
+from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.locate import places
 from dropo_torch.gap.noise import free_forces
@@ -27,6 +27,7 @@ from dropo_torch.gap.search import Ended, Naming, believed, kept, resort, search
 from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
+from dropo_torch.support.report import Report
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:

@@ -6,7 +6,7 @@ A package offers one by an entry point of the group ``dropo_torch.sims`` that is
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.metadata import entry_points
 from pathlib import Path
@@ -14,6 +14,7 @@ from typing import Any, Protocol, cast
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.parallel import Workers
+from dropo_torch.support.report import Report
 
 GROUP = "dropo_torch.sims"
 
@@ -48,9 +49,7 @@ class BundledSim:
 class Study(Protocol):
     """A published study, redone: results into a folder, finished parts kept where it resumes."""
 
-    def __call__(
-        self, out: Path, *, reduced: bool, resume: bool, report: Callable[[str, float], None], workers: Workers
-    ) -> Sequence[str]:
+    def __call__(self, out: Path, *, reduced: bool, resume: bool, report: Report, workers: Workers) -> Sequence[str]:
         """Run it by so many processes, or by a cluster; return what it found, in sentences."""
 
 

@@ -18,10 +18,11 @@ from dropo_torch.parameters import object_names
 from dropo_torch.planning.ground import FEWEST, Ground, rollout
 from dropo_torch.planning.information import Information, information_of
 from dropo_torch.planning.limits import Kept, Limit
-from dropo_torch.planning.search import Found, Report, search
+from dropo_torch.planning.search import Found, search
 from dropo_torch.problem import make_problem
 from dropo_torch.simulators import Simulator
 from dropo_torch.support.checkpoint import Checkpoint
+from dropo_torch.support.report import Report
 
 SCHEMA = "dropo-torch/plan/1"
 #: States between two at which a search looks at forces, contacts and the workspace; share of limits that it allows.

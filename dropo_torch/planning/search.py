@@ -14,6 +14,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.optimizers.cma import evolution, why_stopped
 from dropo_torch.planning.motion import Family
 from dropo_torch.support.checkpoint import Checkpoint
+from dropo_torch.support.report import Report
 
 #: Generations of multi-sines and motions at random among which a search begins, and cost of a motion that diverges.
 FIRST, DIVERGED = 4, 1e6
@@ -24,8 +25,6 @@ STEP = 0.15
 
 #: Costs ``(P,)`` of motions ``(P, dimensions)`` in [0, 1]; the least is the best.
 Cost = Callable[[np.ndarray], np.ndarray]
-#: Told of the stage, and its share.
-Report = Callable[[str, float], None]
 
 
 @dataclass

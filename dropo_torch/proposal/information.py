@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -24,6 +24,7 @@ from dropo_torch.objective import Objective
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.proposal.candidates import Candidate
 from dropo_torch.proposal.draft import Filter
+from dropo_torch.support.report import Report
 
 #: Noise, and ε beside it, relative to a column's standard deviation and to its noise.
 FLOOR, BESIDE = 1e-6, 0.3
@@ -37,8 +38,6 @@ STEP = 1e-5
 FINE = 0.005
 #: Nats for each direction that a longer window must gain.
 GAIN = 0.15
-
-Report = Callable[[str, float], None]
 
 
 @dataclass(frozen=True)

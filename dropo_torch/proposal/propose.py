@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
@@ -31,9 +31,7 @@ from dropo_torch.proposal.places import Place, places_of
 from dropo_torch.proposal.text import config_text
 from dropo_torch.shooting.posing import column_noise, posed
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
-
-#: Told of the stage, and of its share.
-Report = Callable[[str, float], None]
+from dropo_torch.support.report import Report
 
 
 class Review(Protocol):

@@ -13,6 +13,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.support.files import write_atomically
 from dropo_torch.support.given import reading
 from dropo_torch.support.parallel import Task, Workers, check_workers, in_parallel
+from dropo_torch.support.report import Report
 
 SCHEMA = "dropo-torch/study/1"
 
@@ -39,7 +40,7 @@ def run_cells(
     *,
     resume: bool = False,
     workers: Workers = 1,
-    report: Callable[[str, float], None] = lambda stage, share: None,
+    report: Report = lambda stage, share: None,
 ) -> list[dict[str, Any]]:
     """Run every cell whose file is not there yet, and return all results, each with its ``cell``, in the cells' order.
 

@@ -94,7 +94,7 @@ class Visit:
 
 
 @dataclass(frozen=True)
-class Remaining:
+class TimeLeft:
     """What a search has reported so far, and the time that it still takes by that.
 
     Attributes:
@@ -111,7 +111,7 @@ class Remaining:
     row: int = 0
     effects: int = 1
 
-    def told(self, words: str, share: float, now: float) -> Remaining:
+    def told(self, words: str, share: float, now: float) -> TimeLeft:
         """Return what is known once a stage and its share done are reported.
 
         Args:

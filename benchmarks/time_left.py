@@ -1,8 +1,8 @@
 """Score the remaining time that `dropo gap` shows: the share of instants at which it is right within a factor of two.
 
-python benchmarks/remaining_time.py --cases '*torque_arm*' --out out/remaining.jsonl   # run, and keep what is reported
-python benchmarks/remaining_time.py --read out/remaining.jsonl                         # score what was kept
-python benchmarks/remaining_time.py --read out/remaining.jsonl --table                 # and print what stages cost
+python benchmarks/time_left.py --cases '*torque_arm*' --out out/remaining.jsonl   # run, and keep what is reported
+python benchmarks/time_left.py --read out/remaining.jsonl                         # score what was kept
+python benchmarks/time_left.py --read out/remaining.jsonl --table                 # and print what stages cost
 
 Instants from a quarter of a run up to 95 % of it count, as long as two seconds remain. Times are of the processor, with
 one thread, so that other work on the machine has no part in them.
@@ -27,7 +27,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 from benchmarks.hidden.cases import CaseSpec, cases, select
 from dropo_torch.config import load_config
 from dropo_torch.gap import find_gap
-from dropo_torch.gap.remaining import Remaining
+from dropo_torch.gap.time_left import TimeLeft
 from dropo_torch.problem import make_problem
 
 #: Shares of a run between which instants count, how many there are, and the seconds that remain at least.
@@ -52,9 +52,9 @@ class Run:
     seconds: float
     reports: Sequence[tuple[str, float, float]]
 
-    def at(self, now: float) -> Remaining:
+    def at(self, now: float) -> TimeLeft:
         """Return what was known at an instant."""
-        known = Remaining()
+        known = TimeLeft()
         for stage, share, seconds in self.reports:
             if seconds <= now:
                 known = known.told(stage, share, seconds)

@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from dropo_torch.commands.progress import StageProgress
-from dropo_torch.gap.remaining import PLAN, QUIET_PLAN, SCREENING, Remaining
+from dropo_torch.gap.time_left import PLAN, QUIET_PLAN, SCREENING, TimeLeft
 
 Reports = tuple[tuple[str, float, float], ...]
 #: Stages of a search for one effect on a cart-pole, their shares, and when they were reported, in seconds.
@@ -42,8 +42,8 @@ ONE: Reports = (
 END = 12.86
 
 
-def after(reports: Reports, limit: float = math.inf) -> Remaining:
-    known = Remaining(limit)
+def after(reports: Reports, limit: float = math.inf) -> TimeLeft:
+    known = TimeLeft(limit)
     for stage, share, seconds in reports:
         known = known.told(stage, share, seconds)
     return known
@@ -155,7 +155,7 @@ def test_unknown_stages_change_nothing() -> None:
     assert known.told("something else", 0.0, END) == known
 
 
-def shown(*reports: tuple[str, float], remaining: Remaining | None) -> list[str]:
+def shown(*reports: tuple[str, float], remaining: TimeLeft | None) -> list[str]:
     """Lines of a run that is seen elsewhere than on a terminal."""
     console = Console(file=io.StringIO(), width=200)
     with StageProgress(console, "gap", remaining) as progress:
@@ -167,7 +167,7 @@ def shown(*reports: tuple[str, float], remaining: Remaining | None) -> list[str]
 def test_a_line_of_each_stage_tells_what_is_left_once_it_is_known() -> None:
     reports = ((BEGUN[0], 0.0), (BEGUN[1], 0.0), (SCREENING.words, 0.0), (SCREENING.words, 0.5))
     assert shown(*reports, remaining=None) == ["gap: preparing", f"gap: {BEGUN[1]}", "gap: screening"]
-    first, second, third = shown(*reports, remaining=Remaining())
+    first, second, third = shown(*reports, remaining=TimeLeft())
     assert (first, second) == ("gap: preparing", f"gap: {BEGUN[1]}")
     assert third.startswith("gap: screening, about ")
     assert third.endswith(" s left")
