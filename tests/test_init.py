@@ -662,3 +662,11 @@ def test_the_point_at_which_a_log_is_asked_is_the_models() -> None:
         found = nominal_point(SimpleNamespace(simulator=SimpleNamespace(parameters=space)))  # type: ignore[arg-type]
         expected = {"inside": 1.3, "above": 1.2, "below": 2.0}[where]
         assert found == pytest.approx(np.log(expected) if scale == "log" else expected)
+
+
+def test_a_config_that_exists_is_kept_unless_told_otherwise(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "robot.yaml"
+    out.write_text("mine")
+    assert main(["init", "robot.xml", "log.csv", "--out", str(out)]) == 2
+    assert capfd.readouterr().err == f"dropo: --out: {out} already exists; choose another name or pass --overwrite\n"
+    assert out.read_text() == "mine"
