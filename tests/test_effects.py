@@ -373,6 +373,51 @@ def test_planes_sink_only_under_a_geom_that_alone_touches_them() -> None:
         assert sole.extends(setting, Placed(find_effect("contact_margin"), "nothing", (0.01,))) == []
 
 
+ROVER = """<mujoco><option timestep="0.002"/><worldbody>
+  <geom name="floor" type="plane" size="50 50 1" friction="0.9"/>
+  <body name="chassis" pos="0 0 .0999"><freejoint/>
+    <geom name="hull" type="box" size=".2 .1 .03" mass="2" friction="{hull}"/>
+    <geom name="caster" type="sphere" size=".1" pos=".2 0 0" mass=".1" friction="{caster}" {first} solref="{soft} 1"/>
+    <body pos="-.1 .15 0"><joint name="left" axis="0 1 0"/>
+      <geom name="left_tyre" type="sphere" size=".1" mass=".3"/></body>
+    <body pos="-.1 -.15 0"><joint name="right" axis="0 1 0"/>
+      <geom name="right_tyre" type="sphere" size=".1" mass=".3"/></body>
+  </body></worldbody>
+  <actuator><motor joint="left"/><motor joint="right"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    "rover",
+    [
+        {"first": 'condim="1" priority="1"', "caster": 0.01, "soft": 0.02, "hull": 1.0},
+        {"first": 'condim="1" priority="-1"', "caster": 0.01, "soft": 0.02, "hull": 1.0},
+        {"first": "", "caster": 1.4, "soft": 0.05, "hull": 0.5},
+        {"first": 'solmix="3"', "caster": 0.3, "soft": 0.03, "hull": 1.2},
+    ],
+)
+def test_contacts_stay_as_they_are_with_the_numbers_of_the_model(rover: dict[str, object]) -> None:
+    """Whatever touches, of whichever priority and kind; with other numbers, they do not."""
+
+    def driven(model: mujoco.MjModel) -> np.ndarray:
+        data = mujoco.MjData(model)
+        for _ in range(150):
+            data.ctrl[:] = 2.0, 3.0  # they slip
+            mujoco.mj_step(model, data)
+        return np.array(data.qpos)
+
+    model = mujoco.MjModel.from_xml_string(ROVER.format(**rover))
+    before, setting = driven(model), setting_of(model)
+    for name in ("contact_friction", "contact_stiffness"):
+        effect = find_effect(name)
+        for geom in ("floor", "caster", "left_tyre", "right_tyre"):
+            neutral = [q.neutral for q in effect.quantities(setting, geom)]
+            changed = mujoco.MjModel.from_xml_string(ROVER.format(**rover))
+            effect.apply(changed, geom, np.array(neutral))
+            np.testing.assert_allclose(driven(changed), before, rtol=0, atol=1e-12)
+            effect.apply(changed, geom, 0.5 * np.array(neutral))
+            assert geom == "caster" or not np.allclose(driven(changed), before, rtol=0, atol=1e-9)
+
+
 def test_a_geom_alone_decides_its_friction_and_softness() -> None:
     """A box slides with the friction given, whatever the floor's; softness leaves the friction as it was."""
     xml = """<mujoco><option timestep="0.001"/><worldbody>

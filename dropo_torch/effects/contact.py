@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import itertools
+from dataclasses import dataclass
 
 import mujoco
 import numpy as np
@@ -24,31 +24,109 @@ class ContactEffect(Effect):
 
     @staticmethod
     def partners(model: mujoco.MjModel, geom: int) -> list[int]:
-        """Return the geoms that may touch this one."""
+        """Return the geoms that may touch this one, as MuJoCo filters them."""
         kind, affinity, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
         fits = (kind & affinity[geom]) | (kind[geom] & affinity)
-        return [int(g) for g in np.flatnonzero((body != body[geom]) & (fits != 0))]
+        own = int(body[geom])
+        return [int(g) for g in np.flatnonzero(fits) if not _filtered(model, own, int(body[g]))]
 
 
-def take_over(model: mujoco.MjModel, geom: int, partners: list[int]) -> None:
-    """Let one geom alone decide its contacts' properties, which stay as they were mixed."""
-    same = [g for g in [geom, *partners] if model.geom_priority[g] == model.geom_priority[geom]]
-    if higher := [g for g in partners if model.geom_priority[g] > model.geom_priority[geom]]:
-        for field in ("geom_friction", "geom_solref", "geom_solimp", "geom_condim"):
-            getattr(model, field)[geom] = getattr(model, field)[higher[0]]
-    elif len(same) > 1:
-        other = same[1]
-        model.geom_friction[geom] = model.geom_friction[same].max(0)
-        weights = model.geom_solmix[[geom, other]]
+def _filtered(model: mujoco.MjModel, one: int, other: int) -> bool:
+    """Whether geoms of two bodies never touch: they move as one, hang on each other, or are excluded."""
+    first, second = (int(model.body_weldid[b]) for b in (one, other))
+    if first == second:
+        return True
+    above, below = (int(model.body_weldid[model.body_parentid[b]]) for b in (first, second))
+    by_parent = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
+    if by_parent and first and second and (first == below or second == above):
+        return True
+    low, high = sorted((one, other))
+    return bool((model.exclude_signature == (low << 16) + high).any())
+
+
+@dataclass(frozen=True)
+class Mixed:
+    """The properties of the contacts of two geoms.
+
+    Attributes:
+        friction, solref, solimp: as in MJCF, ``(3,)``, ``(2,)`` and ``(5,)``.
+        condim: the dimension of the contacts.
+    """
+
+    friction: np.ndarray
+    solref: np.ndarray
+    solimp: np.ndarray
+    condim: int
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, one: int, other: int) -> Mixed:
+        """Return them as MuJoCo mixes them: of the geom of higher priority, or of both."""
+        first, second = model.geom_priority[[one, other]]
+        if first != second:
+            one = other = one if first > second else other
+        pair, weights = [one, other], model.geom_solmix[[one, other]]
         share = float(weights[0] / weights.sum()) if weights.sum() > 1e-15 else 0.5
-        for field in ("geom_solref", "geom_solimp"):
-            values = getattr(model, field)
-            if field == "geom_solref" and (values[[geom, other], 0] <= 0).any():
-                values[geom] = np.minimum(values[geom], values[other])
-            else:
-                values[geom] = share * values[geom] + (1 - share) * values[other]
-        model.geom_condim[geom] = model.geom_condim[same].max()
-    model.geom_priority[geom] = model.geom_priority[[geom, *partners]].max() + 1
+        references = model.geom_solref[pair]
+        blended = (references[:, 0] > 0).all() or one == other
+        solref = share * references[0] + (1 - share) * references[1] if blended else references.min(0)
+        solimp = share * model.geom_solimp[one] + (1 - share) * model.geom_solimp[other]
+        return cls(model.geom_friction[pair].max(0), solref, solimp, int(model.geom_condim[pair].max()))
+
+    def is_close(self, other: Mixed) -> bool:
+        """Return whether contacts of both kinds are the same."""
+        fields = ("friction", "solref", "solimp", "condim")
+        return all(np.allclose(getattr(self, f), getattr(other, f), rtol=1e-9, atol=0) for f in fields)
+
+
+@dataclass(frozen=True)
+class Deciding:
+    """How a geom's contacts are changed, so that none changes with what the model has.
+
+    Contacts with geoms of higher priority are theirs. Where all others are alike, the geom decides them alone;
+    otherwise numbers of the geom and of those that it mixes with change alike.
+
+    Attributes:
+        geom: the geom.
+        equals: geoms of its priority that it may touch.
+        kinds: its contacts with these, and with those of lower priority; alone if there are none.
+    """
+
+    geom: int
+    equals: list[int]
+    kinds: list[Mixed]
+
+    @classmethod
+    def of(cls, model: mujoco.MjModel, geom: int) -> Deciding:
+        """Return how those of a geom are."""
+        own, partners = model.geom_priority[geom], ContactEffect.partners(model, geom)
+        kinds = [Mixed.of(model, geom, g) for g in partners if model.geom_priority[g] <= own]
+        equals = [g for g in partners if model.geom_priority[g] == own]
+        return cls(geom, equals, kinds or [Mixed.of(model, geom, geom)])
+
+    @property
+    def friction(self) -> float:
+        """Their sliding friction; the largest where they differ."""
+        return float(max(kind.friction[0] for kind in self.kinds))
+
+    @property
+    def solref(self) -> np.ndarray:
+        """Their time constant and damping ratio, ``(2,)``; those of the first where they differ."""
+        return self.kinds[0].solref
+
+    def take_over(self, model: mujoco.MjModel) -> bool:
+        """Let the geom alone decide its contacts, which stay as they are, where this is possible."""
+        kind = self.kinds[0]
+        if not all(kind.is_close(other) for other in self.kinds[1:]):
+            return False
+        for field in ("friction", "solref", "solimp", "condim"):
+            getattr(model, f"geom_{field}")[self.geom] = getattr(kind, field)
+        model.geom_priority[:] *= 2  # above its equals, and below what is above them
+        model.geom_priority[self.geom] += 1
+        return True
+
+    def scale(self, field: np.ndarray, ratio: np.ndarray | float) -> None:
+        """Multiply numbers of the geom and of its equals, ``field`` of all geoms."""
+        field[[self.geom, *self.equals]] *= ratio
 
 
 class ContactFriction(ContactEffect):
@@ -63,19 +141,18 @@ class ContactFriction(ContactEffect):
 
     def own(self, model: mujoco.MjModel, target: str | None) -> float:
         """Return the friction that the model's contacts of this geom have."""
-        geom = object_number(model, "geom", target)
-        same = [geom, *self.partners(model, geom)]
-        top = model.geom_priority[same].max()
-        return float(max(model.geom_friction[g, 0] for g in same if model.geom_priority[g] == top))
+        return Deciding.of(model, object_number(model, "geom", target)).friction
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         size = max(self.own(setting.model, target), LEAST)
         return [np.array([share * size]) for share in (0.9, 0.6, 1.4)]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        geom = object_number(model, "geom", target)
-        take_over(model, geom, self.partners(model, geom))
-        model.geom_friction[geom, 0] = values[0]
+        deciding = Deciding.of(model, object_number(model, "geom", target))
+        if deciding.take_over(model):
+            model.geom_friction[deciding.geom, 0] = values[0]
+        else:
+            deciding.scale(model.geom_friction[:, 0], values[0] / deciding.friction)
 
 
 class ContactStiffness(ContactEffect):
@@ -90,10 +167,7 @@ class ContactStiffness(ContactEffect):
 
     def own(self, model: mujoco.MjModel, target: str | None) -> np.ndarray:
         """Return the time constant and damping ratio that the model's contacts of this geom have."""
-        geom = object_number(model, "geom", target)
-        alone = copy.copy(model)
-        take_over(alone, geom, self.partners(model, geom))
-        return alone.geom_solref[geom].copy()
+        return Deciding.of(model, object_number(model, "geom", target)).solref
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         time, ratio = (float(x) for x in self.own(setting.model, target))
@@ -108,9 +182,11 @@ class ContactStiffness(ContactEffect):
         return [np.array([1.15 * time, ratio]), np.array([2 * time, ratio])]
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
-        geom = object_number(model, "geom", target)
-        take_over(model, geom, self.partners(model, geom))
-        model.geom_solref[geom] = values
+        deciding = Deciding.of(model, object_number(model, "geom", target))
+        if deciding.take_over(model):
+            model.geom_solref[deciding.geom] = values
+        else:
+            deciding.scale(model.geom_solref, np.asarray(values) / deciding.solref)
 
 
 class ContactMargin(ContactEffect):
