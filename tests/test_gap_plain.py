@@ -25,6 +25,7 @@ from dropo_torch.gap.family import needed, not_needed
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.locate import regressors
 from dropo_torch.gap.log import cut_windows, spread
+from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import NamedEffect, Place, Strength
@@ -501,6 +502,19 @@ def test_what_sits_in_one_joint_of_each_leg_is_found_at_once() -> None:
     found = add(ground.at(state), state).current.hypothesis.placed
     assert {p.key for p in found} == {("joint_damping", f"knee{n}") for n in range(3)}
     assert sorted(p.values[0] for p in found) == pytest.approx([0.15, 0.2, 0.25], abs=0.01)
+
+
+def test_a_counting_sensor_at_rest_does_not_hide_the_noise() -> None:
+    scene = scene_of(PENDULUM, lambda model: None, lambda time, phases: np.zeros((len(time), 0)), shape=(6, 150))
+    quantum = np.array([2e-3, 2e-3, 1e-2, 1e-2])
+    counted = replace(scene.short, measured=np.round(scene.short.measured / quantum) * quantum)
+    rested = replace(counted, measured=counted.measured.copy())
+    rested.measured[::2] = 0.0  # it hangs
+    rested.rates[::2] = 0.0
+    variant = scene.begin.variant
+    noise, with_rest = (free_forces(scene.twin, windows, variant).noise for windows in (counted, rested))
+    np.testing.assert_allclose(with_rest, noise, rtol=0.3)
+    np.testing.assert_allclose(noise, quantum / np.sqrt(12), rtol=0.4)
 
 
 def test_a_wave_longer_than_the_motion_is_no_ripple() -> None:

@@ -28,6 +28,8 @@ GUESS, FLOOR = 1e-3, 1e-9
 QUIET_ROUNDS, ROUNDS = 8, 16
 #: Share of windows that are quiet; and of windows without anything but noise that pass for such.
 QUIET, CALM = 0.25, 0.98
+#: Windows that tell the noise, at least.
+ENOUGH = 5
 #: Least degrees of freedom that a feature is taken to have in a window.
 LEAST_DEGREES = 0.3
 
@@ -101,11 +103,24 @@ def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeF
     if (told := usable & twin.knows(variant, windows)).any():
         usable = told
     residual, slope, counted = own[usable], np.moveaxis(changes[:, usable], 0, -1), seen[usable]
-    relative, unsure = _relative_noise(residual, slope, counted, m) if not known else (np.ones(m), np.zeros(m))
+    relative, unsure = np.ones(m), np.zeros(m)
+    if not known:
+        telling = shows_noise(windows.measured[usable])
+        relative, unsure = _relative_noise(residual[telling], slope[telling], counted[telling], m)
     coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)
     forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))
     return FreeForces(np.maximum(evidence.noise * relative, FLOOR * sizes), unsure, forces, standard_errors, windows)
+
+
+def shows_noise(measured: np.ndarray) -> np.ndarray:
+    """Return which of windows ``(W, L + 1, n)`` show noise, ``(W,)`` bool; all, where hardly any would.
+
+    Where a column stands exactly still that moves elsewhere, its sensor is too coarse to show any.
+    """
+    still = np.ptp(measured, axis=1) == 0
+    moving = ~(still & ~still.all(0)).any(1)
+    return moving if moving.sum() >= ENOUGH else np.ones(len(measured), dtype=bool)
 
 
 def _lost(twin: Twin, windows: Windows) -> str:
