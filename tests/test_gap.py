@@ -172,6 +172,27 @@ def test_names_that_close_most_of_a_gap_are_an_answer_in_the_model_as_given(
     assert any("--as_given false" in note for note in answer.notes) == answered
 
 
+def test_a_mass_that_is_another_is_no_load(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the model as given something on the pole may make up for the pole's own mass, which the config declares."""
+    few, problem = [VOCABULARY["joint_damping"]], as_given(hidden(), tmp_path)
+    body = problem.config.parameters["pole_mass"]["name"]  # type: ignore[index]
+    (named,) = found(("joint_damping",)).effects
+    load = dataclasses.replace(
+        found(("joint_damping",)), effects=(dataclasses.replace(named, effect="payload", target=body),)
+    )
+    assert load.verdict == "explained"
+    searches = iter([lambda *_, **__: load, find_gap])
+    monkeypatch.setattr(given, "find_gap", lambda own, **options: next(searches)(own, **options))
+    held, gap = find_gap_as_given(problem, effects=few)
+    assert gap.verdict == "no gap"
+    assert gap.declared["pole_mass"][2] == pytest.approx(hidden().declared["pole_mass"], rel=1e-3)
+    assert list(held.config.parameters or ()) == ["pole_mass"]
+    elsewhere = dataclasses.replace(load, effects=(named,))
+    assert given.as_own(problem, elsewhere) is None
+    better = dataclasses.replace(load, reduced=(load.reduced[0], 0.5))  # what the mass alone cannot do
+    assert given.as_own(problem, better) is None
+
+
 # --- the whole ------------------------------------------------------------------------------------------------
 
 

@@ -303,6 +303,13 @@ def test_values_that_the_model_has_wrong_are_the_answer_where_nothing_else_is_mi
         "Nothing is missing beside other values of parameters: damping is 0.341 N·m·s/rad (0.330 to 0.352), not 0.1."
     )
     assert "0.330 to 0.352" in text_of(text)
+    beside = replace(gap, found=True, effects=single().effects)
+    others = "other values of parameters: damping is 0.341 N·m·s/rad (0.330 to 0.352), not 0.1"
+    sentence, items = gap_words.answer(beside)
+    assert sentence.replace("\u00a0", " ").endswith(f"And it has {others}.")
+    assert not items
+    _, items = gap_words.answer(replace(beside, effects=double().effects))
+    assert items[-1].replace("\u00a0", " ") == f"and {others}"
     assert gap.document()["declared"]["mass"] == {
         "given": 1.2, "alone": 1.21, "with_effects": 1.21, "low": 1.19, "high": 1.23
     }  # fmt: skip

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import Effect
 from dropo_torch.gap.limit import share_of
+from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import Gap
 from dropo_torch.gap.run import find_gap
 from dropo_torch.gap.scene import Scene, prepare
@@ -26,16 +27,24 @@ from dropo_torch.support.report import Report
 _RANKS = {"no gap": 0, "explained": 0, "partly explained": 1, "unnamed": 2}
 #: Share of the open-loop error above the noise floor by which names are an answer although something remains.
 ENOUGH = 0.9
+#: Effects that change what a body weighs, or where; and χ² per degree of freedom, relative to what they leave, up to
+#: which the body's own mass does as well.
+MASSIVE, AS_GOOD = ("payload", "center_of_mass", "inertia"), 1.05
 _HELD = (
     "The config's parameters are as the model has them: names without them close most of the gap. To have the rest "
     "tried with the parameters fitted, add --as_given false."
 )
 
 
-def as_given(problem: Problem) -> Problem:
-    """Return a problem in which the model's own parameters are as the model has them; effects keep theirs."""
+def as_given(problem: Problem, free: Collection[str] = ()) -> Problem:
+    """Return a problem in which the model's own parameters are as the model has them; effects keep theirs.
+
+    Args:
+        problem: the model, its parameters, and the log.
+        free: names of parameters that are fitted all the same.
+    """
     config = problem.config
-    kept = {name: entry for name, entry in (config.parameters or {}).items() if "effect" in entry}
+    kept = {name: entry for name, entry in (config.parameters or {}).items() if "effect" in entry or name in free}
     held = config.model_copy(update={"parameters": kept, "as_given": False})
     made = make_problem(held.model_copy(update={"trajectories": None}), log=problem.trajectories, general=True)
     sensed = problem.sensed
@@ -56,7 +65,8 @@ def find_gap_as_given(
 ) -> tuple[Problem, Gap]:
     """Return what is missing in the model as given; where that has no answer, with its parameters fitted, if better.
 
-    Names that leave something are an answer where they close :data:`ENOUGH` of the gap in open loop.
+    Names that leave something are an answer where they close :data:`ENOUGH` of the gap in open loop. Where the mass of
+    a body does as well as what was named there, it is the answer.
 
     Args:
         problem: the model, its parameters, and the log.
@@ -82,15 +92,45 @@ def find_gap_as_given(
 
     first = sought(held, path, scene or prepare(held), share_of(end, 1))
     if _RANKS[first.verdict] == 0:
-        return held, first
+        if (plain := as_own(problem, first)) is None:
+            return held, first
+        other = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}-own")
+        second = sought(plain, other, prepare(plain), end)
+        return (plain, _both(first, second)) if _RANKS[second.verdict] == 0 else (held, first)
     if first.verdict == "partly explained" and first.closed >= ENOUGH:
         return held, replace(first, notes=(*first.notes, _HELD))
     report("fitting the config's parameters", 0.0)
     second = sought(problem, checkpoint, prepare(problem), end)
-    seconds, count = (first.seconds + second.seconds, first.simulated_transitions + second.simulated_transitions)
-    better = _standing(second) < _standing(first)
-    found, gap = (problem, second) if better else (held, first)
-    return found, replace(gap, seconds=seconds, simulated_transitions=count)
+    if _standing(second) < _standing(first):
+        return problem, _both(first, second)
+    return held, _both(second, first)
+
+
+def as_own(problem: Problem, gap: Gap) -> Problem | None:
+    """Return a problem in which masses that the config has make up for what was named at their bodies, if they do.
+
+    What sits on a body has more numbers than the mass of the body itself, which may just be another than the model's.
+
+    Args:
+        problem: the model, its parameters, and the log.
+        gap: what explains the log in the model as given.
+    """
+    bodies = {e.target for e in gap.effects if e.effect in MASSIVE}
+    parameters = problem.config.parameters or {}
+    free = [n for n, p in parameters.items() if str(p.get("field")).startswith("body_") and p.get("name") in bodies]
+    if not free:
+        return None
+    plain = as_given(problem, free)
+    scene = prepare(plain)
+    left = refit(scene.evidence, scene.begin, slopes=False).cost.reduced
+    named = max(gap.reduced[1], 0.0 if gap.own_step is None else gap.own_step[0])
+    return plain if left <= AS_GOOD * named else None
+
+
+def _both(other: Gap, gap: Gap) -> Gap:
+    """An answer, with what it took to find another one, too."""
+    count = other.simulated_transitions + gap.simulated_transitions
+    return replace(gap, seconds=other.seconds + gap.seconds, simulated_transitions=count)
 
 
 def _standing(gap: Gap) -> tuple[int, float]:

@@ -195,7 +195,16 @@ def ambiguous(effect: NamedEffect) -> str:
 
 
 def answer(gap: Gap) -> tuple[str, list[str]]:
-    """Return what is missing in one sentence, and the items of a list that it announces, if any."""
+    """Return what is missing in a sentence or two, and the items of a list that they announce, if any."""
+    sentence, items = _answer(gap)
+    if not any(map(is_named, gap.effects)) or gap.forces or not (values := corrected(gap)):
+        return sentence, items
+    others = f"other values of parameters: {joined(values, 4)}"
+    return (sentence, [*items, f"and {others}"]) if items else (f"{sentence} And it has {others}.", items)
+
+
+def _answer(gap: Gap) -> tuple[str, list[str]]:
+    """The answer without other values of the config's parameters, unless there is nothing else."""
     named = [e for e in gap.effects if is_named(e)]
     unexplained = f"none of the {len(VOCABULARY)} known effects explains"
     if not gap.found:
