@@ -153,4 +153,5 @@ def test_a_motion_goes_on_as_it_would_be() -> None:
 def test_what_a_log_must_show_to_judge_the_rest(silent: list[tuple[str, str | None]], words: str) -> None:
     placed = [Placed(VOCABULARY[effect], target) for effect, target in silent]
     assert excite(placed) == f"To judge what this log cannot, record a motion that {words}."
+    assert excite([Placed(VOCABULARY["integration"], None, (1e-3,)), *placed]) == excite(placed)
     assert excite([]) is None

@@ -90,10 +90,13 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     if not found:
         return Advice(f"No motion that was tried tells {names}.", tells=False)
     most, words, count = max(found)
-    if most < max(evidence.rules.shown.apart, float(np.sqrt(SURELY * near(own, evidence.rules)))):
+    needed = max(evidence.rules.shown.apart, float(np.sqrt(SURELY * near(own, evidence.rules))))
+    if most < needed:
+        why = "on this robot they may be the same thing"
+        if most > evidence.rules.shown.apart:
+            why = f"beside what neither explains, it takes {needed:.0f} σ"
         return Advice(
-            f"None of {len(found)} motions that were tried would tell {names} (at best {most:.1f} σ): "
-            "on this robot they may be the same thing.",
+            f"None of {len(found)} motions that were tried would tell {names} (at best {most:.1f} σ): {why}.",
             tells=False,
         )
     sentence = f"To tell {names}, record {words}: over {count} windows it would separate them by {most:.0f} σ."
@@ -136,6 +139,7 @@ def separation(motion: Evidence, true: Hypothesis, rival: Refit, share: float = 
 
 def excite(silent: Sequence[Placed]) -> str | None:
     """Return what a log would have to show so that candidates that it cannot judge can be judged."""
+    silent = [p for p in silent if not p.effect.steps]  # whatever moves, the model's step is the same
     if not silent:
         return None
     wanted: dict[str, list[str]] = {}

@@ -299,14 +299,13 @@ def by_joint(named: Iterable[NamedEffect], joints: Mapping[str, str]) -> list[st
 
 def left(remaining: Remaining) -> str:
     """Return what named effects leave, and where and when it shows."""
+    when = f"mostly at {remaining.where}{f', {remaining.when}' if remaining.when else ''}"
+    far = f"open-loop errors are {short(remaining.open_loop)} times what noise makes"
+    astray = remaining.open_loop > Sound().astray
+    if astray and remaining.chi2_per_degree < Sound().rest:
+        return f"short stretches show no more than noise, but {far}, {when}"
     size = f"what remains is {short(remaining.chi2_per_degree)} times what noise would leave (χ² per degree of freedom)"
-    when = f", {remaining.when}" if remaining.when else ""
-    far = (
-        f"; open-loop errors are {short(remaining.open_loop)} times what noise makes"
-        if remaining.open_loop > Sound().astray
-        else ""
-    )
-    return f"{size}, mostly at {remaining.where}{when}{far}"
+    return f"{size}, {when}{f'; {far}' if astray else ''}"
 
 
 def shows(gap: Gap) -> str:
