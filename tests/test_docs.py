@@ -441,7 +441,7 @@ def test_every_effect_is_documented() -> None:
 
     rows = re.findall(r"^\| `(\w+)` \|.*\| (yes|no) \|$", (ROOT / "docs" / "effects.md").read_text(), re.MULTILINE)
     ours = {n: e for n, e in VOCABULARY.items() if type(e).__module__.startswith("dropo_torch.")}
-    assert dict(rows) == {name: "yes" if effect.native else "no" for name, effect in ours.items()}
+    assert dict(rows) == {name: "yes" if effect.in_mjcf else "no" for name, effect in ours.items()}
 
 
 @pytest.mark.skipif("DROPO_DATA" not in os.environ, reason="DROPO_DATA names no folder with DATA_EMPS.mat")

@@ -192,6 +192,20 @@ def test_drag_is_the_square_of_the_speed_and_brakes_no_rotation(geom: str, facin
         np.testing.assert_allclose(data.qfrc_passive[3:], 0, atol=1e-6)  # nor does the other body feel anything
 
 
+def test_linear_drag_slows_a_free_body_in_proportion_to_its_speed() -> None:
+    xml = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
+      <body name="drone"><freejoint/><geom type="box" size=".1 .2 .3" mass="2"/></body>
+      <body name="link" pos="9 0 0"><joint/><geom size=".1" pos=".3 0 0"/></body></worldbody></mujoco>"""
+    model, data = applied(xml, "linear_drag", "drone", 0.4)
+    data.qvel[:6] = 1.0, -2.0, 0.5, 3.0, 1.0, -1.0
+    spin = float(np.linalg.norm(np.diag(model.body_inertia[1]) @ data.qvel[3:6]))
+    mujoco.mj_step(model, data, 1000)
+    np.testing.assert_allclose(data.qvel[:3], np.exp(-0.4 / 2) * np.array([1.0, -2.0, 0.5]), rtol=1e-3)
+    after = float(np.linalg.norm(np.diag(model.body_inertia[1]) @ data.qvel[3:6]))
+    assert after == pytest.approx(spin, rel=1e-2)  # it turns as before
+    assert find_effect("linear_drag").targets(setting_of(general(xml))) == ["drone"]
+
+
 def test_a_payload_is_a_welded_point_mass() -> None:
     loaded, data = applied(RIG, "payload", "lower", 0.4, 0.05, 0.02, -0.3)
     inertial = '<body pos=".05 .02 -.3"><inertial pos="0 0 0" mass="0.4" diaginertia="1e-12 1e-12 1e-12"/></body>'
@@ -1135,7 +1149,7 @@ def test_a_run_says_what_its_model_file_lacks(tmp_path: Path, capsys: pytest.Cap
 
 
 def native_placements() -> list[Any]:
-    return [p for p in placements() if p.values[0].native]
+    return [p for p in placements() if p.values[0].in_mjcf]
 
 
 @pytest.mark.parametrize(("effect", "target"), native_placements())

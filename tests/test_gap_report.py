@@ -354,7 +354,10 @@ LEFT = Remaining(1354.7, 0.0075, 0.83, "wrist", "when wrist accelerates", 2.0)
 def test_what_remains_is_said_in_the_first_sentence(tmp_path: Path, effects: tuple[NamedEffect, ...]) -> None:
     gap = replace(single(), effects=effects, remaining=LEFT)
     faint = gap_words.left(replace(LEFT, chi2_per_degree=1.02, open_loop=8.0))
-    assert faint.startswith("short stretches show no more than noise, but open-loop errors are 8 times what noise makes")
+    words = "short stretches show no more than noise, but open-loop errors are 8 times what noise makes"
+    assert faint.startswith(words)
+        "short stretches show no more than noise, but open-loop errors are 8 times what noise makes"
+    )
     text = page(tmp_path, gap)
     for part in (
         "not explain everything",

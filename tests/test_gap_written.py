@@ -241,7 +241,7 @@ def require_same_everywhere(names: tuple[str, ...], tmp_path: Path) -> None:
     assert torch.isfinite(after_step["next", "observation"]).all()
     assert env.task.timestep == pytest.approx(SKIP * STEP)
     # MuJoCo
-    if all(p.effect.native for p in placed):
+    if all(p.effect.in_mjcf for p in placed):
         model = mujoco.MjModel.from_xml_path(str(out / "model.xml"))
         data, steps = mujoco.MjData(model), round(SKIP * STEP / model.opt.timestep)
         ours, _ = twin.predict([hypothesis.variant], windows)

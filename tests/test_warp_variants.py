@@ -34,6 +34,7 @@ NATIVE: list[tuple[tuple[str, str | None, tuple[float, ...]], ...]] = [
     (("gravity_tilt", None, (0.1, 0.05)),),
     (("integration", None, (0.0025,)),),
     (("fluid_drag", "cart", (0.5,)),),
+    (("linear_drag", "ball", (0.5,)),),
     (("actuator_gain", "lift", (0.7,)), ("armature", "elbow", (0.05,))),
 ]
 #: Effects that are forces, alone, together, and beside another step.

@@ -282,8 +282,13 @@ class Effect(abc.ABC):
 
     @property
     def native(self) -> bool:
-        """Whether MJCF can express the effect: it is numbers of the model and nothing else."""
+        """Whether the effect is numbers of the model and nothing else."""
         return not (self.has("force") or self.has("wrench") or self.is_filter)
+
+    @property
+    def in_mjcf(self) -> bool:
+        """Whether MJCF can express the effect: not all numbers of a model can be told apart there."""
+        return self.native
 
     @property
     def outer(self) -> bool:

@@ -217,6 +217,44 @@ class FluidDrag(BodyEffect):
         model.geom_fluid[geom, 1] = values[0] / (area * self.DENSITY)
 
 
+class LinearDrag(BodyEffect):
+    """Drag of air or water on a free body, in proportion to its speed: of what is slow, small, or driven by rotors.
+
+    It is damping of the three degrees of freedom in which the body's frame moves.
+    """
+
+    name = "linear_drag"
+    turning = False
+    sentence = "drag of air or water on {target}, in proportion to its speed"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        free = [j for j in range(setting.model.njnt) if setting.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
+        names, bodies = setting.names("body"), setting.model.jnt_bodyid[free]
+        floating = {names[b] for b in bodies}
+        return [t for t in super().targets(setting) if t in floating]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        m, body = setting.model, body_number(setting.model, target)
+        scale = float(m.body_subtreemass[body]) / float(setting.signals.linear_speed[body])
+        own = float(self._damping(m, target).min())
+        return (Quantity("coefficient", "N·s/m", 0.0, -own, 100 * scale, scale),)
+
+    @staticmethod
+    def _damping(model: mujoco.MjModel, target: str | None) -> np.ndarray:
+        """The damping of the degrees of freedom in which a body's frame moves, ``(3,)``, a view."""
+        first = int(model.body_dofadr[body_number(model, target)])
+        damping = np.reshape(model.dof_damping, (model.nv, -1))
+        return np.asarray(damping[first : first + 3, 0])
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        self._damping(model, target)[:] += values[0]
+
+    @property
+    def in_mjcf(self) -> bool:
+        """No: there, a free joint has one damping, which slows its turning, too."""
+        return False
+
+
 def _largest_section(model: mujoco.MjModel, geom: int) -> float:
     """Return the largest section of the ellipsoid by which MuJoCo computes a geom's drag, in m²."""
     radius, length, _ = size = model.geom_size[geom]

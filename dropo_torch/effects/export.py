@@ -48,7 +48,7 @@ def write_model(
     model = spec.compile()
     if space is not None and values is not None:
         space.write_into(model, values)
-    model = applied(model, [p for p in placed if p.effect.native])
+    model = applied(model, [p for p in placed if p.effect.in_mjcf])
     try:
         with quiet_mujoco():
             mujoco.mj_setConst(model, mujoco.MjData(model))
@@ -59,7 +59,7 @@ def write_model(
         raise InputError(f"export: MJCF cannot express these effects: {' '.join(str(error).split())}") from None
     write_atomically(path, text.encode())
     _compare(path, model)
-    return [p for p in placed if not p.effect.native]
+    return [p for p in placed if not p.effect.in_mjcf]
 
 
 def _copy_rest(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:

@@ -49,6 +49,7 @@ MOTIONS = {
     "geom": "slides and presses on these geoms",
     "ground_slope": "slides and presses on the ground",
     "fluid_drag": "moves these bodies fast",
+    "linear_drag": "moves these bodies fast",
 }
 
 
