@@ -356,8 +356,6 @@ def test_what_remains_is_said_in_the_first_sentence(tmp_path: Path, effects: tup
     faint = gap_words.left(replace(LEFT, chi2_per_degree=1.02, open_loop=8.0))
     words = "short stretches show no more than noise, but open-loop errors are 8 times what noise makes"
     assert faint.startswith(words)
-        "short stretches show no more than noise, but open-loop errors are 8 times what noise makes"
-    )
     text = page(tmp_path, gap)
     for part in (
         "not explain everything",
