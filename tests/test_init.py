@@ -23,6 +23,7 @@ from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
 from dropo_torch.proposal.clock import find_clock
 from dropo_torch.proposal.columns import read_columns
+from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
 from dropo_torch.proposal.matching import match_columns, motion
 from dropo_torch.proposal.places import places_of
@@ -670,3 +671,14 @@ def test_a_config_that_exists_is_kept_unless_told_otherwise(tmp_path: Path, capf
     assert main(["init", "robot.xml", "log.csv", "--out", str(out)]) == 2
     assert capfd.readouterr().err == f"dropo: --out: {out} already exists; choose another name or pass --overwrite\n"
     assert out.read_text() == "mine"
+
+
+def test_the_noise_of_an_orientation_is_told_as_that_of_its_angular_velocity() -> None:
+    rate, cutoff, size, rows = 100.0, 18.0, 1e-3, 20_000
+    turn = size * np.random.default_rng(0).normal(size=(rows, 3))  # small rotations: a quaternion has half of each
+    density = {f"base.position[q{axis}]": (size / 2) ** 2 / (rate / 2) for axis in "xyz"} | {"base.position[qw]": 0.0}
+    frequency = np.fft.rfftfreq(rows, 1 / rate)[:, None]
+    kept = np.where(frequency <= cutoff, np.fft.rfft(turn, axis=0), 0.0)
+    rates = np.fft.irfft(2j * np.pi * frequency * kept, rows, axis=0)
+    assert Filter(cutoff, density).turning_noise("base") == pytest.approx(rates.std(), rel=0.03)
+    assert Filter(cutoff, density).turning_noise("other") == 0.0

@@ -309,7 +309,18 @@ class Filter:
 
     def noise(self, label: str, *, of_rate: bool) -> float:
         """Return the standard deviation that the filter leaves of a position's noise, or of its derivative's."""
-        power = self.density.get(label, 0.0) * self.cutoff
+        return self._left(self.density.get(label, 0.0), of_rate=of_rate)
+
+    def turning_noise(self, joint: str) -> float:
+        """Return that of an angular velocity, rad/s, from the noise of an orientation.
+
+        A small rotation about an axis changes a unit quaternion by half as much, about each of three at right angles.
+        """
+        parts = (v for label, v in self.density.items() if label.startswith(f"{joint}.position[q"))
+        return self._left(4 / 3 * sum(parts), of_rate=True)
+
+    def _left(self, density: float, *, of_rate: bool) -> float:
+        power = density * self.cutoff
         return math.sqrt(power * ((2 * math.pi * self.cutoff) ** 2 / 3 if of_rate else 1.0))
 
 

@@ -94,7 +94,9 @@ def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
 
 def _left(smooth: Filter, label: str) -> float:
     """The noise that a filter leaves of an observed column."""
-    of_rate = ".velocity" in label
+    of_rate, joint = ".velocity" in label, label.split(".")[0]
+    if of_rate and "[w" in label:
+        return smooth.turning_noise(joint)
     return smooth.noise(label.replace(".velocity[v", ".position[").replace(".velocity", ".position"), of_rate=of_rate)
 
 
