@@ -150,6 +150,23 @@ def test_names_of_poses(name: str, axis: str, quaternion: bool, angular: bool) -
     assert (words.axis, words.quaternion, words.angular) == (axis, quaternion, angular)
 
 
+# --- columns of a cart that nothing but a motor holds ---
+
+CART = """<mujoco><worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1"/></body>
+  </worldbody><actuator><motor name="pusher" joint="rail"/></actuator></mujoco>"""
+
+
+def test_a_model_of_level_slides_alone_is_matched(tmp_path: Path) -> None:
+    """A log may lack every position of such a model, and needs no array of states."""
+    t = 0.02 * np.arange(200)
+    frame = {"time": t, "cart_pos": np.sin(t), "cart_vel": np.cos(t), "force_cmd": np.sin(3 * t)}
+    assert matched(tmp_path, frame, CART) == {
+        "rail.position": "cart_pos", "rail.velocity": "cart_vel", "pusher": "force_cmd",
+    }  # fmt: skip
+    del frame["cart_pos"]
+    assert matched(tmp_path, frame, CART) == {"rail.velocity": "cart_vel", "pusher": "force_cmd"}
+
+
 # --- columns of an arm ---
 
 ARM = """<mujoco><worldbody><body name="turntable"><joint name="base_yaw" axis="0 0 1"/><geom size=".1"/>

@@ -153,7 +153,7 @@ def _whole_state(columns: Columns, places: Sequence[Place], starts: np.ndarray) 
         orders += [some + velocities, velocities + some, some]
         if len(some) == len(velocities):
             orders.append([p for pair in zip(some, velocities, strict=True) for p in pair])
-    orders = [o for o in orders if len(o) == len(array)]
+    orders = [o for o in orders if o and len(o) == len(array)]  # a model that may lack all positions has an empty one
     if not orders:
         return []
     best = max(orders, key=lambda order: _likeness(order, array, starts))
