@@ -536,6 +536,27 @@ def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -
     assert any(note.endswith("short gaps are bridged: 1 of theta") for note in found.draft.notes)
 
 
+def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """A sensor that reports an error once has a column of numbers; one that mostly does has none."""
+    t, q, v, u = log
+    frame = {
+        "time": t, "x": q[:, 0], "theta": q[:, 1], "x_dot": v[:, 0], "theta_dot": v[:, 1], "force_cmd": u[:, 0],
+        "x_state": v[:, 0],
+    }  # fmt: skip
+    files = written(tmp_path, frame)
+    cells = pd.read_csv(files[1], dtype=str)
+    cells.loc[[70, 90], "theta_dot"] = "ERR"
+    cells.loc[cells.index % 3 > 0, "x_state"] = "OK"
+    cells.to_csv(files[1], index=False)
+    proposal = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    assert proposal.matching.at("hinge.velocity") is not None
+    told = [note for note in proposal.draft.notes if "not measured" in note]
+    assert len(told) == 1 and told[0].endswith("2 of theta_dot; theta_dot is 'ERR' at row 70 (counted from 0)")
+    columns = read_columns(files[1])
+    (states,) = (c for c in columns.columns if c.entry == "x_state")
+    assert not states.values.size
+
+
 def test_even_rows_of_a_rate_that_the_model_has_not_stay_as_they_are(tmp_path: Path) -> None:
     """Thirty rows a second are no whole number of steps of 5 ms: resampled, rows would see parts of two commands."""
     model = mujoco.MjModel.from_xml_string(CARTPOLE)

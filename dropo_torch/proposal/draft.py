@@ -197,8 +197,13 @@ def _lost(matching: Matching) -> list[str]:
     notes = [f"not used, for nothing of the model is called so: {', '.join(free[:6])}" + ", ..." * (len(free) > 6)]
     lost = {m.column.entry: int(np.isnan(m.column.values).sum()) for m in matching.matches}
     holes = [f"{count} of {name}" for name, count in lost.items() if count]
+    worded = {m.column.entry: m.column.text for m in matching.matches}
+    texts = [f"{name} is {text[1]!r} at row {text[0]} (counted from 0)" for name, text in worded.items() if text]
     return (notes if free else []) + (
-        [f"values that are NaN or blank count as not measured; short gaps are bridged: {', '.join(holes)}"]
+        [
+            f"values that are {'NaN, blank or text' if texts else 'NaN or blank'} count as not measured; short gaps are "
+            f"bridged: {'; '.join([', '.join(holes), *texts])}"
+        ]
         if holes
         else []
     )
