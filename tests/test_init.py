@@ -557,6 +557,29 @@ def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarr
     assert not states.values.size
 
 
+def comments(config: str) -> dict[str, str]:
+    """What the comments of a config say that columns are, by column."""
+    lines = [line.removeprefix("# ").split(" is ", 1) for line in config.splitlines() if "# " in line and " is " in line]
+    return {column: rest for column, rest in lines if ", by " in rest}
+
+
+def test_comments_tell_columns_as_the_config_reads_them(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """A cure of the examination moves a column or gives it another unit, and the comment says where it then is."""
+    t, q, v, u = log
+    frame = {"time": t, "x": q[:, 0], "theta": v[:, 1], "x_dot": v[:, 0], "theta_dot": q[:, 1], "force_cmd": u[:, 0]}
+    proposal = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
+    entries = [e if isinstance(e, str) else e["signal"] for e in proposal.document["data"]["observations"]]
+    read = dict(zip(entries, proposal.document["observation"], strict=True))
+    assert read["theta"] == "hinge.velocity"
+    told = comments(proposal.text)
+    assert {c: told[c].split(" in ")[0] for c in read} == read
+    assert told["theta"].startswith("hinge.velocity in rad/s: ")
+    assert told["theta_dot"].startswith("hinge.position in rad: ")
+    assert [m.place.label for m in proposal.matching.matches][:4] == [
+        "slider.position", "hinge.position", "slider.velocity", "hinge.velocity",
+    ]  # fmt: skip
+
+
 def test_even_rows_of_a_rate_that_the_model_has_not_stay_as_they_are(tmp_path: Path) -> None:
     """Thirty rows a second are no whole number of steps of 5 ms: resampled, rows would see parts of two commands."""
     model = mujoco.MjModel.from_xml_string(CARTPOLE)

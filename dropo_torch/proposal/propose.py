@@ -23,7 +23,7 @@ from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
-from dropo_torch.proposal.draft import Draft, Reading, is_whole, make_draft
+from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
@@ -159,6 +159,7 @@ def propose_config(
     tell("examining the log", 0.1)
     data = _relative(columns.path, base)
     draft = make_draft(Reading(_relative(path, base), data, columns, matching, places, clock, step, base))
+    matching = as_read(matching, places, draft)
     if step != own:
         draft = draft.noted(
             f"rows {clock.dt:.6g} s apart are no whole number of the model's steps of {own:g} s: {path.name} is the "
