@@ -78,6 +78,49 @@ def cured(config: Mapping[str, Any], cure: Mapping[str, Any], folder: Path) -> t
     return examined({**config, **lines, "data": data}, folder)[0]
 
 
+# --- what kinematics leave open, the model decides or nobody does ---
+
+
+@pytest.mark.parametrize("columns", [(0, 1), (2, 3)])
+def test_of_positions_and_velocities_those_are_exchanged_that_the_model_says(columns: tuple[int, int]) -> None:
+    """The likeness of velocities to positions is the same either way; the cure gives the log that was."""
+    arrays = record(steps=400, noise=1e-4)
+    order = np.arange(4)
+    order[list(columns)] = order[list(columns[::-1])]
+    log = Trajectories(
+        **{**arrays, **{name: arrays[name][:, order] for name in ("observations", "next_observations")}}
+    )
+    (found,) = arm_findings(log)
+    assert names((found,)) == [("order", "sure")]
+    entries = found.cure["observation"]
+    right = parse_observation(mujoco.MjModel.from_xml_string(XML), entries, 4)
+    assert right.columns == tuple(order.tolist())
+
+
+TWINS = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="left" stiffness="3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/></body>
+  <body pos="0 1 0"><joint name="right" stiffness="3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/></body>
+  </worldbody></mujoco>"""
+
+
+def test_an_exchange_that_the_model_cannot_decide_is_told_with_both_readings() -> None:
+    """Of twins that swing by themselves nothing tells which is which: no cure is as good as another."""
+    model = mujoco.MjModel.from_xml_string(TWINS)
+    data, rows, rng = mujoco.MjData(model), [], np.random.default_rng(0)
+    data.qpos[:], data.qvel[:] = (0.5, -0.3), (0.0, 4.0)
+    for _ in range(401):
+        rows.append(np.concatenate([data.qpos[::-1], data.qvel]))
+        mujoco.mj_step(model, data, 2)
+    path = np.array(rows) + 1e-4 * rng.standard_normal((401, 4))
+    log = Trajectories(path[:-1], path[1:], np.zeros((400, 0)), np.arange(400) == 399)
+    found = examine(log, parse_observation(model, None, 4), model, 2)
+    assert names(found) == [("order", "doubtful")]
+    assert not found[0].cure
+    for reading in ("[left.position, right.position, right.velocity, left.velocity]",
+                    "[right.position, left.position, left.velocity, right.velocity]"):  # fmt: skip
+        assert reading in found[0].advice
+
+
 # --- what only a robot can look like is never sure ---
 
 
