@@ -121,6 +121,41 @@ def test_an_exchange_that_the_model_cannot_decide_is_told_with_both_readings() -
         assert reading in found[0].advice
 
 
+WAGON = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="rail" type="slide" axis="1 0 0"{spring}/><geom size=".1" mass="1"/></body></worldbody>
+  <actuator><motor name="pull" joint="rail"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("spring", "negated", "told"),
+    [
+        ("", "joint", ("action_sign", "doubtful")),  # a mass alone goes either way alike
+        (' springref="1" stiffness="9"', "joint", ("joint_sign", "sure")),
+        (' springref="1" stiffness="9"', "command", ("action_sign", "sure")),
+    ],
+)
+def test_a_command_against_its_sign_may_be_the_joints(spring: str, negated: str, told: tuple[str, str]) -> None:
+    """Which of the two was negated the model says, or both are told and neither is a cure."""
+    model = mujoco.MjModel.from_xml_string(WAGON.format(spring=spring))
+    data, path, actions, rng = mujoco.MjData(model), [], [], np.random.default_rng(0)
+    for row in range(401):
+        path.append([data.qpos[0], data.qvel[0]])
+        data.ctrl[0] = 3 * np.sin(0.13 * row) + rng.standard_normal()
+        actions.append([data.ctrl[0]])
+        mujoco.mj_step(model, data, 2)
+    states = np.array(path) + 1e-4 * rng.standard_normal((401, 2))
+    commands = np.array(actions[:-1]) * (-1 if negated == "command" else 1)
+    states *= -1 if negated == "joint" else 1
+    log = Trajectories(states[:-1], states[1:], commands, np.arange(400) == 399)
+    (found,) = examine(log, parse_observation(model, None, 2), model, 2)
+    assert (found.name, found.confidence) == told
+    scale = dict(found.cure["data"]["scale"]) if found.cure else {}
+    joint, command = {"observations[0]": -1.0, "observations[1]": -1.0}, {"actions": -1.0}
+    assert scale == ({} if not found.sure else joint if negated == "joint" else command)
+    if not found.sure:
+        assert "{actions: -1}" in found.advice and "{observations[0]: -1, observations[1]: -1}" in found.advice
+
+
 # --- what only a robot can look like is never sure ---
 
 

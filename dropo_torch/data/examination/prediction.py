@@ -120,9 +120,10 @@ def better_reading(record: Record, readings: Sequence[Reading], rules: Rules) ->
     (least, best), (other, second) = sorted(known)[:2]
     first, following = misfits[best], misfits[second]
     assert first is not None and following is not None
-    change = following - first
-    error = float(change.std(ddof=1)) * np.sqrt(len(change))
-    clear = float(change.sum()) > rules.sure_significance * max(error, 1e-12) and least < rules.reading * other
+    floor = max(float(first.mean()), 1e-12)  # blocks count alike, however much moves in them
+    change = np.log((following + floor) / (first + floor))
+    error = float(change.std(ddof=1)) / np.sqrt(len(change))
+    clear = float(change.mean()) > rules.sure_significance * error and least < rules.reading * other
     return best if clear else None
 
 
