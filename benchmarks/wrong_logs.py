@@ -244,16 +244,19 @@ def _sign(log: Log, rng: np.random.Generator) -> Log:
     return _scaled(log, [int(rng.choice(scalars(log, True) or range(7, 10)))], -1.0)
 
 
-def _swapped(log: Log, rng: np.random.Generator) -> Log:
-    first, second = rng.choice(
-        hinges(log, True) if len(hinges(log, True)) > 1 else scalars(log, True), 2, replace=False
-    )
+def _swapped(log: Log, rng: np.random.Generator, velocities: bool = True) -> Log:
+    turning = hinges(log, velocities)
+    first, second = rng.choice(turning if len(turning) > 1 else scalars(log, velocities), 2, replace=False)
 
     def change(values: np.ndarray) -> np.ndarray:
         values[:, [first, second]] = values[:, [second, first]]
         return values
 
     return log.columns(change)
+
+
+def _swapped_positions(log: Log, rng: np.random.Generator) -> Log:
+    return _swapped(log, rng, velocities=False)
 
 
 def _interleaved(log: Log, rng: np.random.Generator) -> Log:
@@ -419,6 +422,7 @@ FAULTS = (
     Fault("units", "positions in millimetres", ("units",), _millimetres, (CART, BOX)),
     Fault("columns", "a velocity's sign", ("sign",), _sign, (ARM, CART, LEG, BOX)),
     Fault("columns", "two velocities exchanged", ("order",), _swapped, (ARM, LEG)),
+    Fault("columns", "two positions exchanged", ("order",), _swapped_positions, (ARM, LEG)),
     Fault("columns", "positions and velocities in turn", ("order",), _interleaved, (ARM, CART)),
     Fault("velocity late", "velocities a row late", ("delay",), _late_velocity, (ARM, CART, LEG, BOX)),
     Fault("wraps", "angles that wrap", ("wraps",), _wrapped, (ARM, CART)),

@@ -78,6 +78,84 @@ def cured(config: Mapping[str, Any], cure: Mapping[str, Any], folder: Path) -> t
     return examined({**config, **lines, "data": data}, folder)[0]
 
 
+# --- what kinematics leave open, the model decides or nobody does ---
+
+
+@pytest.mark.parametrize("columns", [(0, 1), (2, 3)])
+def test_of_positions_and_velocities_those_are_exchanged_that_the_model_says(columns: tuple[int, int]) -> None:
+    """The likeness of velocities to positions is the same either way; the cure gives the log that was."""
+    arrays = record(steps=400, noise=1e-4)
+    order = np.arange(4)
+    order[list(columns)] = order[list(columns[::-1])]
+    log = Trajectories(
+        **{**arrays, **{name: arrays[name][:, order] for name in ("observations", "next_observations")}}
+    )
+    (found,) = arm_findings(log)
+    assert names((found,)) == [("order", "sure")]
+    entries = found.cure["observation"]
+    right = parse_observation(mujoco.MjModel.from_xml_string(XML), entries, 4)
+    assert right.columns == tuple(order.tolist())
+
+
+TWINS = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="left" stiffness="3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/></body>
+  <body pos="0 1 0"><joint name="right" stiffness="3"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".03"/></body>
+  </worldbody></mujoco>"""
+
+
+def test_an_exchange_that_the_model_cannot_decide_is_told_with_both_readings() -> None:
+    """Of twins that swing by themselves nothing tells which is which: no cure is as good as another."""
+    model = mujoco.MjModel.from_xml_string(TWINS)
+    data, rows, rng = mujoco.MjData(model), [], np.random.default_rng(0)
+    data.qpos[:], data.qvel[:] = (0.5, -0.3), (0.0, 4.0)
+    for _ in range(401):
+        rows.append(np.concatenate([data.qpos[::-1], data.qvel]))
+        mujoco.mj_step(model, data, 2)
+    path = np.array(rows) + 1e-4 * rng.standard_normal((401, 4))
+    log = Trajectories(path[:-1], path[1:], np.zeros((400, 0)), np.arange(400) == 399)
+    found = examine(log, parse_observation(model, None, 4), model, 2)
+    assert names(found) == [("order", "doubtful")]
+    assert not found[0].cure
+    for reading in ("[left.position, right.position, right.velocity, left.velocity]",
+                    "[right.position, left.position, left.velocity, right.velocity]"):  # fmt: skip
+        assert reading in found[0].advice
+
+
+WAGON = """<mujoco><option timestep="0.005"/><worldbody>
+  <body><joint name="rail" type="slide" axis="1 0 0"{spring}/><geom size=".1" mass="1"/></body></worldbody>
+  <actuator><motor name="pull" joint="rail"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("spring", "negated", "told"),
+    [
+        ("", "joint", ("action_sign", "doubtful")),  # a mass alone goes either way alike
+        (' springref="1" stiffness="9"', "joint", ("joint_sign", "sure")),
+        (' springref="1" stiffness="9"', "command", ("action_sign", "sure")),
+    ],
+)
+def test_a_command_against_its_sign_may_be_the_joints(spring: str, negated: str, told: tuple[str, str]) -> None:
+    """Which of the two was negated the model says, or both are told and neither is a cure."""
+    model = mujoco.MjModel.from_xml_string(WAGON.format(spring=spring))
+    data, path, actions, rng = mujoco.MjData(model), [], [], np.random.default_rng(0)
+    for row in range(401):
+        path.append([data.qpos[0], data.qvel[0]])
+        data.ctrl[0] = 3 * np.sin(0.13 * row) + rng.standard_normal()
+        actions.append([data.ctrl[0]])
+        mujoco.mj_step(model, data, 2)
+    states = np.array(path) + 1e-4 * rng.standard_normal((401, 2))
+    commands = np.array(actions[:-1]) * (-1 if negated == "command" else 1)
+    states *= -1 if negated == "joint" else 1
+    log = Trajectories(states[:-1], states[1:], commands, np.arange(400) == 399)
+    (found,) = examine(log, parse_observation(model, None, 2), model, 2)
+    assert (found.name, found.confidence) == told
+    scale = dict(found.cure["data"]["scale"]) if found.cure else {}
+    joint, command = {"observations[0]": -1.0, "observations[1]": -1.0}, {"actions": -1.0}
+    assert scale == ({} if not found.sure else joint if negated == "joint" else command)
+    if not found.sure:
+        assert "{actions: -1}" in found.advice and "{observations[0]: -1, observations[1]: -1}" in found.advice
+
+
 # --- what only a robot can look like is never sure ---
 
 

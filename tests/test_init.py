@@ -25,7 +25,7 @@ from dropo_torch.proposal.clock import find_clock
 from dropo_torch.proposal.columns import read_columns
 from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
-from dropo_torch.proposal.matching import match_columns, motion
+from dropo_torch.proposal.matching import match_columns, motion, unit_name
 from dropo_torch.proposal.places import places_of
 from dropo_torch.proposal.words import read_name
 
@@ -149,6 +149,77 @@ def test_the_words_of_a_joints_name_say_nothing_else(name: str, role: str, objec
 def test_names_of_poses(name: str, axis: str, quaternion: bool, angular: bool) -> None:
     words = read_name(name)
     assert (words.axis, words.quaternion, words.angular) == (axis, quaternion, angular)
+
+
+# --- columns of a cart that nothing but a motor holds ---
+
+CART = """<mujoco><worldbody><body name="cart"><joint name="rail" type="slide" axis="1 0 0"/><geom size=".1"/></body>
+  </worldbody><actuator><motor name="pusher" joint="rail"/></actuator></mujoco>"""
+
+
+def test_a_model_of_level_slides_alone_is_matched(tmp_path: Path) -> None:
+    """A log may lack every position of such a model, and needs no array of states."""
+    t = 0.02 * np.arange(200)
+    frame = {"time": t, "cart_pos": np.sin(t), "cart_vel": np.cos(t), "force_cmd": np.sin(3 * t)}
+    assert matched(tmp_path, frame, CART) == {
+        "rail.position": "cart_pos", "rail.velocity": "cart_vel", "pusher": "force_cmd",
+    }  # fmt: skip
+    del frame["cart_pos"]
+    assert matched(tmp_path, frame, CART) == {"rail.velocity": "cart_vel", "pusher": "force_cmd"}
+
+
+# --- columns of commands that are called after what they drive ---
+
+ROTORS = "".join(f'<motor name="thrust{i}" site="rotor{i}" gear="0 0 1 0 0 .016"/>' for i in range(1, 5))
+DRONE = f"""<mujoco><worldbody><body name="drone"><freejoint/><geom size=".1"/>
+  {"".join(f'<site name="rotor{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(
+      itertools.product((-0.1, 0.1), repeat=2), 1))}</body></worldbody><actuator>{ROTORS}</actuator></mujoco>"""
+
+
+def flown(command: str) -> dict[str, np.ndarray]:
+    """A log of the drone, whose rotors' columns are called so."""
+    names = [f"mocap_{axis}" for axis in ("px", "py", "pz", "qw", "qx", "qy", "qz")]
+    return {"time": 0.02 * np.arange(200)} | swung(names) | swung([command.format(i) for i in (3, 1, 2, 4)])
+
+
+@pytest.mark.parametrize("command", ["thrust{}", "motor{}", "rotor_{}", "thrust{}_cmd"])
+def test_a_command_may_be_called_after_its_actuator_or_be_numbered_like_it(command: str, tmp_path: Path) -> None:
+    """The exact name needs no word for a command, and motors of one number each have their order."""
+    found = matched(tmp_path, flown(command), DRONE)
+    assert [found.get(f"thrust{i}") for i in range(1, 5)] == [command.format(i) for i in range(1, 5)]
+
+
+@pytest.mark.parametrize("command", ["touch{}", "thrust{}_temp"])
+def test_numbered_columns_of_something_else_are_no_commands(command: str, tmp_path: Path) -> None:
+    assert not set(matched(tmp_path, flown(command), DRONE)) & {f"thrust{i}" for i in range(1, 5)}
+
+
+def test_a_column_called_after_a_joint_is_its_position(tmp_path: Path) -> None:
+    """Even if an actuator has the same name."""
+    xml = CART.replace('name="pusher"', 'name="rail"')
+    t = 0.02 * np.arange(200)
+    assert "rail" not in matched(tmp_path, {"time": t, "other_pos": np.sin(3 * t), "rail": np.sin(t)}, xml)
+
+
+@pytest.mark.parametrize(
+    ("gear", "transmission", "unit"),
+    [
+        ("0 0 1 0 0 0", 'site="rotor1"', "N"),
+        ("0 0 0 0 0 2", 'site="rotor1"', "N·m"),
+        ("0 0 1 0 0 .016", 'site="rotor1"', "N"),  # a thrust in newtons, which turns by the way
+        ("0 0 3 0 0 2", 'site="rotor1"', "SI"),
+        ("1", 'joint="fan"', "N·m"),
+        ("1", 'tendon="rope"', "N"),
+    ],
+)
+def test_the_unit_of_a_command_is_that_of_what_it_makes(gear: str, transmission: str, unit: str) -> None:
+    xml = DRONE.replace(ROTORS, f'<motor name="thrust" {transmission} gear="{gear}"/>')
+    fan = '<body><joint name="fan"/><geom size=".1"/><site name="end"/></body></body>'
+    xml = xml.replace("</body>", fan, 1).replace(
+        "<actuator>", '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial></tendon><actuator>'
+    )
+    (place,) = (p for p in places_of(mujoco.MjModel.from_xml_string(xml)) if p.kind == "command")
+    assert unit_name(1.0, place) == unit
 
 
 # --- columns of an arm ---
@@ -466,6 +537,50 @@ def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -
     assert any(note.endswith("short gaps are bridged: 1 of theta") for note in found.draft.notes)
 
 
+def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """A sensor that reports an error once has a column of numbers; one that mostly does has none."""
+    t, q, v, u = log
+    frame = {
+        "time": t, "x": q[:, 0], "theta": q[:, 1], "x_dot": v[:, 0], "theta_dot": v[:, 1], "force_cmd": u[:, 0],
+        "x_state": v[:, 0],
+    }  # fmt: skip
+    files = written(tmp_path, frame)
+    cells = pd.read_csv(files[1], dtype=str)
+    cells.loc[[70, 90], "theta_dot"] = "ERR"
+    cells.loc[cells.index % 3 > 0, "x_state"] = "OK"
+    cells.to_csv(files[1], index=False)
+    proposal = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    assert proposal.matching.at("hinge.velocity") is not None
+    told = [note for note in proposal.draft.notes if "not measured" in note]
+    assert len(told) == 1 and told[0].endswith("2 of theta_dot; theta_dot is 'ERR' at row 70 (counted from 0)")
+    columns = read_columns(files[1])
+    (states,) = (c for c in columns.columns if c.entry == "x_state")
+    assert not states.values.size
+
+
+def comments(config: str) -> dict[str, str]:
+    """What the comments of a config say that columns are, by column."""
+    lines = [line.removeprefix("# ").split(" is ", 1) for line in config.splitlines() if "# " in line and " is " in line]
+    return {column: rest for column, rest in lines if ", by " in rest}
+
+
+def test_comments_tell_columns_as_the_config_reads_them(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """A cure of the examination moves a column or gives it another unit, and the comment says where it then is."""
+    t, q, v, u = log
+    frame = {"time": t, "x": q[:, 0], "theta": v[:, 1], "x_dot": v[:, 0], "theta_dot": q[:, 1], "force_cmd": u[:, 0]}
+    proposal = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
+    entries = [e if isinstance(e, str) else e["signal"] for e in proposal.document["data"]["observations"]]
+    read = dict(zip(entries, proposal.document["observation"], strict=True))
+    assert read["theta"] == "hinge.velocity"
+    told = comments(proposal.text)
+    assert {c: told[c].split(" in ")[0] for c in read} == read
+    assert told["theta"].startswith("hinge.velocity in rad/s: ")
+    assert told["theta_dot"].startswith("hinge.position in rad: ")
+    assert [m.place.label for m in proposal.matching.matches][:4] == [
+        "slider.position", "hinge.position", "slider.velocity", "hinge.velocity",
+    ]  # fmt: skip
+
+
 def test_even_rows_of_a_rate_that_the_model_has_not_stay_as_they_are(tmp_path: Path) -> None:
     """Thirty rows a second are no whole number of steps of 5 ms: resampled, rows would see parts of two commands."""
     model = mujoco.MjModel.from_xml_string(CARTPOLE)
@@ -529,8 +644,8 @@ def test_a_passive_motion_tells_ratios_only(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("renamed", "words"),
     [
-        ({"theta": ""}, ("no column is hinge.position", "theta_dot")),
-        ({"force_cmd": "light"}, ("command of push", "light")),
+        ({"theta": ""}, ("no column is hinge.position", "every column of numbers is something else already")),
+        ({"force_cmd": "light"}, ("command of push", "(there are: light)")),
         ({"time": "row", "x_dot": "", "theta_dot": ""}, ("--dt SECONDS",)),
     ],
 )
@@ -551,6 +666,34 @@ def test_what_a_log_lacks_is_named_with_what_it_has(
     assert error.count("\n") == 1
     assert all(word in error for word in words), error
     assert not (tmp_path / "robot.yaml").exists()
+
+
+def test_a_body_without_an_orientation_in_the_log_is_named_with_what_to_do(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Nobody who has a ball knows of a joint that has no name."""
+    xml = '<mujoco><worldbody><body name="ball"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    frame = {"time": 0.02 * np.arange(200)} | swung(["ball_x", "ball_y", "ball_z", "throw"])
+    assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
+    error = capfd.readouterr().err
+    assert "the orientation of ball is not in the log; log it as ball_qw, ball_qx, ball_qy, ball_qz" in error
+    assert "three slides" in error and "joint0" not in error
+    del frame["ball_z"]
+    assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
+    assert "no column is ball.position[z]" in capfd.readouterr().err
+
+
+def test_what_a_column_was_found_by_is_said_once(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    t, q, v, u = log
+    frame = {"time": t, "x": q[:, 0], "theta": q[:, 1], "spin": v[:, 1], "force_cmd": u[:, 0]}
+    model = cartpole()
+    pd.DataFrame(frame).to_csv(tmp_path / "log.csv", index=False)
+    columns = read_columns(tmp_path / "log.csv", ["slider", "hinge"])
+    starts = np.arange(len(t)) == 0
+    found = match_columns(columns, places_of(model), starts, [c for c in columns.columns if c.entry == "time"])
+    spun = found.at("hinge.velocity")
+    assert spun is not None
+    assert spun.why.startswith("its motion (r²")
 
 
 def test_an_interactive_run_takes_corrections(

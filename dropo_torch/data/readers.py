@@ -248,12 +248,13 @@ def _recording(table: Table, options: ReadOptions) -> Recording:
     infers = isinstance(options.preprocess, Preprocess) and options.preprocess.infers_actions
     commands = [] if infers and options.actions is None else _wanted(table, options.actions, "actions")
     table = _chosen(table, wanted, commands, options)
-    observations, names = table.matrix(wanted, "observations")
+    bridged = replace(table, lenient=_bridges(options))
+    observations, names = bridged.matrix(wanted, "observations")
     if not names:
         raise InputError(f"{table.source}: observations: the list is empty; name at least one column")
     if len(observations) == 0:
         raise InputError(f"{table.source}: the log has no row; at least two samples are needed")
-    actions, action_names = table.matrix(commands, "actions", len(observations))
+    actions, action_names = bridged.matrix(commands, "actions", len(observations))
     episodes = _episodes(table, options, len(observations))
     time = _time(table, options, episodes)
     if options.pause is not None:
@@ -281,8 +282,12 @@ def _chosen(table: Table, observations: ColumnMap, actions: ColumnMap, options: 
     for signal in signals:
         if signal.transpose or isinstance(signal.scale, str):
             raise InputError(f"{table.source}: {signal.signal}: scale is a number here, and there is no transpose")
-    missing_allowed = isinstance(options.preprocess, Preprocess) and options.preprocess.max_gap is not None
-    return table.choose(Choice(tuple(s.signal for s in signals), joints, missing_allowed))
+    return table.choose(Choice(tuple(s.signal for s in signals), joints, _bridges(options)))
+
+
+def _bridges(options: ReadOptions) -> bool:
+    """Whether preprocessing bridges what was not measured."""
+    return isinstance(options.preprocess, Preprocess) and options.preprocess.max_gap is not None
 
 
 def _paused(

@@ -83,6 +83,7 @@ class Table:
         quaternions: first columns of the unit quaternions in a matrix.
         sparse: whether NaN says only that another signal has a sample there.
         choose: reads what some entries name, of a log whose signals have time stamps of their own.
+        lenient: whether text in a few cells of a column of numbers counts as no sample.
     """
 
     source: str
@@ -95,6 +96,7 @@ class Table:
     quaternions: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
     sparse: bool = False
     choose: Callable[[Choice], Table] | None = None
+    lenient: bool = False
 
     def matrix(self, columns: ColumnMap, what: str, rows: int | None = None) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return the float64 matrix ``(N, k)`` that a column map picks, and the ``k`` names.
@@ -140,7 +142,7 @@ class Table:
 
     def _signal(self, signal: Signal, what: str) -> tuple[np.ndarray, list[str]]:
         name, index = self._locate(signal.signal)
-        values = numbers(self.array(name, what), f"{self.source}: {name}")
+        values = numbers(self.array(name, what), f"{self.source}: {name}", lenient=self.lenient)
         if values.ndim == 1:
             values = values[:, None]
         if values.ndim != 2:
@@ -254,8 +256,17 @@ def parse_columns(columns: ColumnMap, where: str) -> tuple[Signal, ...]:
     )
 
 
-def numbers(array: np.ndarray, where: str) -> np.ndarray:
+#: Cells of text, as a share of those with numbers, up to which a column is one of numbers.
+FEW = 0.1
+
+
+def numbers(array: np.ndarray, where: str, *, lenient: bool = False) -> np.ndarray:
     """Return ``array`` as float64, NaN where a table has no value; a column of lists becomes a matrix.
+
+    Args:
+        array: the column.
+        where: it, for messages.
+        lenient: whether text in a few cells, such as ``ERR``, is NaN, too.
 
     Raises:
         InputError: something that is no number, naming its row.
@@ -274,7 +285,7 @@ def numbers(array: np.ndarray, where: str) -> np.ndarray:
         import pandas as pd
     values = np.asarray(pd.to_numeric(pd.Series(array), errors="coerce"), dtype=np.float64)
     bad = np.flatnonzero(np.isnan(values) & ~missing(array))
-    if bad.size:
+    if bad.size and not (lenient and bad.size <= FEW * np.isfinite(values).sum()):
         raise InputError(f"{where} is {str(array[bad[0]])!r} at row {bad[0]} (counted from 0); a number is expected")
     return values
 

@@ -57,6 +57,14 @@ class Column:
         finite = self.values[np.isfinite(self.values)]
         return bool(finite.size and np.ptp(finite) > 0)
 
+    @property
+    def text(self) -> tuple[int, str] | None:
+        """The first row at which a column of numbers holds text, and that; ``None`` where it does nowhere."""
+        if not self.values.size or self.labels.dtype.kind in "biuf":
+            return None
+        rows = np.flatnonzero(np.isnan(self.values) & ~missing(self.labels))
+        return (int(rows[0]), str(self.labels[rows[0]])) if rows.size else None
+
     def as_map(self, scale: float = 1.0, offset: float = 0.0) -> str | dict[str, Any]:
         """Return it as an entry of a column map, in units of the model."""
         options: dict[str, Any] = {"scale": scale} if scale != 1.0 else {}
@@ -220,7 +228,7 @@ def _of_array(name: str, array: np.ndarray, rows: int, table: Table) -> list[Col
     if array.ndim == 2:
         return [] if array.shape[1] > WIDEST else _of_matrix(name, array, labels, transposed=False)
     try:
-        values = numbers(array, name)
+        values = numbers(array, name, lenient=True)
     except InputError:
         return [Column(name, name, None, np.empty(0), array, False)]
     if values.ndim == 2:

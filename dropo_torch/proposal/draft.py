@@ -197,8 +197,13 @@ def _lost(matching: Matching) -> list[str]:
     notes = [f"not used, for nothing of the model is called so: {', '.join(free[:6])}" + ", ..." * (len(free) > 6)]
     lost = {m.column.entry: int(np.isnan(m.column.values).sum()) for m in matching.matches}
     holes = [f"{count} of {name}" for name, count in lost.items() if count]
+    worded = {m.column.entry: m.column.text for m in matching.matches}
+    texts = [f"{name} is {text[1]!r} at row {text[0]} (counted from 0)" for name, text in worded.items() if text]
     return (notes if free else []) + (
-        [f"values that are NaN or blank count as not measured; short gaps are bridged: {', '.join(holes)}"]
+        [
+            f"values that are {'NaN, blank or text' if texts else 'NaN or blank'} count as not measured; short gaps are "
+            f"bridged: {'; '.join([', '.join(holes), *texts])}"
+        ]
         if holes
         else []
     )
@@ -351,6 +356,38 @@ def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequ
 
 
 # --- what an examination cures ---
+
+
+def as_read(matching: Matching, places: Sequence[Place], draft: Draft) -> Matching:
+    """Return what the columns are as the config reads them, after what was cured: their places and their units."""
+    observation, origin = draft.logged.observation, draft.logged.trajectories.origin
+    if origin is None or not origin.observation_names:
+        return matching
+    signals = [origin.observation_names[i] for i in observation.log_columns]
+    place = {p.number: p for p in places if p.kind in ("position", "velocity")}
+    held: dict[str, list[Place]] = {}  # a position whose velocity is derived has two
+    for signal, column in zip(signals, observation.columns, strict=True):
+        held.setdefault(signal, []).extend([place[column]] if column in place else [])
+    factors = draft.document["data"].get("scale", {})
+    read = [_as_read(m, held.get(m.column.entry, ()), factors.get(m.column.entry, 1.0)) for m in matching.matches]
+    order = {p.label: i for i, p in enumerate(places)}
+    matches = tuple(sorted(read, key=lambda m: order.get(m.place.label, len(order))))
+    found = {m.place.label for m in matches}
+    missing = tuple(p for p in places if p.label not in found and p in (*matching.missing, *place.values()))
+    return replace(matching, matches=matches, missing=missing)
+
+
+def _as_read(match: Match, held: Sequence[Place], factor: float) -> Match:
+    """A match with the place and the factor that a cure gave it; markers and commands keep their place."""
+    moved = match.place.kind in ("position", "velocity") and bool(held) and match.place not in held
+    place = held[0] if moved else match.place
+    if not moved and factor == 1.0:
+        return match
+    why = "the examination, not its name" if moved else f"{match.why}; in this unit by the examination"
+    return replace(
+        match, place=place, why=why, sureness="sure" if moved else match.sureness, scale=match.scale * factor,
+        offset=match.offset * factor,
+    )  # fmt: skip
 
 
 def _cured(document: dict[str, Any], base: Path) -> tuple[LoggedData, tuple[Finding, ...], list[str]]:

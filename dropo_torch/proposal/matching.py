@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns, last_part
 from dropo_torch.proposal.places import Place
-from dropo_torch.proposal.words import Words
+from dropo_torch.proposal.words import Words, split
 
 Sureness = Literal["sure", "likely", "guess"]
 
@@ -32,6 +32,11 @@ SPANS = (1, 4, 16)
 #: Relative distance from a factor within which a unit is named.
 UNIT = 0.3
 _AXES = ("x", "y", "z")
+#: What columns of commands are called after where they say nothing else.
+DRIVES = frozenset(
+    "motor motors servo servos actuator actuators drive drives rotor rotors prop props propeller propellers thruster "
+    "thrusters thrust esc muscle muscles".split()
+)
 #: What LeRobot calls a gripper's position, which it has in hundredths of the range, and by how many these may pass it.
 GRIPPER, OF_RANGE, PAST = "gripper.pos", "% of the joint's range", 5.0
 
@@ -122,9 +127,12 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
             wanted = [p for p in wanted if p.label not in found]
         fits = _assigned(wanted, [c for c in free if not _is_taken(c, found)], found, starts)
         found |= {m.place.label: m for m in fits}
+        if kind == "command":
+            found |= {m.place.label: m for m in _namesakes(places, free, found)}
         found |= {m.place.label: m for m in _by_family(places, kind, free, found)}
     found |= {m.place.label: m for m in _in_order(places, free, found)}
     found |= {m.place.label: m for m in _gyroscope(places, free, found, starts)}
+    found |= {m.place.label: m for m in _numbered_drives(places, free, found)}
     matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
     used = [m.column for m in matches] + list(taken)
     unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used) and not _counts(c, starts))
@@ -153,7 +161,7 @@ def _whole_state(columns: Columns, places: Sequence[Place], starts: np.ndarray) 
         orders += [some + velocities, velocities + some, some]
         if len(some) == len(velocities):
             orders.append([p for pair in zip(some, velocities, strict=True) for p in pair])
-    orders = [o for o in orders if len(o) == len(array)]
+    orders = [o for o in orders if o and len(o) == len(array)]  # a model that may lack all positions has an empty one
     if not orders:
         return []
     best = max(orders, key=lambda order: _likeness(order, array, starts))
@@ -217,10 +225,11 @@ def _assigned(
 def _matched(place: Place, column: Column, words: Words, name: float, share: float) -> Match:
     """A match, with what it was found by."""
     spoken = "its name" if words.objects or words.axis else "its number" if words.numbers else "its kind"
-    by = spoken if name >= LEAST else "its motion"
+    seen = f"motion (r² {share:.2f})" if share > LIKE else ""
+    by = f"{spoken} and {seen}" if name >= LEAST and seen else spoken if name >= LEAST else f"its {seen or 'motion'}"
     sureness: Sureness = "sure" if name >= SURE or (name >= LEAST and share > LIKE) else "likely"
     sureness = "guess" if name <= LEAST and share <= LIKE else sureness
-    return Match(place, column, 1.0, sureness, by + (f" and motion (r² {share:.2f})" if share > LIKE else ""))
+    return Match(place, column, 1.0, sureness, by)
 
 
 def _may_be(column: Column, wanted: Sequence[Place]) -> bool:
@@ -416,6 +425,35 @@ def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, 
     return [Match(p, c, 1.0, "guess", "the order of columns") for p, c in zip(wanted, nameless, strict=True)]
 
 
+def _namesakes(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
+    """Commands of actuators after which a column is called, without a word of its kind, and no joint is."""
+    joints = {p.label.rpartition(".")[0] for p in places if p.kind == "position"}
+    called = {c.label or c.entry: c for c in reversed(free) if not _is_taken(c, found)}
+    wanted = [p for p in places if p.kind == "command" and p.label not in found]
+    return [
+        Match(p, called[p.label], 1.0, "sure", "the actuator's name")
+        for p in wanted if p.label in called and p.label not in joints
+    ]  # fmt: skip
+
+
+def _numbered_drives(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
+    """Commands of actuators of which none has a column, by columns of drives that differ by their number only."""
+    wanted = [p for p in places if p.kind == "command"]
+    known = DRIVES | {word for p in wanted for word in p.words}
+    if not wanted or any(p.label in found or p.takes == "position" for p in wanted):
+        return []
+    groups: dict[tuple, dict[int, Column]] = {}
+    for c in (c for c in free if not _is_taken(c, found) and len(c.words.numbers) == 1):
+        own = {word for word in split(c.label or c.entry) if not word.isdigit()}
+        if c.words.role == "" and not c.words.axis and own <= known:
+            groups.setdefault(tuple(sorted(own)), {}).setdefault(c.words.numbers[0], c)
+    whole = [group for group in groups.values() if len(group) == len(wanted) > 1]
+    if len(whole) != 1:
+        return []
+    why = "the order of its number, one for each actuator"
+    return [Match(p, whole[0][n], 1.0, "likely", why) for p, n in zip(wanted, sorted(whole[0]), strict=True)]
+
+
 def _gyroscope(
     places: Sequence[Place], free: Sequence[Column], found: dict[str, Match], starts: np.ndarray
 ) -> list[Match]:
@@ -609,7 +647,7 @@ def unit_name(scale: float, place: Place) -> str:
     if place.measure == "quaternion":
         return "–"
     if place.kind == "command" and place.takes == "effort":
-        return ("N·m" if place.measure == "angle" else "N") if scale == 1.0 else f"{scale:g} × SI"
+        return {"angle": "N·m", "length": "N"}.get(place.measure, "SI") if scale == 1.0 else f"{scale:g} × SI"
     near = next((name for factor, name in known.items() if math.isclose(abs(scale), factor)), f"{abs(scale):g} × SI")
     per = "/s" if (place.kind == "velocity" or (place.takes == "velocity" and place.kind == "command")) else ""
     return near + ("" if near == "rpm" else per) + (", reversed" if scale < 0 else "")

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, cast
 
 import mujoco
 import numpy as np
 
 from dropo_torch.data.observation import joint_name
+from dropo_torch.effects.actuator import unit_of
+from dropo_torch.effects.base import Setting, object_number
 from dropo_torch.parameters import object_names
 from dropo_torch.proposal.words import object_words
 
 Kind = Literal["position", "velocity", "command", "marker"]
-#: Kinds of a place by what is measured there: an angle, a length, a component of a quaternion.
-Measure = Literal["angle", "length", "quaternion"]
+#: Kinds of a place by what is measured there: an angle, a length, a component of a quaternion; of a command that turns
+#: and slides at once, both.
+Measure = Literal["angle", "length", "quaternion", "both"]
 
 
 @dataclass(frozen=True)
@@ -133,18 +136,33 @@ def _commands(model: mujoco.MjModel) -> list[Place]:
         joint = int(model.actuator_trnid[a, 0]) if by_joint else -1
         words, numbers = object_words(name)
         aliases: tuple[str, ...] = ()
-        turns = True
         if joint >= 0:
             others, more = object_words(joint_name(model, joint))
             aliases, numbers = others, numbers or more
-            turns = int(model.jnt_type[joint]) == mujoco.mjtJoint.mjJNT_HINGE
         limits = tuple(model.actuator_ctrlrange[a].tolist()) if model.actuator_ctrllimited[a] else None
         partner = f"{joint_name(model, joint)}.position" if joint >= 0 else ""
         found.append(Place(
-            name, "command", "angle" if turns else "length", "", a, joint, words, numbers, aliases, limits=limits,
+            name, "command", _driven(model, name), "", a, joint, words, numbers, aliases, limits=limits,
             takes=command_kind(model, a), partner=partner,
         ))  # fmt: skip
     return found
+
+
+@dataclass(frozen=True)
+class _Given:
+    """The model as :func:`unit_of` takes it: the rule looks at nothing else of a setting."""
+
+    model: mujoco.MjModel
+
+
+def _driven(model: mujoco.MjModel, actuator: str) -> Measure:
+    """Whether an actuator turns or slides what it acts on; of both, that of which its command is told in the unit."""
+    found = unit_of(cast(Setting, _Given(model)), actuator, "angle", "length")
+    if found:
+        return "angle" if found == "angle" else "length"
+    gear = model.actuator_gear[object_number(model, "actuator", actuator)]
+    pulls, turns = (np.isclose(np.linalg.norm(part), 1.0) for part in (gear[:3], gear[3:]))
+    return "both" if pulls == turns else "length" if pulls else "angle"
 
 
 def command_kind(model: mujoco.MjModel, a: int) -> Literal["position", "velocity", "effort"]:

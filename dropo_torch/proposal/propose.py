@@ -23,7 +23,7 @@ from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
-from dropo_torch.proposal.draft import Draft, Reading, is_whole, make_draft
+from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
@@ -159,6 +159,7 @@ def propose_config(
     tell("examining the log", 0.1)
     data = _relative(columns.path, base)
     draft = make_draft(Reading(_relative(path, base), data, columns, matching, places, clock, step, base))
+    matching = as_read(matching, places, draft)
     if step != own:
         draft = draft.noted(
             f"rows {clock.dt:.6g} s apart are no whole number of the model's steps of {own:g} s: {path.name} is the "
@@ -286,16 +287,14 @@ def _explained(factor: float, matching: Matching) -> bool:
 
 def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: Clock) -> None:
     """Refuse a log that lacks what is needed, naming what there is instead."""
-    free = [c.entry for c in matching.unused]
+    free = _free(matching, columns, clock)
     lacking = [p for p in matching.lacks("position") if not p.optional and not matching.of("marker")]
     lacking += [
         p for p in matching.lacks("velocity")
         if any(o.optional and o.label == p.partner for o in matching.lacks("position"))
     ]  # fmt: skip
     if lacking:
-        names = ", ".join(p.label for p in lacking[:6]) + (", ..." if len(lacking) > 6 else "")
-        known = choices(lacking[0].label.partition(".")[0], free or [c.entry for c in columns.columns])
-        raise InputError(f"{columns.source}: no column is {names}; rename one, or use --interactive{known}")
+        raise InputError(f"{columns.source}: {_lacking(lacking, model, free)}")
     absent = matching.lacks("command")
     told = matching.of("command")
     if absent and (told or any(p.takes != "position" for p in absent)):
@@ -303,13 +302,58 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
         kind = {"position": "targets", "velocity": "target velocities", "effort": "commanded forces"}[absent[0].takes]
         raise InputError(
             f"{columns.source}: no column is the command of {names} ({kind}); rename one, or use --interactive"
-            + choices(absent[0].label, free or [c.entry for c in columns.columns])
+            + _choices(absent[0].label, free)
         )
     if clock.dt is None:
         raise InputError(
             f"{columns.source}: nothing says how far rows are apart: neither time stamps nor velocities; give "
-            "--dt SECONDS" + choices("time", free)
+            "--dt SECONDS" + _choices("time", free)
         )
+
+
+def _free(matching: Matching, columns: Columns, clock: Clock) -> list[str]:
+    """The columns of numbers that are nothing yet, first those that move."""
+    taken = [*(m.column for m in matching.matches), clock.column, clock.episode, *clock.terminals]
+    used = {c.entry for c in taken if c is not None}
+    return [c.entry for c in sorted(columns.numeric, key=lambda c: not c.moves) if c.entry not in used]
+
+
+def _choices(name: str, free: Sequence[str]) -> str:
+    """What there is for a name among the columns that are nothing yet."""
+    return choices(name, free) if free else " (every column of numbers is something else already)"
+
+
+def _lacking(lacking: Sequence[Place], model: mujoco.MjModel, free: Sequence[str]) -> str:
+    """What is told of positions and velocities that no column is: whole orientations by their bodies."""
+    turned = [
+        j for j in dict.fromkeys(p.joint for p in lacking)
+        if sum(p.joint == j and p.measure == "quaternion" for p in lacking) == 4
+    ]  # fmt: skip
+    rest = [p for p in lacking if not (p.measure == "quaternion" and p.joint in turned)]
+    said = []
+    for j in turned:
+        name = _body(model, j)
+        free_joint = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
+        slides = ", or give the model three slides along x, y and z instead of the free joint" if free_joint else ""
+        said.append(
+            f"the orientation of {name} is not in the log; log it as {', '.join(f'{name}_q{a}' for a in 'wxyz')}{slides}"
+        )
+    if rest:
+        names = ", ".join(_called(p, model) for p in rest[:6]) + (", ..." if len(rest) > 6 else "")
+        known = _choices(_called(rest[0], model).partition(".")[0], free)
+        said.append(f"no column is {names}; rename one, or use --interactive{known}")
+    return "; ".join(said)
+
+
+def _body(model: mujoco.MjModel, joint: int) -> str:
+    """The name of a joint's body, or the joint's own where that has none."""
+    return str(model.body(int(model.jnt_bodyid[joint])).name) or joint_name(model, joint)
+
+
+def _called(place: Place, model: mujoco.MjModel) -> str:
+    """What a place is called, after its body where its joint has no name."""
+    name, _, rest = place.label.partition(".")
+    return place.label if model.joint(place.joint).name else f"{_body(model, place.joint)}.{rest}" if rest else name
 
 
 def _with_noise(

@@ -7,14 +7,17 @@ what the velocities did, each degree of freedom with terms of its own for whatev
 from __future__ import annotations
 
 import itertools
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import mujoco
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence
-from dropo_torch.data.examination.prediction import chosen_rows, response_steps, simulate
-from dropo_torch.data.examination.record import Record
+from dropo_torch.data.examination.prediction import Reading as Whole
+from dropo_torch.data.examination.prediction import better_reading, chosen_rows, response_steps, simulate
+from dropo_torch.data.examination.record import Pair, Record
 from dropo_torch.data.examination.rules import Rules
 
 #: Rows by which commands are shifted.
@@ -315,17 +318,55 @@ def _negated(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
         (plain.gains[columns] + rules.sure_significance * plain.errors[columns] < 0).all()
         and (plain.shares[columns] > rules.command_share).all()
     )
-    names = [record.command(int(j)) for j in columns]
-    what = (
-        f"{', '.join(names)} act against the sign that the model gives them (factor "
-        f"{', '.join(f'{plain.gains[j]:.2f}' for j in columns)})"
-    )
+    return _signs(record, plain, columns.tolist(), sure, rules)
+
+
+def _signs(record: Record, plain: Explained, columns: Sequence[int], sure: bool, rules: Rules) -> list[Finding]:
+    """The finding of commands that act with the opposite sign, or of joints that are logged so: as the model says."""
+    joints = {j: pair for j in columns if (pair := _driven(record, j)) is not None}
+    flipped = [c for pair in dict.fromkeys(joints.values()) for c in (pair.position, pair.velocity)]
+    others = [j for j in columns if j not in joints]
+    names = tuple(record.command(j) for j in columns)
+    factors = f"factor {', '.join(f'{plain.gains[j]:.2f}' for j in columns)}"
+    evidence = {n: float(plain.gains[j]) for n, j in zip(names, columns, strict=True)}
+    signs: dict[str, Any] = {"data": {"scale": dict.fromkeys(names, -1.0)}}
+    what = f"{', '.join(names)} act against the sign that the model gives them ({factors})"
+    if not joints:
+        advice = "or the model's gear has the wrong sign"
+        return [Finding("action_sign", names, what, confidence(sure), evidence=evidence, cure=signs, advice=advice)]
+    readings = [Whole.of(record, commands=columns), Whole.of(record, columns=flipped, commands=others)]
+    chosen = better_reading(record, readings, rules)
+    signals = [record.signal(c) for c in flipped]
+    negated = dict.fromkeys([*signals, *(record.command(j) for j in others)], -1.0)
+    if chosen is None:
+        what += f"; either they are negated or {', '.join(signals)} are, and the model tells these not apart"
+        advice = f"data: {{scale: {_flow(signs['data']['scale'])}}}, or data: {{scale: {_flow(negated)}}}"
+        return [Finding("action_sign", names, what, "doubtful", evidence=evidence, advice=advice)]
+    if chosen == 0:
+        advice = "or the model's gear has the wrong sign; with the joint negated the model predicts the log less well"
+        return [Finding("action_sign", names, what, confidence(sure), evidence=evidence, cure=signs, advice=advice)]
+    what = f"{record.named(flipped)} grow against the joint's axis: {', '.join(names)} would act backwards ({factors})"
     return [Finding(
-        "action_sign", tuple(names), what, confidence(sure),
-        evidence={n: float(plain.gains[j]) for n, j in zip(names, columns, strict=True)},
-        cure={"data": {"scale": dict.fromkeys(names, -1.0)}},
-        advice="or the joint's positions and velocities are negated, or the model's gear",
+        "joint_sign", tuple(record.label(c) for c in flipped), what, confidence(sure), evidence=evidence,
+        cure={"data": {"scale": negated}}, advice="or the model's axis points the wrong way",
     )]  # fmt: skip
+
+
+def _driven(record: Record, actuator: int) -> Pair | None:
+    """The coordinate that an actuator drives at its joint, where both its columns are seen."""
+    model = record.model
+    assert model is not None
+    kinds = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    joint = int(model.actuator_trnid[actuator, 0])
+    scalar = (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)
+    if int(model.actuator_trntype[actuator]) not in kinds or int(model.jnt_type[joint]) not in scalar:
+        return None
+    return next((c for c in record.pairs if c.dof == int(model.jnt_dofadr[joint])), None)
+
+
+def _flow(scale: Mapping[str, float]) -> str:
+    """Factors as they stand in YAML."""
+    return f"{{{', '.join(f'{name}: {factor:g}' for name, factor in scale.items())}}}"
 
 
 def _units(record: Record, plain: Explained, rules: Rules) -> list[Finding]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence
+from dropo_torch.data.examination.prediction import Reading, better_reading
 from dropo_torch.data.examination.record import Pair, Record, entry, resampled, windows
 from dropo_torch.data.examination.rules import Rules
 
@@ -113,7 +114,7 @@ def _order(
             continue
         columns = _matched(record, group, own, rules)
         if columns is not None:
-            return _exchanged(record, columns)
+            return _exchanged(record, columns, rules)
     return [], set()
 
 
@@ -195,27 +196,55 @@ def _pairing(table: np.ndarray, pool: Sequence[int], group: Sequence[Pair]) -> l
     return sorted(found, key=lambda pair: pool[pair[0]]) if len(found) == len(group) else None
 
 
-def _exchanged(record: Record, columns: Sequence[tuple[Pair, int, int]]) -> tuple[list[Finding], set[Pair]]:
-    own = dict(enumerate(record.observation.columns))
-    nq = 0 if record.model is None else record.model.nq
-    wanted = dict(own)
-    touched = set()
-    for c, position, velocity in columns:
-        for column, place in ((position, c.qpos), (velocity, nq + c.dof)):
-            wanted[column] = place
-            touched.add(column)
-    listed = ["skip"] * record.observation.log_width
-    for i, place in wanted.items():
-        listed[record.observation.log_columns[i]] = entry(record, place)
+def _exchanged(
+    record: Record, columns: Sequence[tuple[Pair, int, int]], rules: Rules
+) -> tuple[list[Finding], set[Pair]]:
+    """The finding of columns that stand in each other's place.
+
+    Where positions changed places among themselves, or velocities did, the likeness of the ones to the others is the
+    same: the model decides by what it predicts, if it does.
+    """
+    own, nq = record.observation.columns, 0 if record.model is None else record.model.nq
+    readings = [_places(own, [(p, c.qpos) for c, p, _ in columns] + [(v, nq + c.dof) for c, _, v in columns])]
+    pairs = {c.position: c for c, _, _ in columns}
+    if set(pairs) == {p for _, p, _ in columns} and nq:  # the velocities among themselves, or the positions
+        speeds = {c.velocity: c for c, _, _ in columns}
+        readings = [
+            _places(own, [(v, nq + pairs[p].dof) for _, p, v in columns]),
+            _places(own, [(p, speeds[v].qpos) for _, p, v in columns]),
+        ]
+    chosen = 0 if len(readings) == 1 else better_reading(record, [Reading.of(record, r) for r in readings], rules)
+    touched = sorted({i for reading in readings for i, place in enumerate(reading) if place != own[i]})
     names = [f"{record.signal(v)} is the velocity of {record.signal(p)}" for _, p, v in columns]
     what = f"columns stand in each other's place: {'; '.join(names)}"
+    advice = "where the velocities are right and the positions are exchanged, exchange those instead"
+    if chosen is None:
+        what += f"; either {' and '.join(record.signal(v) for _, _, v in columns)} are exchanged or "
+        what += f"{' and '.join(record.signal(p) for _, p, _ in columns)} are, and the model tells these not apart"
+        lines = [f"[{', '.join(_listed(record, reading))}]" for reading in readings]
+        advice = f"observation: {lines[0]} for the velocities, observation: {lines[1]} for the positions"
+    elif len(readings) == 2:
+        advice = f"the {('velocities', 'positions')[chosen]} are, as the model predicts the log so"
     finding = Finding(
-        "order", tuple(record.label(i) for i in sorted(touched)), what, "sure",
+        "order", tuple(record.label(i) for i in touched), what, confidence(chosen is not None),
         evidence={f"{record.label(v)} of {record.label(p)}": likeness(record, p, v).share for _, p, v in columns},
-        cure={"observation": listed},
-        advice="where the velocities are right and the positions are exchanged, exchange those instead",
+        cure={} if chosen is None else {"observation": _listed(record, readings[chosen])}, advice=advice,
     )  # fmt: skip
     return [finding], {c for c, _, _ in columns}
+
+
+def _places(own: Sequence[int], moved: Sequence[tuple[int, int]]) -> tuple[int, ...]:
+    """The places of observed columns, some of which are moved."""
+    places = dict(moved)
+    return tuple(places.get(i, place) for i, place in enumerate(own))
+
+
+def _listed(record: Record, places: Sequence[int]) -> list[str]:
+    """The entries of ``observation`` that put observed columns so."""
+    listed = ["skip"] * record.observation.log_width
+    for i, place in enumerate(places):
+        listed[record.observation.log_columns[i]] = entry(record, place)
+    return listed
 
 
 def _slopes(record: Record, pairs: Sequence[Pair], own: dict[Pair, Likeness], rules: Rules) -> list[Finding]:

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import mujoco
 import numpy as np
 from mujoco import rollout
 
 from dropo_torch.data.examination.record import Record
+from dropo_torch.data.examination.rules import Rules
 from dropo_torch.models.load import quiet_mujoco
 
 #: Microseconds of simulation that an examination may take, about, and the fewest and most rows that are simulated.
 BUDGET, LEAST_ROWS, MOST_ROWS = 4e5, 250, 1200
+#: Blocks of rows over which readings are compared, the fewest rows for that, and what a row counts at most.
+BLOCKS, LEAST_COMPARED, WORST = 20, 100, 9.0
 #: Threads of a simulation; results do not depend on them.
 THREADS = min(4, os.cpu_count() or 1)
 
@@ -77,6 +81,87 @@ def simulate(model: mujoco.MjModel, states: np.ndarray, controls: np.ndarray, st
     return ends
 
 
+@dataclass(frozen=True)
+class Reading:
+    """One way to read a log: what its columns and its commands are.
+
+    Attributes:
+        places: the number of each observed column in the extended state, ``(n,)``.
+        signs: by which observed columns are multiplied, ``(n,)``.
+        commands: by which commands are multiplied, ``(nu,)``.
+    """
+
+    places: tuple[int, ...]
+    signs: tuple[float, ...]
+    commands: tuple[float, ...]
+
+    @classmethod
+    def of(
+        cls, record: Record, places: Sequence[int] | None = None, *, columns: Sequence[int] = (),
+        commands: Sequence[int] = (),
+    ) -> Reading:  # fmt: skip
+        """Return the log's own reading with other places, and with columns and commands negated."""
+        own = record.observation.columns
+        return cls(
+            tuple(own if places is None else places),
+            tuple(-1.0 if i in columns else 1.0 for i in range(len(own))),
+            tuple(-1.0 if i in commands else 1.0 for i in range(record.log.actions.shape[1])),
+        )
+
+
+def better_reading(record: Record, readings: Sequence[Reading], rules: Rules) -> int | None:
+    """Return which of some readings the model predicts clearly better over a row than all others, or ``None``."""
+    if not can_predict(record):
+        return None
+    misfits = [_misfit(record, reading) for reading in readings]
+    known = [(float(m.sum()), i) for i, m in enumerate(misfits) if m is not None]
+    if len(known) < len(readings):
+        return None
+    (least, best), (other, second) = sorted(known)[:2]
+    first, following = misfits[best], misfits[second]
+    assert first is not None and following is not None
+    floor = max(float(first.mean()), 1e-12)  # blocks count alike, however much moves in them
+    change = np.log((following + floor) / (first + floor))
+    error = float(change.std(ddof=1)) / np.sqrt(len(change))
+    clear = float(change.mean()) > rules.sure_significance * error and least < rules.reading * other
+    return best if clear else None
+
+
+def can_predict(record: Record) -> bool:
+    """Whether the model can be simulated from a log's rows, and velocities of it are seen."""
+    model = record.model
+    return (
+        model is not None
+        and not record.observation.is_sensed
+        and record.log.actions.shape[1] == model.nu
+        and not model.na
+        and any(place >= model.nq for place in record.observation.columns)
+    )
+
+
+def _misfit(record: Record, reading: Reading) -> np.ndarray | None:
+    """What a reading leaves of the changes of velocity in each block of rows, of their size, cut at outliers."""
+    model = record.model
+    assert model is not None
+    rows, observation = chosen_rows(record, record.frame_skip), record.observation
+    speeds = [i for i, place in enumerate(reading.places) if place >= model.nq]
+    if len(rows) < LEAST_COMPARED or not speeds:
+        return None
+    full = np.ones(observation.log_width)
+    full[list(observation.log_columns)] = reading.signs
+    try:
+        states = replace(observation, columns=reading.places).states(record.log.observations[rows] * full)
+    except ValueError:  # a zero quaternion
+        return None
+    ends = simulate(model, states, record.log.actions[rows] * np.array(reading.commands), record.frame_skip)
+    signs = np.array(reading.signs)[speeds]
+    before, after = record.before[rows][:, speeds] * signs, record.after[rows][:, speeds] * signs
+    change, told = after - before, ends[:, [reading.places[i] for i in speeds]] - before
+    scale = np.maximum(change.std(axis=0), 1e-12)
+    off = np.minimum(np.nan_to_num(((change - told) / scale) ** 2, nan=WORST, posinf=WORST), WORST).mean(axis=1)
+    return np.array([block.sum() for block in np.array_split(off, BLOCKS)])
+
+
 def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
     """Return which share of the changes of velocity the model explains: as logged, and with columns scaled.
 
@@ -85,13 +170,7 @@ def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
     """
     model = record.model
     columns = np.asarray(record.observation.columns)
-    if (
-        model is None
-        or record.observation.is_sensed
-        or record.log.actions.shape[1] != model.nu
-        or model.na
-        or not (columns >= model.nq).any()
-    ):
+    if model is None or not can_predict(record):
         return 0.0, 0.0
     rows = chosen_rows(record, 2 * record.frame_skip)
     scale = np.ones(len(columns))

@@ -29,6 +29,7 @@ class Rules:
         like: r² that a column must reach to be called another one's derivative.
         unlike: r² that the column in its place must then stay below.
         better: factor by which the unexplained part must fall for columns to be called exchanged.
+        reading: share of another reading's misfit over a row that the best one may leave to be taken.
         slope: relative error of the slope that is told: large steps make a fifth.
         sure_slope: factor of the slope that no faulty sensor has, so that the unit is wrong.
         unit: relative distance from a unit's factor within which the unit is named.
@@ -67,6 +68,7 @@ class Rules:
     like: float = 0.9
     unlike: float = 0.8
     better: float = 5.0
+    reading: float = 0.7
     slope: float = 0.3
     sure_slope: float = 3.0
     unit: float = 0.25
