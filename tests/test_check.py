@@ -87,9 +87,7 @@ def test_of_positions_and_velocities_those_are_exchanged_that_the_model_says(col
     arrays = record(steps=400, noise=1e-4)
     order = np.arange(4)
     order[list(columns)] = order[list(columns[::-1])]
-    log = Trajectories(
-        **{**arrays, **{name: arrays[name][:, order] for name in ("observations", "next_observations")}}
-    )
+    log = Trajectories(**{**arrays, **{name: arrays[name][:, order] for name in ("observations", "next_observations")}})
     (found,) = arm_findings(log)
     assert names((found,)) == [("order", "sure")]
     entries = found.cure["observation"]

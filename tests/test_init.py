@@ -172,8 +172,12 @@ def test_a_model_of_level_slides_alone_is_matched(tmp_path: Path) -> None:
 
 ROTORS = "".join(f'<motor name="thrust{i}" site="rotor{i}" gear="0 0 1 0 0 .016"/>' for i in range(1, 5))
 DRONE = f"""<mujoco><worldbody><body name="drone"><freejoint/><geom size=".1"/>
-  {"".join(f'<site name="rotor{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(
-      itertools.product((-0.1, 0.1), repeat=2), 1))}</body></worldbody><actuator>{ROTORS}</actuator></mujoco>"""
+  {
+    "".join(
+        f'<site name="rotor{i}" pos="{x} {y} 0"/>'
+        for i, (x, y) in enumerate(itertools.product((-0.1, 0.1), repeat=2), 1)
+    )
+}</body></worldbody><actuator>{ROTORS}</actuator></mujoco>"""
 
 
 def flown(command: str) -> dict[str, np.ndarray]:
@@ -216,7 +220,8 @@ def test_the_unit_of_a_command_is_that_of_what_it_makes(gear: str, transmission:
     xml = DRONE.replace(ROTORS, f'<motor name="thrust" {transmission} gear="{gear}"/>')
     fan = '<body><joint name="fan"/><geom size=".1"/><site name="end"/></body></body>'
     xml = xml.replace("</body>", fan, 1).replace(
-        "<actuator>", '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial></tendon><actuator>'
+        "<actuator>",
+        '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial></tendon><actuator>',
     )
     (place,) = (p for p in places_of(mujoco.MjModel.from_xml_string(xml)) if p.kind == "command")
     assert unit_name(1.0, place) == unit
@@ -560,7 +565,9 @@ def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarr
 
 def comments(config: str) -> dict[str, str]:
     """What the comments of a config say that columns are, by column."""
-    lines = [line.removeprefix("# ").split(" is ", 1) for line in config.splitlines() if "# " in line and " is " in line]
+    lines = [
+        line.removeprefix("# ").split(" is ", 1) for line in config.splitlines() if "# " in line and " is " in line
+    ]
     return {column: rest for column, rest in lines if ", by " in rest}
 
 
@@ -825,3 +832,27 @@ def test_the_noise_of_an_orientation_is_told_as_that_of_its_angular_velocity() -
     rates = np.fft.irfft(2j * np.pi * frequency * kept, rows, axis=0)
     assert Filter(cutoff, density).turning_noise("base") == pytest.approx(rates.std(), rel=0.03)
     assert Filter(cutoff, density).turning_noise("other") == 0.0
+
+
+def test_commands_by_a_clock_of_their_own_are_put_back(tmp_path: Path) -> None:
+    """A controller at 30 Hz beside rows at 100 Hz: whether or not anything else needs resampling."""
+    model = mujoco.MjModel.from_xml_string(CLOCKED)
+    data, rng, rows, told = mujoco.MjData(model), np.random.default_rng(0), [], 0.0
+    for i in range(6000):
+        if i % 33 == 0:
+            told = rng.uniform(-1, 1)
+        data.ctrl[0] = told
+        if i % 10 == 0:
+            rows.append([data.time, data.qpos[0], data.qvel[0], told])
+        mujoco.mj_step(model, data)
+    frame = pd.DataFrame(rows, columns=["time", "slide_pos", "slide_vel", "push_cmd"])
+    found = dropo.propose_config(*written(tmp_path, frame, CLOCKED), out=tmp_path / "robot.yaml")
+    assert found.draft.document["data"]["preprocess"]["command_clock"] is True
+    assert any("commands change every 0.033 s" in note for note in found.draft.notes)
+    frame["push_cmd"] = np.repeat(rng.uniform(-1, 1, 200), 3)
+    steady = dropo.propose_config(*written(tmp_path, frame, CLOCKED), out=tmp_path / "steady.yaml")
+    assert "command_clock" not in steady.draft.document["data"].get("preprocess", {})
+
+
+CLOCKED = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="slide" type="slide" axis="1 0 0"/>
+  <geom size=".1"/></body></worldbody><actuator><motor name="push" joint="slide" gear="5"/></actuator></mujoco>"""

@@ -15,11 +15,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
 from dropo_torch.data.recording import Recording, resolve_names
+from dropo_torch.data.ticks import Ticks, find_ticks
 from dropo_torch.data.trajectory import Origin, Trajectories, check_values, concatenate
 from dropo_torch.errors import InputError, choices
 from dropo_torch.support.given import check_keys, number
@@ -60,6 +62,8 @@ class Preprocess:
         actions: ``hold``: the command in force at the step's start; ``mean``: the mean of the commands in
             force during it; ``position`` or ``velocity``: what was measured at its end, which is what a
             robot that tracks its command closely was told.
+        command_clock: whether commands change by a clock of the controller that is not that of the rows; each change is
+            then put back from the row that tells it to the tick at which it was.
         controlled: the positions whose ``position`` or ``velocity`` is the action; all by default.
         delays: signal → seconds by which it is stamped later than what it measures.
         align: signals whose delay against ``reference`` is estimated.
@@ -85,6 +89,7 @@ class Preprocess:
     derive: Sequence[str] = ()
     quaternions: Sequence[Sequence[str]] = ()
     actions: Actions = "hold"
+    command_clock: bool = False
     controlled: Sequence[str] = ()
     delays: Mapping[str, float] = field(default_factory=dict)
     align: Sequence[str] = ()
@@ -114,6 +119,10 @@ class Preprocess:
             raise InputError(
                 f"preprocess: actions: unknown kind {self.actions!r}{choices(self.actions, get_args(Actions))}"
             )
+        if not isinstance(self.command_clock, bool):
+            raise InputError(f"preprocess: command_clock is {self.command_clock!r}; expected true or false")
+        if self.command_clock and self.infers_actions:
+            raise InputError(f"preprocess: command_clock has no meaning with actions: {self.actions}; leave it out")
         if self.derive and self.velocities is None:
             raise InputError("preprocess: derive has no meaning without velocities, as all are derived; leave it out")
         if self.start is not None and self.stop is not None and self.stop <= self.start:
@@ -397,7 +406,25 @@ class _Episode:
 
     def _command(self, name: str) -> _Samples:
         """The samples of a command; of a stream, a single one holds from then on."""
-        return _samples(self.part, name, self.delays.get(name, 0.0), least=1 if self.part.sparse else 2)
+        delay = self.delays.get(name, 0.0)
+        samples = _samples(self.part, name, delay, least=1 if self.part.sparse else 2)
+        if not self.options.command_clock:
+            return samples
+        return replace(samples, time=self._ticks.put_back(samples.time + delay) - delay)
+
+    @cached_property
+    def _ticks(self) -> Ticks:
+        """The clock by which commands change."""
+        part, where = self.part, f"{self.part.source}: preprocess: command_clock"
+        assert part.time is not None
+        if part.sparse:
+            raise InputError(f"{where}: commands have time stamps of their own here; leave it out")
+        commands = np.stack([part.signal(name) for name in part.action_names], axis=1)
+        if np.isnan(commands).any():
+            raise InputError(f"{where}: a command has no value in some rows; give them all one, or leave it out")
+        if (ticks := find_ticks(part.time - part.time[0], commands)) is None:
+            raise InputError(f"{where}: commands do not change by a clock that is not that of the rows; leave it out")
+        return ticks
 
     def _commands(self, name: str, begin: np.ndarray) -> np.ndarray:
         """A command in the steps that begin at the given times, ``(T,)``: in force then, or the mean of each step."""

@@ -6,6 +6,7 @@ import copy
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from dropo_torch.config import make_config
 from dropo_torch.data.examination import Finding
+from dropo_torch.data.ticks import find_ticks
 from dropo_torch.logged import LoggedData, read_log
 from dropo_torch.proposal.clock import GAP, Clock
 from dropo_torch.proposal.columns import Columns
@@ -115,7 +117,8 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
     whole = is_whole(dt, timestep)
     missing = any(np.isnan(m.column.values).any() for m in matching.matches)
     smooth: Filter | None = None
-    resampled = derived or bool(some) or not clock.even or not whole or missing
+    own_clock = _own_period(columns, matching, clock) is not None
+    resampled = derived or bool(some) or not clock.even or not whole or missing or own_clock
     source = _source(reading)
     if not resampled and (whole_arrays := _standard(columns, matching)) is not None:
         source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
@@ -278,10 +281,26 @@ def _preprocess(
         options["controlled"] = [m.column.entry for m in positions if m.place.label in joints]
         notes.append("commands were not logged: servos are taken to have been told what was measured a row later")
     elif matching.of("command"):
-        options["actions"] = (
-            "mean"  # one that changes within a row acts in part of it; on the log's own grid it is held
-        )
+        # one that changes within a row acts in part of it; on the log's own grid it is held
+        options["actions"] = "mean"
+        if (period := _own_period(columns, matching, clock)) is not None:
+            options["command_clock"] = True
+            notes.append(f"commands change every {period:.4g} s, between rows: each is put back to when it changed")
     return options, notes, smooth
+
+
+def _own_period(columns: Columns, matching: Matching, clock: Clock) -> float | None:
+    """Seconds from one command to the next by a controller's own clock, if all episodes show that."""
+    commands = matching.of("command")
+    if clock.column is None or not commands or columns.apart:
+        return None
+    values, time = np.stack([m.values for m in commands], 1), clock.column.values * clock.unit
+    starts = np.append(np.flatnonzero(clock.starts(len(columns), columns.parts)), len(columns))
+    parts = [slice(a, b) for a, b in pairwise(starts)]
+    if np.isnan(values).any() or not np.isfinite(time).all():
+        return None
+    found = [find_ticks(time[p], values[p]) for p in parts]
+    return None if None in found else float(np.mean([ticks.period for ticks in found if ticks is not None]))
 
 
 def _longest(clock: Clock, rows: int, parts: Sequence[int], matches: Sequence[Match] = ()) -> float:
