@@ -87,9 +87,7 @@ def test_of_positions_and_velocities_those_are_exchanged_that_the_model_says(col
     arrays = record(steps=400, noise=1e-4)
     order = np.arange(4)
     order[list(columns)] = order[list(columns[::-1])]
-    log = Trajectories(
-        **{**arrays, **{name: arrays[name][:, order] for name in ("observations", "next_observations")}}
-    )
+    log = Trajectories(**{**arrays, **{name: arrays[name][:, order] for name in ("observations", "next_observations")}})
     (found,) = arm_findings(log)
     assert names((found,)) == [("order", "sure")]
     entries = found.cure["observation"]
@@ -153,7 +151,8 @@ def test_a_command_against_its_sign_may_be_the_joints(spring: str, negated: str,
     joint, command = {"observations[0]": -1.0, "observations[1]": -1.0}, {"actions": -1.0}
     assert scale == ({} if not found.sure else joint if negated == "joint" else command)
     if not found.sure:
-        assert "{actions: -1}" in found.advice and "{observations[0]: -1, observations[1]: -1}" in found.advice
+        assert "{actions: -1}" in found.advice
+        assert "{observations[0]: -1, observations[1]: -1}" in found.advice
 
 
 @pytest.mark.parametrize("seen", [False, True])
@@ -173,7 +172,8 @@ def test_a_spike_is_told_with_its_row_unless_the_velocity_shows_it(seen: bool) -
     for finding in found:
         assert (finding.confidence, finding.rows) == ("doubtful", (120,))
         assert finding.where == (parse_observation(mujoco.MjModel.from_xml_string(XML), None, 4).labels[1],)
-        assert "row 120" in finding.what and "NaN" in finding.advice
+        assert "row 120" in finding.what
+        assert "NaN" in finding.advice
 
 
 # --- what only a robot can look like is never sure ---

@@ -171,8 +171,12 @@ def test_a_model_of_level_slides_alone_is_matched(tmp_path: Path) -> None:
 
 ROTORS = "".join(f'<motor name="thrust{i}" site="rotor{i}" gear="0 0 1 0 0 .016"/>' for i in range(1, 5))
 DRONE = f"""<mujoco><worldbody><body name="drone"><freejoint/><geom size=".1"/>
-  {"".join(f'<site name="rotor{i}" pos="{x} {y} 0"/>' for i, (x, y) in enumerate(
-      itertools.product((-0.1, 0.1), repeat=2), 1))}</body></worldbody><actuator>{ROTORS}</actuator></mujoco>"""
+  {
+    "".join(
+        f'<site name="rotor{i}" pos="{x} {y} 0"/>'
+        for i, (x, y) in enumerate(itertools.product((-0.1, 0.1), repeat=2), 1)
+    )
+}</body></worldbody><actuator>{ROTORS}</actuator></mujoco>"""
 
 
 def flown(command: str) -> dict[str, np.ndarray]:
@@ -215,7 +219,8 @@ def test_the_unit_of_a_command_is_that_of_what_it_makes(gear: str, transmission:
     xml = DRONE.replace(ROTORS, f'<motor name="thrust" {transmission} gear="{gear}"/>')
     fan = '<body><joint name="fan"/><geom size=".1"/><site name="end"/></body></body>'
     xml = xml.replace("</body>", fan, 1).replace(
-        "<actuator>", '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial></tendon><actuator>'
+        "<actuator>",
+        '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial></tendon><actuator>',
     )
     (place,) = (p for p in places_of(mujoco.MjModel.from_xml_string(xml)) if p.kind == "command")
     assert unit_name(1.0, place) == unit
@@ -551,7 +556,8 @@ def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarr
     proposal = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
     assert proposal.matching.at("hinge.velocity") is not None
     told = [note for note in proposal.draft.notes if "not measured" in note]
-    assert len(told) == 1 and told[0].endswith("2 of theta_dot; theta_dot is 'ERR' at row 70 (counted from 0)")
+    assert len(told) == 1
+    assert told[0].endswith("2 of theta_dot; theta_dot is 'ERR' at row 70 (counted from 0)")
     columns = read_columns(files[1])
     (states,) = (c for c in columns.columns if c.entry == "x_state")
     assert not states.values.size
@@ -559,7 +565,9 @@ def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarr
 
 def comments(config: str) -> dict[str, str]:
     """What the comments of a config say that columns are, by column."""
-    lines = [line.removeprefix("# ").split(" is ", 1) for line in config.splitlines() if "# " in line and " is " in line]
+    lines = [
+        line.removeprefix("# ").split(" is ", 1) for line in config.splitlines() if "# " in line and " is " in line
+    ]
     return {column: rest for column, rest in lines if ", by " in rest}
 
 
@@ -676,7 +684,8 @@ def test_a_body_without_an_orientation_in_the_log_is_named_with_what_to_do(
     assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
     error = capfd.readouterr().err
     assert "the orientation of ball is not in the log; log it as ball_qw, ball_qx, ball_qy, ball_qz" in error
-    assert "three slides" in error and "joint0" not in error
+    assert "three slides" in error
+    assert "joint0" not in error
     del frame["ball_z"]
     assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
     assert "no column is ball.position[z]" in capfd.readouterr().err
