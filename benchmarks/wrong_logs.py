@@ -401,6 +401,16 @@ def _no_velocity(log: Log, rng: np.random.Generator) -> Log:
     return _scaled(log, [int(rng.choice(scalars(log, True) or range(7, 10)))], 0.0)
 
 
+def _spiked(log: Log, rng: np.random.Generator) -> Log:
+    column = int(rng.choice(scalars(log, False) or range(3)))
+    inside = np.flatnonzero(~log.arrays["terminals"][:-1]) + 1
+    row, out = int(rng.choice(inside)), {n: np.array(log.arrays[n]) for n in ("observations", "next_observations")}
+    far = 2 * np.ptp(out["observations"][:, column])
+    out["observations"][row, column] += far
+    out["next_observations"][row - 1, column] += far
+    return log.changed(**out)
+
+
 def _quantised(log: Log, rng: np.random.Generator) -> Log:
     columns = scalars(log, False) or [0, 1, 2]
 
@@ -445,6 +455,7 @@ FAULTS = (
     Fault("columns stuck", "every other row a copy", ("repeated",), _held, (ARM, CART, LEG, BOX)),
     Fault("columns stuck", "a position that freezes", ("frozen",), _frozen, (ARM, CART, LEG)),
     Fault("columns stuck", "a velocity that was not measured", ("frozen",), _no_velocity, (ARM, CART, LEG, BOX)),
+    Fault("columns stuck", "a spike in a position", ("spike",), _spiked, (ARM, CART, LEG, BOX)),
     Fault("columns stuck", "positions to a tenth", ("quantised",), _quantised, (ARM, CART, LEG)),
 )  # fmt: skip
 

@@ -151,7 +151,29 @@ def test_a_command_against_its_sign_may_be_the_joints(spring: str, negated: str,
     joint, command = {"observations[0]": -1.0, "observations[1]": -1.0}, {"actions": -1.0}
     assert scale == ({} if not found.sure else joint if negated == "joint" else command)
     if not found.sure:
-        assert "{actions: -1}" in found.advice and "{observations[0]: -1, observations[1]: -1}" in found.advice
+        assert "{actions: -1}" in found.advice
+        assert "{observations[0]: -1, observations[1]: -1}" in found.advice
+
+
+@pytest.mark.parametrize("seen", [False, True])
+def test_a_spike_is_told_with_its_row_unless_the_velocity_shows_it(seen: bool) -> None:
+    """A position that leaves for a row and comes back was not there, if nothing moved so fast."""
+    arrays = record(steps=400, noise=1e-4)
+    path = np.concatenate([arrays["observations"], arrays["next_observations"][-1:]])
+    path[120, 1] += 9.7
+    if seen:
+        step = 2 * mujoco.MjModel.from_xml_string(XML).opt.timestep
+        path[119, 3] += 9.7 / step
+        path[120, 3] += 9.7 / step
+        path[121, 3] -= 3 * 9.7 / step
+    log = Trajectories(path[:-1], path[1:], arrays["actions"], arrays["terminals"])
+    found = [f for f in arm_findings(log) if f.name == "spike"]
+    assert len(found) == (not seen)
+    for finding in found:
+        assert (finding.confidence, finding.rows) == ("doubtful", (120,))
+        assert finding.where == (parse_observation(mujoco.MjModel.from_xml_string(XML), None, 4).labels[1],)
+        assert "row 120" in finding.what
+        assert "NaN" in finding.advice
 
 
 # --- what only a robot can look like is never sure ---

@@ -204,8 +204,8 @@ def _lost(matching: Matching) -> list[str]:
     texts = [f"{name} is {text[1]!r} at row {text[0]} (counted from 0)" for name, text in worded.items() if text]
     return (notes if free else []) + (
         [
-            f"values that are {'NaN, blank or text' if texts else 'NaN or blank'} count as not measured; short gaps are "
-            f"bridged: {'; '.join([', '.join(holes), *texts])}"
+            f"values that are {'NaN, blank or text' if texts else 'NaN or blank'} count as not measured; short gaps "
+            f"are bridged: {'; '.join([', '.join(holes), *texts])}"
         ]
         if holes
         else []

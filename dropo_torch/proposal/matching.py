@@ -34,28 +34,10 @@ UNIT = 0.3
 _AXES = ("x", "y", "z")
 #: What columns of commands are called after where they say nothing else.
 DRIVES = frozenset(
-    [
-        "motor",
-        "motors",
-        "servo",
-        "servos",
-        "actuator",
-        "actuators",
-        "drive",
-        "drives",
-        "rotor",
-        "rotors",
-        "prop",
-        "props",
-        "propeller",
-        "propellers",
-        "thruster",
-        "thrusters",
-        "thrust",
-        "esc",
-        "muscle",
-        "muscles",
-    ]
+    (
+        *("motor", "motors", "servo", "servos", "actuator", "actuators", "drive", "drives", "rotor", "rotors", "prop"),
+        *("props", "propeller", "propellers", "thruster", "thrusters", "thrust", "esc", "muscle", "muscles"),
+    )
 )
 #: What LeRobot calls a gripper's position, which it has in hundredths of the range, and by how many these may pass it.
 GRIPPER, OF_RANGE, PAST = "gripper.pos", "% of the joint's range", 5.0

@@ -335,9 +335,8 @@ def _lacking(lacking: Sequence[Place], model: mujoco.MjModel, free: Sequence[str
         name = _body(model, j)
         free_joint = int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE
         slides = ", or give the model three slides along x, y and z instead of the free joint" if free_joint else ""
-        said.append(
-            f"the orientation of {name} is not in the log; log it as {', '.join(f'{name}_q{a}' for a in 'wxyz')}{slides}"
-        )
+        columns = ", ".join(f"{name}_q{axis}" for axis in "wxyz")
+        said.append(f"the orientation of {name} is not in the log; log it as {columns}{slides}")
     if rest:
         names = ", ".join(_called(p, model) for p in rest[:6]) + (", ..." if len(rest) > 6 else "")
         known = _choices(_called(rest[0], model).partition(".")[0], free)

@@ -11,6 +11,9 @@ from dropo_torch.data.examination.record import Coordinate, Pair, Record
 from dropo_torch.data.examination.rules import Rules
 
 DEGREE = float(np.pi / 180)
+#: Steps of a column from which on one of them is unlike the others, those beside a row that count, and rows that a
+#: sentence names.
+LEAST_STEPS, BESIDE, MOST_NAMED = 50, 6, 3
 
 
 def stuck(record: Record, rules: Rules) -> list[Finding]:
@@ -28,6 +31,48 @@ def stuck(record: Record, rules: Rules) -> list[Finding]:
         else:
             found += _frozen(record, c, step, rules)
     return found + _repeated(record, step, rules)
+
+
+def spikes(record: Record, rules: Rules) -> list[Finding]:
+    """Return positions that leave for a single row and come back, faster by far than they move anywhere else."""
+    found = {column: rows for c, column in record.positions if (rows := _spikes(record, c, column, rules)).size}
+    if not found:
+        return []
+    places = [
+        f"{record.named([column])} at row {', '.join(str(record.file_row(int(r))) for r in rows[:MOST_NAMED])}"
+        + (f" and {len(rows) - MOST_NAMED} more" if len(rows) > MOST_NAMED else "")
+        + f" ({record.before[rows[0], column]:.4g} between {record.before[rows[0] - 1, column]:.4g} and "
+        f"{record.after[rows[0], column]:.4g})"
+        for column, rows in found.items()
+    ]
+    return [Finding(
+        "spike", tuple(record.label(column) for column in found),
+        f"a position jumps away for a single row: {'; '.join(places)}", "doubtful",
+        rows=first_rows(np.unique(np.concatenate(list(found.values())))),
+        evidence={record.label(column): float(len(rows)) for column, rows in found.items()},
+        advice="leave the row out, or set the value to NaN and let preprocess: {max_gap: SECONDS} bridge it",
+    )]  # fmt: skip
+
+
+def _spikes(record: Record, c: Coordinate, column: int, rules: Rules) -> np.ndarray:
+    """Rows whose value departs from those of both rows beside it by far more than the column's other steps."""
+    steps, runs = record.steps[:, column], record.runs
+    size = np.abs(steps)
+    if len(steps) < LEAST_STEPS or not size.any():
+        return np.empty(0, dtype=int)
+    rows = np.arange(1, len(steps))
+    whole = (runs[1:] == runs[:-1]) & ~record.cut[1:] & ~record.cut[:-1]
+    away, back = steps[:-1], steps[1:]
+    least = np.minimum(size[:-1], size[1:])
+    usual = max(float(np.quantile(size, 0.99)), float(np.median(size[size > 0])))
+    padded = np.pad(size, BESIDE)
+    beside = np.max([padded[BESIDE + rows + s] for s in range(-BESIDE, BESIDE) if s not in (-1, 0)], axis=0)
+    whole &= (away * back < 0) & (np.abs(away + back) < 0.5 * least)  # it comes back to where it was
+    whole &= least > rules.spike * np.maximum(usual, beside)
+    if c.velocity is not None:
+        speed = 0.5 * (record.before[:, c.velocity] + record.after[:, c.velocity]) * (record.step or 1.0)
+        whole &= (np.abs(away - speed[:-1]) > 0.5 * size[:-1]) & (np.abs(back - speed[1:]) > 0.5 * size[1:])
+    return rows[whole]
 
 
 def _constant(record: Record, c: Pair, column: int, moved: float) -> Finding:

@@ -119,7 +119,8 @@ def better_reading(record: Record, readings: Sequence[Reading], rules: Rules) ->
         return None
     (least, best), (other, second) = sorted(known)[:2]
     first, following = misfits[best], misfits[second]
-    assert first is not None and following is not None
+    assert first is not None
+    assert following is not None
     floor = max(float(first.mean()), 1e-12)  # blocks count alike, however much moves in them
     change = np.log((following + floor) / (first + floor))
     error = float(change.std(ddof=1)) / np.sqrt(len(change))

@@ -17,6 +17,8 @@ class Rules:
         jump: a row's step against those beside it and the median one, from which on it is a jump: an impact turns a
             velocity around, never a position.
         sure_jump: the same in a single column; two columns that jump together need no more than ``jump``.
+        spike: a single row's departure from both rows beside it, in the largest steps near by and of 99 in 100 rows,
+            from which on it is told: positions do not come back from so far.
         linked: a difference of ``next_observations`` and the next row, in standard deviations of the others': noise
             stays far below.
         out_of_range: share of a limited joint's values beyond its range from which on it is no overshoot.
@@ -57,6 +59,7 @@ class Rules:
     turn_tolerance: float = 0.15
     jump: float = 8.0
     sure_jump: float = 25.0
+    spike: float = 8.0
     linked: float = 12.0
     out_of_range: float = 0.2
     turns: float = 1.5
