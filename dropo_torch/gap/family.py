@@ -7,7 +7,7 @@ one effect after another finds these: each alone explains next to nothing while 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +17,6 @@ from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
 from dropo_torch.gap.accept import SOFT, extend, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
@@ -95,7 +94,7 @@ def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
 
 
 def fitted_family(ground: Ground, begin: Hypothesis, rival: tuple[Hypothesis, float] | None = None) -> Refit | None:
-    """Return the base family fitted at every joint, first on few windows.
+    """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest.
 
     Args:
         ground: what the search stands on.
@@ -104,22 +103,23 @@ def fitted_family(ground: Ground, begin: Hypothesis, rival: tuple[Hypothesis, fl
             leaves more, it is not fitted on all, and none is returned.
     """
     ground.report(STAGE, 0.0)
-    few, iterations = ground.part.few(ROUGHLY), ground.rules.family.iterations
-    rough = _roughly(few, begin, base_family(ground.setting, ground.effects), iterations)
+    iterations = ground.rules.family.iterations
     if rival is not None:
+        few = ground.part.few(ROUGHLY)
+        rough = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
         own = refit(few, rival[0], iterations=0, slopes=False).cost
         if rough.cost.left_of(own) > rival[1]:
             return None
-    ground.report(STAGE, 0.25)
-    return ground.refit(rough.hypothesis, iterations=iterations)
+        ground.report(STAGE, 0.1)
+    return _in_turn(ground, begin, lambda h: ground.refit(h, iterations=iterations))
 
 
-def _roughly(few: Evidence, begin: Hypothesis, family: Sequence[Placed], iterations: int) -> Refit:
-    """The family fitted on few windows: first without delays, which otherwise stand for the rest."""
-    prompt, late = ([p for p in family if p.effect.is_filter == wanted] for wanted in (False, True))
-    fitted = refit(few, begin.with_effects(prompt), iterations=iterations, slopes=False)
-    later = refit(few, fitted.hypothesis.with_effects(late), iterations=iterations, slopes=False)
-    return later if later.loss < fitted.loss else fitted
+def _in_turn(ground: Ground, begin: Hypothesis, fit: Callable[[Hypothesis], Refit]) -> Refit:
+    """The base family as it is fitted without delays, or with delays from there on."""
+    family = base_family(ground.setting, ground.effects)
+    prompt = fit(begin.with_effects([p for p in family if not p.effect.is_filter]))
+    late = fit(prompt.hypothesis.with_effects([p for p in family if p.effect.is_filter]))
+    return late if late.loss < prompt.loss else prompt
 
 
 def softened(ground: Ground, whole: Refit) -> Refit | None:
