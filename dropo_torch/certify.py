@@ -78,6 +78,8 @@ class Certificate:
             raise InputError(f"certificate: {found}; fit with optimizer: fisher or cma instead, and report the model")
 
 
+@torch.inference_mode(mode=False)  # whether or not the caller has switched gradients off
+@torch.enable_grad()
 def certify(objective: Objective, *, max_transitions: int = 100, points: int = 2, seed: int = 0) -> Certificate:
     """Compare the simulator's derivatives of every parameter with central differences of MuJoCo.
 

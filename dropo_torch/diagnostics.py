@@ -12,6 +12,7 @@ from dropo_torch.distribution import Distribution, coordinate_limits, truncated_
 from dropo_torch.initial_noise import InitialStateNoise
 from dropo_torch.objective import Objective
 from dropo_torch.optimizers.gauss_newton import MeansStage
+from dropo_torch.support.by_value import ByValue
 from dropo_torch.support.random import draw_uniforms
 
 #: Windows that follow on each other in what is judged of a log that is too long to be judged whole.
@@ -26,8 +27,8 @@ QUANTILES = 5
 CONFOUNDED = 0.95
 
 
-@dataclass(frozen=True)
-class Diagnostics:
+@dataclass(frozen=True, eq=False)
+class Diagnostics(ByValue):
     """Simulated against measured next states under a fitted distribution.
 
     Attributes:

@@ -24,6 +24,7 @@ import yaml
 
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.support.by_value import ByValue
 from dropo_torch.support.given import read_text, reading
 from dropo_torch.support.random import base_uniforms
 from dropo_torch.support.yaml_text import load_yaml
@@ -78,8 +79,8 @@ def truncated_moments(a: torch.Tensor, b: torch.Tensor) -> tuple[torch.Tensor, t
 DRAWN_STD = float(truncated_moments(*torch.tensor([-TRUNCATION, TRUNCATION], dtype=torch.float64))[1].sqrt())
 
 
-@dataclass(frozen=True)
-class Distribution:
+@dataclass(frozen=True, eq=False)
+class Distribution(ByValue):
     """A fitted (or given) distribution over a simulator's parameters.
 
     Attributes:

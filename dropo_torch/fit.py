@@ -149,6 +149,8 @@ class Fit:
         write_json(Path(path), self.document())
 
 
+@torch.inference_mode(mode=False)  # gradients are taken whether or not the caller has switched them off
+@torch.enable_grad()
 def fit(
     objective: Objective,
     settings: FitSettings | None = None,

@@ -17,6 +17,8 @@ from dropo_torch.objective import Objective
 
 #: Units of what is a position.
 POSITIONS = ("m", "rad", "-")
+#: How reasons end for which a search has stopped that may not have converged.
+SPENT = ("is spent", "are taken")
 Verdict = Literal["explained", "not_explained", "hopeless"]
 
 
@@ -79,7 +81,9 @@ class Judgment:
     standard_errors: dict[str, dict[str, float | None]]
 
 
-def judge(distribution: Distribution, method: str, diagnostics: Diagnostics, diverged: float) -> Judgment:
+def judge(
+    distribution: Distribution, method: str, diagnostics: Diagnostics, diverged: float, stop_reason: str = ""
+) -> Judgment:
     """Return the verdict on a fitted distribution.
 
     Args:
@@ -87,6 +91,7 @@ def judge(distribution: Distribution, method: str, diagnostics: Diagnostics, div
         method: how it was found; only DROPO's σ says how much must vary, and a random box is not judged.
         diagnostics: of the fit.
         diverged: share of simulations that diverge under it.
+        stop_reason: why the search has stopped; one that has spent what it was given may not have converged.
     """
     is_dropo = method == "dropo"
     errors = _standard_errors(distribution, diagnostics)
@@ -99,7 +104,8 @@ def judge(distribution: Distribution, method: str, diagnostics: Diagnostics, div
     if method == "udr":
         reason = f"this is a box drawn at random; the log was not used. {scale_of(diagnostics)}"
     elif hopeless:
-        verdict, reason = "hopeless", hopeless
+        spent = f" Or the search has not converged, for {stop_reason}: give it more, or try optimizer: fisher."
+        verdict, reason = "hopeless", hopeless + (spent if stop_reason.endswith(SPENT) else "")
     elif doubt := _doubt(distribution, diagnostics, is_dropo):
         verdict, reason = "not_explained", f"{doubt}. {scale_of(diagnostics)}"
     else:

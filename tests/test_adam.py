@@ -1,5 +1,7 @@
 """Adam, exact derivatives and certificates on the Warp backend."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -72,6 +74,14 @@ def advance(search: AdamOptimizer, objective: Objective) -> None:
     np.testing.assert_array_equal(request.values, search.ask().values)
     sums = answer(objective, request)
     search.tell(sums.total, sums.gradient)
+
+
+@pytest.mark.parametrize("off", [torch.no_grad, torch.inference_mode])
+def test_gradients_are_taken_where_the_caller_has_switched_them_off(objective: Objective, off: Any) -> None:
+    settings = FitSettings(optimizer="adam", adam=AdamSettings(steps=2, batch=4, samples=2), samples=4, seed=1)
+    with off():
+        found = dropo.fit(objective, settings)
+    assert found.distribution == dropo.fit(objective, settings).distribution
 
 
 def test_adam_approaches_the_masses_and_continues_from_any_state(objective: Objective) -> None:

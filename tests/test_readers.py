@@ -711,3 +711,9 @@ def test_a_pause_ends_an_episode_of_a_table(tmp_path):
     check(read_trajectories(table, observations=["q", "dq"], actions="u", time="t", pause=0.2))
     with pytest.raises(InputError, match="pause needs time stamps"):
         read_trajectories(table, observations=["q", "dq"], actions="u", pause=0.2)
+
+
+def test_a_data_frame_with_a_column_twice_is_refused() -> None:
+    frame = pd.DataFrame(np.zeros((5, 3)), columns=["q", "u", "q"])
+    with pytest.raises(InputError, match="two columns are named 'q'; give each a name of its own"):
+        read_trajectories(frame, observations=["q"], actions=["u"], dt=0.1)

@@ -89,6 +89,17 @@ def test_a_log_in_other_units_or_of_another_time_step_is_hopeless_and_ends_early
     assert result.history[-1].evaluations < 120
 
 
+def test_a_search_that_spent_its_budget_may_not_have_converged(tmp_path: Path) -> None:
+    """Not only the log is to blame then; a search that ends by itself blames the log alone."""
+    for optimizer, keys in (("cma", {"budget": 20}), ("fisher", {})):
+        problem, result, found = judged(tmp_path, in_degrees(arm_log(0)), optimizer=optimizer, **keys)
+        assert found.verdict == "hopeless"
+        diagnostics = diagnose(problem.objective, result.distribution, seed=0)
+        for reason, told in (("the budget of 20 evaluations is spent", True), ("it is hopeless", False)):
+            again = judge(result.distribution, result.method, diagnostics, 0.0, reason)
+            assert ("the search has not converged, for the budget" in again.reason) == told
+
+
 def test_a_hopeless_fit_writes_everything_and_exits_3(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     judged(tmp_path, in_degrees(arm_log(0)))
     (tmp_path / "config.json").write_text(json.dumps({**arm.CONFIG, "epsilon": (NOISE**2).tolist()}))

@@ -81,7 +81,7 @@ def run_fit(
     diagnostics = diagnose(problem.objective, result.distribution, seed=config.seed, known=known)
     diagnostics = replace(diagnostics, unjoined=estimated.unjoined if estimated else ())
     lost = result.diverged / (len(problem.objective) * result.samples)
-    result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost))
+    result = replace(result, judgment=judge(result.distribution, result.method, diagnostics, lost, result.stop_reason))
     _write(problem, result, diagnostics, out)
     if log is not None:
         _write_events(result, out / "tensorboard")

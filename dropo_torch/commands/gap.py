@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -117,4 +118,6 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
         soft_wrap=True,
     )  # fmt: skip
     if (out / "config.yaml").exists():
-        console.print(f"to fit the strengths: dropo fit {out / 'config.yaml'} --out DIR", soft_wrap=True)
+        console.print(
+            f"to fit the strengths: dropo fit {shlex.quote(str(out / 'config.yaml'))} --out DIR", soft_wrap=True
+        )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -80,8 +81,9 @@ def _show(proposal: Proposal, path: Path, page: Path, took: float, console: Cons
     for finding in proposal.findings:
         console.print(f"log: {finding.confidence}: {told(finding)}", soft_wrap=True)
     console.print(f"{took:.1f} s; config: {path}, explained in {page}", soft_wrap=True)
-    console.print(f"what the model lacks: dropo gap {path} --out {path.with_suffix('')}-gap", soft_wrap=True)
-    console.print(f"a distribution: dropo fit {path} --out {path.with_suffix('')}-fit", soft_wrap=True)
+    for what, command in (("what the model lacks", "gap"), ("a distribution", "fit")):
+        out = shlex.quote(f"{path.with_suffix('')}-{command}")
+        console.print(f"{what}: dropo {command} {shlex.quote(str(path))} --out {out}", soft_wrap=True)
 
 
 def columns_table(matching: Matching) -> Table:

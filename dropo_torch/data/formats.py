@@ -267,6 +267,9 @@ def frame_table(source: str, frame: pd.DataFrame) -> Table:
     if any(name is not None for name in frame.index.names):
         frame = frame.reset_index()
     columns = {str(name): i for i, name in enumerate(frame.columns)}
+    if len(columns) < frame.shape[1]:
+        name = next(str(n) for i, n in enumerate(frame.columns) if columns[str(n)] != i)
+        raise InputError(f"{source}: two columns are named {name!r}; give each a name of its own")
     return Table(source, tuple(columns), lambda name: frame.iloc[:, columns[name]].to_numpy())
 
 

@@ -9,13 +9,14 @@ import numpy as np
 
 from dropo_torch.data.trajectory import Origin, Trajectories, check_values, set_frozen
 from dropo_torch.errors import InputError, choices
+from dropo_torch.support.by_value import ByValue
 
 TOLERANCE = 0.05
 """Fraction by which the spacing of regular time stamps may differ from its median."""
 
 
-@dataclass(frozen=True)
-class Recording:
+@dataclass(frozen=True, eq=False)
+class Recording(ByValue):
     """Samples in time of named signals, one row a time stamp, in one or more episodes.
 
     A transition runs from a sample to the next one of the same episode, under the first one's action.

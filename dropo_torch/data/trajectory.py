@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.data.observation import Observation
 from dropo_torch.errors import InputError
+from dropo_torch.support.by_value import ByValue
 
 
 @dataclass(frozen=True)
@@ -44,8 +45,8 @@ class Origin:
         return cls(*names.pop(), *(None if any(a is None for a in of) else np.concatenate(of) for of in arrays))
 
 
-@dataclass(frozen=True)
-class Trajectories:
+@dataclass(frozen=True, eq=False)
+class Trajectories(ByValue):
     """Logged episodes, one row a transition, in the order in which they were recorded.
 
     Attributes:
@@ -202,8 +203,8 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
     )
 
 
-@dataclass(frozen=True)
-class Transitions:
+@dataclass(frozen=True, eq=False)
+class Transitions(ByValue):
     """λ-step windows of a log: from a state, through λ controls, to what was measured.
 
     Attributes:

@@ -55,6 +55,7 @@ class AdamOptimizer(LikelihoodOptimizer):
     """
 
     name = "adam"
+    improves = False  # from far away it may need all of its steps
     STATE = ("_phi", "_first", "_second", "_basis", "_curvature", "_refreshed", "_step", "_smoothed", "_linearised",
              "_least", "_stable")  # fmt: skip
 
