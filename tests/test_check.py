@@ -58,6 +58,15 @@ def test_a_good_log_is_left_in_peace(system: str, tmp_path: Path) -> None:
     assert names(found) == []
 
 
+def test_a_log_in_which_nothing_moves_is_told() -> None:
+    states = np.zeros((300, 4))
+    rested = arm_log(observations=states[:100], next_observations=states[:100], actions=np.zeros((100, 2)),
+                     terminals=np.arange(1, 101) == 100)  # fmt: skip
+    (found,) = arm_findings(rested)
+    assert (found.name, found.sure) == ("frozen", True)
+    assert "no column changes in 100 rows" in found.what
+
+
 @pytest.mark.parametrize("fault", FAULTS, ids=lambda fault: fault.name)
 def test_a_fault_is_told_and_cured(fault: Fault, tmp_path: Path) -> None:
     log = fault.make(good_log(fault.systems[0]), np.random.default_rng(3))

@@ -17,7 +17,10 @@ LEAST_STEPS, BESIDE, MOST_NAMED = 50, 6, 3
 
 
 def stuck(record: Record, rules: Rules) -> list[Finding]:
-    """Return columns that stand still while their position or velocity says that they move."""
+    """Return columns that stand still while their position or velocity says that they move, or all where none moves."""
+    still = not np.ptp(np.concatenate([record.before, record.after]), axis=0).any()
+    if record.pairs and still and len(record.before) >= rules.frozen:
+        return [_motionless(record)]
     found = []
     step = record.step or 1.0
     usual = float(np.median([np.ptp(record.before[:, c.position]) for c in record.pairs])) if record.pairs else 0.0
@@ -73,6 +76,12 @@ def _spikes(record: Record, c: Coordinate, column: int, rules: Rules) -> np.ndar
         speed = 0.5 * (record.before[:, c.velocity] + record.after[:, c.velocity]) * (record.step or 1.0)
         whole &= (np.abs(away - speed[:-1]) > 0.5 * size[:-1]) & (np.abs(back - speed[1:]) > 0.5 * size[1:])
     return rows[whole]
+
+
+def _motionless(record: Record) -> Finding:
+    what = f"no column changes in {len(record.before)} rows: the robot stood still, or its state was not recorded"
+    labels = tuple(record.label(column) for column in range(record.before.shape[1]))
+    return Finding("frozen", labels, what, "sure", advice="record a motion; this log tells nothing")
 
 
 def _constant(record: Record, c: Pair, column: int, moved: float) -> Finding:
