@@ -858,3 +858,9 @@ def test_commands_by_a_clock_of_their_own_are_put_back(tmp_path: Path) -> None:
 
 CLOCKED = """<mujoco><option timestep="0.001"/><worldbody><body><joint name="slide" type="slide" axis="1 0 0"/>
   <geom size=".1"/></body></worldbody><actuator><motor name="push" joint="slide" gear="5"/></actuator></mujoco>"""
+
+
+def test_columns_of_decimal_commas_are_told_as_text(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    frame = {"time": np.arange(50) * 0.01, "slide_pos": [f"0,{i:03d}" for i in range(50)], "push_cmd": np.ones(50)}
+    assert main(["init", *written(tmp_path, frame, CLOCKED), "--out", str(tmp_path / "robot.yaml")]) == 2
+    assert "these hold text, and no numbers: slide_pos such as '0,000'" in capfd.readouterr().err

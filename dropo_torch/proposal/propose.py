@@ -294,7 +294,7 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
         if any(o.optional and o.label == p.partner for o in matching.lacks("position"))
     ]  # fmt: skip
     if lacking:
-        raise InputError(f"{columns.source}: {_lacking(lacking, model, free)}")
+        raise InputError(f"{columns.source}: {_lacking(lacking, model, free)}{_texts(columns)}")
     absent = matching.lacks("command")
     told = matching.of("command")
     if absent and (told or any(p.takes != "position" for p in absent)):
@@ -302,8 +302,8 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
         kind = {"position": "targets", "velocity": "target velocities", "effort": "commanded forces"}[absent[0].takes]
         raise InputError(
             f"{columns.source}: no column is the command of {names} ({kind}); rename one, or use --interactive"
-            + _choices(absent[0].label, free)
-        )
+            + _choices(absent[0].label, free) + _texts(columns)
+        )  # fmt: skip
     if clock.dt is None:
         raise InputError(
             f"{columns.source}: nothing says how far rows are apart: neither time stamps nor velocities; give "
@@ -316,6 +316,12 @@ def _free(matching: Matching, columns: Columns, clock: Clock) -> list[str]:
     taken = [*(m.column for m in matching.matches), clock.column, clock.episode, *clock.terminals]
     used = {c.entry for c in taken if c is not None}
     return [c.entry for c in sorted(columns.numeric, key=lambda c: not c.moves) if c.entry not in used]
+
+
+def _texts(columns: Columns) -> str:
+    """Which columns hold text where numbers may be meant, such as with decimal commas."""
+    told = [f"{c.entry} such as {str(c.labels[0])!r}" for c in columns.columns if not c.values.size and len(c.labels)]
+    return f"; these hold text, and no numbers: {', '.join(told[:3])}{', ...' if len(told) > 3 else ''}" if told else ""
 
 
 def _choices(name: str, free: Sequence[str]) -> str:
