@@ -432,6 +432,24 @@ def test_contacts_stay_as_they_are_with_the_numbers_of_the_model(rover: dict[str
             assert geom == "caster" or not np.allclose(driven(changed), before, rtol=0, atol=1e-9)
 
 
+def test_the_friction_of_one_geom_of_a_robot_is_not_that_of_its_others() -> None:
+    """A foot that is rougher than the ground stays so when the friction of what is above it changes."""
+    model = mujoco.MjModel.from_xml_string(
+        """<mujoco><worldbody><geom name="floor" type="plane" size="9 9 1" friction=".9"/><body pos="0 0 1"><freejoint/>
+        <geom name="torso" size=".1" friction="1.1"/><body pos="0 0 -.4"><joint axis="0 1 0"/>
+        <geom name="shank" size=".05"/><body pos="0 0 -.4"><joint axis="0 1 0"/>
+        <geom name="foot" size=".05" friction="2"/></body></body></body></worldbody></mujoco>"""
+    )
+    effect, before = find_effect("contact_friction"), model.geom_friction[:, 0].copy()
+    for name in ("torso", "shank", "foot"):
+        changed = with_effects(model, [Placed(effect, name, (0.4,))])
+        own = changed.geom(name).id
+        others = np.arange(model.ngeom) != own
+        np.testing.assert_array_equal(changed.geom_friction[others, 0], before[others])
+        assert changed.geom_friction[own, 0] == 0.4
+        assert changed.geom_priority[own] > changed.geom_priority[0]
+
+
 def test_a_geom_alone_decides_its_friction_and_softness() -> None:
     """A box slides with the friction given, whatever the floor's; softness leaves the friction as it was."""
     xml = """<mujoco><option timestep="0.001"/><worldbody>

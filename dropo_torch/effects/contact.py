@@ -83,7 +83,8 @@ class Deciding:
     """How a geom's contacts are changed, so that none changes with what the model has.
 
     Contacts with geoms of higher priority are theirs. Where all others are alike, the geom decides them alone;
-    otherwise numbers of the geom and of those that it mixes with change alike.
+    otherwise numbers of the geom and of those that it mixes with change alike. Of a robot's contacts with itself none
+    counts, unless it has no others: they are rare, and would tie its geoms to each other.
 
     Attributes:
         geom: the geom.
@@ -98,7 +99,9 @@ class Deciding:
     @classmethod
     def of(cls, model: mujoco.MjModel, geom: int) -> Deciding:
         """Return how those of a geom are."""
-        own, partners = model.geom_priority[geom], ContactEffect.partners(model, geom)
+        own, root = model.geom_priority[geom], model.body_rootid[model.geom_bodyid]
+        partners = ContactEffect.partners(model, geom)
+        partners = [g for g in partners if root[g] != root[geom]] or partners
         kinds = [Mixed.of(model, geom, g) for g in partners if model.geom_priority[g] <= own]
         equals = [g for g in partners if model.geom_priority[g] == own]
         return cls(geom, equals, kinds or [Mixed.of(model, geom, geom)])
