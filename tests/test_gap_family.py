@@ -294,6 +294,7 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     monkeypatch.setattr(members, "significant", lambda *_: True)
     monkeypatch.setattr(members, "one_kind", lambda _: False)
     monkeypatch.setattr(members, "extend", lambda _, found: found)
+    monkeypatch.setattr(members, "leaves_too_much", lambda *_: False)
     monkeypatch.setattr(members, "fitted_family", lambda *_: whole)
     monkeypatch.setattr(members, "whole_family", lambda _, fit: judged.append(fit))
     few: Any = SimpleNamespace(

@@ -67,8 +67,10 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
         return found
     most = rules.hopeless * rules.clearer[int(kind)]
-    fitted = fitted_family(ground, state.base.hypothesis, (best.current.hypothesis, most))
-    if fitted is None or fitted.cost.left_of(cost) > most:
+    if leaves_too_much(ground, state.base.hypothesis, best.current.hypothesis, most):
+        return found
+    fitted = fitted_family(ground, state.base.hypothesis)
+    if fitted.cost.left_of(cost) > most:
         return found
     whole = whole_family(ground, fitted)
     if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)]:
@@ -93,25 +95,18 @@ def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
     return whole
 
 
-def fitted_family(ground: Ground, begin: Hypothesis, rival: tuple[Hypothesis, float] | None = None) -> Refit | None:
-    """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest.
-
-    Args:
-        ground: what the search stands on.
-        begin: to what its members are added.
-        rival: a fitted hypothesis, and the share of what it leaves that the family may leave on few windows; where it
-            leaves more, it is not fitted on all, and none is returned.
-    """
+def leaves_too_much(ground: Ground, begin: Hypothesis, rival: Hypothesis, most: float) -> bool:
+    """Return whether the base family leaves more than a share of what a fitted rival leaves, on few windows."""
     ground.report(STAGE, 0.0)
-    iterations = ground.rules.family.iterations
-    if rival is not None:
-        few = ground.part.few(ROUGHLY)
-        rough = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
-        own = refit(few, rival[0], iterations=0, slopes=False).cost
-        if rough.cost.left_of(own) > rival[1]:
-            return None
-        ground.report(STAGE, 0.1)
-    return _in_turn(ground, begin, lambda h: ground.refit(h, iterations=iterations))
+    few, iterations = ground.part.few(ROUGHLY), ground.rules.family.iterations
+    rough = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
+    return rough.cost.left_of(refit(few, rival, iterations=0, slopes=False).cost) > most
+
+
+def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
+    """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest."""
+    ground.report(STAGE, 0.1)
+    return _in_turn(ground, begin, lambda h: ground.refit(h, iterations=ground.rules.family.iterations))
 
 
 def _in_turn(ground: Ground, begin: Hypothesis, fit: Callable[[Hypothesis], Refit]) -> Refit:

@@ -288,8 +288,7 @@ def resort(ground: Ground, naming: Naming) -> Naming:
         return naming
     evidence = replace(naming.evidence, caps=1.0)
     here, base = with_base(replace(ground, evidence=evidence), naming.base.hypothesis)
-    fitted = fitted_family(here, base.hypothesis)
-    if fitted is None or (whole := whole_family(here, fitted)) is None:
+    if (whole := whole_family(here, fitted_family(here, base.hypothesis))) is None:
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
     state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.few)

@@ -117,8 +117,8 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
     whole = is_whole(dt, timestep)
     missing = any(np.isnan(m.column.values).any() for m in matching.matches)
     smooth: Filter | None = None
-    own_clock = _own_period(columns, matching, clock) is not None
-    resampled = derived or bool(some) or not clock.even or not whole or missing or own_clock
+    period = _own_period(columns, matching, clock)
+    resampled = derived or bool(some) or not clock.even or not whole or missing or period is not None
     source = _source(reading)
     if not resampled and (whole_arrays := _standard(columns, matching)) is not None:
         source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
@@ -134,8 +134,9 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         source["actions"] = [m.entry for m in commands]
     if resampled or follows:
         source["preprocess"], more, smooth = _preprocess(
-            columns, matching, clock, positions, velocities, skip * timestep, follows=follows, derive=some
-        )
+            columns, matching, clock, positions, velocities, skip * timestep, follows=follows, derive=some,
+            period=period,
+        )  # fmt: skip
         notes += more
         notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
         notes += (
@@ -252,6 +253,7 @@ def _rates(positions: Sequence[Match], places: Sequence[Place]) -> list[str]:
 def _preprocess(
     columns: Columns, matching: Matching, clock: Clock, positions: Sequence[Match], velocities: Sequence[Match],
     step: float, *, follows: bool, derive: Sequence[Match] = (),
+    period: float | None = None,
 ) -> tuple[dict[str, Any], list[str], Filter | None]:  # fmt: skip
     """Options that resample a log, what they are for, and the filter among them."""
     options: dict[str, Any] = {"dt": float(f"{step:.9g}")}
@@ -283,7 +285,7 @@ def _preprocess(
     elif matching.of("command"):
         # one that changes within a row acts in part of it; on the log's own grid it is held
         options["actions"] = "mean"
-        if (period := _own_period(columns, matching, clock)) is not None:
+        if period is not None:
             options["command_clock"] = True
             notes.append(f"commands change every {period:.4g} s, between rows: each is put back to when it changed")
     return options, notes, smooth
