@@ -206,6 +206,47 @@ def test_linear_drag_slows_a_free_body_in_proportion_to_its_speed() -> None:
     assert find_effect("linear_drag").targets(setting_of(general(xml))) == ["drone"]
 
 
+def holding(name: str, target: str, values: np.ndarray) -> np.ndarray:
+    """Generalized forces at rest, away from the model's rest position, ``(nv,)``."""
+    plain = general()
+    placed = Placed(find_effect(name), target, tuple(float(v) for v in values))
+    model = with_effects(plain, [placed])
+    data = mujoco.MjData(model)
+    data.qpos[:2] += 0.3, -0.4
+    mujoco.mj_forward(model, data)
+    free = placed.effect.force(setting_of(plain), target, values[None], data.qpos[None], data.qvel[None])
+    return np.asarray(data.qfrc_passive - data.qfrc_bias + free[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "start", "end"),
+    [
+        ("joint_stiffness", "elbow", (0.5, 0.2), (2.0, 1.7)),
+        ("joint_stiffness", "elbow", (2.0, 0.2), (1.5, -0.6)),
+        ("payload", "lower", (0.1, 0.02, 0.0, -0.1), (0.5, 0.1, -0.07, -0.4)),
+        ("joint_cogging", "elbow", (0.3, 4.0, 0.5), (0.9, 4.0, 2.5)),
+    ],
+)
+def test_numbers_that_multiply_move_what_acts_as_predicted(name: str, target: str, start: tuple, end: tuple) -> None:
+    effect, a, b = find_effect(name), np.array(start), np.array(end)
+    before, step = holding(name, target, a), 1e-6
+    slopes = [
+        (holding(name, target, a + step * e) - holding(name, target, a - step * e)) / (2 * step) for e in np.eye(len(a))
+    ]
+    predicted = before + np.transpose(slopes) @ (b - a)
+    assert np.abs(predicted - before).max() > 0.05
+    np.testing.assert_allclose(holding(name, target, effect.settle(a, b)), predicted, atol=1e-6)
+    assert np.array_equal(effect.settle(a, a), a)
+
+
+def test_an_amount_that_vanishes_leaves_its_place_where_it_is() -> None:
+    effect = find_effect("payload")
+    for gone in (0.0, -0.1):
+        assert effect.settle(np.array([0.1, 0.0, 0.0, -0.1]), np.array([gone, 0.0, 0.0, -0.2]))[3] == pytest.approx(
+            -0.2
+        )
+
+
 def test_a_payload_is_a_welded_point_mass() -> None:
     loaded, data = applied(RIG, "payload", "lower", 0.4, 0.05, 0.02, -0.3)
     inertial = '<body pos=".05 .02 -.3"><inertial pos="0 0 0" mass="0.4" diaginertia="1e-12 1e-12 1e-12"/></body>'

@@ -22,6 +22,8 @@ from dropo_torch.parameters import object_names, object_number
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
 #: The methods by which an effect acts on a simulation.
 Method = Literal["apply", "force", "wrench", "command", "sense"]
+#: Share of its start that an amount is at least, where a prediction of places is divided by it.
+LEAST_AMOUNT = 0.2
 
 
 @dataclass(frozen=True)
@@ -204,7 +206,10 @@ class Effect(abc.ABC):
         return None
 
     def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
-        """Return the values that a linear prediction ``values`` from ``start`` stands for."""
+        """Return the values that a linear prediction ``values`` from ``start`` stands for.
+
+        Numbers that act by their product are not linear, such as a mass and where it is: see :func:`by_product`.
+        """
         return values
 
     def eased(self, setting: Setting, values: tuple[float, ...]) -> tuple[float, ...]:
@@ -336,6 +341,22 @@ class Placed:
     def summary(self, setting: Setting) -> dict[str, Any]:
         """Return the values by name."""
         return {q.name: v for q, v in zip(self.effect.quantities(setting, self.target), self.values, strict=True)}
+
+
+def by_product(start: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the values that a linear prediction stands for where the first number multiplies the others, ``(p,)``.
+
+    What acts is linear: of a mass at a place, its moment; of a spring, the force at rest. The prediction moves that by
+    the amount at the start times the move of a place, and a larger amount does it with less of a move.
+
+    Args:
+        start: an amount, and places where it acts.
+        values: the prediction.
+    """
+    least = LEAST_AMOUNT * abs(start[0])
+    amount = values[0] if values[0] * start[0] > 0 else start[0]
+    share = start[0] / (np.sign(amount) * max(abs(amount), least)) if amount else 1.0
+    return np.concatenate([values[:1], start[1:] + share * (values[1:] - start[1:])])
 
 
 def apply_all(model: mujoco.MjModel, placed: Iterable[Placed]) -> None:

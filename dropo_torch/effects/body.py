@@ -7,7 +7,7 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, object_number
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, by_product, object_number
 
 
 def body_number(model: mujoco.MjModel, target: str | None) -> int:
@@ -99,6 +99,9 @@ class Payload(BodyEffect):
         starts = np.tile([mass, *setting.model.body_ipos[body]], (3, 1))
         starts[1:, 1 + longest] = low[longest], high[longest]
         return list(starts)
+
+    def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return by_product(start, values)
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
         """Begin with masses, where they are in reach, that shift the centre of mass as far."""

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.data.observation import joint_name
-from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals, object_number
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals, by_product, object_number
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -251,6 +251,9 @@ class JointStiffness(JointEffect):
         begin = [rest] if abs(rest - middle) < 0.2 * reference.scale else [rest, middle]
         return [np.array([0.05 * stiffness.scale, at]) for at in begin]
 
+    def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
+        return by_product(start, values)
+
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         joint = object_number(model, "jnt", target)
         own, at = float(model.jnt_stiffness[joint]), model.jnt_qposadr[joint]
@@ -299,8 +302,8 @@ class JointCogging(JointEffect):
         return [0, 2]
 
     def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:
-        sine, cosine = values[0], start[0] * values[2]
-        return np.array([np.hypot(sine, cosine), values[1], np.arctan2(cosine, sine)])
+        sine, cosine = values[0], start[0] * (values[2] - start[2])
+        return np.array([np.hypot(sine, cosine), values[1], start[2] + np.arctan2(cosine, sine)])
 
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray

@@ -26,7 +26,7 @@ from dropo_torch.gap.rules import (
     significant,
     simplest,
 )
-from dropo_torch.gap.screen import Candidate, promising_families, promising_pairs, screen
+from dropo_torch.gap.screen import Candidate, nearer, promising_families, promising_pairs, screen
 from dropo_torch.gap.sound import absurd
 
 #: Places from which on an effect is a family, whose members stand together.
@@ -176,7 +176,8 @@ def add(ground: Ground, state: State) -> State:
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
     alive = [c for c in ranked if not c.dead]
-    hopeless, groups = most_left(current, rules) + rules.tried.slack, [(c.placed,) for c in alive[: rules.tried.refits]]
+    hopeless, focus = most_left(current, rules) + rules.tried.slack, ground.focus(current)
+    groups = [(nearer(focus, current.hypothesis, c),) for c in alive[: rules.tried.refits]]
     singles, state = ground.refits(state, current, groups, "refitting", hopeless=hopeless)
     state = replace(state, refused=next((why for r in singles[:1] for why in nonsense(ground, r)), state.refused))
     promising, singles = singles, sound(ground, singles)

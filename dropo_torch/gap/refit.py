@@ -66,6 +66,13 @@ class Hypothesis:
         placed = tuple(p.at(v) for p, v in zip(self.placed, values, strict=True))
         return Hypothesis(tuple(float(v) for v in declared), placed)
 
+    def settled(self, vector: np.ndarray) -> np.ndarray:
+        """Return the numbers ``(q,)`` that a linear prediction from these stands for."""
+        there = self.at(vector).placed
+        pairs = zip(self.placed, there, strict=True)
+        values = [own.effect.settle(np.array(own.values), np.array(new.values)) for own, new in pairs]
+        return np.concatenate([vector[: len(self.declared)], *values])
+
     def with_effects(self, placed: Sequence[Placed]) -> Hypothesis:
         """Return the same with more effects."""
         return replace(self, placed=(*self.placed, *placed))
@@ -176,7 +183,7 @@ def refit(
         evidence: the windows.
         hypothesis: where to begin.
         linear: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
-        iterations: the most of them.
+        iterations: the most steps that make it better; others only shorten the next, and cost little.
         slopes: whether the result needs its derivatives; without them they may be zero.
     """
     limits = limits_of(hypothesis, evidence.twin)
@@ -184,24 +191,23 @@ def refit(
     variant = hypothesis.variant
     linear = evidence.linearise(variant) if linear is None else evidence.counting(linear, variant)
     here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
-    begin, damping, sloped = here, DAMPING, False
-    for _ in range(iterations):
+    begin, damping, sloped, taken = here, DAMPING, False, 0
+    while taken < iterations and damping <= MOST_DAMPING:
         if not sloped:
             here, sloped = _sloped(evidence, here, limits, residuals), True
         trial = here.hypothesis.vector + newton_step(here, limits, evidence.caps, damping) * limits.scale
+        trial = here.hypothesis.settled(np.clip(trial, limits.low, limits.high))
         trial = np.clip(trial, limits.low, limits.high)
         if _distance(trial, here.hypothesis, limits) < LEAST_MOVE:
             break
         there, found = _at(evidence, hypothesis, linear, limits, trial)
-        if there.loss < here.loss:
-            gain, damping = here.loss - there.loss, max(damping / 8, LEAST_DAMPING)
-            here, residuals, sloped = there, found, False
-            if gain < 1e-6 * here.loss + 0.01:
-                break
-        else:
+        if not there.loss < here.loss:
             damping *= 6
-            if damping > MOST_DAMPING:
-                break
+            continue
+        gain, damping, taken = here.loss - there.loss, max(damping / 8, LEAST_DAMPING), taken + 1
+        here, residuals, sloped = there, found, False
+        if gain < 1e-6 * here.loss + 0.01:
+            break
     if relinearise and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
         again = evidence.linearise(here.hypothesis.variant)
         return refit(evidence, here.hypothesis, linear=again, iterations=4, slopes=slopes)

@@ -19,13 +19,15 @@ from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.engine import Variant, parts
 from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.limbs import by_limbs
-from dropo_torch.gap.refit import Limits, Refit, beside, limits_of
+from dropo_torch.gap.refit import Hypothesis, Limits, Refit, beside, limits_of, refit
 from dropo_torch.gap.rules import Tried
 
 #: Difference step of a candidate's numbers, relative to their scale.
 STEP = 2e-3
 #: Damping and ridge of the predicted moves; ridge, of columns of length 1, where only χ² is predicted.
 DAMPING, RIDGE, FAINT = 1e-6, 1e-10, 1e-9
+#: Shares of the way from where a candidate begins to where it is predicted that are tried, too.
+ALONG = (0.75, 0.5, 0.25, 0.125)
 #: Candidates that one batch of simulations holds.
 BATCH = 24
 
@@ -139,6 +141,44 @@ def screen(
     return list(best.values())
 
 
+@dataclass(frozen=True)
+class _Plan:
+    """How a candidate's prediction is simulated.
+
+    Attributes:
+        placed: the candidate at its start.
+        variant: the hypothesis with it.
+        moving: which of its numbers move, ``(q,)``.
+        limits: bounds and scales of these.
+        steps: differences by which they move, in units of their scale, ``(q,)``.
+        rows: the simulations that belong to it.
+    """
+
+    placed: Placed
+    variant: Variant
+    moving: np.ndarray
+    limits: Limits
+    steps: np.ndarray
+    rows: slice
+
+    @property
+    def start(self) -> np.ndarray:
+        """The numbers that move, as they begin, ``(q,)``."""
+        return np.array(self.placed.values)[self.moving]
+
+    def settled(self, move: np.ndarray) -> np.ndarray:
+        """Return all of its numbers after a move ``(q,)`` that was predicted to first order."""
+        start = np.array(self.placed.values)
+        values = start.copy()
+        values[self.moving] += move * self.limits.scale
+        return self.placed.effect.settle(start, values)
+
+    def allows(self, move: np.ndarray) -> bool:
+        """Return whether what a move stands for is within the bounds."""
+        there = self.settled(move)[self.moving]
+        return bool(np.all((self.limits.low <= there) & (there <= self.limits.high)))
+
+
 def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Candidate]:
     """Simulate candidates at their starts and beside them, in one batch, and predict.
 
@@ -160,42 +200,57 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         own = [h.variant for h in (*begins, *moved)]
         rows = slice(len(variants), len(variants) + len(own))
         variants += own
-        plans.append((hypothesis.variant, moving, limits.of(columns), steps, rows))
+        plans.append(_Plan(placed, hypothesis.variant, moving, limits.of(columns), steps, rows))
     found, _ = evidence.residuals(variants)
     before, shared = focus.residual, focus.slope
-    for placed, (variant, moving, limits, steps, rows) in zip(part, plans, strict=True):
-        begin, *there = found[rows] if len(steps) < len(found[rows]) else (focus.simulated, *found[rows])
+    for plan in plans:
+        size = len(plan.steps)
+        begin, *there = found[plan.rows] if size < len(found[plan.rows]) else (focus.simulated, *found[plan.rows])
         residual = evidence.project(begin, linear).ravel() * factor
-        change = (np.reshape(there, (len(steps), *begin.shape)) - begin) / steps[:, None, None]
-        slope = evidence.project_slope(change, linear).reshape(len(moving), factor.size) * factor
-        known = evidence.twin.knows(variant, evidence.windows)
+        change = (np.reshape(there, (size, *begin.shape)) - begin) / plan.steps[:, None, None]
+        slope = evidence.project_slope(change, linear).reshape(size, factor.size) * factor
+        known = evidence.twin.knows(plan.variant, evidence.windows)
         here = np.repeat(known, len(residual) // len(known))  # windows whose commands it does not know stay as they are
         residual, slope = np.where(here, residual, before), slope * here
         lengths = np.sqrt((slope**2).sum(1))
         dead = bool(np.linalg.norm(residual - before) < least and lengths.max(initial=0.0) < least)
-        start = np.array(placed.values)
         columns = np.concatenate([shared, slope])
-        move = _move(columns * here, residual * here, limits, start[moving])
-        values = start.copy()
-        values[moving] += move[len(shared) :] * limits.scale
+        move = _move(columns * here, residual * here, plan)
         left = ((residual + move @ columns) ** 2).reshape(len(evidence.windows), -1).sum(-1)
         chi2 = promised(float(left[known].mean() * len(left)) if known.any() else np.inf)
-        predicted = placed.at(placed.effect.settle(start, values))
-        yield Candidate(predicted, placed, chi2, residual, slope, dead)
+        predicted = plan.placed.at(plan.settled(move[len(shared) :]))
+        yield Candidate(predicted, plan.placed, chi2, residual, slope, dead)
 
 
-def _move(columns: np.ndarray, residual: np.ndarray, limits: Limits, values: np.ndarray) -> np.ndarray:
-    """Least-squares move whose last entries, those of the candidate's own ``values``, stay within bounds."""
-    normal, shared = columns @ columns.T, len(columns) - len(values)
+def _move(columns: np.ndarray, residual: np.ndarray, plan: _Plan) -> np.ndarray:
+    """Least-squares move whose last entries, those of the candidate's own numbers, stay within bounds."""
+    normal, shared = columns @ columns.T, len(columns) - len(plan.steps)
     diagonal = np.diag(normal)
     damped = normal + np.diag(DAMPING * diagonal + RIDGE * diagonal.max(initial=1e-300))
     move = np.linalg.solve(damped, -(columns @ residual))
-    own = np.clip(move[shared:], *limits.moves(values))
+    if plan.allows(move[shared:]):
+        return move
+    own = np.clip(move[shared:], *plan.limits.moves(plan.start))
     if not np.array_equal(own, move[shared:]):
         rest = residual + own @ columns[shared:]
         move[:shared] = np.linalg.solve(damped[:shared, :shared], -(columns[:shared] @ rest))
         move[shared:] = own
     return move
+
+
+def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
+    """Return a candidate with the numbers, from those begun with to the predicted, that explain most.
+
+    A prediction goes too far where numbers act by their product, as the mass and the place of a payload do.
+    """
+    begin, end = np.array(candidate.start.values), np.array(candidate.placed.values)
+    between = [candidate.placed.at(begin + share * (end - begin)) for share in ALONG]
+
+    def loss(placed: Placed) -> float:
+        hypothesis = origin.with_effects([placed])
+        return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0, slopes=False).loss
+
+    return min((candidate.placed, candidate.start, *between), key=loss)
 
 
 def promising_families(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:

@@ -7,17 +7,13 @@ from collections.abc import Sequence
 from dataclasses import replace
 from itertools import permutations
 
-import numpy as np
-
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.accept import nonsense
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.refit import Refit
 from dropo_torch.gap.rules import Alike, significant
-from dropo_torch.gap.screen import Candidate, Focus, left_by
+from dropo_torch.gap.screen import Candidate, Focus, left_by, nearer
 
-#: Shares of the way from where a candidate begins to where it is predicted that are tried, too.
-ALONG = (0.75, 0.5, 0.25, 0.125)
 #: Iterations of their fits on few windows: a tie with more numbers than needed settles slowly.
 ITERATIONS = (6, 12)
 #: Iterations in which one effect settles in the place of two, of which it had done the part of one.
@@ -131,21 +127,6 @@ def varieties(ground: Ground, placed: Sequence[Placed], own: Placed) -> list[Pla
         for values in effect.extends(ground.setting, p)
         if len(values) == len(p.values)
     ]
-
-
-def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
-    """Return a candidate with the numbers, from those begun with to the predicted, that explain most.
-
-    A prediction goes too far where numbers act by their product, as the mass and the place of a payload do.
-    """
-    begin, end = np.array(candidate.start.values), np.array(candidate.placed.values)
-    between = [candidate.placed.at(begin + share * (end - begin)) for share in ALONG]
-
-    def loss(placed: Placed) -> float:
-        hypothesis = origin.with_effects([placed])
-        return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=0, slopes=False).loss
-
-    return min((candidate.placed, candidate.start, *between), key=loss)
 
 
 def surpasses(ground: Ground, better: Refit, own: Refit) -> bool:
