@@ -187,6 +187,11 @@ def test_a_mass_that_is_another_is_no_load(tmp_path: Path, monkeypatch: pytest.M
     assert gap.verdict == "no gap"
     assert gap.declared["pole_mass"][2] == pytest.approx(hidden().declared["pole_mass"], rel=1e-3)
     assert list(held.config.parameters or ()) == ["pole_mass"]
+    center = {"field": "body_ipos", "index": 2, "name": body, "bounds": [-0.5, 0.5]}
+    both = problem.config.model_copy(update={"parameters": {**(problem.config.parameters or {}), "center": center}})
+    plain = given.as_own(dataclasses.replace(problem, config=both), load)  # a mass and its center are no simpler
+    assert plain is not None
+    assert list(plain.config.parameters or ()) == ["pole_mass"]
     elsewhere = dataclasses.replace(load, effects=(named,))
     assert given.as_own(problem, elsewhere) is None
     better = dataclasses.replace(load, reduced=(load.reduced[0], 0.5))  # what the mass alone cannot do

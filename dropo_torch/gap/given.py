@@ -110,6 +110,7 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
     """Return a problem in which masses that the config has make up for what was named at their bodies, if they do.
 
     What sits on a body has more numbers than the mass of the body itself, which may just be another than the model's.
+    A mass and its center together have as many: they are no simpler answer.
 
     Args:
         problem: the model, its parameters, and the log.
@@ -117,7 +118,7 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
     """
     bodies = {e.target for e in gap.effects if e.effect in MASSIVE}
     parameters = problem.config.parameters or {}
-    free = [n for n, p in parameters.items() if str(p.get("field")).startswith("body_") and p.get("name") in bodies]
+    free = [n for n, p in parameters.items() if p.get("field") == "body_mass" and p.get("name") in bodies]
     if not free:
         return None
     plain = as_given(problem, free)
