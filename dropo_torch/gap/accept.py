@@ -188,12 +188,23 @@ def add(ground: Ground, state: State) -> State:
     if not singles:
         return replace(state, done=True)
     best = simplest(singles, rules)
+    rivals = [r for r in singles if not significant(r.cost, rules)]
     if best.cost.left_of(current.cost) > 1 - rules.most and not accounts(current, state.base, rules):
         best, state = _among_several(ground, state, alive, best)
     worse = is_hopeless(best, current, rules) or not matters(ground, state.base, best, current)
     if worse or not beats(ground, best, current):
         return replace(state, done=True)
-    return replace(state, current=best)
+    return replace(state, current=best, rivals=tuple(r.hypothesis for r in rivals if r is not best))
+
+
+def reconsidered(ground: Ground, state: State) -> State:
+    """Return the best of a hypothesis and its rivals under the noise as it is now: a lower one may tell them apart."""
+    if not state.rivals:
+        return state
+    ground.report("comparing anew", 0.0)
+    fitted = [state.current, *(ground.refit(h, iterations=6) for h in state.rivals)]
+    fitted = sorted(sound(ground, fitted), key=lambda r: r.cost.excess)
+    return replace(state, current=simplest(fitted, ground.rules) if fitted else state.current, rivals=())
 
 
 def _among_several(ground: Ground, state: State, alive: Sequence[Candidate], best: Refit) -> tuple[Refit, State]:

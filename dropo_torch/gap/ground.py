@@ -87,6 +87,7 @@ class State:
         refused: why what explained the most has no name, if it has none.
         family: whether the hypothesis is the base family, at all joints where it is needed.
         few: windows that refits use, at most.
+        rivals: hypotheses that left no more than noise, either, as it was when this one was chosen.
     """
 
     noise: np.ndarray
@@ -101,6 +102,7 @@ class State:
     refused: str = ""
     family: bool = False
     few: int = FEW
+    rivals: tuple[Hypothesis, ...] = ()
 
 
 @dataclass(frozen=True)

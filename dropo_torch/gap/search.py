@@ -11,7 +11,18 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed
 from dropo_torch.gap.absent import Allowed, family_ties, left_out, with_absent
-from dropo_torch.gap.accept import accounts_finely, add, everywhere, extend, imitates, is_done, nonsense, prune, swap
+from dropo_torch.gap.accept import (
+    accounts_finely,
+    add,
+    everywhere,
+    extend,
+    imitates,
+    is_done,
+    nonsense,
+    prune,
+    reconsidered,
+    swap,
+)
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.family import fitted_family, has_family, shares_of, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
@@ -200,6 +211,8 @@ def step(ground: Ground, state: State) -> State:
     if found.done:
         return found
     found = renewed(ground, found)
+    if not np.array_equal(found.noise, state.noise):
+        found = reconsidered(ground.at(found), found)
     ground, accepted = ground.at(found), found.current.hypothesis
     if ground.evidence.robust and not is_done(ground, found):
         found = everywhere(ground, found)
