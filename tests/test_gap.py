@@ -73,6 +73,8 @@ STIFFNESS = Effect("joint_stiffness", "hinge", {"stiffness": 0.2, "reference": 0
 UNEVEN = {"friction": 1.0, "waves": 6.0, "phase": 0.3}
 HYSTERESIS = Effect("hysteresis", "hinge", {"stiffness": 0.5, "yield": 0.4})
 SIZE = {"episodes": 4, "transitions": 100}
+#: By how much a noise is too large with which more than one effect leaves no more.
+LOUD = 40.0
 FILES = {"gap.json", "report.html", "picture.png", "model.xml", "config.yaml", "gap-progress.bin"}
 
 
@@ -1240,6 +1242,27 @@ def test_what_the_own_step_distorts_is_fitted_with_a_finer_one() -> None:
     finer = resolved(ground.part, refined, anew=True).fit
     assert finer.cost.reduced < 1.5 < resolved(ground.part, refined).fit.cost.reduced
     assert finer.hypothesis.placed[0].values == pytest.approx((0.06, 0.0975, 0.303), rel=0.1)
+
+
+def test_what_too_large_a_noise_does_not_tell_apart_is_told_once_it_is_lower() -> None:
+    """The search is on the noise as it first seems; beside what it accepts, that may fall by an order of magnitude."""
+    names = ("joint_damping",)
+    scene, right = scene_of(*names), true(hidden(*names))
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in FEW), short=scene.noisy)
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    loud = ground.on(LOUD * state.noise, state.since)
+    base = loud.refit(scene.begin)
+    begun = dataclasses.replace(state, noise=LOUD * state.noise, base=base, current=base, done=False)
+    found = accept.add(loud, begun)
+    told = [found.current.hypothesis, *found.rivals]
+    assert len(told) > 1
+    assert ("joint_damping", "hinge") in {h.placed[0].key for h in told}
+    wrong = next(h for h in told if h.placed[0].key != ("joint_damping", "hinge"))
+    mistaken = dataclasses.replace(found, current=ground.refit(wrong), rivals=tuple(h for h in told if h is not wrong))
+    again = accept.reconsidered(ground, mistaken)
+    assert [p.key for p in again.current.hypothesis.placed] == [p.key for p in right.placed]
+    assert not again.rivals
 
 
 def test_names_are_believed_on_other_windows_only_if_they_leave_nothing_there() -> None:
