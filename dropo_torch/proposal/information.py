@@ -34,6 +34,8 @@ LAGS, LONGEST = (1, 2, 4, 8, 16, 32), 1.0
 BUDGET, FEWEST, MOST = 1e6, 150, 3000
 #: Step of the differences, as a share of a candidate's bounds.
 STEP = 1e-5
+#: Lengths of windows, one after the other, that tell less than a shorter one: longer ones are not tried then.
+ENOUGH = 2
 #: Standard errors, in sizes of candidates, below which more does not count when the length of windows is chosen.
 FINE = 0.005
 #: Nats for each direction that a longer window must gain.
@@ -134,13 +136,17 @@ def information_of(
     step = problem.simulator.timestep or 1.0
     tried = [n for n in LAGS if n > least and n * 4 <= longest and n * step <= LONGEST]
     tried = [min(least, max(1, longest // 2)), *tried]
-    best: Information | None = None
+    best, fewer = None, 0
     for number, lag in enumerate(tried):
         if report is not None:
             report(f"Fisher information of windows of {lag} rows", number / len(tried))
         found = _at_lag(problem, candidates, lag, steps)
-        if best is None or _worth(found.gram) > _worth(best.gram) + GAIN * _rank(found.gram):
+        worth = _worth(found.gram)
+        fewer = fewer + 1 if best is not None and worth < _worth(best.gram) else 0
+        if best is None or worth > _worth(best.gram) + GAIN * _rank(found.gram):
             best = found
+        if fewer == ENOUGH:
+            break
     assert best is not None
     return best
 
