@@ -154,6 +154,19 @@ def test_parameters_are_fitted_where_the_model_as_given_has_no_answer(tmp_path: 
     assert {"gap-progress.bin", "gap-progress-given.bin"} <= {path.name for path in tmp_path.iterdir()}
 
 
+def test_parameters_are_not_fitted_where_no_time_is_left_for_it(tmp_path: Path) -> None:
+    """As long as it takes, it cannot be broken off; with a longer limit, a search that is resumed goes on with it."""
+    problem, store = as_given(hidden(), tmp_path), tmp_path / "gap-progress.bin"
+    few = [VOCABULARY[e] for e in FEW]
+    held, gap = find_gap_as_given(problem, effects=few, checkpoint=store, time_limit=0.01)
+    assert not held.config.parameters
+    assert gap.verdict != "no gap"
+    assert any("longer --time-limit" in note for note in gap.notes)
+    found, gap = find_gap_as_given(problem, effects=few, checkpoint=store, resume=True)
+    assert found is problem
+    assert gap.verdict == "no gap"
+
+
 @pytest.mark.parametrize(("after", "answered"), [(0.02, True), (0.5, False)])
 def test_names_that_close_most_of_a_gap_are_an_answer_in_the_model_as_given(
     after: float, answered: bool, monkeypatch: pytest.MonkeyPatch, tmp_path: Path

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import Effect
+from dropo_torch.gap.ground import FEW
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import Gap
@@ -34,6 +35,12 @@ _HELD = (
     "The config's parameters are as the model has them: names without them close most of the gap. To have the rest "
     "tried with the parameters fitted, add --as_given false."
 )
+_UNFITTED = (
+    "The config's parameters are as the model has them. To fit them, too, would take {} s at least, where {} s were "
+    "left: --resume with a longer --time-limit does."
+)
+#: Fits of the declared parameters that a search takes as long as, at least.
+FITS = 40
 
 
 def as_given(problem: Problem, free: Collection[str] = ()) -> Problem:
@@ -100,7 +107,10 @@ def find_gap_as_given(
     if first.verdict == "partly explained" and first.closed >= ENOUGH:
         return held, replace(first, notes=(*first.notes, _HELD))
     report("fitting the config's parameters", 0.0)
-    second = sought(problem, checkpoint, prepare(problem), end)
+    free, left = prepare(problem), end - time.monotonic()
+    if (needed := _seconds(free, first)) > left:
+        return held, replace(first, notes=(*first.notes, _UNFITTED.format(int(needed), max(int(left), 0))))
+    second = sought(problem, checkpoint, free, end)
     if _standing(second) < _standing(first):
         return problem, _both(first, second)
     return held, _both(second, first)
@@ -126,6 +136,13 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
     left = refit(scene.evidence, scene.begin, slopes=False).cost.reduced
     named = max(gap.reduced[1], 0.0 if gap.own_step is None else gap.own_step[0])
     return plain if left <= AS_GOOD * named else None
+
+
+def _seconds(scene: Scene, first: Gap) -> float:
+    """Seconds that a search with the declared parameters takes at the least, by what simulations took so far."""
+    windows = scene.evidence.windows
+    simulated = FITS * (1 + len(scene.begin.declared)) * min(len(windows), FEW) * windows.length
+    return simulated * first.seconds / max(first.simulated_transitions, 1)
 
 
 def _both(other: Gap, gap: Gap) -> Gap:
