@@ -132,47 +132,21 @@ def propose_config(
             model or log is refused for.
     """
     tell = report or (lambda stage, share: None)
-    path, base = Path(model), Path(out).resolve().parent
+    path = Path(model)
     tell("reading the model and the log", 0.0)
     compiled = load_model(path)
     columns = read_columns(log, [joint_name(compiled, j) for j in range(compiled.njnt)])
-    if len(prescribed_bodies(compiled)):
-        raise InputError(
-            f"model: {prescribed_names(compiled)}: mocap bodies act in this model, and their poses belong to the "
-            "actions; write the config by hand (docs/data.md)"
-        )
-    compiled, path, commanded = _with_motors(compiled, path, columns, Path(out))
-    places, step = places_of(compiled), float(compiled.opt.timestep)
-    clock = find_clock(columns, step, dt)
-    matching, clock = _matched(columns, places, clock, step, commanded)
-    given, config = Path(model), Path(out)
-    matching, path = _marked(given, path, config, columns, matching, clock, commanded)
-    if review is not None:
-        matching, clock = review.columns(columns, matching, places), review.clock(clock)
-    _check(matching, columns, compiled, clock)
-    own = step
-    path, step = _with_whole_steps(given, path, config, columns, matching, clock, commanded, own)
-    if not commanded:
-        keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
-        places = tuple(p for p in places if p.label in keep)
-        matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
+    robot = _robot(compiled, path, Path(out), columns)
+    reading = _reading(robot, columns, dt, review)
     tell("examining the log", 0.1)
-    data = _relative(columns.path, base)
-    draft = make_draft(Reading(_relative(path, base), data, columns, matching, places, clock, step, base))
-    matching = as_read(matching, places, draft)
-    if step != own:
-        draft = draft.noted(
-            f"rows {clock.dt:.6g} s apart are no whole number of the model's steps of {own:g} s: {path.name} is the "
-            f"model with steps of {step:g} s"
-        )
+    draft = _drafted(reading, robot)
     document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
     tell("estimating the noise", 0.2)
-    noise, candidates, document = _with_noise(document, draft, base)
-    least = 1 if draft.smooth is None else math.ceil(0.5 / (draft.smooth.cutoff * document["frame_skip"] * step))
+    noise, candidates, document = _with_noise(document, draft, reading.base)
+    skip, step = document["frame_skip"], reading.timestep
+    least = 1 if draft.smooth is None else math.ceil(0.5 / (draft.smooth.cutoff * skip * step))
     found = information_of(noise.config, candidates, least=least, report=tell, log=noise.log)
-    choice = choose(candidates, found.gram)
-    if review is not None and (names := review.parameters(choice)) is not None:
-        choice = choose(candidates, found.gram, names)
+    choice = _chosen(candidates, found, review)
     if not choice.chosen:
         raise InputError(
             f"{log}: the log tells none of the model's {len(candidates)} physical parameters; log a motion"
@@ -180,9 +154,87 @@ def propose_config(
     document |= {"lag": found.lag, "as_given": True}
     document |= {"parameters": {t.candidate.name: t.candidate.spec for t in choice.chosen}}
     return Proposal(
-        document, base, matching, clock, draft, noise.columns, choice, found.windows, _rate(clock, document, step),
-        _window(found, document["frame_skip"] * step),
+        document, reading.base, as_read(reading.matching, reading.places, draft), reading.clock, draft, noise.columns,
+        choice, found.windows, _rate(reading.clock, document, step), _window(found, skip * step),
     )  # fmt: skip
+
+
+@dataclass(frozen=True)
+class _Robot:
+    """The model, and where the config finds it.
+
+    Attributes:
+        given: its file as given.
+        out: the config to be written.
+        path: its file as the config names it: the one that was given, or where a copy will stand.
+        model: with motors where it gets some.
+        commanded: whether it has actuators as given.
+    """
+
+    given: Path
+    out: Path
+    path: Path
+    model: mujoco.MjModel
+    commanded: bool
+
+    @property
+    def step(self) -> float:
+        """Seconds of a step of the model as given."""
+        return float(self.model.opt.timestep)
+
+    def driven(self, matching: Matching) -> list[str]:
+        """Return the joints at which a model that has no actuators gets motors."""
+        return [] if self.commanded else [m.place.label for m in matching.of("command")]
+
+
+def _robot(model: mujoco.MjModel, path: Path, out: Path, columns: Columns) -> _Robot:
+    """The model with motors at all joints where it has no actuators and the log has forces."""
+    if len(prescribed_bodies(model)):
+        raise InputError(
+            f"model: {prescribed_names(model)}: mocap bodies act in this model, and their poses belong to the "
+            "actions; write the config by hand (docs/data.md)"
+        )
+    forces = [c for c in columns.numeric if c.words.role in ("effort", "command") and c.moves]
+    joints = drivable(model)
+    if model.nu or not forces or not joints or path.suffix == ".mjb":
+        return _Robot(path, out, path, model, bool(model.nu))
+    return _Robot(path, out, out_of(out, path, "motors"), motor_spec(path, joints).compile(), False)
+
+
+def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review | None) -> Reading:
+    """Which column is which number of the model and when rows were taken, with the model of which they are rows."""
+    places = places_of(robot.model)
+    matching, clock = _matched(columns, places, find_clock(columns, robot.step, dt), robot.step)
+    matching, path = _marked(robot, columns, matching, clock)
+    if review is not None:
+        matching, clock = review.columns(columns, matching, places), review.clock(clock)
+    _check(matching, columns, robot.model, clock)
+    path, step = _with_whole_steps(robot, path, columns, matching, clock)
+    if not robot.commanded:
+        keep = {m.place.label for m in matching.matches} | {p.label for p in places if p.kind != "command"}
+        places = tuple(p for p in places if p.label in keep)
+        matching = replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
+    base = robot.out.resolve().parent
+    return Reading(_relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base)
+
+
+def _drafted(reading: Reading, robot: _Robot) -> Draft:
+    """The config's keys but noise and parameters, with a note where the model is one with finer steps."""
+    draft = make_draft(reading)
+    if reading.timestep == robot.step:
+        return draft
+    return draft.noted(
+        f"rows {reading.clock.dt:.6g} s apart are no whole number of the model's steps of {robot.step:g} s: "
+        f"{Path(reading.model).name} is the model with steps of {reading.timestep:g} s"
+    )
+
+
+def _chosen(candidates: Sequence[Candidate], found: Information, review: Review | None) -> Choice:
+    """The parameters to fit, as the log tells them or as a review names them."""
+    choice = choose(candidates, found.gram)
+    if review is not None and (names := review.parameters(choice)) is not None:
+        choice = choose(candidates, found.gram, names)
+    return choice
 
 
 def _relative(path: Path, base: Path) -> str:
@@ -193,45 +245,29 @@ def _relative(path: Path, base: Path) -> str:
         return str(path.resolve())
 
 
-def _with_motors(model: mujoco.MjModel, path: Path, columns: Columns, out: Path) -> tuple[mujoco.MjModel, Path, bool]:
-    """The model with motors at all joints where it has no actuators and the log has forces; where it will stand."""
-    forces = [c for c in columns.numeric if c.words.role in ("effort", "command") and c.moves]
-    joints = drivable(model)
-    if model.nu or not forces or not joints or path.suffix == ".mjb":
-        return model, path, bool(model.nu)
-    return motor_spec(path, joints).compile(), out_of(out, path, "motors"), False
-
-
-def _driven(matching: Matching, commanded: bool) -> list[str]:
-    """The joints at which a model that has no actuators gets motors."""
-    return [] if commanded else [m.place.label for m in matching.of("command")]
-
-
-def _marked(
-    given: Path, path: Path, out: Path, columns: Columns, matching: Matching, clock: Clock, commanded: bool
-) -> tuple[Matching, Path]:
+def _marked(robot: _Robot, columns: Columns, matching: Matching, clock: Clock) -> tuple[Matching, Path]:
     """What columns are where markers show the positions that no column is, and the model that has sensors for them."""
     if all(p.optional for p in matching.lacks("position")):
-        return matching, path
-    source = given
-    if driven := _driven(matching, commanded):
-        source = path
-        write_copy(given, driven, float(load_model(given).opt.timestep), source)
-    matching, copy = with_markers(load_model(source), source, out, columns, matching, clock)
-    return matching, copy if matching.of("marker") else path
+        return matching, robot.path
+    source = robot.given
+    if driven := robot.driven(matching):
+        source = robot.path
+        write_copy(robot.given, driven, float(load_model(robot.given).opt.timestep), source)
+    matching, copy = with_markers(load_model(source), source, robot.out, columns, matching, clock)
+    return matching, copy if matching.of("marker") else robot.path
 
 
 def _with_whole_steps(
-    given: Path, path: Path, out: Path, columns: Columns, matching: Matching, clock: Clock, commanded: bool, own: float
+    robot: _Robot, path: Path, columns: Columns, matching: Matching, clock: Clock
 ) -> tuple[Path, float]:
-    """The model that the config names, written where it is a copy, and its step in seconds; ``own`` is the given's."""
+    """The model that the config names, written where it is a copy, and its step in seconds."""
     if matching.of("marker"):
         return path, float(load_model(path).opt.timestep)
-    step = _whole_step(path, columns, clock, own)
-    if step != own and path == given:
-        path = out_of(out, path, "step")
-    if path != given:
-        write_copy(given, _driven(matching, commanded), step, path)
+    step = _whole_step(path, columns, clock, robot.step)
+    if step != robot.step and path == robot.given:
+        path = out_of(robot.out, path, "step")
+    if path != robot.given:
+        write_copy(robot.given, robot.driven(matching), step, path)
     return path, step
 
 
@@ -246,9 +282,7 @@ def _whole_step(path: Path, columns: Columns, clock: Clock, step: float) -> floa
     return float(f"{clock.dt / math.ceil(clock.dt / step):.6g}")  # as MJCF is written
 
 
-def _matched(
-    columns: Columns, places: Sequence[Place], clock: Clock, timestep: float, commanded: bool
-) -> tuple[Matching, Clock]:
+def _matched(columns: Columns, places: Sequence[Place], clock: Clock, timestep: float) -> tuple[Matching, Clock]:
     """Columns and their units, with the clock's unit as velocities show it."""
     starts = clock.starts(len(columns), columns.parts)
     taken = [c for c in (clock.column, clock.episode, *clock.terminals) if c is not None]
