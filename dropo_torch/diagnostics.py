@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from dropo_torch.data.trajectory import Transitions
 from dropo_torch.distribution import Distribution, coordinate_limits, truncated_interval, truncated_moments
 from dropo_torch.initial_noise import InitialStateNoise
 from dropo_torch.objective import Objective
@@ -103,52 +104,65 @@ def diagnose(
         known: standard errors of the means, in coordinates, ``(d,)``, and the correlation of their estimates
             ``(d, d)``, where more was estimated than the objective knows of.
     """
-    if len(objective) > max_transitions:
-        begins = np.linspace(0, len(objective) - RUN, max(1, max_transitions // RUN)).astype(int)
-        chosen = np.unique(begins[:, None] + np.arange(RUN))
-        objective = objective.on(objective.transitions.select(chosen))
+    objective = _judged(objective, max_transitions)
     initial = objective.initial_noise_of(distribution)
-    values = distribution.rsample(draw_uniforms(samples, len(distribution), seed, 3))
-    mean, variance, center, jacobian, lost = _simulate(objective, distribution, values, initial)
+    simulated = _simulate(objective, distribution, draw_uniforms(samples, len(distribution), seed, 3), initial)
     covariance = objective.base_covariance(slice(None), initial)
     base = torch.diagonal(covariance, dim1=-2, dim2=-1)
     widened = torch.ones(1, dtype=torch.float64) if initial is None else initial.widening[:, None]
-    log = objective.transitions
-    follows = np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
-    together = None if initial is None else initial.carried[1:] * torch.from_numpy(follows[:-1, None, None])
-    residual = objective.target(slice(None), initial) - mean
+    follows = _follows(objective.transitions)
     if known is None:
+        residual = objective.target(slice(None), initial) - simulated.mean
+        together = None if initial is None else initial.carried[1:] * torch.from_numpy(follows[:-1, None, None])
         error, correlation, std_error = _standard_errors(
-            objective, distribution, covariance, jacobian, residual, together
+            objective, distribution, covariance, simulated.jacobian, residual, together
         )
     else:
         (error, correlation), std_error = known, np.full(len(distribution), np.nan)
     started, columns = objective.evaluator.columns_at_start, objective.evaluator.columns
-    names = distribution.names
-    pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
+    width = objective.box.width[:, None]
     return Diagnostics(
         labels=objective.features.labels,
         units=objective.features.units,
         rows=objective.transitions.rows,
         episodes=objective.transitions.episodes,
         measured=objective.measured.numpy(),
-        mean=mean.numpy(),
-        spread=variance.sqrt().numpy(),
-        expected=(variance + base).sqrt().numpy(),
+        mean=simulated.mean.numpy(),
+        spread=simulated.variance.sqrt().numpy(),
+        expected=(simulated.variance + base).sqrt().numpy(),
         given=(base / widened).sqrt().numpy(),
         change=(objective.measured - objective.features.values(started, columns)).numpy(),
         follows=follows,
-        at_center=center.numpy(),
-        sensitivity=0.01 * objective.box.width[:, None] * jacobian.square().mean(0).sqrt().numpy(),
+        at_center=simulated.center.numpy(),
+        sensitivity=0.01 * width * simulated.jacobian.square().mean(0).sqrt().numpy(),
         standard_error=error,
         std_error=std_error,
         correlation=correlation,
-        confounded=tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs),
-        diverged=lost,
+        confounded=_confounded(distribution.names, correlation),
+        diverged=simulated.diverged,
         at_rest=objective.observation.at_rest,
         noisy_starts=objective.noise is not None,
         is_sensed=objective.observation.is_sensed,
     )
+
+
+def _judged(objective: Objective, most: int) -> Objective:
+    """The likelihood of about so many windows at most, in runs spread evenly over the log."""
+    if len(objective) <= most:
+        return objective
+    begins = np.linspace(0, len(objective) - RUN, max(1, most // RUN)).astype(int)
+    return objective.on(objective.transitions.select(np.unique(begins[:, None] + np.arange(RUN))))
+
+
+def _follows(log: Transitions) -> np.ndarray:
+    """Whether the next window begins where each one ends, ``(T,)``; not the last."""
+    return np.append((np.diff(log.rows) == log.lag) & (np.diff(log.episodes) == 0), False)
+
+
+def _confounded(names: Sequence[str], correlation: np.ndarray) -> tuple[tuple[str, str, float], ...]:
+    """Pairs of parameters whose estimates are correlated too much, with their correlation."""
+    pairs = [(i, j) for i in range(len(names)) for j in range(i) if abs(correlation[i, j]) > CONFOUNDED]
+    return tuple((names[j], names[i], float(correlation[i, j])) for i, j in pairs)
 
 
 def _standard_errors(
@@ -303,10 +317,29 @@ def _scatter(gram: torch.Tensor, score: torch.Tensor, inverse: torch.Tensor, gro
     return left.T @ left
 
 
+@dataclass(frozen=True)
+class _Simulated:
+    """What simulations of the windows give.
+
+    Attributes:
+        mean, variance: over samples, ``(T, m)``.
+        center: the state at μ, ``(T, m)``.
+        jacobian: its derivative by the coordinates of μ, ``(T, d, m)``.
+        diverged: simulations that did.
+    """
+
+    mean: torch.Tensor
+    variance: torch.Tensor
+    center: torch.Tensor
+    jacobian: torch.Tensor
+    diverged: int
+
+
 def _simulate(
-    objective: Objective, distribution: Distribution, values: torch.Tensor, initial: InitialStateNoise | None
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, int]:
-    """Mean and variance over samples, the state at μ, its Jacobian ``(T, d, m)``, and how many diverged."""
+    objective: Objective, distribution: Distribution, uniforms: torch.Tensor, initial: InitialStateNoise | None
+) -> _Simulated:
+    """Simulate all windows under samples of a distribution, from uniforms ``(N, d)``, and around its center."""
+    values = distribution.rsample(uniforms)
     stencil = MeansStage(objective.box.low, objective.box.high, distribution.mean)
     steps = torch.from_numpy(stencil.steps)
     parts: list[tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]] = []
@@ -324,7 +357,7 @@ def _simulate(
     every = np.concatenate([values.numpy(), objective.box.values(stencil.points())])
     lost = objective.map(every, keep, initial=initial)
     mean, variance, center, jacobian = (torch.cat(p) for p in zip(*parts, strict=True))
-    return mean, variance, center, jacobian, int(lost.total)
+    return _Simulated(mean, variance, center, jacobian, int(lost.total))
 
 
 def estimates(information: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
