@@ -218,6 +218,31 @@ def apply_native(model: mujoco.MjModel, effects: EffectSet) -> mujoco.MjModel:
     return out
 
 
+def native_model(backend: str, effects: EffectSet) -> tuple[mujoco.MjModel, int]:
+    """Return the model with the fixed native effects in it, and how many of its steps make one of the model's.
+
+    Raises:
+        InputError: steps that the backend cannot have.
+    """
+    native = effects.native
+    model = apply_native(effects.setting.model, native)
+    finer = finer_steps(effects.setting.model, model, native)
+    if backend == "gymnasium" and finer > 1:
+        raise InputError(f"effects: {native.entries[0].place} changes the step, which an environment has for itself")
+    return model, finer
+
+
+def check_steps(effects: EffectSet, space: ParameterSpace) -> None:
+    """Refuse native effects whose steps do not fill the model's, at the search box's lower bounds or its center.
+
+    Raises:
+        InputError: no whole number of steps.
+    """
+    model = effects.setting.model
+    for vector in (space.low, 0.5 * (space.low + space.high)):
+        finer_steps(model, applied(model, effects.native.at(vector)), effects.native)
+
+
 def overlap(effects: EffectSet, space: ParameterSpace) -> tuple[Entry, str] | None:
     """Return a native effect and a parameter that write the same number of the model, or ``None``."""
     model = effects.setting.model
@@ -304,30 +329,21 @@ def effect_simulator(
         InputError: effects that the backend cannot have.
     """
     setting = effects.setting
-    native, outer = effects.native, effects.outer
     if check_backend(backend, effects, space):
         make(setting.model, setting.frame_skip, space)  # for what it refuses
-        lead = filter_memory(space)
-        engine, kept = inner_engine(effects, space, num_threads), effects
-        for vector in (space.low, 0.5 * (space.low + space.high)):  # the finer steps must fill the model's
-            finer_steps(setting.model, applied(setting.model, native.at(vector)), native)
+        engine, kept, lead = inner_engine(effects, space, num_threads), effects, filter_memory(space)
+        check_steps(effects, space)
     else:
-        if len(native) and not owns_model:
+        if len(effects.native) and not owns_model:
             raise InputError(
-                f"effects: {native.entries[0].place} changes the model, which an adapter has for itself; "
+                f"effects: {effects.native.entries[0].place} changes the model, which an adapter has for itself; "
                 "let the adapter do it"
             )
-        model = apply_native(setting.model, native)
-        finer = finer_steps(setting.model, model, native)
-        if backend == "gymnasium" and finer > 1:
-            raise InputError(
-                f"effects: {native.entries[0].place} changes the step, which an environment has for itself"
-            )
-        inner_space = space.on(model)
-        if not len(outer):
-            return make(model, setting.frame_skip * finer, inner_space)
-        inner = make(model, finer, inner_space)
-        engine, kept, lead = outer_engine(outer, inner), outer, inner.history
+        model, finer = native_model(backend, effects)
+        if not len(effects.outer):
+            return make(model, setting.frame_skip * finer, space.on(model))
+        inner = make(model, finer, space.on(model))
+        engine, kept, lead = outer_engine(effects.outer, inner), effects.outer, inner.history
     history = history_steps(kept, space, timestep, longest, lead)
     return EffectSimulator(
         engine, kept, parameters=space, history=history, lead=lead, timestep=timestep, name=backend,
