@@ -274,23 +274,13 @@ class VariantEngine:
         """
         num_k, num_w, total = *signals.shape[:2], signals.shape[2] - self.lead
         rows, nq = num_k * num_w, self._base.nq
-        batch = self._batch(rows)
-        batch.set_models([m for m in models for _ in range(num_w)])
-        batch.state[:] = self._row
+        batch, control = self._batch(rows), signals.reshape(rows, self.lead + total, -1)
+        self._begin(batch, models, variants, starts, control[:, : self.lead])
+        control, forces = control[:, self.lead :], forces_of(variants, num_w)
         qpos, qvel, ctrl, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
-        starts, control = starts.reshape(rows, -1), signals.reshape(rows, self.lead + total, -1)
-        qpos[:], qvel[:] = starts[:, :nq], starts[:, nq:]
-        if len(self._filters):
-            constants = np.array([m.actuator_dynprm[self._filters.actuators, 0] for m in models if m is not None])
-            acting = self._filters.replayed(self._base, control[:, : self.lead], 1, constants.repeat(num_w, 0))
-            batch.bind("act")[:, self._filters.activations] = acting
-        control = control[:, self.lead :]
-        forces = forces_of(variants, num_w)
-        if any(v.has("wrench") for v in variants):
-            batch.bind("xfrc_applied")[:] += self._wrenches(variants).repeat(num_w, 0)
         held = 1 if forces or _varies(control, every) else every  # steps of the base between changes
         calls, steps = (finer, 1) if forces else (1, finer * held)
-        out, failed, before = np.empty((rows, total // every, starts.shape[1])), np.zeros(rows, bool), qvel.copy()
+        out, failed, before = np.empty((rows, total // every, starts.shape[2])), np.zeros(rows, bool), qvel.copy()
         for step in range(0, total, held):
             ctrl[:] = control[:, step]
             for _ in range(calls):
@@ -313,6 +303,29 @@ class VariantEngine:
         out[failed] = np.nan
         batch.set_models(None)
         return out.reshape(num_k, num_w, *out.shape[1:])
+
+    def _begin(
+        self, batch: mujoco.batch.Batch, models: Models, variants: Sequence[Variant], starts: np.ndarray,
+        past: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Give simulations their models and wrenches, and states in which filters remember the commands of the past.
+
+        Args:
+            batch: ``K · W`` simulations.
+            models, variants: K of them.
+            starts: states, ``(K, W, nq + nv)``.
+            past: commands of ``lead`` physics steps, ``(K · W, lead, nu)``.
+        """
+        num_w, nq, states = starts.shape[1], self._base.nq, starts.reshape(-1, starts.shape[2])
+        batch.set_models([m for m in models for _ in range(num_w)])
+        batch.state[:] = self._row
+        batch.bind("qpos")[:], batch.bind("qvel")[:] = states[:, :nq], states[:, nq:]
+        if len(self._filters):
+            constants = np.array([m.actuator_dynprm[self._filters.actuators, 0] for m in models if m is not None])
+            acting = self._filters.replayed(self._base, past, 1, constants.repeat(num_w, 0))
+            batch.bind("act")[:, self._filters.activations] = acting
+        if any(v.has("wrench") for v in variants):
+            batch.bind("xfrc_applied")[:] += self._wrenches(variants).repeat(num_w, 0)
 
     def _wrenches(self, variants: Sequence[Variant]) -> np.ndarray:
         """Return the wrenches on all bodies, as ``xfrc_applied`` has them ``(K, nbody, 6)``."""
