@@ -146,42 +146,53 @@ def write_config(
         whole: name ``model_path``, which has all effects, in any case; only numbers that are its fields then vary.
     """
     document = _document(config, path.parent)
-    boxes = {p.key: _boxes(p, setting, intervals.get(p.key, {})) for p in placed}
-    native = {p.key: p for p in placed if p.effect.native}
-    # Fields are written after the model is read: what both a parameter and an effect write must stay an effect.
-    entries = tuple(Entry(p.effect, p.target, p.values, (-1,) * len(p.values)) for p in native.values())
-    fields: dict[tuple[str, str | None], _Specifications | None] = {}
     if config.backend == "gymnasium" and any(not p.effect.outer for p in placed):
         document = {k: v for k, v in document.items() if k != "environment"}  # it has its model for itself
         document |= {"backend": "mujoco", "frame_skip": setting.frame_skip}
-    if not (
-        model_path is None
-        or config.backend == "gymnasium"
-        or config.effects
-        or applied(setting.model, list(native.values())).opt.timestep != setting.model.opt.timestep
-        or overlap(EffectSet(entries, setting), space)
-        or any(spec.get("relative") for spec in document["parameters"].values())
-    ):
-        fields = {key: _fields(p, setting, boxes[key]) for key, p in native.items()}
+    boxes = {p.key: _boxes(p, setting, intervals.get(p.key, {})) for p in placed}
+    native = {p.key: p for p in placed if p.effect.native}
+    fields: dict[tuple[str, str | None], _Specifications] = {}
     if whole:
         fields = {key: _fields(p, setting, boxes[key]) or {} for key, p in native.items()}
-    plain = None not in fields.values()
-    if model_path is not None and fields and plain:
+    elif model_path is not None and _may_be_fields(config, document, space, setting, list(native.values())):
+        found = {key: _fields(p, setting, boxes[key]) for key, p in native.items()}
+        fields = {key: own for key, own in found.items() if own is not None and None not in found.values()}
+    if model_path is not None and fields:
         document["model"] = os.path.relpath(model_path.resolve(), path.parent.resolve())
     for p in placed:
-        found = fields.get(p.key) if plain else None
-        if found is None:
-            entry, found = _effect(p, setting, boxes[p.key])
-            document["effects"] = [*document.get("effects", []), entry]
-        for number, specification in found.items():
-            document["parameters"][_free_name(document["parameters"], p, number)] = specification
-    inside = [p for p in placed if not p.effect.outer and not (plain and p.key in fields)]
-    if inside and config.backend == "warp":
+        _put(document, p, setting, boxes[p.key], fields.get(p.key))
+    if config.backend == "warp" and any(not p.effect.outer and p.key not in fields for p in placed):
         document["backend"] = "mujoco"
     if document.get("effects") and config.optimizer == "adam":
         document["optimizer"] = "fisher"
     text = yaml.safe_dump(document, sort_keys=False, allow_unicode=True)
     write_atomically(path, text.encode())
+
+
+def _may_be_fields(
+    config: Config, document: Mapping[str, Any], space: ParameterSpace, setting: Setting, native: Sequence[Placed]
+) -> bool:
+    """Whether a config may name the model with native effects in it, whose numbers are then fields."""
+    # Fields are written after the model is read: what both a parameter and an effect write must stay an effect.
+    entries = tuple(Entry(p.effect, p.target, p.values, (-1,) * len(p.values)) for p in native)
+    return not (
+        config.backend == "gymnasium"
+        or config.effects
+        or applied(setting.model, native).opt.timestep != setting.model.opt.timestep
+        or overlap(EffectSet(entries, setting), space)
+        or any(spec.get("relative") for spec in document["parameters"].values())
+    )
+
+
+def _put(
+    document: dict[str, Any], placed: Placed, setting: Setting, boxes: _Boxes, fields: _Specifications | None
+) -> None:
+    """Put an effect's numbers into a config: as ``fields`` of its model, or beside an entry of ``effects``."""
+    if fields is None:
+        entry, fields = _effect(placed, setting, boxes)
+        document["effects"] = [*document.get("effects", []), entry]
+    for number, specification in fields.items():
+        document["parameters"][_free_name(document["parameters"], placed, number)] = specification
 
 
 def _boxes(placed: Placed, setting: Setting, intervals: Mapping[str, tuple[float, float]]) -> _Boxes:
