@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from dropo_torch.effects import VOCABULARY, Effect, Placed
 from dropo_torch.errors import InputError
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.forces.motion import has_forces
 from dropo_torch.gap.forces.view import ForceView, force_view
 from dropo_torch.gap.ground import Ground
@@ -192,46 +193,91 @@ def _name(
     or if these find no others that do. Where no search has names, the base family of all joints is the last resort;
     where something else has ``decided`` by then, there are no more searches.
     """
-    touches = bool(scene.setting.signals.contacts.any())
-    known = f"{scene.problem.fingerprint} {ground.rules} {[e.name for e in ground.effects]}"
+    searches = _Searches(scene, ground, checkpoint, resume, end)
     found, waiting = list[Ended](), list(searched(scene))
-
-    def sought(suffix: str, ground: Ground, end: float) -> Ended:
-        path = None if checkpoint is None else kept(checkpoint.with_stem(f"{checkpoint.stem}{suffix}"), known)
-        return search(ground, scene.begin, path, resume=resume, end=end)
-
-    while waiting and (not found or time.monotonic() < end):
+    while waiting and (not found or searches.has_time):
         suffix, evidence = waiting.pop(0)
         if found:
             ground.report("searching over shorter windows", 0.0)
-        found.append(sought(suffix, replace(ground, evidence=evidence), share_of(end, len(waiting))))
+        found.append(searches.over(suffix, replace(ground, evidence=evidence), share_of(end, len(waiting))))
         last = found[-1].naming
-        doubtful = touches and remains(last.final.cost, ground.rules)
         if not found[0].naming.gap:
-            rare = outstanding(scene, last.evidence, last.base.hypothesis)
-            now = tuple(e for e in ground.effects if not e.has("command"))
-            return (
-                last if rare is None else with_ties(sought("-rare", replace(ground, evidence=rare, effects=now), end))
-            )
-        if last.named and not doubtful:
+            return searches.over_rare(last)
+        if not last.named:
+            if decided(last):
+                return last
+        elif not searches.doubts(last):
             return with_ties(found[-1])
-        if not last.named and decided(last):
-            return last
-        for _, other in waiting if last.named else ():
-            sure = None
-            if time.monotonic() < end:
-                sure = believed(replace(ground, evidence=other), scene.begin, found[-1])
+        elif (sure := searches.sure_of(found[-1], [other for _, other in waiting])) is not None:
+            return sure
+    return searches.best(found, len(waiting))
+
+
+@dataclass(frozen=True)
+class _Searches:
+    """Searches of one log, over one choice of windows after the other.
+
+    Attributes:
+        scene: of the log.
+        ground: what they stand on, but for the windows.
+        checkpoint: file by which those are called that keep their states; ``None`` for nowhere.
+        resume: whether they go on from there.
+        end: when they are over, by ``time.monotonic``.
+    """
+
+    scene: Scene
+    ground: Ground
+    checkpoint: Path | None
+    resume: bool
+    end: float
+
+    @property
+    def has_time(self) -> bool:
+        """Whether there is time for another one."""
+        return time.monotonic() < self.end
+
+    def over(self, suffix: str, ground: Ground, end: float) -> Ended:
+        """Search some windows, with a checkpoint of their own."""
+        path = None
+        if self.checkpoint is not None:
+            known = f"{self.scene.problem.fingerprint} {self.ground.rules} {[e.name for e in self.ground.effects]}"
+            path = kept(self.checkpoint.with_stem(f"{self.checkpoint.stem}{suffix}"), known)
+        return search(ground, self.scene.begin, path, resume=self.resume, end=end)
+
+    def over_rare(self, nothing: Naming) -> Naming:
+        """Search the windows that show something where others show nothing, if there are any."""
+        rare = outstanding(self.scene, nothing.evidence, nothing.base.hypothesis)
+        if rare is None:
+            return nothing
+        effects = tuple(e for e in self.ground.effects if not e.has("command"))
+        return with_ties(self.over("-rare", replace(self.ground, evidence=rare, effects=effects), self.end))
+
+    def doubts(self, naming: Naming) -> bool:
+        """Whether names leave a rest where there are contacts."""
+        touches = bool(self.scene.setting.signals.contacts.any())
+        return touches and remains(naming.final.cost, self.ground.rules)
+
+    def sure_of(self, ended: Ended, others: Sequence[Evidence]) -> Naming | None:
+        """Return what a search named, if it leaves nothing in one of the other choices of windows."""
+        for other in others:
+            if not self.has_time:
+                break
+            sure = believed(replace(self.ground, evidence=other), self.scene.begin, ended)
             if sure is not None:
-                return replace(with_ties(sure), unfinished=last.unfinished)
-    best = min(found, key=lambda e: (not e.naming.named, not e.naming.partial))
-    for ended in () if best.naming.named else found:
-        if time.monotonic() < end and (resorted := resort(ground, ended.naming)).named:
-            return resorted
-    late = next((e.naming.unfinished for e in found if e.naming.unfinished), "")
-    if waiting:
-        late = late or f"{len(waiting)} more searches over shorter windows were waiting"
-    refused = best.naming.refused or next((e.naming.refused for e in found if e.naming.refused), "")
-    return replace(with_ties(best), refused="" if best.naming.named else refused, unfinished=late)
+                return replace(with_ties(sure), unfinished=ended.naming.unfinished)
+        return None
+
+    def best(self, found: Sequence[Ended], waiting: int) -> Naming:
+        """Return the best of what searches found of which none decides; so many more were waiting."""
+        best = min(found, key=lambda e: (not e.naming.named, not e.naming.partial))
+        for ended in () if best.naming.named else found:
+            if self.has_time and (resorted := resort(self.ground, ended.naming)).named:
+                return resorted
+        late = next((e.naming.unfinished for e in found if e.naming.unfinished), "")
+        if waiting:
+            late = late or f"{waiting} more searches over shorter windows were waiting"
+        refused = best.naming.refused or next((e.naming.refused for e in found if e.naming.refused), "")
+        return replace(with_ties(best), refused="" if best.naming.named else refused, unfinished=late)
 
 
 def _ruled(scene: Scene, rules: Rules | None) -> Scene:
