@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, object_number
+from dropo_torch.models.contacts import condim, mixing, never_touch
 
 #: Sliding friction of slippery things, from which a search begins where the model has less, or none.
 LEAST = 0.1
@@ -28,20 +29,7 @@ class ContactEffect(Effect):
         kind, affinity, body = model.geom_contype, model.geom_conaffinity, model.geom_bodyid
         fits = (kind & affinity[geom]) | (kind[geom] & affinity)
         own = int(body[geom])
-        return [int(g) for g in np.flatnonzero(fits) if not _filtered(model, own, int(body[g]))]
-
-
-def _filtered(model: mujoco.MjModel, one: int, other: int) -> bool:
-    """Whether geoms of two bodies never touch: they move as one, hang on each other, or are excluded."""
-    first, second = (int(model.body_weldid[b]) for b in (one, other))
-    if first == second:
-        return True
-    above, below = (int(model.body_weldid[model.body_parentid[b]]) for b in (first, second))
-    by_parent = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_FILTERPARENT
-    if by_parent and first and second and (first == below or second == above):
-        return True
-    low, high = sorted((one, other))
-    return bool((model.exclude_signature == (low << 16) + high).any())
+        return [int(g) for g in np.flatnonzero(fits) if not never_touch(model, own, int(body[g]))]
 
 
 @dataclass(frozen=True)
@@ -64,13 +52,12 @@ class Mixed:
         first, second = model.geom_priority[[one, other]]
         if first != second:
             one = other = one if first > second else other
-        pair, weights = [one, other], model.geom_solmix[[one, other]]
-        share = float(weights[0] / weights.sum()) if weights.sum() > 1e-15 else 0.5
-        references = model.geom_solref[pair]
+        pair = [one, other]
+        share, references = float(mixing(model, np.array([pair]))[0]), model.geom_solref[pair]
         blended = (references[:, 0] > 0).all() or one == other
         solref = share * references[0] + (1 - share) * references[1] if blended else references.min(0)
         solimp = share * model.geom_solimp[one] + (1 - share) * model.geom_solimp[other]
-        return cls(model.geom_friction[pair].max(0), solref, solimp, int(model.geom_condim[pair].max()))
+        return cls(model.geom_friction[pair].max(0), solref, solimp, condim(model, one, other))
 
     def is_close(self, other: Mixed) -> bool:
         """Return whether contacts of both kinds are the same."""

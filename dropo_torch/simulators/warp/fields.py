@@ -14,10 +14,10 @@ import mujoco
 import numpy as np
 import torch
 
+from dropo_torch.models.contacts import mixing
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.couplings import equality_bodies, has_dofs, welds
 from dropo_torch.simulators.warp.layout import ADDED, DIRECT, FRAMES, MIXED, PAIR
-from dropo_torch.simulators.warp.pairs import mixing
 from dropo_torch.simulators.warp.varied import Frames, Pose, Section
 from dropo_torch.support.threads import single_thread
 
@@ -183,8 +183,9 @@ class _Mixing:
     """Contact parameters of geom pairs."""
 
     def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]]) -> None:
-        self.g1, self.g2, self.pair = torch.tensor(pairs, dtype=torch.long).reshape(-1, 3).T
-        self.weight = torch.from_numpy(mixing(model, pairs))[:, None]
+        table = torch.tensor(pairs, dtype=torch.long).reshape(-1, 3)
+        self.g1, self.g2, self.pair = table.T
+        self.weight = torch.from_numpy(mixing(model, table[:, :2].numpy()))[:, None]
         priority = torch.from_numpy(model.geom_priority)
         self.rank = (priority[self.g1] - priority[self.g2])[:, None]
 

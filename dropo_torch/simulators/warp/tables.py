@@ -26,7 +26,7 @@ from dropo_torch.simulators.warp.couplings import (
 )
 from dropo_torch.simulators.warp.layout import FIELDS
 from dropo_torch.simulators.warp.meshes import mesh_tables
-from dropo_torch.simulators.warp.pairs import condim, joins_branches, relative_dofs
+from dropo_torch.simulators.warp.pairs import contact_dimension, joins_branches, relative_dofs
 from dropo_torch.simulators.warp.types import BALL, EULER, HINGE, IMPLICITFAST, RK4, SLIDE, TRANSLATION, Tables, fill
 from dropo_torch.simulators.warp.varied import varied
 
@@ -389,7 +389,7 @@ def _pairs(model: mujoco.MjModel, pairs: list[tuple[int, int, int]], space: Para
         "pair_sign": dofs[:, 1], "pair_gap": gap,
         "pair_bound": (bound[table[:, 1]] + bound[table[:, 0]]) * (1 + 1e-9),
         "pair_body1": bodies[:, 0], "pair_body2": bodies[:, 1], "pair_geom1": table[:, 0], "pair_geom2": table[:, 1],
-        "pair_dim": np.array([condim(model, *p) for p in pairs], dtype=int),
+        "pair_dim": np.array([contact_dimension(model, *p) for p in pairs], dtype=int),
         "pair_dense": np.array([joins_branches(model, int(a), int(b)) for a, b in bodies], dtype=int),
         "touching": np.unique(table[:, :2]), "ntouching": len(np.unique(table[:, :2])),
         "geom_body": model.geom_bodyid, "geom_pos": model.geom_pos, "geom_mat": _matrices(model.geom_quat),
