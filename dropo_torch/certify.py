@@ -14,6 +14,7 @@ import torch
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
 from dropo_torch.simulators.mujoco import MujocoSimulator
+from dropo_torch.support.rows import evenly
 
 SCHEMA = "dropo-torch/certificate/1"
 #: Half the distance of the central differences, as a share of the search width.
@@ -95,7 +96,7 @@ def certify(objective: Objective, *, max_transitions: int = 100, points: int = 2
     simulator = objective.simulator
     if not simulator.differentiable or not hasattr(simulator, "jacobian"):
         raise InputError(f"backend: {simulator.name} has no gradients to certify; {simulator.remedy}")
-    spread = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
+    spread = evenly(len(objective), max_transitions)
     part = objective.transitions.select(spread)
     states, controls = torch.from_numpy(part.states.copy()), torch.from_numpy(part.controls.copy())
     box, space = objective.box, simulator.parameters

@@ -7,6 +7,7 @@ import torch
 
 from dropo_torch.errors import InputError
 from dropo_torch.objective import Objective
+from dropo_torch.support.rows import evenly
 
 
 def no_effect(objective: Objective, *, max_transitions: int = 500) -> tuple[list[str], int]:
@@ -29,7 +30,7 @@ def no_effect(objective: Objective, *, max_transitions: int = 500) -> tuple[list
         magnitude = 1e-12 * torch.nan_to_num(features).abs().amax((0, 1))
         return (change > magnitude).sum((0, 2)).double()
 
-    spread = np.unique(np.linspace(0, len(objective) - 1, max_transitions).astype(int))
+    spread = evenly(len(objective), max_transitions)
     if bool((objective.map(values, count_moved, spread).total > 0).all()):
         return [], 0
     found = objective.map(values, count_moved)

@@ -14,6 +14,7 @@ from dropo_torch.diagnostics import Diagnostics
 from dropo_torch.distribution import Distribution, SearchBox, to_values
 from dropo_torch.initial_noise import parameter_covariance
 from dropo_torch.objective import Objective
+from dropo_torch.support.rows import evenly
 
 #: Units of what is a position.
 POSITIONS = ("m", "rad", "-")
@@ -119,7 +120,7 @@ def hopeless_at(objective: Objective, mean: np.ndarray) -> str:
 
     It looks at some windows of the log, which count as none.
     """
-    rows = np.unique(np.linspace(0, len(objective) - 1, THRESHOLDS.windows).astype(int))
+    rows = evenly(len(objective), THRESHOLDS.windows)
     part = objective.on(objective.transitions.select(rows))
     run = part.evaluator
     center = run.after(slice(None), torch.from_numpy(objective.box.values(mean)[None]))[:, 0]

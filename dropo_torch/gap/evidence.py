@@ -18,6 +18,7 @@ from dropo_torch.data.features import Features
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.rules import Rules, Weighed
 from dropo_torch.gap.twin import Twin, Windows
+from dropo_torch.support.rows import evenly
 
 #: Antithetic pairs of noise on the initial states by which rough windows are linearised, and a few that are far off;
 #: their seed.
@@ -98,7 +99,7 @@ class Evidence:
 
     def few(self, most: int) -> Evidence:
         """Return the same over at most so many windows, evenly spread."""
-        return self.select(np.unique(np.linspace(0, len(self.windows) - 1, most).astype(int)))
+        return self.select(evenly(len(self.windows), most))
 
     @cached_property
     def chart(self) -> Features:

@@ -13,6 +13,7 @@ from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Setting, Signals
 from dropo_torch.gap.twin import Windows
 from dropo_torch.problem import Problem
+from dropo_torch.support.rows import evenly
 
 #: Configurations of the log at which the typical forces are computed.
 SAMPLES = 400
@@ -80,7 +81,7 @@ def spread(windows: Windows, most: int) -> Windows:
     """Return at most so many windows, evenly spread."""
     if len(windows) <= most:
         return windows
-    return windows.select(np.unique(np.linspace(0, len(windows) - 1, most).astype(int)))
+    return windows.select(evenly(len(windows), most))
 
 
 def blocks_of(episodes: np.ndarray, least: int) -> np.ndarray:
@@ -113,7 +114,7 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     step = problem.simulator.frame_skip * physics if step is None else step
     frame_skip = round(step / physics)  # steps of the given model, whatever the simulator makes of them
     states, after = observation.states(log.observations, log.unseen), observation.states(log.next_observations)
-    rows = np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int))
+    rows = evenly(len(states), SAMPLES)
     inertia, force, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.ngeom, bool)
     squares = np.zeros((model.nbody, 2))  # of angular and linear velocity
     data, dense, velocity = mujoco.MjData(model), np.zeros((nv, nv)), np.empty(6)

@@ -33,6 +33,7 @@ from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
 from dropo_torch.shooting.posing import posed
 from dropo_torch.simulators.hidden import refuse_prescribed
+from dropo_torch.support.rows import evenly
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
@@ -203,7 +204,7 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
     if not far.size:
         return None
     others, count = np.sort(order[len(far) :]), BESIDE - min(RARE, len(far))
-    beside = others[np.unique(np.linspace(0, len(others) - 1, min(count, len(others))).astype(int))]
+    beside = others[evenly(len(others), min(count, len(others)))]
     return evidence.on(windows.select(np.sort(np.concatenate([far[:RARE], beside]))))
 
 

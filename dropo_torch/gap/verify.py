@@ -26,6 +26,7 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Simulator
 from dropo_torch.simulators.hidden import filter_memory
 from dropo_torch.simulators.mujoco import MujocoSimulator
+from dropo_torch.support.rows import evenly
 
 #: Seconds of an open-loop prediction that are tried, the longest first.
 SECONDS = (3.0, 1.0, 0.3, 0.1)
@@ -90,7 +91,7 @@ def cut_held(evidence: Evidence, log: Trajectories, hypothesis: Hypothesis) -> H
     known = np.flatnonzero(np.arange(len(log)) >= (begins + since)[log.episodes])
     if not len(known):  # better scores of something
         since, known = np.zeros_like(since), np.arange(len(log))
-    rows = known[np.unique(np.linspace(0, len(known) - 1, MOST).astype(int))]
+    rows = known[evenly(len(known), MOST)]
     positions = position_features(setting)
     size = _rms(feature_sizes(setting, observation.observed(log.observations[rows]))[positions])
 

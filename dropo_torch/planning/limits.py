@@ -16,6 +16,7 @@ from dropo_torch.planning.drives import Drive
 from dropo_torch.planning.motion import Reach
 from dropo_torch.planning.settings import PlanSettings
 from dropo_torch.simulators.hidden import control_range, filters_of
+from dropo_torch.support.rows import evenly
 
 #: Speed of hinges (rad/s) and slides (m/s) where neither config nor log tell one, and positions around the start.
 SPEED, AWAY = {"rad": 2.0, "m": 0.5}, {"rad": np.pi / 2, "m": 0.25}
@@ -376,7 +377,7 @@ def _touching(model: mujoco.MjModel, states: np.ndarray, most: int = 400) -> set
     data, found = mujoco.MjData(model), set[frozenset[int]]()
     if not touchable(model):
         return found
-    for row in np.unique(np.linspace(0, len(states) - 1, most).astype(int)):
+    for row in evenly(len(states), most):
         data.qpos[:] = states[row, : model.nq]
         mujoco.mj_kinematics(model, data)
         mujoco.mj_collision(model, data)

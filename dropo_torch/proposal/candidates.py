@@ -13,6 +13,7 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.effects.base import Setting
 from dropo_torch.parameters import object_names
 from dropo_torch.proposal.places import command_kind
+from dropo_torch.support.rows import evenly
 
 Kind = Literal["mass", "damping", "friction", "armature", "stiffness", "gain", "contact", "softness", "centre", "gear"]
 
@@ -261,7 +262,7 @@ def touching_groups(model: mujoco.MjModel, states: np.ndarray) -> list[list[int]
 
     deciding: set[int] = set()
     data = mujoco.MjData(model)
-    for row in np.unique(np.linspace(0, len(states) - 1, SAMPLES).astype(int)):
+    for row in evenly(len(states), SAMPLES):
         data.qpos[:], data.qvel[:] = states[row, : model.nq], states[row, model.nq :]
         mujoco.mj_fwdPosition(model, data)
         for contact in data.contact[: data.ncon]:

@@ -25,6 +25,7 @@ from dropo_torch.problem import Problem, make_problem
 from dropo_torch.proposal.candidates import Candidate
 from dropo_torch.proposal.draft import Filter
 from dropo_torch.support.report import Report
+from dropo_torch.support.rows import evenly
 
 #: Noise, and ε beside it, relative to a column's standard deviation and to its noise.
 FLOOR, BESIDE = 1e-6, 0.3
@@ -174,7 +175,7 @@ def _at_lag(problem: Problem, candidates: Sequence[Candidate], lag: int, steps: 
         problem.trajectories, problem.observation, lag=lag, history=problem.simulator.history, since=problem.since
     )
     wanted = max(8, steps // lag)
-    rows = np.unique(np.linspace(0, len(every) - 1, wanted).astype(int))
+    rows = evenly(len(every), wanted)
     objective = problem.objective.on(every.select(rows))
     jacobian, covariance = sensitivities(objective)
     scaled = jacobian * torch.tensor([c.size for c in candidates], dtype=torch.float64)[None, :, None]

@@ -19,6 +19,7 @@ from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.errors import InputError
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.shooting.begin import scatter
+from dropo_torch.support.rows import evenly
 
 _SENSOR = mujoco.mjtSensor
 #: Sensors of where things are that are smooth in it.
@@ -238,7 +239,7 @@ class _Reading:
             InputError: the joint, or the sensor.
         """
         rows = [(row, p) for path, own in zip(paths, found, strict=True) for row, p in zip(path, own, strict=True)]
-        some = [rows[i] for i in np.unique(np.linspace(0, len(rows) - 1, 100).astype(int))]
+        some = [rows[i] for i in evenly(len(rows), 100)]
         untold = np.zeros(self._model.nv)
         for row, position in some:
             slope = self._slope(row, position, self._residual(row, position, noise), noise) * self._lengths

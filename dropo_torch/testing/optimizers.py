@@ -18,6 +18,7 @@ from dropo_torch.objective import Objective
 from dropo_torch.optimizers.base import Optimizer, Progress, Request
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.support.checkpoint import dumps, loads
+from dropo_torch.support.rows import evenly
 from dropo_torch.testing.laws import NotApplicable, Report, require, require_same, try_laws
 from dropo_torch.testing.linear import LinearSimulator, linear_objective
 
@@ -268,7 +269,7 @@ def _it_goes_on_from_any_state_as_if_never_interrupted(case: OptimizerCase) -> N
     used = whole.optimizer  # one that has finished takes up an earlier state, too
     final = _flat(whole.optimizer.candidates())
     reason = whole.optimizer.stop_reason
-    for number, at in enumerate(np.unique(np.linspace(0, len(whole.steps) - 1, _CONTINUED).astype(int))):
+    for number, at in enumerate(evenly(len(whole.steps), _CONTINUED)):
         if not whole.steps:
             return
         objective = case.problem.objective()

@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.simulators.hidden import POSE, prescribed_bodies
+from dropo_torch.support.rows import evenly
 
 #: Points of a circle, of an ellipsoid's circles, and of a mesh.
 CIRCLE, RINGS, MESH = 16, 5, 40
@@ -228,7 +229,7 @@ def aim(scene: Scene, logged: np.ndarray, *simulated: np.ndarray) -> Camera:
         simulated: other poses of them, NaN where they diverged.
     """
     count = len(logged)
-    chosen = np.unique(np.linspace(0, count - 1, SAMPLES).astype(int))
+    chosen = evenly(count, SAMPLES)
     points = placed_points(scene, logged[chosen])
     if not points.size:
         return Camera(90.0, ELEVATION, np.zeros((count, 3)), 1.0, 1.0)
@@ -347,7 +348,7 @@ def _relief(model: mujoco.MjModel, field: int) -> list[np.ndarray]:
     heights = size[2] * model.hfield_data[first : first + rows * columns].reshape(rows, columns)
     x, y = np.meshgrid(np.linspace(-size[0], size[0], columns), np.linspace(-size[1], size[1], rows))
     points = np.stack([x, y, heights], -1)
-    every = [np.unique(np.linspace(0, n - 1, LINES // 2).astype(int)) for n in (rows, columns)]
+    every = [evenly(n, LINES // 2) for n in (rows, columns)]
     return [points[r][every[1]] for r in every[0]] + [points[every[0], c] for c in every[1]]
 
 

@@ -13,6 +13,7 @@ from mujoco import rollout
 from dropo_torch.data.examination.record import Record
 from dropo_torch.data.examination.rules import Rules
 from dropo_torch.models.load import quiet_mujoco
+from dropo_torch.support.rows import evenly
 
 #: Microseconds of simulation that an examination may take, about, and the fewest and most rows that are simulated.
 BUDGET, LEAST_ROWS, MOST_ROWS = 4e5, 250, 1200
@@ -39,7 +40,7 @@ def chosen_rows(record: Record, steps: int, block: int = 40, reach: int = 0) -> 
     if len(rows) <= most:
         return rows
     blocks = np.array_split(rows, max(1, len(rows) // block))
-    picked = np.unique(np.linspace(0, len(blocks) - 1, max(1, most // block)).astype(int))
+    picked = evenly(len(blocks), max(1, most // block))
     return np.concatenate([blocks[i] for i in picked])
 
 

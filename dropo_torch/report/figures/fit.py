@@ -9,6 +9,7 @@ import numpy as np
 
 from dropo_torch.report.figures import drawing
 from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GREY, INK, MAX_POINTS, ORANGE, SKY, Axis
+from dropo_torch.support.rows import evenly
 
 
 def distribution_row(axis: Axis, values: np.ndarray, density: np.ndarray, center: float, nominal: float) -> Any:
@@ -140,7 +141,7 @@ def progress_panel(
         marks: horizontal guides.
     """
     figure, axes = drawing.new_panel(340, 225, label, (58, 36, 12, 34))
-    keep = np.unique(np.linspace(0, max(len(cost) - 1, 0), min(len(cost), MAX_POINTS)).astype(int))
+    keep = evenly(len(cost), min(len(cost), MAX_POINTS))
     lines = np.where(np.isfinite(lines) & ((lines > 0) | (not log)), lines, np.nan)
     for column, colour in sorted(enumerate(colours), key=lambda pair: pair[1] != FAINT):
         few = colour != FAINT and len(keep) <= 40

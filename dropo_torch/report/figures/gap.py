@@ -11,6 +11,7 @@ from dropo_torch.gap.result import Course
 from dropo_torch.report.figures import drawing
 from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GREY, INK, ORANGE
 from dropo_torch.report.formatting import number, score
+from dropo_torch.support.rows import evenly
 
 #: Points of a cloud are thinned to about this many.
 MAX_DOTS = 700
@@ -115,7 +116,7 @@ def draw_course(axes: Any, course: Course, *, named: bool, width: float = 1.0) -
         named: whether there are effects.
         width: factor of the lines' widths.
     """
-    keep = np.unique(np.linspace(0, course.time.shape[1] - 1, drawing.MAX_POINTS).astype(int))
+    keep = evenly(course.time.shape[1], drawing.MAX_POINTS)
     low, high = float(course.measured.min()), float(course.measured.max())
     pad = BEYOND * (high - low) or 0.5
     frame, lines = (low - pad, high + pad), [(course.before, ORANGE, 1.5)]
