@@ -145,7 +145,7 @@ def run(name: str, folder: Path, seed: int, fit: bool = True) -> Outcome:
     seconds, truth = time.perf_counter() - began, true_values(proposal, system)
     missed = tuple(
         f"{t.candidate.name} ({100 * t.error / abs(truth[t.candidate.name]):.2g} %)" for t in proposal.choice.told
-        if not t.is_in and t.candidate.kind != "centre" and t.error < 0.1 * abs(truth[t.candidate.name])
+        if not t.is_in and t.candidate.kind != "center" and t.error < 0.1 * abs(truth[t.candidate.name])
     )  # fmt: skip
     checked, began = command(["check", str(path)]), time.perf_counter()
     fitted = command(["fit", str(path), "--out", str(place / "fit")]) if fit else -1

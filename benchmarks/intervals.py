@@ -101,7 +101,7 @@ class Coverage:
     logs: int
 
 
-def synthesise(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: int) -> Problem:
+def synthesize(problem: Problem, truths: np.ndarray, noise: np.ndarray, seed: int) -> Problem:
     """Return the problem with a log simulated under known parameters, from its episodes' initial states and actions.
 
     Args:
@@ -175,7 +175,7 @@ def calibrate(cell: CalibrationCell, problem: Problem, *, noise: np.ndarray) -> 
     truths, _ = draw_truths(problem, cell.kind, cell.log)
     values = to_values(truths, space.is_log)
     config = problem.config.model_copy(update={"seed": cell.log})  # fits of several logs are independent
-    fitted = fit_problem(replace(synthesise(problem, values, noise, seed=cell.log), config=config))
+    fitted = fit_problem(replace(synthesize(problem, values, noise, seed=cell.log), config=config))
     inside, width = {}, {}
     for level in LEVELS:
         low, high = interval(fitted, level)
@@ -201,6 +201,6 @@ def coverages(runs: Sequence[CalibrationRun]) -> list[Coverage]:
 def wilson(share: float, count: int) -> tuple[float, float]:
     """Return Wilson's 95 % interval of a probability, from the share of so many independent runs."""
     z = 1.96
-    centre = (share + z * z / (2 * count)) / (1 + z * z / count)
+    center = (share + z * z / (2 * count)) / (1 + z * z / count)
     reach = z / (1 + z * z / count) * math.sqrt(share * (1 - share) / count + z * z / (4 * count**2))
-    return max(0.0, centre - reach), min(1.0, centre + reach)
+    return max(0.0, center - reach), min(1.0, center + reach)

@@ -21,7 +21,7 @@ import calibration
 import numpy as np
 
 import dropo_torch as dropo
-from benchmarks.intervals import KINDS, CalibrationCell, draw_truths, synthesise, wilson, with_log
+from benchmarks.intervals import KINDS, CalibrationCell, draw_truths, synthesize, wilson, with_log
 from dropo_torch.distribution import SearchBox, to_values
 from dropo_torch.gap.refit import Z90
 from dropo_torch.studies.study import grouped
@@ -59,7 +59,7 @@ def fit_cell(cell: CalibrationCell, *, transitions: int, seed: int, threads: int
         space, seed, ends = problem.space, 100_003 * seed + cell.log, cell.method == "ends"
         truths, center = draw_truths(problem, cell.kind, seed)
         values, noise = to_values(truths, space.is_log), calibration.NOISE * ends
-        made = synthesise(problem, values, noise, seed)
+        made = synthesize(problem, values, noise, seed)
         made = made if ends else with_noise(made, seed)
         found = dropo.fit_problem(made).distribution
         error = dropo.diagnose(made.objective, found).standard_error

@@ -64,9 +64,9 @@ DIED = "the run died"
 #: A hair's breadth: displacement of a state, or of the margins, that must not change which geoms touch.
 NUDGE = 1e-9
 #: Nudged states of each, how often as many more are tried where no answer is near; and how far a contact must not be
-#: shifted by a nudge, in metres.
+#: shifted by a nudge, in meters.
 NUDGES, ROUNDS, SHIFT = 32, 32, 1e-4
-#: Tolerance in metres and iterations of a search for contacts that is done.
+#: Tolerance in meters and iterations of a search for contacts that is done.
 FINISHED = 1e-12, 400
 #: Steps of central differences, relative to a parameter's size.
 MOVES = (1e-5, 1e-4, 1e-3)
@@ -299,7 +299,7 @@ def _answers_nearby(
 def _finished(space: ParameterSpace) -> ParameterSpace:
     """The same of a model whose search for contacts of curved shapes ends when it is done.
 
-    By default it ends within a micrometre, with a normal that is off by as much over the size of the shapes, and
+    By default it ends within a micrometer, with a normal that is off by as much over the size of the shapes, and
     differences are those of where it ends.
     """
     model = copy.copy(space.model)

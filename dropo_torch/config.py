@@ -140,11 +140,11 @@ class Config(pydantic.BaseModel):
 
     @property
     def moves_centres(self) -> bool:
-        """Whether bodies' centres of mass or their axes may move: by effects, or as parameters."""
-        from dropo_torch.models.load import CENTRES  # imports MuJoCo
+        """Whether bodies' centers of mass or their axes may move: by effects, or as parameters."""
+        from dropo_torch.models.load import CENTERS  # imports MuJoCo
 
         fields = (str(p.get("field", "")) for p in (self.parameters or {}).values())
-        return self.has_effects or any(field.startswith(CENTRES) for field in fields)
+        return self.has_effects or any(field.startswith(CENTERS) for field in fields)
 
     def document(self) -> dict[str, Any]:
         """Return the config as plain data, as it would stand in a file."""

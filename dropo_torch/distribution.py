@@ -331,7 +331,7 @@ def coordinate_limits(limits: np.ndarray, is_log: np.ndarray) -> tuple[np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class SearchBox:
-    """Where μ and σ are searched, in coordinates, and the normalised form that CMA-ES sees.
+    """Where μ and σ are searched, in coordinates, and the normalized form that CMA-ES sees.
 
     Means are linear and standard deviations logarithmic, both scaled to [0, 4], so that one initial step size
     fits all of them. σ lies between 1e-5 (or 1e-5 of the width where that is less) and a quarter of
@@ -386,14 +386,14 @@ class SearchBox:
         """Return σ ``(d,)``; ``None`` where each is at its floor: a point estimate."""
         return None if (std <= 2 * self.min_std).all() else std
 
-    def normalise(self, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
+    def normalize(self, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
         """Return φ in [0, 4]: d means, then d logarithms of σ, ``(..., 2d)``."""
         means = (mean - self.low) / self.width
         logs = np.log(std / self.min_std) / np.log(self.max_std / self.min_std)
         return self.WIDTH * np.concatenate([means, logs], axis=-1)
 
-    def denormalise(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return μ and σ, ``(..., d)`` each, of normalised φ ``(..., 2d)``."""
+    def denormalize(self, phi: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return μ and σ, ``(..., d)`` each, of normalized φ ``(..., 2d)``."""
         unit = np.clip(np.asarray(phi) / self.WIDTH, 0.0, 1.0)
         means, logs = np.split(unit, 2, axis=-1)
         return self.low + means * self.width, self.min_std * (self.max_std / self.min_std) ** logs

@@ -1,4 +1,4 @@
-"""What the measurement noise of initial states does to the predicted next states: statistical linearisation."""
+"""What the measurement noise of initial states does to the predicted next states: statistical linearization."""
 
 from __future__ import annotations
 

@@ -20,8 +20,8 @@ LogDensity = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 def sample_moments(samples: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
     """Return mean ``(..., n)`` and unbiased covariance ``(..., n, n)`` of samples ``(..., K, n)`` (eq. 2)."""
     mean = samples.mean(-2)
-    centred = samples - mean.unsqueeze(-2)
-    return mean, centred.mT @ centred / (samples.shape[-2] - 1)
+    centered = samples - mean.unsqueeze(-2)
+    return mean, centered.mT @ centered / (samples.shape[-2] - 1)
 
 
 def gaussian_log_density(residual: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:

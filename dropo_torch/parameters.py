@@ -23,7 +23,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
-from dropo_torch.models.load import CENTRES, load_model
+from dropo_torch.models.load import CENTERS, load_model
 from dropo_torch.support.given import check_keys
 
 #: Fields whose values must be positive, whatever the search bounds.
@@ -41,7 +41,7 @@ _SERVO = {
     "actuator_kp": (("actuator_gainprm", 0, 1.0), ("actuator_biasprm", 1, -1.0)),
     "actuator_kv": (("actuator_biasprm", 2, -1.0),),
 }
-#: Fields of directions and of rotations: what is written there is normalised.
+#: Fields of directions and of rotations: what is written there is normalized.
 UNIT_FIELDS = frozenset({"body_quat", "geom_quat", "site_quat", "jnt_axis"})
 _FIRST_COMPONENT = frozenset({"geom_friction", "pair_friction", "actuator_gear", "actuator_gainprm"})
 #: First word of a field → the kind of object that carries it.
@@ -225,20 +225,20 @@ class ParameterSpace:
         for column, target in self.targets:
             fields[target.field].reshape(len(values), -1)[:, target.index] = target.factor * values[:, column]
         for field in UNIT_FIELDS.intersection(self.fields):
-            _normalise(field, fields[field])
+            _normalize(field, fields[field])
 
     def write_into(self, model: mujoco.MjModel, vector: Sequence[float] | np.ndarray) -> None:
         """Write values ``(d,)`` into a model, but not yet what is derived from them."""
         for column, target in self.targets:
             write_field(model, target.field, target.index, target.factor * vector[column])
         for field in UNIT_FIELDS.intersection(self.fields):
-            _normalise(field, getattr(model, field))
+            _normalize(field, getattr(model, field))
 
     def apply(self, values: np.ndarray | Mapping[str, float]) -> mujoco.MjModel:
         """Return a copy of the model with the given values and everything derived from them.
 
         Raises:
-            InputError: no model, other names, or the centre of mass of a body that is compiled as simple.
+            InputError: no model, other names, or the center of mass of a body that is compiled as simple.
         """
         if self.model is None:
             raise InputError("parameters: these belong to no MuJoCo model")
@@ -248,12 +248,12 @@ class ParameterSpace:
         try:
             mujoco.mj_setConst(model, mujoco.MjData(model))
         except mujoco.FatalError:
-            _check_centres(self.model, self)
+            _check_centers(self.model, self)
             raise
         return model
 
 
-def _normalise(field: str, array: np.ndarray) -> None:
+def _normalize(field: str, array: np.ndarray) -> None:
     """Give the directions or quaternions of a field length 1, in place; those of length 0 stay."""
     rows = array.reshape(-1, 4 if field.endswith("quat") else 3)
     length = np.linalg.norm(rows, axis=1, keepdims=True)
@@ -270,31 +270,31 @@ def unmark_frames(model: mujoco.MjModel, space: ParameterSpace) -> None:
     ``mj_setConst`` does so for a single model; the simulations of a batch share these marks.
 
     Raises:
-        InputError: the centre of mass of a body that is compiled as simple.
+        InputError: the center of mass of a body that is compiled as simple.
     """
-    _check_centres(model, space)
+    _check_centers(model, space)
     none = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
     for _, target in space.targets:
         if target.field not in _FRAMES:
             continue
         row = target.index // read_field(model, target.field).shape[-1]
         getattr(model, target.field.split("_")[0] + "_sameframe")[row] = none
-        if target.field not in CENTRES:
+        if target.field not in CENTERS:
             continue
         model.geom_sameframe[model.geom_bodyid == row] = none  # some coincide with the body's inertial frame
         model.site_sameframe[model.site_bodyid == row] = none
 
 
-def _check_centres(model: mujoco.MjModel, space: ParameterSpace) -> None:
-    """Raise an :class:`InputError` for the centre of mass of a body that is compiled as simple."""
+def _check_centers(model: mujoco.MjModel, space: ParameterSpace) -> None:
+    """Raise an :class:`InputError` for the center of mass of a body that is compiled as simple."""
     for column, target in space.targets:
-        if target.field not in CENTRES:
+        if target.field not in CENTERS:
             continue
         row = target.index // read_field(model, target.field).shape[-1]
         if model.body_simple[row]:
             raise InputError(
                 f"parameters: {space.names[column]!r}: body {row} ({model.body(row).name}) is compiled as simple, its "
-                'centre of mass in its frame; give the path of the model, or compile it with simple="false"'
+                'center of mass in its frame; give the path of the model, or compile it with simple="false"'
             )
 
 

@@ -92,7 +92,7 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
     Args:
         config: the config.
         log: the log, such as one read from memory, in place of the config's ``data``.
-        general: as the search for missing effects needs it: free bodies are compiled so that their mass and its centre
+        general: as the search for missing effects needs it: free bodies are compiled so that their mass and its center
             may change in any way, and a config may name no parameters.
 
     Raises:

@@ -28,10 +28,10 @@ class Thresholds:
     """When a verdict changes, and why there.
 
     Attributes:
-        unexplained: root mean square of standardised residuals, in a column, above which it is not explained. A model
+        unexplained: root mean square of standardized residuals, in a column, above which it is not explained. A model
             that misses by as much as it expects has 1; one that lacks an effect of the size of its σ has 1.4.
         chance: standard errors of that root mean square which a short log has on top.
-        autocorrelation: of the standardised residuals of consecutive windows, from which on they are no accident:
+        autocorrelation: of the standardized residuals of consecutive windows, from which on they are no accident:
             right models have 0, friction that is lacking gives 0.5 to 0.8, whatever σ covers it.
         autocorrelation_errors: standard errors, 1/√T, by which it must differ from 0.
         counts: root mean square below which a column's residuals are so far within ε that their order does not matter.
@@ -209,12 +209,12 @@ def _doubt(distribution: Distribution, diagnostics: Diagnostics, is_dropo: bool)
 
 
 def autocorrelation(diagnostics: Diagnostics) -> tuple[np.ndarray, float]:
-    """Return the correlation of standardised residuals of consecutive windows, ``(m,)``, and where it is no accident.
+    """Return the correlation of standardized residuals of consecutive windows, ``(m,)``, and where it is no accident.
 
     Where initial states are noisy, consecutive windows share a measurement: windows that lie two apart are compared.
     """
     t, apart = THRESHOLDS, 2 if diagnostics.noisy_starts else 1
-    z, follows = standardised_residual(diagnostics), diagnostics.follows
+    z, follows = standardized_residual(diagnostics), diagnostics.follows
     pairs = np.all([follows[i : len(z) - apart + i] for i in range(apart)], axis=0)
     first, second = (np.nan_to_num(part[pairs]) for part in (z[: len(z) - apart], z[apart:]))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -272,13 +272,13 @@ def _standard_errors(distribution: Distribution, diagnostics: Diagnostics) -> di
 
 
 def column_rms(diagnostics: Diagnostics) -> np.ndarray:
-    """Return the root mean square standardised residual of each column, over finite entries; NaN where none."""
-    return root_mean_square(standardised_residual(diagnostics))
+    """Return the root mean square standardized residual of each column, over finite entries; NaN where none."""
+    return root_mean_square(standardized_residual(diagnostics))
 
 
 def overall_rms(diagnostics: Diagnostics) -> float:
-    """Return the root mean square standardised residual over all columns; NaN where none is finite."""
-    return float(root_mean_square(standardised_residual(diagnostics).ravel()))
+    """Return the root mean square standardized residual over all columns; NaN where none is finite."""
+    return float(root_mean_square(standardized_residual(diagnostics).ravel()))
 
 
 def root_mean_square(values: np.ndarray) -> np.ndarray:
@@ -288,7 +288,7 @@ def root_mean_square(values: np.ndarray) -> np.ndarray:
     return np.sqrt(np.where(finite.any(0), total / np.maximum(finite.sum(0), 1), np.nan))
 
 
-def standardised_residual(diagnostics: Diagnostics) -> np.ndarray:
+def standardized_residual(diagnostics: Diagnostics) -> np.ndarray:
     """Return residual over expected standard deviation, ``(T, m)``."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         return np.asarray(diagnostics.residual / diagnostics.expected)

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import dropo_torch as dropo
 
-BLUE, ORANGE, GREY = "#0072b2", "#d55e00", "#9aa0a6"
+BLUE, ORANGE, GRAY = "#0072b2", "#d55e00", "#9aa0a6"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = list(problem.space.names)
     for row, name in enumerate(names):
         low, high = problem.space.low[row], problem.space.high[row]
-        right.plot([low, high], [row, row], color=GREY, lw=6, alpha=0.25, solid_capstyle="round")
+        right.plot([low, high], [row, row], color=GRAY, lw=6, alpha=0.25, solid_capstyle="round")
         right.plot(problem.space.nominal[row], row, "|", color=ORANGE, ms=16, mew=2.5)
         right.plot(SIM.truth[name], row, "o", color="white", mec="black", ms=10)
         right.plot(fit.distribution.center[row], row, ".", color=BLUE, ms=9)

@@ -38,7 +38,7 @@ from dropo_torch.studies.compare import Comparison, Run, compare
 EPSILON = 1e-6
 #: Smallest difference of the figure, in nats; curves that reach the best end there.
 SMALLEST = 0.1
-COLOURS = {
+COLORS = {
     "fisher-mujoco": "#56b4e9",
     "fisher-warp": "#0072b2",
     "adam-warp": "#d55e00",
@@ -75,7 +75,7 @@ def walker() -> System:
 
 
 def chain(links: int) -> System:
-    """A motorised chain that hangs from a point, in three dimensions: its axes alternate."""
+    """A motorized chain that hangs from a point, in three dimensions: its axes alternate."""
     bodies, motors = "", ""
     for i in range(links):
         axis = "0 1 0" if i % 2 == 0 else "1 0 0"
@@ -196,7 +196,7 @@ def draw_run(axes: Axes, run: Run, best: float) -> None:
     short = np.maximum(best - found, SMALLEST)
     optimizer, backend = run.method.split("-")
     label = f"{NAMES[optimizer]} ({NAMES[backend]})"
-    color, style = COLOURS[run.method], "--" if run.method == "fisher-mujoco" else "-"
+    color, style = COLORS[run.method], "--" if run.method == "fisher-mujoco" else "-"
     axes.plot(cost, short, style, color=color, lw=1.4, label=label, zorder=3 if style == "--" else 2)
     axes.plot(cost[-1], short[-1], "o", color=color, ms=5, clip_on=False)
 

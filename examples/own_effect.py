@@ -53,7 +53,7 @@ class MagneticCatch(JointEffect):
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        """Return generalised forces, one row a state; each may have numbers of its own, or all share one row."""
+        """Return generalized forces, one row a state; each may have numbers of its own, or all share one row."""
         out = np.zeros_like(velocity)
         torque, reach = values.T
         away = position[:, setting.coordinate(str(target))] / reach

@@ -46,7 +46,7 @@ def recover(
     begun = time.monotonic()
     fit = dropo.fit(objective, dropo.FitSettings(optimizer=optimizer, samples=samples, budget=budget, seed=seed))
     seconds = time.monotonic() - begun
-    realised = log.masses[::25] if experiment == "distribution" else log.masses
+    realized = log.masses[::25] if experiment == "distribution" else log.masses
     return {
         "experiment": experiment,
         "optimizer": optimizer,
@@ -56,12 +56,12 @@ def recover(
         "names": list(space.names),
         "mean": fit.distribution.mean.tolist(),
         "std": fit.distribution.std.tolist(),
-        "true_mean": realised.mean(0).tolist(),
-        "true_std": realised.std(0).tolist(),
+        "true_mean": realized.mean(0).tolist(),
+        "true_std": realized.std(0).tolist(),
         "log_likelihood": fit.log_likelihood,
         "simulated_per_logged": fit.simulated_transitions / len(objective),
-        "to_percent": reached(fit, realised.mean(0), 1e-2),
-        "to_permille": reached(fit, realised.mean(0), 1e-3),
+        "to_percent": reached(fit, realized.mean(0), 1e-2),
+        "to_permille": reached(fit, realized.mean(0), 1e-3),
         "seconds": seconds,
         "stop_reason": fit.stop_reason,
     }

@@ -165,10 +165,10 @@ def draw(found: dict[str, Any], path: Path) -> None:
     for row, method in enumerate(METHODS):
         values = [r["target"] for r in found["runs"] if r["method"] == method]
         mean, low, high = found["target"][method]
-        colour = "#d55e00" if method == "fitted" else "#7b8794"
-        axes.plot([low, high], [row, row], color=colour, linewidth=3, alpha=0.4, solid_capstyle="butt")
-        axes.plot(values, [row] * len(values), "o", color=colour, markersize=4)
-        axes.plot([mean, mean], [row - 0.3, row + 0.3], color=colour, linewidth=2)
+        color = "#d55e00" if method == "fitted" else "#7b8794"
+        axes.plot([low, high], [row, row], color=color, linewidth=3, alpha=0.4, solid_capstyle="butt")
+        axes.plot(values, [row] * len(values), "o", color=color, markersize=4)
+        axes.plot([mean, mean], [row - 0.3, row + 0.3], color=color, linewidth=2)
     axes.set_yticks(range(len(METHODS)), [LABELS[m] for m in METHODS])
     axes.set_ylim(len(METHODS) - 0.5, -0.5)
     axes.set_xlabel(f"return in the target (dot: seed; bar: {100 * CONFIDENCE:.0f} % interval of the mean)")

@@ -32,7 +32,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--resume", action="store_true", help="keep what is finished there")
     parser.add_argument("--reduced", action="store_true", help="a minute or two, which says nothing of the methods")
     parser.add_argument("--seeds", type=int, help="logs")
-    parser.add_argument("--boxes", type=int, help="boxes of uniform randomisation")
+    parser.add_argument("--boxes", type=int, help="boxes of uniform randomization")
     parser.add_argument("--methods", nargs="+", choices=METHODS, help="whose policies are trained")
     parser.add_argument("--workers", type=workers, default=1, metavar="N|ray", help="processes side by side")
     given = parser.parse_args(arguments)

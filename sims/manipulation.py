@@ -167,14 +167,14 @@ def run_cell(cell: Cell, *, study: Study, plan: Plan, logs: Path, threads: int =
     begun = time.monotonic()
     fit = fit_problem(problem)
     return {
-        "truth": realised(log.parameters, study),
+        "truth": realized(log.parameters, study),
         "transitions": len(log.actions),
         "wall_seconds": round(time.monotonic() - begun, 3),
         "fit": fit.document(),
     }
 
 
-def realised(parameters: np.ndarray, study: Study) -> dict[str, dict[str, float]]:
+def realized(parameters: np.ndarray, study: Study) -> dict[str, dict[str, float]]:
     """Return mean and standard deviation of the parameters that were drawn for a log, ``(E, d)``."""
     drawn = zip(study.about.sim.parameters, parameters.T, strict=True)
     return {name: {"mean": float(values.mean()), "std": float(values.std())} for name, values in drawn}

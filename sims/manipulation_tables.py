@@ -53,7 +53,7 @@ class About:
 COLLAPSED = 1e-3
 #: What identifies a distribution: its means within this share, its standard deviations within that.
 MEANS, WIDTHS = 0.05, 0.25
-_COLOURS = {
+_COLORS = {
     "dropo (fisher)": "#0072b2", "dropo (adam)": "#56b4e9", "droid": "#d55e00", "bayessim (mdnn)": "#009e73",
     "bayessim (mdrff)": "#cc79a7", "simopt": "#e69f00", "udr": "#7b8794",
 }  # fmt: skip
@@ -76,7 +76,7 @@ def write_results(out: Path, about: About, results: Sequence[Result], plan: dict
     }
     units = {name: str(p.get("unit", "")) for name, p in about.sim.parameters.items()}
     chosen = [varying(r) for r in pick(results, "table", variant="distribution", seed=0)]
-    figure, page = draw_recovery(chosen, label, _COLOURS, units), sections(tables, list(about.sim.parameters))
+    figure, page = draw_recovery(chosen, label, _COLORS, units), sections(tables, list(about.sim.parameters))
     return write_recovery_study(
         out, title=about.title, lead=about.lead, plan=plan, findings=all_findings(results), tables=tables,
         sections=page, drawn={"recovery.png": figure}, versions=versions(),

@@ -58,7 +58,7 @@ class Plan:
     Attributes:
         seeds: logs, each with fits and policies of its own.
         methods: of :data:`METHODS`, those whose policies are trained.
-        boxes: of uniform randomisation, each with a policy.
+        boxes: of uniform randomization, each with a policy.
         runs: episodes of a log.
         rollouts: of a policy in the target.
         gap_seconds: after which no more effects are looked for.
@@ -153,7 +153,7 @@ class Cell:
         stage: ``gap``, ``fit`` or ``policy``.
         method: of :data:`METHODS`; none of a gap.
         seed: of the log and all that follows.
-        box: of uniform randomisation.
+        box: of uniform randomization.
     """
 
     stage: str

@@ -11,7 +11,7 @@ import scipy.stats
 
 from dropo_torch.commands.folder import versions
 from dropo_torch.report import figures
-from dropo_torch.report.figures.drawing import BLUE, GREY, INK, ORANGE, name_rows
+from dropo_torch.report.figures.drawing import BLUE, GRAY, INK, ORANGE, name_rows
 from dropo_torch.report.recovery import write_recovery_study
 from dropo_torch.studies.study import Finding, Section, grouped
 
@@ -160,11 +160,11 @@ def draw_distances(rows: Sequence[Mapping[str, Any]]) -> Any:
     figure = figures.new_figure(560, 60 + 34 * len(rows))
     axes = figures.new_axes(figure, (130, 44, 16, 12), grid="x")
     for y, row in enumerate(rows):
-        colour = {"own": INK, "dropo": ORANGE, "plain": BLUE}.get(row["method"], GREY)
+        color = {"own": INK, "dropo": ORANGE, "plain": BLUE}.get(row["method"], GRAY)
         values = np.concatenate(row["policies"])
-        axes.plot([row["low"], row["high"]], [y, y], color=colour, linewidth=4, alpha=0.35, solid_capstyle="butt")
-        axes.plot(values, np.full(len(values), y), "o", color=colour, markersize=4, alpha=0.8)
-        axes.plot([row["mean"]] * 2, [y - 0.28, y + 0.28], color=colour, linewidth=2)
+        axes.plot([row["low"], row["high"]], [y, y], color=color, linewidth=4, alpha=0.35, solid_capstyle="butt")
+        axes.plot(values, np.full(len(values), y), "o", color=color, markersize=4, alpha=0.8)
+        axes.plot([row["mean"]] * 2, [y - 0.28, y + 0.28], color=color, linewidth=2)
     name_rows(axes, [LABELS[row["method"]] for row in rows])
     axes.set_xlim(left=0)
     axes.set_xlabel(f"final distance, cm (dots: rollouts; bars: mean and its {100 * CONFIDENCE:.0f} % interval)")

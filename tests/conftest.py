@@ -73,7 +73,7 @@ WHOLE = {
                          "test_a_state_that_is_seen_is_fitted_as_it_is_without_sensors",
                          "test_a_model_that_lacks_friction_does_not_explain_what_a_camera_saw",
                          "test_masses_of_the_arm_are_found_by_what_it_has",
-                         "test_the_centre_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope",
+                         "test_the_center_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope",
                          "test_the_command_writes_what_it_always_writes"),
     "test_sweep.py": ("test_the_noise_of_every_measurement_is_found",),
     "test_view.py": ("test_a_video_has_a_pane_for_each_simulation",

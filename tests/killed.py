@@ -2,7 +2,7 @@
 
 Every attempt is a process of its own, forked where all is imported. A kill falls on a seeded write of the
 checkpoint, just before or just after the temporary file takes the checkpoint's name, or at a seeded moment
-of the optimisation. The last line of the output tells, as JSON, what happened.
+of the optimization. The last line of the output tells, as JSON, what happened.
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from benchmarks.intervals import (
     coverages,
     draw_truths,
     interval,
-    synthesise,
+    synthesize,
     wilson,
 )
 from dropo_torch.baselines import Mixture, fit_problem, make_search
@@ -219,8 +219,8 @@ def test_bayessim_contains_the_truth_and_is_narrower_than_the_prior(folder: Path
 def moments(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
     """Mean and covariance of a mixture without its box."""
     mean = mixture.weights @ mixture.means
-    centred = mixture.means - mean
-    between = np.einsum("m,mi,mj->ij", mixture.weights, centred, centred)
+    centered = mixture.means - mean
+    between = np.einsum("m,mi,mj->ij", mixture.weights, centered, centered)
     return mean, np.einsum("m,mij->ij", mixture.weights, mixture.covariances) + between
 
 
@@ -688,7 +688,7 @@ def test_a_synthetic_log_is_explained_by_its_truth(folder: Path) -> None:
     ours = problem(folder, "laplace")
     truths, center = draw_truths(ours, "fixed", 3)
     assert (truths == center).all()
-    made = synthesise(ours, truths, np.zeros(2), seed=0)
+    made = synthesize(ours, truths, np.zeros(2), seed=0)
     found = fit_problem(made).distribution
     assert found.mean == pytest.approx(truths[0], rel=1e-6)
     varying, center = draw_truths(ours, "varying", 3)
@@ -841,7 +841,7 @@ def test_the_entropy_bonus_widens_a_full_covariance() -> None:
     assert np.sqrt(np.diag(random_effects(gram, draws * 1e8, start, entropy=100.0)[0])).max() <= 1 + 1e-9
 
 
-def test_bayessim_summarises_orientations_of_log_and_replays_alike(tmp_path: Path) -> None:
+def test_bayessim_summarizes_orientations_of_log_and_replays_alike(tmp_path: Path) -> None:
     """A ball that spins: without noise, the log's own parameters give the log's own summary."""
     xml = """<mujoco><option timestep="0.01"/><worldbody><body><joint type="ball" damping="0.05"/>
     <geom name="top" type="box" size=".1 .2 .05" pos=".1 0 .1" mass="1"/></body></worldbody>
@@ -884,7 +884,7 @@ def test_what_varies_is_no_outlier_where_the_starts_are_noisy(folder: Path) -> N
     for seed in range(3):
         exact = problem(folder, "dropo", epsilon=(noise**2).tolist())
         truths, _ = draw_truths(exact, "varying", seed)
-        made = synthesise(exact, truths, noise, seed=seed)
+        made = synthesize(exact, truths, noise, seed=seed)
         log = made.trajectories
         starts = log.observations + noise * np.random.default_rng([seed, 1]).standard_normal(log.observations.shape)
         np.savez(
@@ -898,14 +898,14 @@ def test_what_varies_is_no_outlier_where_the_starts_are_noisy(folder: Path) -> N
 
 
 def test_several_explanations_are_told(folder: Path) -> None:
-    """A centre of mass to one side or the other swings alike where nothing pulls it."""
+    """A center of mass to one side or the other swings alike where nothing pulls it."""
     xml = PENDULUM_XML.replace('timestep="0.005"', 'timestep="0.005" gravity="0 0 0"').replace("0 0 -.5", "0 0 -.3")
     (folder / "turntable.xml").write_text(xml)
     given = config(folder, "bayessim", method_options={"simulations": 400, "horizon": 20}) | {
         "model": str(folder / "turntable.xml"),
         "parameters": {"offset": {"field": "body_ipos[2]", "name": "bob", "bounds": [-0.5, 0.5]}},
     }
-    ours = synthesise(make_problem(make_config(given)), np.full((STEPS, 1), 0.3), np.full(2, 1e-4), seed=0)
+    ours = synthesize(make_problem(make_config(given)), np.full((STEPS, 1), 0.3), np.full(2, 1e-4), seed=0)
     result = fit_problem(ours)
     told = {f.title: f.text for f in findings(result, diagnose(ours.objective, result.distribution))}
     assert "Several values explain the log" in told

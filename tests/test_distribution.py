@@ -256,21 +256,21 @@ boxes = st.builds(
 
 
 @given(boxes, st.lists(st.floats(0, 4), min_size=4, max_size=4))
-def test_normalising_undoes_denormalising(box, phi):
+def test_normalizing_undoes_denormalizing(box, phi):
     phi = np.array(phi)
-    mean, std = box.denormalise(phi)
-    np.testing.assert_allclose(box.normalise(mean, std), phi, atol=1e-9)
+    mean, std = box.denormalize(phi)
+    np.testing.assert_allclose(box.normalize(mean, std), phi, atol=1e-9)
     assert (mean >= box.low - 1e-12).all()
     assert (mean <= box.high + 1e-9 * box.width).all()
 
 
 @given(boxes)
 def test_bounds_map_to_zero_and_four(box):
-    np.testing.assert_allclose(box.normalise(box.low, box.min_std), 0, atol=1e-12)
-    np.testing.assert_allclose(box.normalise(box.high, box.max_std), 4, rtol=1e-12)
-    np.testing.assert_allclose(box.normalise(box.middle, np.sqrt(box.min_std * box.max_std)), 2, rtol=1e-9)
+    np.testing.assert_allclose(box.normalize(box.low, box.min_std), 0, atol=1e-12)
+    np.testing.assert_allclose(box.normalize(box.high, box.max_std), 4, rtol=1e-12)
+    np.testing.assert_allclose(box.normalize(box.middle, np.sqrt(box.min_std * box.max_std)), 2, rtol=1e-9)
     np.testing.assert_allclose(box.max_std, box.width / 4)
-    outside = box.denormalise(np.array([-1.0, 5.0, -1.0, 5.0]))
+    outside = box.denormalize(np.array([-1.0, 5.0, -1.0, 5.0]))
     np.testing.assert_allclose(outside[0], [box.low[0], box.high[1]])
 
 

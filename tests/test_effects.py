@@ -110,7 +110,7 @@ def placements() -> list[Any]:
     ]
 
 
-#: Places where an effect does nothing: what does not turn has no use for its centre or inertia, no force depends on
+#: Places where an effect does nothing: what does not turn has no use for its center or inertia, no force depends on
 #: where something is, and a geom may touch nothing.
 IDLE: dict[str, tuple[str, ...]] = {
     "center_of_mass": ("cart",), "inertia": ("cart",),
@@ -259,7 +259,7 @@ def test_a_payload_is_a_welded_point_mass() -> None:
     np.testing.assert_allclose(data.qacc, other.qacc, rtol=1e-6, atol=1e-9)
 
 
-def test_a_payload_may_sit_on_a_free_body_off_its_centre() -> None:
+def test_a_payload_may_sit_on_a_free_body_off_its_center() -> None:
     model, _ = applied(RIG, "payload", "ball", 0.5, 0.05, 0.0, 0.0)
     assert model.body("ball").mass[0] == pytest.approx(1.5)
     np.testing.assert_allclose(model.body("ball").ipos, [0.05 / 3, 0, 0], atol=1e-12)
@@ -299,7 +299,7 @@ def test_dry_friction_slides_and_sticks() -> None:
     assert forces(slid)[-1] == pytest.approx(1.5, rel=1e-3)
 
 
-#: A cart of 2 kg on a rail, whose friction gives over a centimetre.
+#: A cart of 2 kg on a rail, whose friction gives over a centimeter.
 PRESLIDING = {"effect": "joint_presliding", "target": "rail", "coulomb": 0.5, "displacement": 0.01}
 
 
@@ -359,7 +359,7 @@ def test_passive_forces_of_a_joint(speed: float) -> None:
     assert model.dof_M0[0] == pytest.approx(2.4)
 
 
-def test_inertia_and_centre_and_stops() -> None:
+def test_inertia_and_center_and_stops() -> None:
     model, _ = applied(RIG, "inertia", "lower", 1.5)
     np.testing.assert_allclose(model.body("lower").inertia, 1.5 * general().body("lower").inertia)
     model, _ = applied(RIG, "center_of_mass", "lower", 0.01, 0.02, -0.03)
@@ -434,9 +434,9 @@ ROVER = """<mujoco><option timestep="0.002"/><worldbody>
     <geom name="hull" type="box" size=".2 .1 .03" mass="2" friction="{hull}"/>
     <geom name="caster" type="sphere" size=".1" pos=".2 0 0" mass=".1" friction="{caster}" {first} solref="{soft} 1"/>
     <body pos="-.1 .15 0"><joint name="left" axis="0 1 0"/>
-      <geom name="left_tyre" type="sphere" size=".1" mass=".3"/></body>
+      <geom name="left_tire" type="sphere" size=".1" mass=".3"/></body>
     <body pos="-.1 -.15 0"><joint name="right" axis="0 1 0"/>
-      <geom name="right_tyre" type="sphere" size=".1" mass=".3"/></body>
+      <geom name="right_tire" type="sphere" size=".1" mass=".3"/></body>
   </body></worldbody>
   <actuator><motor joint="left"/><motor joint="right"/></actuator></mujoco>"""
 
@@ -464,7 +464,7 @@ def test_contacts_stay_as_they_are_with_the_numbers_of_the_model(rover: dict[str
     before, setting = driven(model), setting_of(model)
     for name in ("contact_friction", "contact_stiffness"):
         effect = find_effect(name)
-        for geom in ("floor", "caster", "left_tyre", "right_tyre"):
+        for geom in ("floor", "caster", "left_tire", "right_tire"):
             neutral = [q.neutral for q in effect.quantities(setting, geom)]
             changed = mujoco.MjModel.from_xml_string(ROVER.format(**rover))
             effect.apply(changed, geom, np.array(neutral))
@@ -532,7 +532,7 @@ def test_cogging_ripples_with_the_position() -> None:
     np.testing.assert_allclose(forces(path, 1.0), 0.7 * np.sin(9 * middle + 0.4), atol=1e-9)
 
 
-def test_coupling_is_a_spring_between_neighbours() -> None:
+def test_coupling_is_a_spring_between_neighbors() -> None:
     model = general()
     setting = setting_of(model)
     states = some_states(model).numpy()
@@ -545,7 +545,7 @@ def test_coupling_is_a_spring_between_neighbours() -> None:
     np.testing.assert_allclose(found[:, 0], 2 * stretch)
 
 
-def test_an_external_force_pushes_the_centre() -> None:
+def test_an_external_force_pushes_the_center() -> None:
     path = driven([{"effect": "external_force", "target": "cart", "x": 0.6, "y": 3.0, "z": 1.0}], np.zeros(5))
     np.testing.assert_allclose(forces(path), 0.6, atol=1e-9)
 

@@ -433,7 +433,7 @@ def test_friction_that_is_larger_at_rest_is_told_from_what_the_step_leaves() -> 
 
 
 def test_what_is_absurd_gives_way_to_what_contains_it() -> None:
-    """A heavy tool shifts the centre of mass beyond the hand itself: it is a tool, not a shift."""
+    """A heavy tool shifts the center of mass beyond the hand itself: it is a tool, not a shift."""
     tool = Effect("payload", "hand", {"mass": 0.8, "x": 0.15, "y": 0.0, "z": -0.016})
     only_the_best = dataclasses.replace(Rules(), tried=dataclasses.replace(Rules().tried, refits=1))
     case = simulate_truth(SERVO_ARM, [tool], 3, **SIZE)
@@ -443,7 +443,7 @@ def test_what_is_absurd_gives_way_to_what_contains_it() -> None:
     assert gap.effects[0].parameters["mass"].value == pytest.approx(0.8, rel=0.02)
 
 
-def test_a_payload_begins_where_it_shifts_the_centre_of_mass_as_far() -> None:
+def test_a_payload_begins_where_it_shifts_the_center_of_mass_as_far() -> None:
     payload, setting, shift = find_effect("payload"), scene_of().setting, np.array([0.004, 0.0, -0.003])
     moved = Placed(find_effect("center_of_mass"), "pole", tuple(shift))
     body = setting.model.body("pole").id
@@ -783,7 +783,7 @@ def test_document_keeps_its_contract(arguments: tuple) -> None:
 
 
 def test_body_that_only_turns_is_no_body_at_rest() -> None:
-    """The first link of an arm turns about its own centre: what changes its inertia shows, a force on it does not."""
+    """The first link of an arm turns about its own center: what changes its inertia shows, a force on it does not."""
     case = simulate_truth(TORQUE_ARM, [Effect("armature", "yaw", {"armature": 0.008})], 3, **SIZE)
     setting = prepare(load(case)).setting
     assert {e for e in VOCABULARY if "turret" in VOCABULARY[e].targets(setting)} == {

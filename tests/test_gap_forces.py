@@ -59,7 +59,7 @@ def recorded(
     """Return rows of positions and velocities, and torques, of joints that follow sines exactly.
 
     Nothing is simulated: the torques are those that the motion needs, with dry friction, less a constant force at the
-    shoulder, with the fore arm's centre of mass elsewhere, and with ripple relative to each joint's largest torque.
+    shoulder, with the fore arm's center of mass elsewhere, and with ripple relative to each joint's largest torque.
     Friction falls below a speed, or gives over a displacement before the joint slides.
     """
     draw, n = np.random.default_rng(seed), int(seconds / dt)
@@ -222,7 +222,7 @@ def test_a_right_model_has_nothing_named(tmp_path: Path, ripple: float) -> None:
 
 
 def test_what_ties_is_told(tmp_path: Path) -> None:
-    """A shoulder that moves little cannot tell a constant force from a centre of mass further out."""
+    """A shoulder that moves little cannot tell a constant force from a center of mass further out."""
     view = view_of(problem_of(tmp_path, 1, friction=(0.5, 0.8, 0.3), offset=0.4, center=0.05, ripple=0.06))
     told = {p.key: {other.key for other in tied} for p, tied in zip(view.placed, view.ties, strict=True)}
     assert ("actuator_bias", "m2") in told or ("actuator_bias", "m2") in told["center_of_mass", "upper"]

@@ -167,8 +167,8 @@ def test_curves_and_picture_show_what_was_predicted(tmp_path: Path) -> None:
     assert write_gap_picture(tmp_path / "picture.png", gap)
     drawn = image.imread(tmp_path / "picture.png")
     assert drawn.shape[:2] == (1080, 1920)
-    for colour in (ORANGE, BLUE):
-        assert (np.abs(drawn[..., :3] - to_rgb(colour)).max(-1) < 0.02).sum() > 1000
+    for color in (ORANGE, BLUE):
+        assert (np.abs(drawn[..., :3] - to_rgb(color)).max(-1) < 0.02).sum() > 1000
     before = (tmp_path / "picture.png").read_bytes()
     write_gap_picture(tmp_path / "picture.png", gap)
     assert (tmp_path / "picture.png").read_bytes() == before

@@ -79,13 +79,13 @@ def _with_payload(model: mujoco.MjModel, mass: float, place: np.ndarray, name: s
     turn = np.zeros(9)
     mujoco.mju_quat2Mat(turn, body.iquat)
     turn = turn.reshape(3, 3)
-    centre = (body.mass[0] * body.ipos + mass * place) / (body.mass[0] + mass)
+    center = (body.mass[0] * body.ipos + mass * place) / (body.mass[0] + mass)
     tensor = turn @ np.diag(body.inertia) @ turn.T
-    for m, at in ((body.mass[0], body.ipos - centre), (mass, place - centre)):
+    for m, at in ((body.mass[0], body.ipos - center), (mass, place - center)):
         tensor += m * (at @ at * np.eye(3) - np.outer(at, at))
     inertia, axes = np.linalg.eigh(tensor)
     axes[:, 0] *= np.linalg.det(axes)
-    body.ipos[:], body.inertia[:] = centre, inertia
+    body.ipos[:], body.inertia[:] = center, inertia
     mujoco.mju_mat2Quat(body.iquat, axes.reshape(-1))
     body.mass[0] += mass
 
@@ -254,9 +254,9 @@ def test_sensors() -> None:
     np.testing.assert_allclose(seen.observations[:, 1], 0.02 + true.observations[:, 1])
 
 
-def test_neighbours() -> None:
+def test_neighbors() -> None:
     arm = mujoco.MjModel.from_xml_string(TORQUE_ARM.xml)
-    assert [truths.neighbour(arm, j) for j in ("yaw", "shoulder", "elbow")] == ["shoulder", "yaw", "shoulder"]
+    assert [truths.neighbor(arm, j) for j in ("yaw", "shoulder", "elbow")] == ["shoulder", "yaw", "shoulder"]
 
 
 def test_equivalents_follow_the_mechanism() -> None:
@@ -366,7 +366,7 @@ def test_a_log_that_begins_at_its_first_command_is_as_before() -> None:
 
 
 @pytest.mark.parametrize("noise", [*truths.UNEQUAL, truths.ONE_ROUGH])
-def test_unequal_noises_are_realised(noise: str) -> None:
+def test_unequal_noises_are_realized(noise: str) -> None:
     recording = truths.make_recording(SERVO_ARM, [], 3, noise=noise, episodes=2, transitions=300)
     case = truths.make_case(SERVO_ARM, [], recording)
     clean = np.concatenate([s[:-1] for s in recording.log.states])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from dropo_sims.manipulation import Cell, all_cells, config_of, identifiability, realised
+from dropo_sims.manipulation import Cell, all_cells, config_of, identifiability, realized
 from dropo_sims.manipulation_tables import all_findings, beyond_box, label, optimizer_rows, sections, write_results
 from dropo_sims.puck.study import STUDY as PUCK
 from dropo_sims.push.study import STUDY as PUSH
@@ -130,7 +130,7 @@ def test_every_cell_has_a_config_that_is_understood(name: str, cell: Cell, tmp_p
     study, path = STUDIES[name], tmp_path / "log.npz"
     log = study.record(variant=cell.variant, episodes=2, steps=study.reduced.steps, truth=study.truth)
     log.save(path)
-    assert {n: value["mean"] for n, value in realised(log.parameters, study).items()} == pytest.approx(
+    assert {n: value["mean"] for n, value in realized(log.parameters, study).items()} == pytest.approx(
         dict(zip(study.truth, log.parameters.mean(0), strict=True))
     )
     document = config_of(cell, study, replace(study.reduced, backend="mujoco"))

@@ -533,7 +533,7 @@ def test_start_noise_follows_scaling_and_masks():
     assert float(masked.base_covariance(slice(0, 1), initial)) == pytest.approx(expected[1, 1] + 1e-6, rel=1e-10)
 
 
-def test_before_the_first_linearisation_the_noise_is_that_of_the_measured_end():
+def test_before_the_first_linearization_the_noise_is_that_of_the_measured_end():
     objective, _ = slide_objective([0.02, 0.3])
     np.testing.assert_allclose(
         torch.diagonal(objective.base_covariance(slice(0, 8)), dim1=1, dim2=2),

@@ -107,7 +107,7 @@ def test_markers_tell_the_poses_of_a_chain(entries):
     rng = np.random.default_rng(0)
     found, told = posed_log(model, observation, log_of(columns + 5e-4 * rng.standard_normal(columns.shape)), 1 / RATE)
     off = found.observations - states[:-1]
-    assert np.abs(off[:, :2]).max() < 0.012  # of a rad, by half a millimetre at 0.3 m
+    assert np.abs(off[:, :2]).max() < 0.012  # of a rad, by half a millimeter at 0.3 m
     assert np.sqrt(np.mean(off[:, 2:] ** 2)) < 0.06 * states[:, 2:].std()
     assert tuple(told.blind) == ("upper.velocity", "lower.velocity")
 
@@ -176,7 +176,7 @@ class Camera:
 
 
 TRACKS = {
-    "millimetres": Camera({"x": "marker_x_mm", "z": "marker_z_mm"}, 1e3),
+    "millimeters": Camera({"x": "marker_x_mm", "z": "marker_z_mm"}, 1e3),
     "site": Camera({"x": "led_x", "y": "led_y", "z": "led_z"}, 1.0),
     "no unit": Camera({"x": "track_x", "z": "track_z"}, 1e3),
     "bare": Camera({"x": "x", "z": "z"}, 1.0),
@@ -218,7 +218,7 @@ def test_init_knows_a_markers_track(name, tmp_path):
 
 
 def test_a_marker_that_is_hidden_now_and_then_is_interpolated(tmp_path):
-    model, log = film(tmp_path, TRACKS["millimetres"], seconds=8)
+    model, log = film(tmp_path, TRACKS["millimeters"], seconds=8)
     lines = log.read_text().splitlines()
     for row in (60, 61, 62, 200, 300, 301):
         lines[row] = lines[row].split(",")[0] + ",,"
@@ -244,7 +244,7 @@ def test_what_is_no_track_of_the_models_is_told(tmp_path):
     ],
 )
 def test_gap_names_what_a_marker_shows(own, effect, truth, tmp_path, capsys):
-    model, log = film(tmp_path, TRACKS["millimetres"], own)
+    model, log = film(tmp_path, TRACKS["millimeters"], own)
     config, out = tmp_path / "robot.yaml", tmp_path / "gap"
     text = dropo.propose_config(model, log, out=config).text
     config.write_text(text.partition("\nparameters:")[0] + "\n")  # or they would take it in

@@ -252,7 +252,7 @@ def test_a_state_that_is_seen_is_fitted_as_it_is_without_sensors(tmp_path):
     assert (by_windows.std < by_transitions.std).all()  # windows of many steps tell more than single transitions
 
 
-def test_the_centre_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope(tmp_path):
+def test_the_center_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope(tmp_path):
     """Its states have an orientation, which no column shows."""
     xml = """
     <mujoco>
@@ -287,7 +287,7 @@ def test_the_centre_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope(tmp_pat
     }  # fmt: skip
     path = arm(
         tmp_path, log, model="box.xml", observation=["sensor"],
-        parameters={"centre": {"field": "body_ipos", "name": "box", "index": 0, "bounds": [-0.05, 0.05]}},
+        parameters={"center": {"field": "body_ipos", "name": "box", "index": 0, "bounds": [-0.05, 0.05]}},
     )  # fmt: skip
     (tmp_path / "box.xml").write_text(xml.format(0))
     found = fit_problem(make_problem(load_config(path)))

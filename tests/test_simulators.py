@@ -485,7 +485,7 @@ def test_a_frame_that_coincided_with_another_moves_with_its_parameter(entry: dic
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9 if backend == "warp" else 0)
 
 
-def test_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
+def test_the_center_of_a_body_compiled_as_simple_is_refused() -> None:
     model = mujoco.MjModel.from_xml_string(COINCIDING_XML)
     model.body_simple[1] = 1
     space = ParameterSpace(model, {"x": {"field": "body_ipos[0]", "name": "link", "bounds": [-0.4, 0.4]}})
@@ -494,7 +494,7 @@ def test_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
             make()
 
 
-def test_moving_the_centre_of_a_body_compiled_as_simple_is_refused() -> None:
+def test_moving_the_center_of_a_body_compiled_as_simple_is_refused() -> None:
     model = mujoco.MjModel.from_xml_string(BOX_XML)
     assert model.body_simple[1]
     space = ParameterSpace(model, {"x": {"field": "body_ipos[0]", "name": model.body(1).name, "bounds": [-0.4, 0.4]}})

@@ -303,9 +303,9 @@ def test_the_camera_follows_who_travels_and_sees_all_frames(tmp_path: Path) -> N
         frames = poses(model, drawn, states, view.controls)
         camera = aim(drawn, frames)
         sides = np.stack(axes_of(camera.azimuth, camera.elevation))
-        points = (scene.placed_points(drawn, frames) - camera.centres[:, None]) @ sides.T
+        points = (scene.placed_points(drawn, frames) - camera.centers[:, None]) @ sides.T
         assert (np.abs(points).max((0, 1)) <= 0.5 * np.array([camera.width, camera.height])).all()
-        assert (np.ptp(camera.centres[:, 0]) > 10) == (name == "far")
+        assert (np.ptp(camera.centers[:, 0]) > 10) == (name == "far")
         assert camera.width < 5
 
 

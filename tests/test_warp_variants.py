@@ -203,7 +203,7 @@ def test_an_own_effect_is_simulated_as_by_mujoco_whatever_came_before() -> None:
 
 
 def test_pushes_are_those_of_mujoco() -> None:
-    """Generalised forces of every logged step, alone and beside an effect that is a force."""
+    """Generalized forces of every logged step, alone and beside an effect that is a force."""
     ours, theirs = engines()
     variants = [variant(effects, 0.7) for effects in ((), FORCED[0], WRENCHED[0], WRENCHED[2])]
     pushes = np.random.default_rng(1).normal(0, 0.5, (len(variants), STEPS // SKIP, 9))
@@ -228,8 +228,8 @@ def test_what_acts_besides_has_gradients(applied: bool, wrenched: bool, integrat
     """Of all that stands in the controls, of the state and of θ beside it, by central differences."""
     model = mujoco.MjModel.from_xml_string(ROUND)
     model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
-    centre = {"centre": {"field": "body_ipos", "name": "lower", "index": 2, "bounds": [-0.3, 0.3]}}
-    engine = Engine(model, ParameterSpace(model, MASS | centre), skip=SKIP, chunk_size=8, num_threads=1, device="cpu")
+    center = {"center": {"field": "body_ipos", "name": "lower", "index": 2, "bounds": [-0.3, 0.3]}}
+    engine = Engine(model, ParameterSpace(model, MASS | center), skip=SKIP, chunk_size=8, num_threads=1, device="cpu")
     width, rng = model.nu + 6 * model.nbody * wrenched + model.nv * applied, np.random.default_rng(2)
     state = np.concatenate([model.qpos0, rng.normal(0, 0.3, model.nv)])
     state[[0, 1, 4, 9]] += [0.2, -0.3, 0.5, 0.1]  # the ball is in the air

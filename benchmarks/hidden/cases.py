@@ -443,7 +443,7 @@ def _bias(t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
 
 
 def _place(system: System, target: str | None, rng: np.random.Generator) -> np.ndarray:
-    """A point on a body, off its centre of mass: further out, and a little aside."""
+    """A point on a body, off its center of mass: further out, and a little aside."""
     body = load(system.xml).body(target)
     out = body.ipos * rng.uniform(1.5, 2.0)
     aside = rng.uniform(0.2, 0.5) * max(float(np.linalg.norm(body.ipos)), 0.05) * rng.standard_normal(3)

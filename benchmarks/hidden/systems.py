@@ -22,7 +22,7 @@ class Command:
 
     Attributes:
         amplitude: of the excitation, in command units.
-        offset: what it is centred on.
+        offset: what it is centered on.
         band: lowest and highest frequency, Hz.
         hold: gains on position and velocity of ``joint`` around ``offset``: a feedback that a torque needs to stay put.
         joint: the joint that is held.
@@ -56,7 +56,7 @@ class System:
         declared: name → mapping of the project's ``parameters``: what the user lets vary.
         commands: one for each actuator.
         start: joint → half width of the positions, half width of the velocities at the start.
-        start_mean: joint → what the start's positions are centred on, where that is not ``qpos0``.
+        start_mean: joint → what the start's positions are centered on, where that is not ``qpos0``.
         scales: joint → typical sizes.
         equivalents: groups of (effect, target) that are the same thing here, by construction of the mechanism.
         observation: what the log's columns are.

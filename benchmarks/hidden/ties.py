@@ -16,7 +16,7 @@ import mujoco
 import numpy as np
 
 from benchmarks.hidden.systems import DT, Scale, System, fine, load
-from benchmarks.hidden.truths import Effect, Recording, constant_forces, make_plant, neighbour, observed
+from benchmarks.hidden.truths import Effect, Recording, constant_forces, make_plant, neighbor, observed
 from dropo_torch.parameters import ParameterSpace
 
 #: Effects that depend on the past, and one that is none of the system's.
@@ -155,7 +155,7 @@ def _joint_rivals(system: System, model: mujoco.MjModel, joint: int) -> Iterator
     yield _one("joint_quadratic_damping", name, "coefficient", 0.0, t / v**2, 0.0)
     yield _one("joint_friction", name, "friction", 0.01 * t, t, 0.0)
     yield _one("armature", name, "armature", 0.0, scale.inertia, -float(own.armature[0]))
-    if np.isin(model.jnt_type, (2, 3)).sum() > 1 and model.joint(neighbour(model, name)).id < joint:  # else its synonym
+    if np.isin(model.jnt_type, (2, 3)).sum() > 1 and model.joint(neighbor(model, name)).id < joint:  # else its synonym
         yield _one("joint_coupling", name, "stiffness", 0.0, t)
     yield Rival(
         "joint_stribeck", name, {"coulomb": 0.05 * t, "static": 0.08 * t, "velocity": 0.1 * v},

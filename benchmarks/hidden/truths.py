@@ -241,7 +241,7 @@ def _dry_friction(plant: Plant, joint: str, level: Callable[[float, float], floa
     return force
 
 
-def neighbour(model: mujoco.MjModel, joint: str) -> str:
+def neighbor(model: mujoco.MjModel, joint: str) -> str:
     """The nearest hinge or slide above a joint in the kinematic chain; below it, for the first."""
     scalar = [j for j in range(model.njnt) if model.jnt_type[j] in (2, 3)]
     number = model.joint(joint).id
@@ -262,7 +262,7 @@ def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
 
 
 def _coupling(plant: Plant, joint: str, stiffness: float) -> Force:
-    other = neighbour(plant.model, joint)
+    other = neighbor(plant.model, joint)
     i, j = plant.dof(joint), plant.dof(other)
     a, b = plant.address(joint), plant.address(other)
 
@@ -342,7 +342,7 @@ def tilt(roll: float, pitch: float) -> np.ndarray:
 
 
 def constant_forces(model: mujoco.MjModel, effects: Sequence[Effect]) -> np.ndarray | None:
-    """Forces at the bodies' centres of mass, ``(nbody, 6)``: external forces, and gravity's change when tilted."""
+    """Forces at the bodies' centers of mass, ``(nbody, 6)``: external forces, and gravity's change when tilted."""
     wrench = np.zeros((model.nbody, 6))
     for e in effects:
         x = e.parameters
@@ -612,7 +612,7 @@ def true_model(system: System, declared: Mapping[str, float], effects: Sequence[
 def _touch_as_one(model: mujoco.MjModel, body: int) -> None:
     """Make a body's contacts as stiff as those of one rigid body with all that is welded to it.
 
-    A contact's stiffness grows with the inertia of the bodies that touch, which MuJoCo takes at the centre of mass of
+    A contact's stiffness grows with the inertia of the bodies that touch, which MuJoCo takes at the center of mass of
     each; two bodies that are welded together are to it not what one with the mass of both is.
     """
     data, whole = mujoco.MjData(model), [body]
@@ -930,9 +930,9 @@ def equivalents(system: System, effect: Effect) -> tuple[tuple[str, str | None],
 
 
 def _same_coupling(model: mujoco.MjModel, joint: str) -> set[tuple[str, str | None]]:
-    """A spring between two joints is named by either, where each is the other's neighbour."""
-    other = neighbour(model, joint)
-    return {("joint_coupling", other)} if neighbour(model, other) == joint else set()
+    """A spring between two joints is named by either, where each is the other's neighbor."""
+    other = neighbor(model, joint)
+    return {("joint_coupling", other)} if neighbor(model, other) == joint else set()
 
 
 def true_declared(system: System, rng: np.random.Generator) -> dict[str, float]:

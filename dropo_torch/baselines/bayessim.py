@@ -53,7 +53,7 @@ class BayesSimOptimizer(Optimizer):
     """Simulation-based inference from a uniform prior over the search box.
 
     The log is cut into windows of ``horizon`` steps, which are replayed *open loop* from their logged states with the
-    logged actions, under parameter vectors of the prior. A replay is summarised by mean and variance of the columns'
+    logged actions, under parameter vectors of the prior. A replay is summarized by mean and variance of the columns'
     changes per step and their correlation with the controls, over all windows together. A network learns the
     parameters' distribution given the summary, a mixture of Gaussians; put to the log's own summary it gives the
     posterior. The result is the normal whose draws have the posterior's mean and covariance inside the box, its

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 
 #: Training stops after so many epochs without a better loss on the share of the pairs that is held out.
 _TRAINING = {"training_batch_size": 100, "learning_rate": 2e-3, "validation_fraction": 0.1, "stop_after_epochs": 40}
-#: Standardised inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
+#: Standardized inputs are cut off here, so that a log unlike all simulations is not extrapolated to without bound.
 FARTHEST = 5.0
-#: The neighbour to which distances are measured.
-_NEIGHBOURS = 5
+#: The neighbor to which distances are measured.
+_NEIGHBORS = 5
 #: Directions in which simulations differ by less than this share of the largest count as none, as the smallest noise
 #: would be far there; and there is at most one for so many simulations, as few do not show how far apart they are.
 _FLAT, _ROWS_PER_DIRECTION = 1e-2, 5
@@ -202,7 +202,7 @@ def unlikeness(inputs: np.ndarray, at: np.ndarray) -> float:
     """Return how far a log's x is from the simulations', compared with how far they are from each other.
 
     That is its distance to the fifth nearest simulation over the distance that 99 % of them have to theirs: a log that
-    the simulator explains is seldom above 1. Distances are those of standardised and then whitened columns, so that a
+    the simulator explains is seldom above 1. Distances are those of standardized and then whitened columns, so that a
     summary between the simulations, but off the surface on which they lie, is far. Columns that no simulation moves do
     not count, as the network does not see them.
 
@@ -211,7 +211,7 @@ def unlikeness(inputs: np.ndarray, at: np.ndarray) -> float:
         at: the log's, ``(q,)``.
     """
     alive = inputs[np.isfinite(inputs).all(1)]
-    if len(alive) <= _NEIGHBOURS:
+    if len(alive) <= _NEIGHBORS:
         return float("inf")
     center, scale, moves = _standard(alive)
     if not moves.any():
@@ -222,8 +222,8 @@ def unlikeness(inputs: np.ndarray, at: np.ndarray) -> float:
     kept = (size > _FLAT * size[0]) & (np.arange(len(size)) < max(1, len(rows) // _ROWS_PER_DIRECTION))
     white = directions[kept].T / size[kept] * math.sqrt(len(rows))
     tree = scipy.spatial.KDTree((rows - mean) @ white)
-    among = tree.query(tree.data, k=_NEIGHBOURS + 1)[0][:, -1]  # the nearest of all is the point itself
-    nearest = tree.query((here - mean) @ white, k=_NEIGHBOURS)[0][-1]
+    among = tree.query(tree.data, k=_NEIGHBORS + 1)[0][:, -1]  # the nearest of all is the point itself
+    nearest = tree.query((here - mean) @ white, k=_NEIGHBORS)[0][-1]
     return float(nearest / np.quantile(among, 0.99))
 
 

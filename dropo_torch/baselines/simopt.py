@@ -36,8 +36,8 @@ def discrepancy(
 def reps_weights(costs: np.ndarray, kl: float) -> np.ndarray:
     """Return the weights of relative-entropy policy search, ``(N,)``, summing to 1.
 
-    They minimise the expected cost among all reweightings of the samples whose relative entropy to the samples is
-    at most ``kl``: w ∝ exp(−cost / η), with η the minimiser of the dual η kl + η log mean exp(−cost / η).
+    They minimize the expected cost among all reweightings of the samples whose relative entropy to the samples is
+    at most ``kl``: w ∝ exp(−cost / η), with η the minimizer of the dual η kl + η log mean exp(−cost / η).
 
     Args:
         costs: of the samples, ``(N,)``; one that is not finite gets no weight.
@@ -108,8 +108,8 @@ class SimOptOptimizer(Optimizer):
             )
         weights = reps_weights(costs, self._settings.kl)
         self._mean = weights @ draws
-        centred = draws - self._mean
-        covariance = (weights[:, None] * centred).T @ centred
+        centered = draws - self._mean
+        covariance = (weights[:, None] * centered).T @ centered
         lost = float(weights @ weights)  # a weighted covariance is too small by the inverse of the effective number
         covariance /= max(1 - lost, 0.1)
         floor = (self._box.min_std / self._box.width) ** 2

@@ -1,4 +1,4 @@
-"""From a raw recording to transitions: synchronise, filter, resample, differentiate, infer commands.
+"""From a raw recording to transitions: synchronize, filter, resample, differentiate, infer commands.
 
 The sensors of a real robot report at times of their own, and seldom its velocities or what the
 simulator takes as action. Following Tiboni et al. (2023), every measured signal is put on one uniform
@@ -247,9 +247,9 @@ def estimate_delay(
             "expected at least four times as long"
         )
     windows = np.lib.stride_tricks.sliding_window_view(signal, middle)
-    centred = reference[most : most + middle] - reference[most : most + middle].mean()
-    scale = windows.std(axis=1) * np.linalg.norm(centred) * np.sqrt(middle)
-    correlation = np.divide(windows @ centred, scale, out=np.zeros(len(windows)), where=scale > 0)
+    centered = reference[most : most + middle] - reference[most : most + middle].mean()
+    scale = windows.std(axis=1) * np.linalg.norm(centered) * np.sqrt(middle)
+    correlation = np.divide(windows @ centered, scale, out=np.zeros(len(windows)), where=scale > 0)
     peak = int(correlation.argmax())
     if correlation[peak] < _LEAST_CORRELATION:
         raise InputError(

@@ -122,7 +122,7 @@ def read_trajectories(
         tolerance: fraction by which the spacing of time stamps may differ from its median.
         group: pattern of HDF5 groups with an episode each, such as ``data/demo_*``.
         separator: what separates the columns of a text file.
-        preprocess: how to synchronise, filter and resample; see :class:`~dropo_torch.data.preprocess.Preprocess`.
+        preprocess: how to synchronize, filter and resample; see :class:`~dropo_torch.data.preprocess.Preprocess`.
         scale: signal → factor by which its values are multiplied: 0.0174532925 for degrees, -1 for a sign.
         unwrap: angles in rad that wrap at ±π or at 2π, which become continuous in each episode.
         shift: rows by which the commands stand too late; each row takes the command of so many rows further on.

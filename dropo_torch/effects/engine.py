@@ -96,7 +96,7 @@ class Forces:
     def __call__(
         self, acting: Iterable[Force], position: np.ndarray, velocity: np.ndarray, before: np.ndarray, step: float
     ) -> np.ndarray:
-        """Return generalised forces ``(R, nv)``.
+        """Return generalized forces ``(R, nv)``.
 
         Args:
             acting: the effects.
@@ -193,7 +193,7 @@ class VariantEngine:
             signals: commands of every physics step, those of ``lead`` steps before the window first,
                 ``(K, W, lead + S, nu)``.
             fine: return the states after every physics step instead of every logged one.
-            pushes: further generalised forces in every logged step, ``(K, S / skip, nv)``; none by default.
+            pushes: further generalized forces in every logged step, ``(K, S / skip, nv)``; none by default.
 
         Returns:
             States ``(K, W, S, nq + nv)`` or ``(K, W, S / skip, nq + nv)``, NaN where a simulation diverged or has no
@@ -268,7 +268,7 @@ class VariantEngine:
             models, variants: K that go together.
             starts: states, ``(K, W, nq + nv)``.
             signals: commands of every physics step of the base model, ``(K, W, lead + S, nu)``.
-            pushes: further generalised forces, as for :meth:`paths`.
+            pushes: further generalized forces, as for :meth:`paths`.
             finer: steps of the models that make one of the base's.
             every: steps of the base from one wanted state to the next.
         """

@@ -212,7 +212,7 @@ def apply_native(model: mujoco.MjModel, effects: EffectSet) -> mujoco.MjModel:
     except mujoco.FatalError as error:
         places = ", ".join(e.place for e in effects.entries)
         raise InputError(
-            f"effects: MuJoCo refuses the model with {places}: {error}; a free body whose mass or centre changes must "
+            f"effects: MuJoCo refuses the model with {places}: {error}; a free body whose mass or center changes must "
             "not be compiled as simple: name the model by its path, so that it is compiled for it"
         ) from None
     return out

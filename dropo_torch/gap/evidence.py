@@ -20,7 +20,7 @@ from dropo_torch.gap.rules import Rules, Weighed
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.support.rows import evenly
 
-#: Antithetic pairs of noise on the initial states by which rough windows are linearised, and a few that are far off;
+#: Antithetic pairs of noise on the initial states by which rough windows are linearized, and a few that are far off;
 #: their seed.
 PAIRS, MORE, SEED = 16, 48, 11
 #: Whitened residual of a window whose simulation diverged, at least.
@@ -68,7 +68,7 @@ class Evidence:
         windows: the stretches of the log.
         noise: standard deviation of the measurement of each feature, ``(m,)``.
         begin: the model as given: where a simulation diverges, this was no worse.
-        rough: linearise statistically, over draws of noise on the initial states, as contacts need it.
+        rough: linearize statistically, over draws of noise on the initial states, as contacts need it.
         model_error: by how much the model's own error exceeds the noise in each residual of a window, ``(N,)``.
         robust: whether windows that are far off count by the logarithm of their χ² only (a Cauchy cost): what is named
             must then be right in most windows, and otherwise explain all of them together.
@@ -176,7 +176,7 @@ class Evidence:
         return self.counting(found, variant)
 
     def counting(self, linear: Linearisation, variant: Variant) -> Linearisation:
-        """Return a linearisation without windows in which commands act that a hypothesis cannot know from the log."""
+        """Return a linearization without windows in which commands act that a hypothesis cannot know from the log."""
         known = self.twin.knows(variant, self.windows)
         return linear if known.all() else replace(linear, weights=linear.weights * known[:, None])
 
@@ -199,7 +199,7 @@ class Evidence:
         return replace(linear, **arrays)
 
     def _differences(self, variant: Variant) -> tuple[Linearisation, np.ndarray]:
-        """The linearisation, and the residuals ``(W, N)`` at the measured initial states."""
+        """The linearization, and the residuals ``(W, N)`` at the measured initial states."""
         m = self.chart.size
         (residual,), (known,) = self.residuals([variant])
         changes = self.changes(variant, residual, [variant] * m, np.eye(m)[:, None])
@@ -318,7 +318,7 @@ def cost_of(
 
     Args:
         projected: the residuals.
-        linear: the linearisation in the initial states.
+        linear: the linearization in the initial states.
         degrees: degrees of freedom of all windows.
         caps: factors of the windows' residuals, ``(W,)``.
         tail: of :meth:`Evidence.tail`; then a window with as much as noise makes still costs its degrees of freedom.

@@ -54,7 +54,7 @@ def dof_names(model: mujoco.MjModel) -> list[str]:
 
 
 def force_unit(model: mujoco.MjModel, dof: int) -> str:
-    """Return the unit of the generalised force on a degree of freedom."""
+    """Return the unit of the generalized force on a degree of freedom."""
     (joint, offset), kinds = _joint_of(model, dof), mujoco.mjtJoint
     kind = int(model.jnt_type[joint])
     return "N" if kind == int(kinds.mjJNT_SLIDE) or (kind == int(kinds.mjJNT_FREE) and offset < 3) else "N·m"
@@ -102,7 +102,7 @@ def regime(setting: Setting, free: FreeForces, dof: int, rules: Shown = SHOWN) -
     """Return what the missing force of a degree of freedom goes with; the velocity without words if with nothing.
 
     Each explanation is a regression over the windows of one trajectory; a t-test over trajectories says whether its
-    slope has a sign at all, so that neighbouring samples do not count as independent.
+    slope has a sign at all, so that neighboring samples do not count as independent.
     """
     found = regressors(setting, free.windows, dof)
     best, most = replace(found[1], words=""), 0.0

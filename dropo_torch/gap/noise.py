@@ -1,6 +1,6 @@
 """The noise of the measurement, and where the simulated forces are wrong, from short windows with free forces.
 
-Over a few logged steps almost any missing effect looks like a generalised force that changes smoothly. A window is
+Over a few logged steps almost any missing effect looks like a generalized force that changes smoothly. A window is
 fitted with its initial state and a quadratic force of time for each degree of freedom left free, all to first order.
 What even this cannot explain is noise; the forces that it needed tell where the simulation is wrong, and when.
 """

@@ -139,7 +139,7 @@ class Residuals:
         label: the variable and its unit.
         unit: unit of the force.
         variable: its values, ``(N,)``.
-        before, after: missing generalised force without and with the effects, ``(N,)``.
+        before, after: missing generalized force without and with the effects, ``(N,)``.
     """
 
     title: str

@@ -167,7 +167,7 @@ class Cut:
         enough: windows of such a length that the log must have.
         rough: share of residuals whose variance, over noise on the initial states, stays unexplained, up to which a
             length will do.
-        bent: the share from which on windows are linearised statistically.
+        bent: the share from which on windows are linearized statistically.
         astray: typical error at a window's end, relative to the motion, from which on contacts come at other times than
             measured.
     """

@@ -135,7 +135,7 @@ class Twin:
             windows: the stretches of the log.
             starts: observed columns at the starts as the sensors would show them, ``(W, n)`` for all variants or
                 ``(K, W, n)``; the measured ones by default.
-            pushes: generalised forces in every logged step, ``(K, L, nv)``, the same in all windows; none by default.
+            pushes: generalized forces in every logged step, ``(K, L, nv)``, the same in all windows; none by default.
 
         Returns:
             What the sensors would show, ``(K, W, L + 1, n)``, NaN where a simulation diverged, and which entries

@@ -39,14 +39,14 @@ PLAIN = re.compile(
     "projection|colorspace|data|policy|interp|passive|selfcollide|activelayers|simple|sameframe|plasticmode|attr)$"
 )
 #: Fields of bodies that MuJoCo takes for granted where it has compiled the body as simple.
-CENTRES = ("body_ipos", "body_iquat")
+CENTERS = ("body_ipos", "body_iquat")
 
 
 def load_model(model: mujoco.MjModel | str | Path, *, general: bool = False) -> mujoco.MjModel:
     """Return ``model``, compiled from MJCF, URDF or MJB when it is a path.
 
-    With ``general``, a free body whose centre of mass is its frame's is compiled without MuJoCo's short cuts for such
-    bodies, so that the centre and the axes may move.
+    With ``general``, a free body whose center of mass is its frame's is compiled without MuJoCo's short cuts for such
+    bodies, so that the center and the axes may move.
 
     Raises:
         InputError: a missing file, or one that MuJoCo does not compile, with MuJoCo's reason.
@@ -128,7 +128,7 @@ def checked(model: mujoco.MjModel, where: str) -> mujoco.MjModel:
 
 
 def unsimplify(spec: mujoco.MjSpec) -> None:
-    """Let every body's centre and axes move after compilation."""
+    """Let every body's center and axes move after compilation."""
     for body in spec.bodies[1:]:
         body.simple = 0
 

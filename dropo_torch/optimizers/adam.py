@@ -1,4 +1,4 @@
-"""Adam on φ with reparameterised samples, for simulators that differentiate.
+"""Adam on φ with reparameterized samples, for simulators that differentiate.
 
 Adam (Kingma and Ba 2015) gives every coordinate a rate of its own, which is slow where parameters trade off against
 each other: the valley of the likelihood then lies across the coordinates. As in SOAP (Vyas et al. 2024), Adam
@@ -30,7 +30,7 @@ _WARM_UP = 10
 #: Standard errors by which residuals must exceed their covariance for σ to leave its floor at once.
 _SIGNIFICANCE = 3.0
 #: Steps after which the noise of the initial states is propagated anew, at the current μ.
-_RELINEARISE = 100
+_RELINEARIZE = 100
 
 
 class AdamOptimizer(LikelihoodOptimizer):
@@ -77,8 +77,8 @@ class AdamOptimizer(LikelihoodOptimizer):
 
     def ask(self) -> Request:
         """Return a minibatch of transitions, with the gradient wanted or, at a refresh, for the Gauss-Newton matrix."""
-        if self._noisy and self._step % _RELINEARISE == 0:
-            self._linearised = self._box.denormalise(self._phi)[0]
+        if self._noisy and self._step % _RELINEARIZE == 0:
+            self._linearised = self._box.denormalize(self._phi)[0]
         if self._is_refresh_due:
             stage = self._means_stage()
             return Request(
@@ -131,7 +131,7 @@ class AdamOptimizer(LikelihoodOptimizer):
     def candidates(self) -> list[tuple[np.ndarray, np.ndarray]]:
         """Return the last φ, and the last at which no more diverged than anywhere."""
         last = [self._phi] if np.array_equal(self._phi, self._stable) else [self._phi, self._stable]
-        return [self._box.denormalise(phi) for phi in last]
+        return [self._box.denormalize(phi) for phi in last]
 
     @property
     def _is_joint(self) -> bool:
@@ -191,7 +191,7 @@ class AdamOptimizer(LikelihoodOptimizer):
         if self._is_new_stage:
             self._first, self._second, self._smoothed = np.zeros(2 * d), np.zeros(2 * d), math.nan
             guess = stage.first_std(self._box, significance=_SIGNIFICANCE)
-            self._phi = np.concatenate([self._phi[:d], self._box.normalise(stage.point, guess)[d:]])
+            self._phi = np.concatenate([self._phi[:d], self._box.normalize(stage.point, guess)[d:]])
         self._basis, self._refreshed = basis, self._step
 
     def _values(self, phi: torch.Tensor) -> torch.Tensor:
@@ -213,14 +213,14 @@ class AdamOptimizer(LikelihoodOptimizer):
 
     def _means_stage(self) -> MeansStage:
         """The stencil around μ, and what its sums say."""
-        return MeansStage(self._box.low, self._box.high, self._box.denormalise(self._phi)[0])
+        return MeansStage(self._box.low, self._box.high, self._box.denormalize(self._phi)[0])
 
     def _normal_equations(self, stage: MeansStage) -> Reduce:
         """The stencil's reduction; a σ that moves counts as covariance, by the linear model."""
         plain = stage.reduction()
         if not self._is_joint or self._is_new_stage:
             return plain
-        spread = torch.from_numpy(self._box.denormalise(self._phi)[1])
+        spread = torch.from_numpy(self._box.denormalize(self._phi)[1])
         steps = torch.from_numpy(np.diag(stage.points()[1:] - stage.point).copy())
 
         def reduce(features: torch.Tensor, measured: torch.Tensor, covariance: torch.Tensor) -> torch.Tensor:

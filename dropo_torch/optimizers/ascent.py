@@ -19,7 +19,7 @@ LEAST_RAISED = 0.05
 
 @dataclass
 class Ascent(abc.ABC):
-    """A stage that maximises a likelihood over μ and log σ, and where it stands.
+    """A stage that maximizes a likelihood over μ and log σ, and where it stands.
 
     Attributes:
         box: bounds of μ and σ in coordinates.

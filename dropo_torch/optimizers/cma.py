@@ -1,4 +1,4 @@
-"""CMA-ES over normalised φ, as in the paper, by pycma."""
+"""CMA-ES over normalized φ, as in the paper, by pycma."""
 
 from __future__ import annotations
 
@@ -156,7 +156,7 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
         generation = self._generation()
         if self._noisy and self._best_phi is not None:
             generation = np.concatenate([generation, self._best_phi[None]])
-        mean, std = self._box.denormalise(generation)
+        mean, std = self._box.denormalize(generation)
         settings = self._settings
         draw = 0 if settings.common_random_numbers else self._search.countiter
         uniforms = draw_uniforms(settings.samples, len(self._space), settings.seed, 1, draw)
@@ -172,7 +172,7 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
         """Rank the generation by its log-likelihoods."""
         every, count = sums.reshape(5, -1).numpy(), len(self._generation())
         points = np.array([*self._generation(), self._best_phi][: every.shape[1]])
-        values = every[0] + self._settings.entropy * np.log(self._box.denormalise(points)[1]).sum(-1)
+        values = every[0] + self._settings.entropy * np.log(self._box.denormalize(points)[1]).sum(-1)
         if len(points) > count:  # the best so far, under the noise of this generation
             self._best = (-every[4, -1], values[-1])
         best = int(np.lexsort((values, -every[4]))[-1])
@@ -196,8 +196,8 @@ class CMAOptimizer(Evolution, LikelihoodOptimizer):
         found = [np.asarray(self._search.result.xfavorite)]
         if self._best_phi is not None:
             found.append(self._best_phi)
-        return [self._box.denormalise(phi) for phi in found]
+        return [self._box.denormalize(phi) for phi in found]
 
     def _center(self) -> np.ndarray:
         """Return μ of the search distribution, in coordinates."""
-        return self._box.denormalise(np.asarray(self._search.mean))[0]
+        return self._box.denormalize(np.asarray(self._search.mean))[0]

@@ -1,4 +1,4 @@
-"""A full covariance of p_φ: expectation-maximisation after Fisher scoring.
+"""A full covariance of p_φ: expectation-maximization after Fisher scoring.
 
 With the next state linear in the parameters around μ, the parameters of each transition are a random effect:
 r_t = A_t (ξ_t − μ) + noise, ξ_t ~ N(μ, C). The likelihood depends on the log through G_t = A_tᵀΣ_t⁻¹A_t and
@@ -19,7 +19,7 @@ from dropo_torch.optimizers.gauss_newton import MeansStage
 from dropo_torch.optimizers.settings import FitSettings
 from dropo_torch.parameters import ParameterSpace
 
-#: Times that the simulation is linearised anew, at most.
+#: Times that the simulation is linearized anew, at most.
 _ROUNDS = 5
 _ITERATIONS = 500
 #: The means have converged when no round moves them by more than this share of their box.
@@ -31,7 +31,7 @@ def random_effects(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """Return the covariance C ``(d, d)`` and the shift of μ ``(d,)`` that make the residuals most likely.
 
-    With ``entropy`` β, the log-likelihood plus ½ β log det C is maximised: each step's C is larger by T / (T − β).
+    With ``entropy`` β, the log-likelihood plus ½ β log det C is maximized: each step's C is larger by T / (T − β).
 
     Args:
         gram: G_t, ``(T, d, d)``.
@@ -48,8 +48,8 @@ def random_effects(
         inner = 0.5 * (inner + inner.mT)
         means = (inner @ (force - gram @ total)[..., None])[..., 0]
         shift = means.mean(0)
-        centred = means - shift
-        updated = wider * (inner.mean(0) + centred.T @ centred / len(means))
+        centered = means - shift
+        updated = wider * (inner.mean(0) + centered.T @ centered / len(means))
         within = updated.diagonal().clamp(min=1.0).rsqrt()
         updated = updated * torch.outer(within, within)
         change = (updated - covariance).abs().max() / covariance.diagonal().max().clamp(min=1e-300)
@@ -73,7 +73,7 @@ class CorrelatedOptimizer(FisherOptimizer):
         self._gathered: list[tuple[torch.Tensor, torch.Tensor]] = []
 
     def ask(self) -> Request:
-        """Return the points of the stage at work, or the stencil that linearises the simulation."""
+        """Return the points of the stage at work, or the stencil that linearizes the simulation."""
         if super().stop_reason is None:
             return super().ask()
         stage = MeansStage(self._box.low, self._box.high, self._at)
@@ -88,7 +88,7 @@ class CorrelatedOptimizer(FisherOptimizer):
         )
 
     def tell(self, sums: torch.Tensor, gradient: torch.Tensor | None = None) -> None:
-        """Hand the sums to the stage at work, or maximise over μ and C."""
+        """Hand the sums to the stage at work, or maximize over μ and C."""
         if super().stop_reason is None:
             super().tell(sums, gradient)
             return
@@ -135,11 +135,11 @@ class CorrelatedOptimizer(FisherOptimizer):
 
     @property
     def _at(self) -> np.ndarray:
-        """Where the simulation is linearised, in coordinates, ``(d,)``."""
+        """Where the simulation is linearized, in coordinates, ``(d,)``."""
         return self.candidates()[0][0] if self._center is None else self._center
 
     def _first_guess(self) -> np.ndarray:
-        """A diagonal covariance wider than the scoring's: from a point, expectation-maximisation never leaves."""
+        """A diagonal covariance wider than the scoring's: from a point, expectation-maximization never leaves."""
         return np.diag(np.maximum(1.5 * self.candidates()[0][1], self._box.width / 200) ** 2)
 
     def _gather(self, points: np.ndarray) -> Reduce:

@@ -36,7 +36,7 @@ class FisherOptimizer(LikelihoodOptimizer):
     refitted until convergence; the scoring then works on that covariance. Where the
     simulation bends within the distribution, the scoring goes on over ``samples`` samples.
 
-    With ``entropy`` β, the scoring maximises the log-likelihood plus β Σ log σ: the entropy of p_φ but for a
+    With ``entropy`` β, the scoring maximizes the log-likelihood plus β Σ log σ: the entropy of p_φ but for a
     constant, as in E-DROPO (arXiv 2506.10133). It keeps σ open where the log alone would close it.
 
     Args:

@@ -28,7 +28,7 @@ STARTS = 16
 
 @dataclass
 class MeansStage:
-    """Minimises Σ rᵀC⁻¹r over μ inside its box, or a robust sum, by which no transition counts for all others.
+    """Minimizes Σ rᵀC⁻¹r over μ inside its box, or a robust sum, by which no transition counts for all others.
 
     Attributes:
         low, high: the box of μ in coordinates, ``(d,)``.

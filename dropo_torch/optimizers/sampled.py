@@ -21,7 +21,7 @@ from dropo_torch.optimizers.ascent import Ascent
 
 @dataclass
 class SampledStage(Ascent):
-    """Maximises the sampled likelihood on fixed base uniforms.
+    """Maximizes the sampled likelihood on fixed base uniforms.
 
     Attributes:
         uniforms: base uniforms, ``(K, d)``.
@@ -74,12 +74,12 @@ def sampled_scores(
     features, measured, covariance, lost = survivors(features, measured, covariance)
     mean, sampled = sample_moments(features)
     total = sampled + covariance
-    residual, centred = measured - mean, features - mean[:, None]
+    residual, centered = measured - mean, features - mean[:, None]
     value = gaussian_log_density(residual, total).sum()
     slope, bend = _regress(features, z)
     solved = torch.linalg.solve(total, residual[..., None])  # C⁻¹ r
-    pull = torch.linalg.solve(total, centred.mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
-    along = centred @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
+    pull = torch.linalg.solve(total, centered.mT).mT  # C⁻¹ (s_k − s̄), (t, K, m)
+    along = centered @ solved  # (s_k − s̄)ᵀ C⁻¹ r, (t, K, 1)
     # ∂ log N / ∂ s_k, with C's and s̄'s dependence on the samples (eq. 2)
     force = (along * solved.mT - pull) / (num_samples - 1) + solved.mT / num_samples
     flat = torch.einsum("tkm,tdm->tkd", force, slope) + torch.einsum("tkm,tdm->tkd", force, bend) * z
@@ -89,7 +89,7 @@ def sampled_scores(
     v = z.var(0)
     fisher_mean = gram.sum(0) / torch.outer(std, std)
     fisher_log = 2 * torch.outer(v, v) * gram.square().sum(0)
-    distance = (centred * pull).sum(-1)  # (s_k − s̄)ᵀ C⁻¹ (s_k − s̄), (t, K)
+    distance = (centered * pull).sum(-1)  # (s_k − s̄)ᵀ C⁻¹ (s_k − s̄), (t, K)
     influence = (along[..., 0] + 0.5 * (along[..., 0].square() - distance)).sum(0)
     parts = (value, lost, score_mean, score_log, fisher_mean, fisher_log, influence)
     return torch.cat([p.flatten() for p in parts])

@@ -23,7 +23,7 @@ MUCH_BENDING = 1.0
 
 @dataclass
 class SigmaPointStage(Ascent):
-    """Maximises the sigma-point likelihood."""
+    """Maximizes the sigma-point likelihood."""
 
     TITLE = "Fisher scoring on sigma points"
     BEGUN_AT = 0.4

@@ -1,4 +1,4 @@
-"""What a log, or a planned one, tells of the parameters: Fisher information of the likelihood that a fit maximises."""
+"""What a log, or a planned one, tells of the parameters: Fisher information of the likelihood that a fit maximizes."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def information_of(objective: Objective, point: np.ndarray, *, quick: bool = Fal
         point: parameters in coordinates, ``(d,)``.
         quick: propagate the noise of initial states to first order, by one simulation a column.
     """
-    jacobian, covariance, carried = _linearised(objective, point, quick)
+    jacobian, covariance, carried = _linearized(objective, point, quick)
     pull = torch.linalg.solve(covariance, jacobian.mT)
     each = torch.nan_to_num(jacobian @ pull)
     pull = torch.nan_to_num(pull)
@@ -112,7 +112,7 @@ def inefficiency(size: int) -> float:
     return float((weight**2 * chi2 / size).mean() / (weight + 2 * chi2 * slope / size).mean() ** 2)
 
 
-def _linearised(
+def _linearized(
     objective: Objective, point: np.ndarray, quick: bool
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
     """Derivatives of the features ``(T, d, m)``, their covariance ``(T, m, m)``, and what noise carries over."""

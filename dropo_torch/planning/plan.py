@@ -213,7 +213,7 @@ def make_plan(
 ) -> Plan:
     """Return the motion that tells most of the parameters, with what is known of them, within all limits.
 
-    It maximises the determinant of the information of the log so far and of the motion together; or, to tell tied
+    It maximizes the determinant of the information of the log so far and of the motion together; or, to tell tied
     effects apart, their least separation. Limits are kept by the model at the point, and by others that the bounds and
     the log leave possible.
 

@@ -15,13 +15,13 @@ from dropo_torch.parameters import object_names
 from dropo_torch.proposal.places import command_kind
 from dropo_torch.support.rows import evenly
 
-Kind = Literal["mass", "damping", "friction", "armature", "stiffness", "gain", "contact", "softness", "centre", "gear"]
+Kind = Literal["mass", "damping", "friction", "armature", "stiffness", "gain", "contact", "softness", "center", "gear"]
 
 #: A joint's friction, damping and rotor inertia that count, as a share of its typical force, force by speed, inertia.
 TYPICAL = 0.1
 #: The largest of them, in the same units, and as multiples of the model's own.
 MOST, MULTIPLE = 1.0, 3.0
-#: How far a centre of mass may lie from the model's, in radii of gyration.
+#: How far a center of mass may lie from the model's, in radii of gyration.
 AWAY = 0.5
 #: Share of the largest joint speed of its kind below which a joint stands still.
 STILL = 1e-3
@@ -65,7 +65,7 @@ def all_candidates(setting: Setting, states: np.ndarray) -> tuple[Candidate, ...
     model = setting.model
     found = [*_masses(model), *_joints(setting), *_actuators(model), *_tendons(model)]
     found += _contacts(model, states)
-    return tuple(_unique([*found, *_centres(model)]))
+    return tuple(_unique([*found, *_centers(model)]))
 
 
 def _unique(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -122,7 +122,7 @@ def _masses(model: mujoco.MjModel) -> list[Candidate]:
     return found
 
 
-def _centres(model: mujoco.MjModel) -> list[Candidate]:
+def _centers(model: mujoco.MjModel) -> list[Candidate]:
     names, found = object_names(model, "body"), []
     for members in _rigid(model).values():
         if len(members) > 1:
@@ -138,7 +138,7 @@ def _centres(model: mujoco.MjModel) -> list[Candidate]:
                 "bounds": [rounded(own - AWAY * radius), rounded(own + AWAY * radius)], "unit": "m",
             }  # fmt: skip
             found.append(Candidate(
-                f"{_word(names[b])}_centre_{axis}", "centre", spec, own, AWAY * radius,
+                f"{_word(names[b])}_centre_{axis}", "center", spec, own, AWAY * radius,
                 "half a radius of gyration to either side of the model's",
             ))  # fmt: skip
     return found

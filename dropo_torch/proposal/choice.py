@@ -19,7 +19,7 @@ CERTAIN = 0.1
 #: How readily a candidate is left out: what models have right more often goes first.
 READINESS: dict[Kind, float] = {
     "mass": 1.0, "damping": 0.8, "friction": 0.7, "armature": 1.1, "stiffness": 1.0, "gain": 1.2, "contact": 0.8,
-    "softness": 2.0, "centre": 3.0, "gear": 6.0,
+    "softness": 2.0, "center": 3.0, "gear": 6.0,
 }  # fmt: skip
 #: Share of a candidate's effect that the chosen ones make up for, from which on they are confused with it.
 EXPLAINED = 0.9
@@ -55,7 +55,7 @@ class Told:
     def percent(self) -> float:
         """The error relative to the model's value, or where that is 0 to the size that matters, as a share."""
         own = abs(self.candidate.nominal)
-        return self.error / (own if own > 0 and self.candidate.kind != "centre" else self.candidate.size)
+        return self.error / (own if own > 0 and self.candidate.kind != "center" else self.candidate.size)
 
     @property
     def is_in(self) -> bool:
@@ -150,12 +150,12 @@ def choose(candidates: Sequence[Candidate], gram: np.ndarray, forced: Sequence[s
 
 def _errors(gram: np.ndarray, kept: Sequence[int]) -> np.ndarray:
     """Standard errors of some candidates, fitted together, in their sizes; infinite along what does nothing."""
-    scale, values, vectors = _normalised(gram[np.ix_(kept, kept)])
+    scale, values, vectors = _normalized(gram[np.ix_(kept, kept)])
     variance = (vectors**2) @ (1 / np.where(values > ACCURACY, values, NOTHING))
     return np.asarray(np.sqrt(variance) / scale)
 
 
-def _normalised(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _normalized(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Scales with which an information matrix has a diagonal of 1, and its eigenvalues and vectors then."""
     scale = np.sqrt(np.maximum(np.diag(part), 1e-300))
     return (scale, *np.linalg.eigh(part / np.outer(scale, scale)))
@@ -163,7 +163,7 @@ def _normalised(part: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 def _inverse(part: np.ndarray) -> np.ndarray:
     """The inverse of an information matrix, without what does nothing."""
-    scale, values, vectors = _normalised(part)
+    scale, values, vectors = _normalized(part)
     known = values > ACCURACY
     return np.asarray((vectors[:, known] / values[known]) @ vectors[:, known].T / np.outer(scale, scale))
 

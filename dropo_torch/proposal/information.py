@@ -153,7 +153,7 @@ def information_of(
 
 
 def _worth(gram: np.ndarray) -> float:
-    """Nats that are learnt beside a prior of the candidates' sizes, up to what is known finely enough."""
+    """Nats that are learned beside a prior of the candidates' sizes, up to what is known finely enough."""
     values = np.maximum(np.linalg.eigvalsh(gram), 0.0)
     return float(-0.5 * np.log(1 / (1 + values) + FINE**2).sum())
 

@@ -115,7 +115,7 @@ def _left(told: Told) -> str:
 
 def error_text(told: Told) -> str:
     """Return the error to expect of a parameter: in percent of the model's value, or in its unit where that is 0."""
-    if told.candidate.nominal and told.candidate.kind != "centre":
+    if told.candidate.nominal and told.candidate.kind != "center":
         return f"{100 * told.percent:.2g} %"
     return f"{told.error:.2g} {told.candidate.unit}".rstrip()
 

@@ -9,7 +9,7 @@ from dropo_torch.report.figures.compare import cost_panel
 from dropo_torch.report.page import Frame, write_page
 from dropo_torch.studies.compare import Comparison
 
-_COLOURS = ("#0072b2", "#56b4e9", "#009e73", "#d55e00", "#e69f00", "#cc79a7")
+_COLORS = ("#0072b2", "#56b4e9", "#009e73", "#d55e00", "#e69f00", "#cc79a7")
 
 
 def write_compare_report(path: str | Path, comparison: Comparison, **frame: Unpack[Frame]) -> None:
@@ -21,13 +21,13 @@ def write_compare_report(path: str | Path, comparison: Comparison, **frame: Unpa
         frame: title, config and versions: :class:`~dropo_torch.report.page.Frame`.
     """
     runs = comparison.runs
-    colours = dict(zip(dict.fromkeys(run.method for run in runs), _COLOURS, strict=False))
+    colors = dict(zip(dict.fromkeys(run.method for run in runs), _COLORS, strict=False))
     best = max(run.log_likelihood for run in runs)
     content = {
         "title": "Comparison of optimizers",
-        "colours": colours,
+        "colors": colors,
         "panels": [
-            cost_panel(runs, colours, best, cost=cost, shown=shown)
+            cost_panel(runs, colors, best, cost=cost, shown=shown)
             for shown in ("shortfall", "error")
             for cost in ("simulated_transitions", "seconds")
         ],

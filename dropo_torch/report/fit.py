@@ -26,7 +26,7 @@ TAGS = {"explained": "✓ Explained", "not_explained": "! Not fully explained", 
 MAX_COLUMNS = 24
 #: Transitions in the traces of measured and simulated next states.
 TRACE_LENGTH = 100
-#: Pairs of inseparable parameters that are spelt out.
+#: Pairs of inseparable parameters that are spelled out.
 MAX_PAIRS = 10
 #: Draws of a mixture in each pair's panel, and panels.
 PAIR_DRAWS = 300
@@ -80,16 +80,16 @@ def write_fit_report(
 
 def shown_columns(diagnostics: Diagnostics, most: int = MAX_COLUMNS) -> list[int]:
     """Return the columns that get figures: all, or the worst explained, in the log's order."""
-    standardised = np.nan_to_num(words.column_rms(diagnostics), nan=np.inf)
-    return sorted(int(i) for i in np.argsort(-standardised, kind="stable")[:most])
+    standardized = np.nan_to_num(words.column_rms(diagnostics), nan=np.inf)
+    return sorted(int(i) for i in np.argsort(-standardized, kind="stable")[:most])
 
 
-def worst_stretch(standardised: np.ndarray, length: int = TRACE_LENGTH) -> slice:
-    """Return the stretch ``length`` long over which standardised residuals ``(T, m)`` are largest."""
-    count = len(standardised)
+def worst_stretch(standardized: np.ndarray, length: int = TRACE_LENGTH) -> slice:
+    """Return the stretch ``length`` long over which standardized residuals ``(T, m)`` are largest."""
+    count = len(standardized)
     if count <= length:
         return slice(0, count)
-    size = np.nan_to_num(np.minimum(standardised**2, 1e6), nan=1e6).sum(1)  # a diverged entry counts, boundedly
+    size = np.nan_to_num(np.minimum(standardized**2, 1e6), nan=1e6).sum(1)  # a diverged entry counts, boundedly
     total = np.concatenate([[0.0], np.cumsum(size)])
     start = int(np.argmax(total[length:] - total[:-length]))
     return slice(start, start + length)
@@ -167,7 +167,7 @@ def _posterior(fit: Fit) -> dict[str, Any]:
 
 def _columns(diagnostics: Diagnostics) -> dict[str, Any]:
     """Table, traces and residual panels of the compared columns."""
-    z, size = words.standardised_residual(diagnostics), words.column_rms(diagnostics)
+    z, size = words.standardized_residual(diagnostics), words.column_rms(diagnostics)
     limit = words.unexplained_above(diagnostics)
     both = (np.where(np.isfinite(z), v, np.nan) for v in (diagnostics.residual, diagnostics.expected))
     residual, expected = map(words.root_mean_square, both)
@@ -222,7 +222,7 @@ def _convergence(fit: Fit) -> dict[str, Any]:
     means = (np.array([entry.mean for entry in history]) - box.low) / box.width
     stds = np.array([entry.std for entry in history]) / box.width
     shortfall = _shortfall(history, spans)
-    colours = _line_colours(means)
+    colors = _line_colors(means)
     cost = np.array([float(entry.simulated_transitions) for entry in history])
     seconds = np.array([entry.seconds for entry in history])
     changes = [0.0 if i == 0 else float(cost[i - 1]) for i in begins]
@@ -234,13 +234,13 @@ def _convergence(fit: Fit) -> dict[str, Any]:
             "Log-likelihood": panel(
                 shortfall, [BLUE] * len(spans), label="nats below the best", log=True, upside_down=True
             ),
-            "Means": panel(means, colours, label="0, 1: ends of search box", limits=(-0.04, 1.04), marks=(0, 1)),
+            "Means": panel(means, colors, label="0, 1: ends of search box", limits=(-0.04, 1.04), marks=(0, 1)),
             "Standard deviations": panel(
-                stds, colours, label="share of search box", log=True, limits=(5e-6, 0.5), marks=(0.25,)
+                stds, colors, label="share of search box", log=True, limits=(5e-6, 0.5), marks=(0.25,)
             ),
         },
-        "legend": [(name, colour) for name, colour in zip(names, colours, strict=True) if colour != FAINT],
-        "others": colours.count(FAINT),
+        "legend": [(name, color) for name, color in zip(names, colors, strict=True) if color != FAINT],
+        "others": colors.count(FAINT),
     }
 
 
@@ -254,13 +254,13 @@ def _shortfall(history: Sequence[HistoryEntry], spans: Sequence[tuple[int, int]]
     return np.where(stage[:, None] == stages, gap[:, None], np.nan)
 
 
-def _line_colours(means: np.ndarray) -> list[str]:
-    """Colours of the parameters whose means moved most; the others are faint."""
+def _line_colors(means: np.ndarray) -> list[str]:
+    """Colors of the parameters whose means moved most; the others are faint."""
     moved = np.nan_to_num(np.ptp(means, axis=0))
-    colours = [FAINT] * means.shape[1]
-    for colour, i in zip(PALETTE, sorted(np.argsort(-moved, kind="stable")[: len(PALETTE)]), strict=False):
-        colours[i] = colour
-    return colours
+    colors = [FAINT] * means.shape[1]
+    for color, i in zip(PALETTE, sorted(np.argsort(-moved, kind="stable")[: len(PALETTE)]), strict=False):
+        colors[i] = color
+    return colors
 
 
 def _identifiability(fit: Fit, diagnostics: Diagnostics) -> dict[str, Any]:

@@ -63,7 +63,7 @@ def short(value: float) -> str:
 
 
 def rms(value: float) -> str:
-    """Return a standardised root mean square, to what matters of it."""
+    """Return a standardized root mean square, to what matters of it."""
     if not np.isfinite(value):
         return "n/a"
     return f"{value:.2f}" if 0.095 <= value < 10 else f"{value:.2g}" if value < 10 else number(round(value, 0), 1.0)

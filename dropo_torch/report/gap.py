@@ -84,7 +84,7 @@ def _scores(gap: Gap, named: bool) -> list[tuple[str, str, Any]]:
 
 
 def _residual(residuals: Residuals, named: bool) -> list[tuple[str, str, Any]]:
-    """Name, colour and figure of one missing force, before and after, on the same axes."""
+    """Name, color and figure of one missing force, before and after, on the same axes."""
     of = (residuals.variable, residuals.before, residuals.after)
     variable, before, after = (np.asarray(v, dtype=float).ravel() for v in of)
     clouds = [("Before", ORANGE, before)]
@@ -93,8 +93,8 @@ def _residual(residuals: Residuals, named: bool) -> list[tuple[str, str, Any]]:
     frame = force_frame(variable, *(force for *_, force in clouds))
     label = f"missing force{f' ({residuals.unit})' if residuals.unit else ''}"
     return [
-        (name, colour, force_panel(variable, force, frame, residuals.label, label, colour))
-        for name, colour, force in clouds
+        (name, color, force_panel(variable, force, frame, residuals.label, label, color))
+        for name, color, force in clouds
     ]
 
 

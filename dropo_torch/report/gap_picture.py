@@ -13,7 +13,7 @@ import numpy as np
 
 from dropo_torch.gap.result import Course, Gap
 from dropo_torch.report import gap_words as words
-from dropo_torch.report.figures.drawing import BLUE, CLOUD, GREY, INK, ORANGE, new_axes, new_figure
+from dropo_torch.report.figures.drawing import BLUE, CLOUD, GRAY, INK, ORANGE, new_axes, new_figure
 from dropo_torch.report.figures.gap import draw_course
 from dropo_torch.support.files import write_atomically
 
@@ -49,11 +49,11 @@ def _say(figure: Any, gap: Gap) -> float:
     said += [] if gap.remaining is None else [f"They do not explain everything: {words.left(gap.remaining)}."]
     lines = [(line, 23, "bold", INK) for line in textwrap.wrap(headline, 74)]
     lines += [(line, 15, "normal", INK) for line in _listed(items)]
-    lines += [(line, 13, "normal", GREY) for text in said for line in textwrap.wrap(text, 146)]
+    lines += [(line, 13, "normal", GRAY) for text in said for line in textwrap.wrap(text, 146)]
     height = HEIGHT - 30.0
-    for text, size, weight, colour in lines:
+    for text, size, weight, color in lines:
         height -= 1.5 * size
-        figure.text(48 / WIDTH, height / HEIGHT, text, size=size, weight=weight, color=colour, va="bottom")
+        figure.text(48 / WIDTH, height / HEIGHT, text, size=size, weight=weight, color=color, va="bottom")
     return height - 24
 
 
@@ -82,8 +82,8 @@ def _draw(figure: Any, gap: Gap, height: float) -> None:
     legend = [("measured", CLOUD), ("model as given" if named else "your model", ORANGE)]
     legend += [("with what was missing", BLUE)] if named else []
     place = 84.0
-    for text, colour in legend:
-        figure.text(place / WIDTH, (height - 12) / HEIGHT, text, size=15, weight="bold", color=colour, va="center")
+    for text, color in legend:
+        figure.text(place / WIDTH, (height - 12) / HEIGHT, text, size=15, weight="bold", color=color, va="center")
         place += 9.2 * len(text) + 30
 
 

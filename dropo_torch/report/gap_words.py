@@ -264,7 +264,7 @@ def _closest(gap: Gap) -> str:
 
 
 def by_force(named: Sequence[NamedEffect]) -> list[str]:
-    """Return an item for each effect that forces tell; centres of mass that are only known together are one."""
+    """Return an item for each effect that forces tell; centers of mass that are only known together are one."""
     kinds = [e.effect for e in named]
     grouped = [e for e in named if any(effect == e.effect in kinds for effect, _ in e.indistinguishable_from)]
     items = []

@@ -84,7 +84,7 @@ def _column(match: Match) -> dict[str, Any]:
 
 def _parameter(told: Told) -> dict[str, Any]:
     c = told.candidate
-    relative = c.nominal != 0 and c.kind != "centre"
+    relative = c.nominal != 0 and c.kind != "center"
     low, high = c.spec["bounds"]
     return {
         "name": c.name, "where": _where(told), "own": plain(c.nominal), "unit": c.unit, "low": plain(low),

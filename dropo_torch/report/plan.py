@@ -46,7 +46,7 @@ def write_plan_report(path: str | Path, plan: Plan, *, video: str = "", **frame:
         ],
         "remarks": plan.remarks, "video": video,
         "bars": figures.error_bars(space.names, shares),
-        "keys": [(WORDS[kind], figures.COLOURS[kind]) for kind in errors],
+        "keys": [(WORDS[kind], figures.COLORS[kind]) for kind in errors],
         "kinds": [WORDS[kind] for kind in errors],
         "parameters": [_parameter(name, p, errors) for name, p in document["parameters"].items()],
         "commands": _commands(plan),

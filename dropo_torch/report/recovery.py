@@ -52,14 +52,14 @@ def write_recovery_study(
 
 
 def draw_recovery(
-    chosen: Sequence[Result], label: Callable[[Result], str], colours: Mapping[str, str], units: Mapping[str, str]
+    chosen: Sequence[Result], label: Callable[[Result], str], colors: Mapping[str, str], units: Mapping[str, str]
 ) -> Any:
-    """Draw the fitted normals of what varied over the realised ones; points as upright lines.
+    """Draw the fitted normals of what varied over the realized ones; points as upright lines.
 
     Args:
         chosen: one result a method, of one log.
         label: what a result's method is called.
-        colours: of the methods.
+        colors: of the methods.
         units: of the parameters, where they have one.
     """
     names = list(chosen[0]["fit"]["parameters"])
@@ -67,14 +67,14 @@ def draw_recovery(
     for i, name in enumerate(names):
         axes = panel(figure, i, len(names))
         truth = chosen[0]["truth"][name]
-        curves = {"realised": (truth["mean"], truth["std"])} | {
+        curves = {"realized": (truth["mean"], truth["std"])} | {
             label(r): (r["fit"]["parameters"][name]["mean"], drawn_std(r, name)) for r in chosen
         }
         reach = 3.5 * max(std for _, std in curves.values())
         for method, (mean, std) in curves.items():
             x, density = _bell(mean, std, 1e-2 * reach)
-            style = {"color": "#1f2933", "linestyle": "--", "zorder": 3} if method == "realised" else {}
-            axes.plot(x, density, **{"color": colours.get(method), "linewidth": 1.4, "label": method, **style})
+            style = {"color": "#1f2933", "linestyle": "--", "zorder": 3} if method == "realized" else {}
+            axes.plot(x, density, **{"color": colors.get(method), "linewidth": 1.4, "label": method, **style})
         centers = [mean for mean, _ in curves.values()]
         axes.set_xlim(min(centers) - reach, max(centers) + reach)
         axes.set_yticks([])

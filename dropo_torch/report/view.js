@@ -2,7 +2,7 @@
 (() => {
   const page = JSON.parse(document.getElementById("view-data").textContent);
   const floats = (text) => new Float32Array(Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer);
-  const times = floats(page.times), centres = floats(page.centres);
+  const times = floats(page.times), centers = floats(page.centers);
   const robots = page.robots.map((robot) => ({ ...robot, poses: floats(robot.poses), shown: true }));
   const takes = page.takes.map((take) => ({ ...take, residuals: floats(take.residuals) }));
   const { frames, bodies, labels, shapes, lines, camera, starts, worst } = page;
@@ -29,7 +29,7 @@
   const dot = (a, x, y, z) => a[0] * x + a[1] * y + a[2] * z;
   const projector = (canvas, frame) => {
     const { right, up, forward } = axes();
-    const [cx, cy, cz] = centres.subarray(3 * frame, 3 * frame + 3);
+    const [cx, cy, cz] = centers.subarray(3 * frame, 3 * frame + 3);
     const scale = Math.min(canvas.width / camera.width, canvas.height / camera.height);
     const project = (x, y, z) => {
       x -= cx; y -= cy; z -= cz;
@@ -168,7 +168,7 @@
         path += `L${x} ${height(value).toFixed(2)}`;
         last = windowOf[f];
       }
-      node("path", { d: path, stroke: take.colour }, svg);
+      node("path", { d: path, stroke: take.color }, svg);
     }
     cursors.push(node("line", { y1: 0, y2: HEIGHT, class: "cursor" }, svg));
     readings.push([...figure.querySelectorAll("output")]);

@@ -18,7 +18,7 @@ from dropo_torch.view.scene import Camera, Scene, aim, floor_lines, make_scene, 
 
 #: Fill, edge and opacity of the logged robot and of one or two simulated ones.
 GHOST = ("#1f2933", "#000000", 0.42)
-COLOURS = {1: ((BLUE, "#004a75"),), 2: ((ORANGE, "#8c3d00"), (BLUE, "#004a75"))}
+COLORS = {1: ((BLUE, "#004a75"),), 2: ((ORANGE, "#8c3d00"), (BLUE, "#004a75"))}
 #: Simulations as subjects of sentences.
 NAMES = {
     "before": "the model before", "after": "the model with what it lacked", "fitted": "the fitted model",
@@ -42,8 +42,8 @@ def write_view_page(
     """
     drawing, worst = _drawing(view), _worst(view)
     takes = [
-        {"name": take.name, "colour": colour, "residuals": packed(take.residuals)}
-        for take, (colour, _) in zip(view.takes, COLOURS[len(view.takes)], strict=True)
+        {"name": take.name, "color": color, "residuals": packed(take.residuals)}
+        for take, (color, _) in zip(view.takes, COLORS[len(view.takes)], strict=True)
     ]
     data = {
         "frames": len(view.times), "times": packed(view.times), "labels": view.labels, "takes": takes, "worst": worst,
@@ -74,12 +74,12 @@ def packed(array: np.ndarray) -> str:
 def _drawing(view: View) -> dict[str, Any]:
     """What the page draws: shapes, floors, poses and the camera; nothing for a simulator that is no MuJoCo model."""
     names = ["measured", *(take.name for take in view.takes)]
-    looks = [GHOST, *((*colours, 1.0) for colours in COLOURS[len(view.takes)])]
+    looks = [GHOST, *((*colors, 1.0) for colors in COLORS[len(view.takes)])]
     models = [take.candidate.model for take in view.takes]
     if models[-1] is None:
-        scene, centres = None, np.zeros((len(view.times), 3))
+        scene, centers = None, np.zeros((len(view.times), 3))
         frames = [np.zeros((len(view.times), 0, 7))] * len(names)
-        camera = Camera(90.0, 0.0, centres, 1.0, 1.0)
+        camera = Camera(90.0, 0.0, centers, 1.0, 1.0)
     else:
         scene = make_scene(models[-1])
         logged = poses(models[-1], scene, view.logged, view.controls)
@@ -94,7 +94,7 @@ def _drawing(view: View) -> dict[str, Any]:
         "bodies": 0 if scene is None else len(scene.bodies),
         "shapes": [] if scene is None else _shapes(models[-1], scene),
         "lines": [] if scene is None else [line.round(5).ravel().tolist() for line in floor_lines(models[-1], camera)],
-        "centres": packed(camera.centres),
+        "centers": packed(camera.centers),
         "camera": {key: getattr(camera, key) for key in ("azimuth", "elevation", "width", "height")},
     }  # fmt: skip
 

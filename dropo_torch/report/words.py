@@ -19,7 +19,7 @@ from dropo_torch.verdict import THRESHOLDS, Judgment, at_floor, at_largest_std, 
 from dropo_torch.verdict import column_rms as column_rms
 from dropo_torch.verdict import overall_rms as overall_rms
 from dropo_torch.verdict import root_mean_square as root_mean_square
-from dropo_torch.verdict import standardised_residual as standardised_residual
+from dropo_torch.verdict import standardized_residual as standardized_residual
 from dropo_torch.verdict import unexplained_above as unexplained_above
 
 #: A mean whose standard error exceeds this share of the search box is poorly identified.
@@ -252,15 +252,15 @@ def _several_peaks(fit: Fit) -> dict[str, list[str]]:
 
 def _residuals(diagnostics: Diagnostics) -> dict[str, list[str]]:
     """Columns whose residuals are too large, too small or not there."""
-    standardised, labels, limit = column_rms(diagnostics), diagnostics.labels, unexplained_above(diagnostics)
-    order = np.argsort(-np.nan_to_num(standardised, nan=-1))
+    standardized, labels, limit = column_rms(diagnostics), diagnostics.labels, unexplained_above(diagnostics)
+    order = np.argsort(-np.nan_to_num(standardized, nan=-1))
     drowned = [label for i, label in enumerate(labels) if _is_drowned(diagnostics, i)]
     return {
         "The model does not explain every column": [
-            f"{labels[i]} ({rms(standardised[i])})" for i in order if standardised[i] > limit
+            f"{labels[i]} ({rms(standardized[i])})" for i in order if standardized[i] > limit
         ],
         "Columns that barely count": [f"{len(drowned)} of {len(labels)} columns: {joined(drowned)}"] if drowned else [],
-        "Columns without a finite residual": list(compress(labels, ~np.isfinite(standardised))),
+        "Columns without a finite residual": list(compress(labels, ~np.isfinite(standardized))),
     }
 
 

@@ -58,7 +58,7 @@ class Learner(Stateful, ABC):
         self._seen.update(rollout["parameters"][..., : len(self._seen.mean)])
 
     def _features(self, observation: torch.Tensor, parameters: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """The actor's and the critic's normalised inputs."""
+        """The actor's and the critic's normalized inputs."""
         features = self.policy.normalizer(observation)
         return features, torch.cat([features, self._seen(parameters[..., : len(self._seen.mean)])], -1)
 

@@ -1,4 +1,4 @@
-"""A policy: networks over normalised observations, what maps these to actions, and the file that holds it."""
+"""A policy: networks over normalized observations, what maps these to actions, and the file that holds it."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from dropo_torch.support.given import reading
 
 SCHEMA = "dropo-torch/policy/1"
 Plain = Mapping[str, Any]
-#: Normalised inputs are cut off here: a rare large one must not throw the network.
+#: Normalized inputs are cut off here: a rare large one must not throw the network.
 CLIP = 10.0
 #: Least and largest logarithm of a state-dependent standard deviation.
 LOG_STD = (-5.0, 2.0)
@@ -56,7 +56,7 @@ class Normalizer(nn.Module):
         self.count += len(rows)
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Return normalised inputs ``(..., n)``, float32, cut off at ±:data:`CLIP`."""
+        """Return normalized inputs ``(..., n)``, float32, cut off at ±:data:`CLIP`."""
         variance = torch.where(self.count > 0, self.square / self.count.clamp(min=1) + 1e-8, 1.0)
         scaled = (values.double() - self.mean) / torch.sqrt(variance)
         return scaled.clamp(-CLIP, CLIP).float()

@@ -1,4 +1,4 @@
-"""Proximal policy optimization on batches of environments, with TorchRL's loss and generalised advantages."""
+"""Proximal policy optimization on batches of environments, with TorchRL's loss and generalized advantages."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class PPO(Learner):
 
     @torch.no_grad()
     def _prepared(self, rollout: TensorDict) -> TensorDict:
-        """Normalised inputs, advantages and value targets of all steps, batch ``(N · horizon,)``."""
+        """Normalized inputs, advantages and value targets of all steps, batch ``(N · horizon,)``."""
         following = rollout["next"]
         self._scale.update(following["reward"][..., 0], following["done"][..., 0])
         features, seen = self._features(rollout["observation"], rollout["parameters"])

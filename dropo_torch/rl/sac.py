@@ -82,7 +82,7 @@ class SAC(Learner):
 
     @torch.no_grad()
     def _batch(self) -> TensorDict:
-        """Remembered steps with inputs normalised by today's statistics."""
+        """Remembered steps with inputs normalized by today's statistics."""
         drawn = self._memory.sample().to(self._device)
         following = drawn["next"]
         features, seen = self._features(drawn["observation"], drawn["parameters"])

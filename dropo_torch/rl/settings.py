@@ -50,14 +50,14 @@ class TrainSettings(pydantic.BaseModel):
 
 
 class PPOSettings(TrainSettings):
-    """How PPO learns (Schulman et al. 2017), with generalised advantages.
+    """How PPO learns (Schulman et al. 2017), with generalized advantages.
 
     Attributes:
         horizon: steps of every environment between two updates.
         epochs: passes over them, fewer where the policy moves further than ``target_kl``.
         minibatch: steps of a gradient.
         anneal: the learning rate falls linearly to 0.
-        lambda_: of the generalised advantages; ``lambda`` in a config.
+        lambda_: of the generalized advantages; ``lambda`` in a config.
         clip: of the probability ratio.
         entropy: weight of the policy's entropy.
         target_kl: divergence from the policy that acted, after which no further epoch begins.

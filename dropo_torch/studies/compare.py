@@ -95,7 +95,7 @@ def compare(
     """Run every method on every seed.
 
     Args:
-        fit_with: ``fit_with(optimizer, backend, seed, threads=...)`` → the fit and the objective it maximised; where
+        fit_with: ``fit_with(optimizer, backend, seed, threads=...)`` → the fit and the objective it maximized; where
             there are several workers it is pickled.
         methods: of :data:`METHODS`.
         seeds: of the optimizers' random numbers.

@@ -90,7 +90,7 @@ def check_effect(
 
 
 def rig() -> mujoco.MjModel:
-    """Return the model on which effects are tried, its bodies ready for any mass and centre."""
+    """Return the model on which effects are tried, its bodies ready for any mass and center."""
     spec = mujoco.MjSpec.from_string(RIG)
     for body in spec.bodies[1:]:
         body.simple = 0

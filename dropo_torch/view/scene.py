@@ -74,13 +74,13 @@ class Camera:
 
     Attributes:
         azimuth, elevation: direction of view as MuJoCo has it, in degrees.
-        centres: point that is looked at in each frame, ``(F, 3)``.
+        centers: point that is looked at in each frame, ``(F, 3)``.
         width, height: of what must be seen there, in m, in the picture's directions.
     """
 
     azimuth: float
     elevation: float
-    centres: np.ndarray
+    centers: np.ndarray
     width: float
     height: float
 
@@ -145,7 +145,7 @@ def mesh_points(model: mujoco.MjModel, mesh: int) -> np.ndarray:
 
 
 def link_shapes(model: mujoco.MjModel, bodies: np.ndarray) -> list[Shape]:
-    """Return shapes of bodies without geoms: links to their children and centres of mass, and joints as balls."""
+    """Return shapes of bodies without geoms: links to their children and centers of mass, and joints as balls."""
     radius = THIN * max(float(model.stat.extent), 1e-3)
     found = []
     for body in bodies:
@@ -246,9 +246,9 @@ def aim(scene: Scene, logged: np.ndarray, *simulated: np.ndarray) -> Camera:
     seen = seen[(np.abs(seen) <= reach).all(-1)]
     low, high = seen.min(0) - radius, seen.max(0) + radius
     middle = middle + 0.5 * (low + high) @ sides
-    centres = np.stack([np.interp(np.arange(count), chosen, middle[:, axis]) for axis in range(3)], 1)
+    centers = np.stack([np.interp(np.arange(count), chosen, middle[:, axis]) for axis in range(3)], 1)
     width, height = (1 + 2 * MARGIN) * np.maximum(high - low, 0.25 * (high - low).max())
-    return Camera(azimuth, elevation, centres, float(width), float(height))
+    return Camera(azimuth, elevation, centers, float(width), float(height))
 
 
 def direction(points: np.ndarray) -> tuple[float, float]:
@@ -307,13 +307,13 @@ def floor_lines(model: mujoco.MjModel, camera: Camera, lift: float = 0.0) -> lis
         camera: what is looked at.
         lift: how far they lie above their surface, in m.
     """
-    data, centres, size = mujoco.MjData(model), camera.centres, max(camera.width, camera.height)
+    data, centers, size = mujoco.MjData(model), camera.centers, max(camera.width, camera.height)
     mujoco.mj_kinematics(model, data)
     found: list[np.ndarray] = []
     for geom in range(model.ngeom):
         frame = data.geom_xmat[geom].reshape(3, 3)
         if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_PLANE:
-            local = (centres - data.geom_xpos[geom]) @ frame
+            local = (centers - data.geom_xpos[geom]) @ frame
             lines = _grid(local[:, :2], size, model.geom_size[geom, :2])
         elif model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_HFIELD:
             lines = _relief(model, int(model.geom_dataid[geom]))
@@ -323,9 +323,9 @@ def floor_lines(model: mujoco.MjModel, camera: Camera, lift: float = 0.0) -> lis
     return found
 
 
-def _grid(centres: np.ndarray, size: float, ends: np.ndarray) -> list[np.ndarray]:
+def _grid(centers: np.ndarray, size: float, ends: np.ndarray) -> list[np.ndarray]:
     """Lines at round distances on a plane, around what is looked at and within the plane's ends."""
-    low, high = centres.min(0) - size, centres.max(0) + size
+    low, high = centers.min(0) - size, centers.max(0) + size
     low, high = (np.where(ends > 0, np.clip(v, -ends, ends), v) for v in (low, high))
     raw = float(np.max(high - low)) / LINES
     if not raw > 0:

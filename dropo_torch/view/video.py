@@ -22,8 +22,8 @@ from dropo_torch.view.scene import Scene, aim, floor_lines, make_scene, poses, s
 RATE, LEAST = 25, 4.0
 #: Speeds of which the fastest is taken that makes a video last long enough.
 SPEEDS = (1.0, 0.5, 0.25, 0.1, 0.05, 0.02, 0.01)
-#: Colours of the simulated robots: of the model that was improved, and of the last or only one.
-COLOURS = ((0.835, 0.369, 0.0, 1.0), (0.0, 0.447, 0.698, 1.0))
+#: Colors of the simulated robots: of the model that was improved, and of the last or only one.
+COLORS = ((0.835, 0.369, 0.0, 1.0), (0.0, 0.447, 0.698, 1.0))
 #: How much farther away a camera with perspective stands than one without.
 BACK = 1.15
 #: Width of a pane over its height.
@@ -91,10 +91,10 @@ def _drawing(view: View, models: list[mujoco.MjModel]) -> dict[str, Any]:
         "logged": logged[:, : model.nq],
         **{f"qpos{i}": take.states[shown][:, : model.nq] for i, take in enumerate(view.takes)},
         "mocap_pos": np.array([p for p, _ in mocap]), "mocap_quat": np.array([q for _, q in mocap]),
-        "centres": camera.centres, "direction": np.array([camera.azimuth, camera.elevation]),
+        "centers": camera.centers, "direction": np.array([camera.azimuth, camera.elevation]),
         "size": BACK * max(camera.height, camera.width / ASPECT) / 2,
         "names": np.array([take.name for take in view.takes]),
-        "colours": np.array(COLOURS[-len(view.takes) :]), "lines": np.array(lines).reshape(-1, 2, 3),
+        "colors": np.array(COLORS[-len(view.takes) :]), "lines": np.array(lines).reshape(-1, 2, 3),
         "texts": np.array([f"{view.times[f]:.2f} s{slower}" for f in shown]),
         "rate": RATE, "hidden": scene.hidden, "rods": _rods(scene),
     }  # fmt: skip

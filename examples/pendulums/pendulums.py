@@ -24,7 +24,7 @@ from dropo_torch.gap import Hypothesis, Scene, name, open_loop, prepare
 HERE = Path(__file__).parent
 LOGS = {"double": [f"trajectory_0{i}.csv" for i in range(4)], "simple": ["ddp.csv"]}
 SECONDS = (0.1, 0.3, 1.0)
-#: Least moment of inertia about the centre of mass, as a share of that about the joint.
+#: Least moment of inertia about the center of mass, as a share of that about the joint.
 LEAST = 0.1
 
 

@@ -13,7 +13,7 @@ LEAST = 1e-4
 POWERS, TOGETHER = (0.0, 0.5, 1.0), ((0, 1), (2,))
 #: Draws of a prediction, and batches of them, whose scatter says how exact an energy score is.
 SAMPLES, BATCHES = 200_000, 10
-#: m from the centre at which an angle counts as a distance.
+#: m from the center at which an angle counts as a distance.
 ARM = 0.025
 Groups = Sequence[tuple[str, int]]
 
@@ -23,8 +23,8 @@ class ErrorTerm:
     """An error of three independent axes: scale · distance^power · Student's t.
 
     Attributes:
-        scale: of each axis after a metre, ``(3,)``.
-        power: of the distance in metres, of each axis, ``(3,)``.
+        scale: of each axis after a meter, ``(3,)``.
+        power: of the distance in meters, of each axis, ``(3,)``.
         free: degrees of freedom of t; infinite for a normal.
     """
 

@@ -88,7 +88,7 @@ def read(folder: Path, condition: str) -> Iterator[Push]:
 
 
 def _push(condition: str, repeat: str, number: int, rows: np.ndarray) -> Push:
-    """A push from the file's rows, without outliers; in metres, angles without jumps."""
+    """A push from the file's rows, without outliers; in meters, angles without jumps."""
     time, scale = rows[:, 0] - rows[0, 0], np.array([1e-3, 1e-3, 1.0])
     pose, hand = rows[:, 1:4] * scale, rows[:, 4:7] * scale
     seen = (rows[:, 1:4] != 0).any(1)
@@ -249,8 +249,8 @@ def regions(
 
 
 def _row(label: str, found: np.ndarray) -> str:
-    millimetres, degrees = np.sqrt((found**2).mean(0))
-    return f"{f'{label}, {len(found)} pushes':<46}{millimetres:>8.2f}{degrees:>9.2f}"
+    millimeters, degrees = np.sqrt((found**2).mean(0))
+    return f"{f'{label}, {len(found)} pushes':<46}{millimeters:>8.2f}{degrees:>9.2f}"
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -86,7 +86,7 @@ def _unlike(first: np.ndarray, second: np.ndarray, rules: Rules) -> np.ndarray:
 
 
 def _jumps(record: Record, rules: Rules) -> np.ndarray:
-    """How far the step of each row and position column is beyond what its neighbours allow, ``(T, n)``; 1 is a jump."""
+    """How far the step of each row and position column is beyond what its neighbors allow, ``(T, n)``; 1 is a jump."""
     size = np.abs(record.steps)
     excess = np.zeros_like(size)
     for c, column in record.positions if len(size) >= 5 else ():

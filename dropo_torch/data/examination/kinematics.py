@@ -16,7 +16,7 @@ from dropo_torch.data.examination.rules import Rules
 LENGTHS = (1, 4, 16, 64)
 DEGREE = float(np.pi / 180)
 #: Factors from a unit to the model's, by whether the coordinate is an angle.
-UNITS = {True: {DEGREE: "degrees"}, False: {1e-3: "millimetres", 1e-2: "centimetres"}}
+UNITS = {True: {DEGREE: "degrees"}, False: {1e-3: "millimeters", 1e-2: "centimeters"}}
 
 
 @dataclass(frozen=True)

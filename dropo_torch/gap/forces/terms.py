@@ -20,7 +20,7 @@ PRESLIDING = "joint_presliding"
 LINEAR = (FRICTION, "joint_damping", OFFSET, CENTER, "armature")
 #: Speed, by a joint's root mean square, at which dry friction is three quarters of what it is in full motion.
 AT_REST = 0.02
-#: Difference step, by a number's scale; forces are quadratic in a centre of mass at most, so any size will do.
+#: Difference step, by a number's scale; forces are quadratic in a center of mass at most, so any size will do.
 STEP = 0.1
 
 

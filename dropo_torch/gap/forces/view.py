@@ -48,7 +48,7 @@ class ForceView:
         placed: the effects, with values; none where forces give no names.
         halves: half-widths of the 90 % intervals of each effect's numbers.
         shares: share of the unseen forces' mean squares that comes back without each.
-        ties: for each effect those that may stand in its place: others that explain the log as well, and centres of
+        ties: for each effect those that may stand in its place: others that explain the log as well, and centers of
             mass of other bodies, which are only known together.
         left_out: what none of the forces needs, with half-widths of the 90 % intervals of its numbers.
     """

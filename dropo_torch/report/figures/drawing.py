@@ -1,6 +1,6 @@
 """What the figures share: canvas and axes in one style, few round ticks, dots and strokes that take few bytes.
 
-Everything is drawn for a white page in the colours of Okabe and Ito, which colour-blind readers tell
+Everything is drawn for a white page in the colors of Okabe and Ito, which color-blind readers tell
 apart. Figures are small panels that a page arranges; names and units are the page's business, so that
 they wrap and can be searched. Dense data are thinned to what the eye can separate.
 """
@@ -14,9 +14,9 @@ import numpy as np
 
 from dropo_torch.report.formatting import duration, plain
 
-INK, GREY, FAINT, CLOUD, GRID = "#1f2933", "#7b8794", "#d5dbe1", "#a3afbb", "#edf0f3"
+INK, GRAY, FAINT, CLOUD, GRID = "#1f2933", "#7b8794", "#d5dbe1", "#a3afbb", "#edf0f3"
 BLUE, SKY, ORANGE = "#0072b2", "#cfe6f5", "#d55e00"
-#: Colours of lines that must be told apart.
+#: Colors of lines that must be told apart.
 PALETTE = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000", "#8c6d31")
 #: Points of a curve, and of a log's overview, are thinned to about this many.
 MAX_POINTS = 120
@@ -56,9 +56,9 @@ def new_axes(figure: Any, margins: Margins, *, grid: Literal["x", "y", "both"] |
         (left / width, bottom / height, (width - left - right) / width, (height - bottom - top) / height)
     )
     axes.patch.set_visible(False)
-    axes.tick_params(length=3, width=0.7, color=GREY, labelcolor=INK, labelsize=9.5, pad=2)
+    axes.tick_params(length=3, width=0.7, color=GRAY, labelcolor=INK, labelsize=9.5, pad=2)
     for side, spine in axes.spines.items():
-        spine.set(color=GREY, linewidth=0.7, visible=side in ("left", "bottom"))
+        spine.set(color=GRAY, linewidth=0.7, visible=side in ("left", "bottom"))
     for label in (axes.xaxis.label, axes.yaxis.label):
         label.set(color=INK, fontsize=9.5, parse_math=False)
     if grid is not None:
@@ -134,7 +134,7 @@ def name_rows(axes: Any, names: list[str]) -> None:
 
 def say_empty(axes: Any) -> None:
     """Write that there is nothing to draw."""
-    axes.text(0.5, 0.5, "no finite value", transform=axes.transAxes, ha="center", color=GREY, fontsize=9.5)
+    axes.text(0.5, 0.5, "no finite value", transform=axes.transAxes, ha="center", color=GRAY, fontsize=9.5)
 
 
 def clock(axes: Any, cost: np.ndarray, seconds: np.ndarray) -> None:
@@ -145,18 +145,18 @@ def clock(axes: Any, cost: np.ndarray, seconds: np.ndarray) -> None:
     ticks = [t for t in axes.get_xticks() if axes.get_xlim()[0] <= t <= axes.get_xlim()[1]]
     passed = np.interp(ticks, np.concatenate([[0], cost]), np.concatenate([[0], np.nan_to_num(seconds)]))
     twin.set_xticks(ticks, [duration(float(s)) for s in passed])
-    twin.tick_params(length=3, width=0.7, color=GREY, labelcolor=GREY, labelsize=9.5, pad=2)
+    twin.tick_params(length=3, width=0.7, color=GRAY, labelcolor=GRAY, labelsize=9.5, pad=2)
     for spine in twin.spines.values():
         spine.set_visible(False)
 
 
-def dots(axes: Any, x: np.ndarray, y: np.ndarray, colour: str) -> None:
+def dots(axes: Any, x: np.ndarray, y: np.ndarray, color: str) -> None:
     """Draw dots as strokes of no length with round caps: a tenth of the bytes of markers."""
     finite = np.isfinite(x) & np.isfinite(y)
-    strokes(axes, x[finite], y[finite], y[finite], colour, 2.6)
+    strokes(axes, x[finite], y[finite], y[finite], color, 2.6)
 
 
-def strokes(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour: str, width: float) -> None:
+def strokes(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, color: str, width: float) -> None:
     """Draw upright strokes, all as one path; the limits of the axes follow."""
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path
@@ -166,7 +166,7 @@ def strokes(axes: Any, x: np.ndarray, low: np.ndarray, high: np.ndarray, colour:
     ends = np.stack([np.stack([x, low], -1), np.stack([x, high], -1)], 1).reshape(-1, 2)
     path = Path(ends, np.tile([Path.MOVETO, Path.LINETO], len(x)))
     path.should_simplify = False  # or strokes of no length are left out
-    axes.add_patch(PathPatch(path, facecolor="none", edgecolor=colour, linewidth=width, capstyle="round"))
+    axes.add_patch(PathPatch(path, facecolor="none", edgecolor=color, linewidth=width, capstyle="round"))
     axes.autoscale_view()
 
 

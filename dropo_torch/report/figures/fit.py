@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.report.figures import drawing
-from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GREY, INK, MAX_POINTS, ORANGE, SKY, Axis
+from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GRAY, INK, MAX_POINTS, ORANGE, SKY, Axis
 from dropo_torch.support.rows import evenly
 
 
@@ -70,7 +70,7 @@ def trace_panel(
     drawing.dots(upper, position, measured, INK)
     for start, stop in _runs(joined):
         x, simulation, band = joined[:, start:stop]
-        if stop - start == 1:  # no neighbour to draw a line to
+        if stop - start == 1:  # no neighbor to draw a line to
             drawing.strokes(upper, x, simulation, simulation, BLUE, 6)
             x, band = x[0] + np.array([-0.4, 0.4]), np.repeat(band, 2)
         lower.fill_between(x, -2 * band, 2 * band, color=SKY, linewidth=0)
@@ -86,17 +86,17 @@ def trace_panel(
     return figure
 
 
-def residual_panel(position: np.ndarray, standardised: np.ndarray) -> Any:
-    """Draw standardised residuals along the log, and their histogram against the standard normal, sideways.
+def residual_panel(position: np.ndarray, standardized: np.ndarray) -> Any:
+    """Draw standardized residuals along the log, and their histogram against the standard normal, sideways.
 
     Args:
         position: place in the log, ``(T,)``.
-        standardised: residual over its expected standard deviation, ``(T,)``; what is not finite is left out.
+        standardized: residual over its expected standard deviation, ``(T,)``; what is not finite is left out.
     """
-    figure = drawing.new_figure(320, 130, "standardised residuals along the log and their histogram")
+    figure = drawing.new_figure(320, 130, "standardized residuals along the log and their histogram")
     along, across = drawing.new_axes(figure, (34, 20, 92, 6)), drawing.new_axes(figure, (236, 20, 8, 6))
-    finite = np.isfinite(standardised)
-    x, z = position[finite], standardised[finite]
+    finite = np.isfinite(standardized)
+    x, z = position[finite], standardized[finite]
     reach = _reach(z)
     z = np.clip(z, -reach, reach)
     for axes in (along, across):
@@ -106,7 +106,7 @@ def residual_panel(position: np.ndarray, standardised: np.ndarray) -> Any:
     _dots_or_envelope(along, x, z)
     edges = np.linspace(-reach, reach, 42)
     share = np.histogram(z, edges)[0] / max(len(z), 1) / (edges[1] - edges[0])
-    across.stairs(share, edges, orientation="horizontal", fill=True, color=GREY)
+    across.stairs(share, edges, orientation="horizontal", fill=True, color=GRAY)
     grid = np.linspace(-4, 4, 61)
     across.plot(np.exp(-0.5 * grid**2) / np.sqrt(2 * np.pi), grid, color=ORANGE, linewidth=1.3)
     across.set(xlim=(0, 1.08 * max(0.4, float(share.max()))), xticks=[])
@@ -120,7 +120,7 @@ def progress_panel(
     seconds: np.ndarray,
     changes: Sequence[float],
     lines: np.ndarray,
-    colours: Sequence[str],
+    colors: Sequence[str],
     *,
     label: str,
     log: bool = False,
@@ -134,7 +134,7 @@ def progress_panel(
         cost, seconds: ``(n,)`` each, ascending.
         changes: ``cost`` at which stages begin; they are lettered A, B, ...
         lines: ``(n, lines)``; not drawn where not finite.
-        colours: one a line.
+        colors: one a line.
         label: of the vertical axis.
         log, upside_down: of the vertical axis.
         limits: of the vertical axis.
@@ -143,9 +143,9 @@ def progress_panel(
     figure, axes = drawing.new_panel(340, 225, label, (58, 36, 12, 34))
     keep = evenly(len(cost), min(len(cost), MAX_POINTS))
     lines = np.where(np.isfinite(lines) & ((lines > 0) | (not log)), lines, np.nan)
-    for column, colour in sorted(enumerate(colours), key=lambda pair: pair[1] != FAINT):
-        few = colour != FAINT and len(keep) <= 40
-        axes.plot(cost[keep], lines[keep, column], color=colour, linewidth=1.4, marker="." if few else "", markersize=4)
+    for column, color in sorted(enumerate(colors), key=lambda pair: pair[1] != FAINT):
+        few = color != FAINT and len(keep) <= 40
+        axes.plot(cost[keep], lines[keep, column], color=color, linewidth=1.4, marker="." if few else "", markersize=4)
     if not np.isfinite(lines).any():
         drawing.say_empty(axes)
     elif log:
@@ -156,13 +156,13 @@ def progress_panel(
     if upside_down:
         axes.invert_yaxis()
     for mark in marks:
-        axes.axhline(mark, color=GREY, linewidth=0.8, linestyle=(0, (3, 3)))
+        axes.axhline(mark, color=GRAY, linewidth=0.8, linestyle=(0, (3, 3)))
     axes.set_xlim(0, 1.02 * (float(cost[-1]) if len(cost) and cost[-1] > 0 else 1.0))
     for number, change in enumerate(changes):
-        axes.axvline(change, color=GREY, linewidth=0.8)
+        axes.axvline(change, color=GRAY, linewidth=0.8)
         letter = chr(ord("A") + number % 26)
-        offset = (3, -10 - 11 * (number % 2))  # neighbours may begin close together
-        at, style = ("data", "axes fraction"), {"color": GREY, "fontsize": 8.5, "fontweight": "bold"}
+        offset = (3, -10 - 11 * (number % 2))  # neighbors may begin close together
+        at, style = ("data", "axes fraction"), {"color": GRAY, "fontsize": 8.5, "fontweight": "bold"}
         axes.annotate(letter, (change, 1), offset, at, "offset points", **style)
     axes.set(xlabel="simulated transitions", ylabel=label)
     axes.yaxis.set_label_coords(-48 / 270, 0.5)
@@ -175,12 +175,12 @@ def progress_panel(
 def heat_map(
     matrix: np.ndarray, rows: Sequence[str], columns: Sequence[str], *, diverging: bool = False, lower: bool = False
 ) -> Any:
-    """Draw a matrix as coloured cells, with numbers in them where it is small.
+    """Draw a matrix as colored cells, with numbers in them where it is small.
 
     Args:
         matrix: ``(rows, columns)``; what is not finite is left white.
         rows, columns: labels.
-        diverging: colours from -1 to 1; otherwise four decades up to :func:`heat_top`.
+        diverging: colors from -1 to 1; otherwise four decades up to :func:`heat_top`.
         lower: leave out what is above the diagonal.
     """
     count, width = matrix.shape
@@ -193,8 +193,8 @@ def heat_map(
         left + cell[0] * width + right, top + cell[1] * count + 6, "heat map", (left, 6, right, top)
     )
     shown = np.where(np.tri(count, width, dtype=bool) | (not lower), matrix, np.nan)
-    colours = heat_colours(shown, diverging)
-    axes.imshow(colours, aspect="auto", interpolation="none")
+    colors = heat_colors(shown, diverging)
+    axes.imshow(colors, aspect="auto", interpolation="none")
     axes.set_xticks(range(width), columns, rotation=60 if roomy else 90, ha="left" if roomy else "center")
     axes.set_yticks(range(count), rows)
     axes.xaxis.tick_top()
@@ -207,34 +207,34 @@ def heat_map(
         text.set_parse_math(False)
     if roomy:
         for i, j in np.argwhere(np.isfinite(shown)):
-            dark = colours[i, j, :3] @ (0.2126, 0.7152, 0.0722) < 0.5
+            dark = colors[i, j, :3] @ (0.2126, 0.7152, 0.0722) < 0.5
             text, ink = _brief(shown[i, j], diverging), "white" if dark else INK
             axes.text(j, i, text, ha="center", va="center", fontsize=7.5, color=ink)
     return figure
 
 
 def heat_top(matrix: np.ndarray) -> float:
-    """Return the power of ten at or above a matrix's largest finite entry, the top of its colours."""
+    """Return the power of ten at or above a matrix's largest finite entry, the top of its colors."""
     top = float(np.max(np.abs(matrix), initial=0.0, where=np.isfinite(matrix)))
     return float(10.0 ** np.ceil(np.log10(top) - 1e-9)) if top > 0 else 1.0
 
 
-def heat_colours(matrix: np.ndarray, diverging: bool) -> np.ndarray:
+def heat_colors(matrix: np.ndarray, diverging: bool) -> np.ndarray:
     """Return RGBA in [0, 1] of a matrix's cells; see :func:`heat_map`."""
     if diverging:
         share = 0.5 + 0.5 * matrix
     else:
         with np.errstate(divide="ignore", invalid="ignore"):
             share = 1 + np.log10(np.abs(matrix) / heat_top(matrix)) / 4
-    colours = _colormap(diverging)(np.clip(np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0), 0, 1))
-    colours[~np.isfinite(matrix)] = 0.0  # transparent
-    return colours
+    colors = _colormap(diverging)(np.clip(np.nan_to_num(share, nan=0.0, posinf=1.0, neginf=0.0), 0, 1))
+    colors[~np.isfinite(matrix)] = 0.0  # transparent
+    return colors
 
 
 def ramp(diverging: bool) -> str:
-    """Return the colours of :func:`heat_map` as a CSS gradient, for a legend."""
-    colours = 255 * _colormap(diverging)(np.linspace(0, 1, 9))[:, :3]
-    stops = ",".join("#{:02x}{:02x}{:02x}".format(*(round(c) for c in colour)) for colour in colours)
+    """Return the colors of :func:`heat_map` as a CSS gradient, for a legend."""
+    colors = 255 * _colormap(diverging)(np.linspace(0, 1, 9))[:, :3]
+    stops = ",".join("#{:02x}{:02x}{:02x}".format(*(round(c) for c in color)) for color in colors)
     return f"linear-gradient(to right,{stops})"
 
 
@@ -249,9 +249,9 @@ def _tick_the_ends(axes: Any, axis: Axis) -> None:
     labels[-1].set_horizontalalignment("right")
 
 
-def _reach(standardised: np.ndarray) -> float:
-    """How far an axis of standardised residuals goes: to the largest, or to where but a few lie beyond."""
-    size = np.abs(standardised)
+def _reach(standardized: np.ndarray) -> float:
+    """How far an axis of standardized residuals goes: to the largest, or to where but a few lie beyond."""
+    size = np.abs(standardized)
     if not len(size) or size.max() <= 4:
         return 4.0
     return float(1.05 * size.max()) if size.max() <= 12 else max(4.0, 1.1 * float(np.quantile(size, 0.995)))

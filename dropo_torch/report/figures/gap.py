@@ -9,7 +9,7 @@ import numpy as np
 
 from dropo_torch.gap.result import Course
 from dropo_torch.report.figures import drawing
-from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GREY, INK, ORANGE
+from dropo_torch.report.figures.drawing import BLUE, CLOUD, FAINT, GRAY, INK, ORANGE
 from dropo_torch.report.formatting import number, score
 from dropo_torch.support.rows import evenly
 
@@ -21,7 +21,7 @@ LEAST_POINTS = 8
 LEAST_NATS = 20.0
 #: Axes of a course reach this share of the measured range beyond it; what is predicted farther off is cut.
 BEYOND = 0.75
-_COLOURS = {"your model": ORANGE, "before": ORANGE, "after": BLUE, "noise floor": GREY}
+_COLORS = {"your model": ORANGE, "before": ORANGE, "after": BLUE, "noise floor": GRAY}
 
 
 def score_panel(scores: Mapping[str, float], label: str, *, log: bool) -> Any:
@@ -44,7 +44,7 @@ def score_panel(scores: Mapping[str, float], label: str, *, log: bool) -> Any:
     for row, (name, value) in enumerate(scores.items()):
         axes.axhline(row, color=FAINT, linewidth=0.7, zorder=0.5)
         if np.isfinite(value):
-            axes.plot([value], [row], marker="o", markersize=8, color=_COLOURS[name], clip_on=False)
+            axes.plot([value], [row], marker="o", markersize=8, color=_COLORS[name], clip_on=False)
         text = score(value) if np.isfinite(value) else "not known" if np.isnan(value) else number(value)
         axes.text(1.05, row, text, transform=axes.get_yaxis_transform(), va="center", fontsize=11, color=INK)
     drawing.name_rows(axes, list(scores))
@@ -59,7 +59,7 @@ def score_panel(scores: Mapping[str, float], label: str, *, log: bool) -> Any:
 
 def force_panel(
     variable: np.ndarray, force: np.ndarray, frame: tuple[float, float, float, float], x_label: str, y_label: str,
-    colour: str,
+    color: str,
 ) -> Any:  # fmt: skip
     """Draw a force against a variable as a cloud, with its running median.
 
@@ -67,7 +67,7 @@ def force_panel(
         variable, force: ``(N,)`` each; what is not finite is left out.
         frame: left, right, lower and upper end of the axes; what lies beyond is drawn at the edge.
         x_label, y_label: of the axes.
-        colour: of the median.
+        color: of the median.
     """
     figure, axes = drawing.new_panel(420, 250, f"{y_label} against {x_label}", (62, 42, 14, 10))
     left, right, low, high = frame
@@ -76,14 +76,14 @@ def force_panel(
     finite = np.isfinite(variable) & np.isfinite(force)
     x, y = variable[finite], force[finite]
     if len(x):
-        axes.axhline(0, color=GREY, linewidth=0.8)
+        axes.axhline(0, color=GRAY, linewidth=0.8)
         few = len(x) <= MAX_DOTS  # of more, some at random, but always the same
         keep = np.arange(len(x)) if few else np.sort(np.random.default_rng(0).choice(len(x), MAX_DOTS, replace=False))
         cloud = np.clip(y[keep], low, high)
         drawing.strokes(axes, np.clip(x[keep], left, right), cloud, cloud, CLOUD, 2.6)
         middle, median = running_median(x, y)
         inside = (middle >= left) & (middle <= right)
-        axes.plot(middle[inside], np.clip(median[inside], low, high), color=colour, linewidth=2.0)
+        axes.plot(middle[inside], np.clip(median[inside], low, high), color=color, linewidth=2.0)
     else:
         drawing.say_empty(axes)
     axes.set(xlim=(left, right), ylim=(low, high))
@@ -129,15 +129,15 @@ def draw_course(axes: Any, course: Course, *, named: bool, width: float = 1.0) -
         axes.axvline(time, color=FAINT, linewidth=0.7 * width, zorder=0.5)
     for time, measured in zip(course.time, course.measured, strict=True):
         axes.plot(time[keep], measured[keep], color=CLOUD, linewidth=4.5 * width, solid_capstyle="round")
-    for line, colour, size in lines:
+    for line, color, size in lines:
         for time, predicted in zip(course.time, line, strict=True):
-            axes.plot(time[keep], predicted[keep], color=colour, linewidth=size * width)
+            axes.plot(time[keep], predicted[keep], color=color, linewidth=size * width)
     axes.set(xlim=(course.time.min(), course.time.max()), ylim=(shown.min() - margin, shown.max() + margin))
     drawing.few_ticks(axes, 6, 5)
 
 
 def running_median(x: np.ndarray, y: np.ndarray, most: int = 40) -> tuple[np.ndarray, np.ndarray]:
-    """Return medians of x and y over neighbours in x, as many in each; the whole where there are few."""
+    """Return medians of x and y over neighbors in x, as many in each; the whole where there are few."""
     order = np.argsort(x, kind="stable")
     count = int(np.clip(len(x) // LEAST_POINTS, 1, most))
     groups = [g for g in np.array_split(order, count) if len(g)]

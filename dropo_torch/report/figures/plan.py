@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.report.figures import drawing
-from dropo_torch.report.figures.drawing import BLUE, GREY, ORANGE
+from dropo_torch.report.figures.drawing import BLUE, GRAY, ORANGE
 
 #: Points of a curve that are drawn.
 POINTS = 400
-#: Colours of standard errors by what they rest on.
-COLOURS = {"log": GREY, "plan": ORANGE, "both": BLUE}
+#: Colors of standard errors by what they rest on.
+COLORS = {"log": GRAY, "plan": ORANGE, "both": BLUE}
 
 
 def time_panel(time: np.ndarray, values: np.ndarray, limits: tuple[float, float] | None, label: str) -> Any:
@@ -52,7 +52,7 @@ def error_bars(names: Sequence[str], errors: Mapping[str, np.ndarray]) -> Any:
     for row in range(len(names)):
         for i, (kind, values) in enumerate(errors.items()):
             at = row - 0.4 + thick * (i + 0.5)
-            axes.barh(at, float(values[row]) - least, left=least, height=0.86 * thick, color=COLOURS[kind])
+            axes.barh(at, float(values[row]) - least, left=least, height=0.86 * thick, color=COLORS[kind])
     axes.set_xlim(least, max(1.0, float(np.max(finite)) * 1.2))
     drawing.log_scale(axes, "x")
     drawing.name_rows(axes, [drawing.shorten(n) for n in names])

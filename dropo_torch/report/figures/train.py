@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.report.figures import drawing
-from dropo_torch.report.figures.drawing import BLUE, GREY, INK, ORANGE
+from dropo_torch.report.figures.drawing import BLUE, GRAY, INK, ORANGE
 from dropo_torch.rl.collect import Returns
 from dropo_torch.rl.train import Training
 
-_COLOURS = {"distribution": GREY, "nominal": BLUE, "target": ORANGE}
+_COLORS = {"distribution": GRAY, "nominal": BLUE, "target": ORANGE}
 
 
 def learning_curve(training: Training) -> Any:
@@ -39,8 +39,8 @@ def episodes_panel(evaluations: Mapping[str, Returns]) -> Any:
         760, 58 + 34 * len(evaluations), "returns of the evaluation episodes", (120, 42, 14, 8), grid="x"
     )
     for row, (name, e) in enumerate(evaluations.items()):
-        axes.plot(e.returns, np.full(len(e.returns), row), "o", color=_COLOURS[name], alpha=0.45, markersize=6)
-        axes.plot([e.mean, e.mean], [row - 0.32, row + 0.32], color=_COLOURS[name], linewidth=2.2)
+        axes.plot(e.returns, np.full(len(e.returns), row), "o", color=_COLORS[name], alpha=0.45, markersize=6)
+        axes.plot([e.mean, e.mean], [row - 0.32, row + 0.32], color=_COLORS[name], linewidth=2.2)
     drawing.name_rows(axes, list(evaluations))
     drawing.few_ticks(axes, x=7)
     axes.set_xlabel("return of an episode")

@@ -83,7 +83,7 @@ def _reach(rot: mat33, size: vec3) -> vec3:
 def best_axis(rot: mat33, x21: vec3, x12: vec3, size1: vec3, size2: vec3, margin: f64) -> int:
     """The axis of largest separation, −1 where the boxes are apart by more than the margin.
 
-    ``rot`` has the second box's axes in the frame of the first as columns, x21 and x12 are the centres in the other's
+    ``rot`` has the second box's axes in the frame of the first as columns, x21 and x12 are the centers in the other's
     frame. Edges have to be better than faces, which give more contacts.
     """
     most = margin + SEPARATION * (wp.dot(size1, vec3(ONE, ONE, ONE)) + wp.dot(size2, vec3(ONE, ONE, ONE)))
@@ -166,7 +166,7 @@ def cut(corners: Corners, labels: Labels, lines: Labels, count: int, side: int, 
 def face_base(axis: int, rot: mat33, x: vec3) -> int:
     """Code of a face contact without its corner: the reference face and the incident one, each an axis and a sign.
 
-    ``rot`` has the axes of the incident box in the reference box's frame, ``x`` its centre.
+    ``rot`` has the axes of the incident box in the reference box's frame, ``x`` its center.
     """
     a = axis % 3
     up = wp.where(x[a] >= ZERO, 1, 0)

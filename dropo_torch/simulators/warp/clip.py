@@ -263,13 +263,13 @@ def _face(m: wp.ref[Tables], w: wp.ref[World], side: int, s: Shape, face: int) -
             _set_corner(w, side, c, _corner(m, s, m.poly_vert[first + n - 1 - c]))
     elif s.kind == CYLINDER:
         sign = wp.where(face != 0, -ONE, ONE)
-        centre = s.rot[:, 2] * (sign * s.size[1]) + s.pos
+        center = s.rot[:, 2] * (sign * s.size[1]) + s.pos
         u = s.rot[:, 0] * s.size[0]
         v = s.rot[:, 1] * (s.size[0] * sign)
         n = DISK
         for c in range(n):
             angle = f64(wp.pi) * f64(c) / f64(8.0)
-            _set_corner(w, side, c, u * wp.cos(angle) - v * wp.sin(angle) + centre)
+            _set_corner(w, side, c, u * wp.cos(angle) - v * wp.sin(angle) + center)
     return n
 
 

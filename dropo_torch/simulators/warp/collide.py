@@ -3,7 +3,7 @@
 A contact is found by ``find_contacts`` (touch.py) and named by its pair and a number ``which`` within the pair;
 its geometry is then one of a few shapes. Against a plane it is decided by a point x fixed in the other geom, or by
 the support point of a cylinder or an ellipsoid; between round geoms by the closest points of two segments; against a
-box by a ball, at a capsule's centre line wherever ``which`` says (:func:`capsule_place`); between a sphere and a
+box by a ball, at a capsule's center line wherever ``which`` says (:func:`capsule_place`); between a sphere and a
 cylinder by a side, a cap or a rim. Two boxes have a module of their own.
 """
 
@@ -207,7 +207,7 @@ def support_dual(kind: int, n: vec3, c: vec3, rot: mat33, size: vec3, which: int
 
 @wp.func(inline=False)
 def cylinder_place(v: vec3, axis: vec3, size: vec3) -> int:
-    """Where a cylinder is touched by a sphere whose centre is ``v`` from its own."""
+    """Where a cylinder is touched by a sphere whose center is ``v`` from its own."""
     x = wp.dot(axis, v)
     r = wp.length(v - axis * x)
     beside = wp.abs(x) < size[1]
@@ -261,7 +261,7 @@ def box_closest(c: vec3, rot: mat33, size: vec3, x: vec3, radius: f64) -> vec7:
         n = away / dist
         point = (q + local + n * radius) * HALF
     else:
-        # centre inside: leave through the nearest face
+        # center inside: leave through the nearest face
         gap = size - wp.abs(local)
         k = int(wp.argmin(gap))
         n = vec3()

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.impedance import damping, impedance, regularisation, stiffness
+from dropo_torch.simulators.warp.impedance import damping, impedance, regularization, stiffness
 from dropo_torch.simulators.warp.spatial import theta_vec5
 from dropo_torch.simulators.warp.types import (
     MINVAL,
@@ -290,7 +290,7 @@ def elliptic_power(
     if friction_ref[0] != ZERO or friction_ref[1] != ZERO:
         bf = damping(friction_ref, solimp, h, refsafe)
     w0 = u[0] + b * v[0] + stiffness(solref, solimp, h, refsafe) * imp * x
-    d = normal_d(dim, 1, regularisation(imp, ONE), invweight, mu[0], impratio)
+    d = normal_d(dim, 1, regularization(imp, ONE), invweight, mu[0], impratio)
     w = vec6(w0, u[1] + bf * v[1], u[2] + bf * v[2], u[3] + bf * v[3], u[4] + bf * v[4], u[5] + bf * v[5])
     return -_elliptic(dim, w, jl, mu, d, impratio)
 
@@ -304,7 +304,7 @@ def contact_scalars(
     x = dist - margin
     imp = impedance(x, solimp)
     return (
-        dbar * normal_d(dim, 0, regularisation(imp, ONE), invweight, mu, impratio)
+        dbar * normal_d(dim, 0, regularization(imp, ONE), invweight, mu, impratio)
         + bbar * damping(solref, solimp, h, refsafe)
         + sbar * stiffness(solref, solimp, h, refsafe) * imp * x
     )

@@ -13,7 +13,7 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.cone import cone_force, cone_of, cone_piece, elliptic_power, normal_d
-from dropo_torch.simulators.warp.impedance import damping, regularisation
+from dropo_torch.simulators.warp.impedance import damping, regularization
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
 from dropo_torch.simulators.warp.spatial import add_at, ang, at, cross_force, join, late, pull, theta_vec2, theta_vec5
 from dropo_torch.simulators.warp.touch import geometry_adjoint
@@ -68,7 +68,7 @@ def make_contacts(m: wp.ref[Tables], w: wp.ref[World], ncon: int):
         w.con_aref[w.t, c] = aref
         mu = w.th[m.o_pair_friction + 5 * k]
         w.con_d[w.t, c] = normal_d(
-            m.pair_dim[k], m.elliptic, regularisation(soft.imp, ONE), soft.weight, mu, m.impratio
+            m.pair_dim[k], m.elliptic, regularization(soft.imp, ONE), soft.weight, mu, m.impratio
         )
 
 
@@ -135,7 +135,7 @@ def _pyramid_adjoint(m: wp.ref[Tables], w: wp.ref[World], c: int, ju: vec6, jv: 
     jar6 = ju + jv * soft.b
     jar6[0] += soft.k * soft.imp * soft.x
     dim = m.pair_dim[k]
-    d = normal_d(dim, 0, regularisation(soft.imp, ONE), soft.weight, w.th[o_mu], m.impratio)
+    d = normal_d(dim, 0, regularization(soft.imp, ONE), soft.weight, w.th[o_mu], m.impratio)
     cone = cone_of(m, w, k, d)
     wbar = vec6()
     lbar = vec6()

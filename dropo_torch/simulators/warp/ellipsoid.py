@@ -104,8 +104,8 @@ def fluid_frame(m: wp.ref[Tables], w: wp.ref[World], b: int, g: int) -> mat33:
 
 
 @wp.func(inline=True)
-def fluid_centre(m: wp.ref[Tables], w: wp.ref[World], b: int, g: int) -> vec3:
-    """Centre of geom ``g`` of body ``b``, from the origin of the sweep."""
+def fluid_center(m: wp.ref[Tables], w: wp.ref[World], b: int, g: int) -> vec3:
+    """Center of geom ``g`` of body ``b``, from the origin of the sweep."""
     return w.xpos[w.t, b] + w.xmat[w.t, b] * m.geom_pos[g]
 
 
@@ -120,7 +120,7 @@ def ellipsoids_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     for i in range(first, first + m.body_nfluid[b]):
         g = m.fluid_geom[i]
         rot = fluid_frame(m, w, b, g)
-        c = fluid_centre(m, w, b, g)
+        c = fluid_center(m, w, b, g)
         back = wp.transpose(rot)
         turn = back * wp.spatial_top(vel)
         move = back * (at(vel, c) - theta_vec3(w.th, m.o_wind))

@@ -46,7 +46,7 @@ class Batch:
         skip: physics steps of a logged step.
         paired: whether each transition has a parameter vector of its own (``T = K``); otherwise each is simulated
             under all of them.
-        applied: whether generalised forces, ``nv`` of them, stand at the end.
+        applied: whether generalized forces, ``nv`` of them, stand at the end.
         wrenched: whether wrenches on the bodies, ``6 nbody`` of them as in ``xfrc_applied``, stand after the controls.
     """
 

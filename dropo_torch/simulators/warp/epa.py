@@ -98,7 +98,7 @@ def _add_support(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, d: vec
 
 @wp.func(inline=False)
 def _attach(w: wp.ref[World], v1: int, v2: int, v3: int, n1: int, n2: int, n3: int) -> f64:
-    """Append a face with its neighbours and return its squared distance from the origin, zero without a plane."""
+    """Append a face with its neighbors and return its squared distance from the origin, zero without a plane."""
     k = w.epa_state[w.t, FACES]
     w.epa_state[w.t, FACES] = k + 1
     w.epa_corners[w.t, k] = vec3i(v1, v2, v3)
@@ -106,7 +106,7 @@ def _attach(w: wp.ref[World], v1: int, v2: int, v3: int, n1: int, n2: int, n3: i
     w.epa_place[w.t, k] = UNLISTED
     p = w.epa_point[w.t, v1]
     x, ok = project_on_plane(w.epa_point[w.t, v3], w.epa_point[w.t, v2], p)
-    if ok and wp.dot(x, p - w.epa_centre[w.t, 0]) < ZERO:
+    if ok and wp.dot(x, p - w.epa_center[w.t, 0]) < ZERO:
         x = -x
     w.epa_near[w.t, k] = x
     w.epa_dist[w.t, k] = wp.dot(x, x)
@@ -209,7 +209,7 @@ def _around_segment(m: wp.ref[Tables], w: wp.ref[World], a: Shape, b: Shape, s: 
     total = vec3()
     for k in range(5):
         total += w.epa_point[w.t, k]
-    w.epa_centre[w.t, 0] = total * f64(0.2)
+    w.epa_center[w.t, 0] = total * f64(0.2)
     out = s
     status = int(BUILT)
     faces = int(6)  # a variable: the loop is not unrolled
@@ -328,7 +328,7 @@ def _around_triangle(
             total = w.epa_point[w.t, k[0]] + w.epa_point[w.t, k[1]] + w.epa_point[w.t, k[3]] + w.epa_point[w.t, k[4]]
             least = f64(FAR)
             if whole != 0:
-                w.epa_centre[w.t, 0] = (total + w.epa_point[w.t, k[2]]) * f64(0.2)
+                w.epa_center[w.t, 0] = (total + w.epa_point[w.t, k[2]]) * f64(0.2)
                 least = wp.min(least, _attach(w, k[3], k[0], k[1], 1, 3, 2))
                 least = wp.min(least, _attach(w, k[3], k[2], k[0], 2, 4, 0))
                 least = wp.min(least, _attach(w, k[3], k[1], k[2], 0, 5, 1))
@@ -336,7 +336,7 @@ def _around_triangle(
                 least = wp.min(least, _attach(w, k[4], k[0], k[2], 3, 1, 5))
                 least = wp.min(least, _attach(w, k[4], k[2], k[1], 4, 2, 3))
             else:
-                w.epa_centre[w.t, 0] = total * f64(0.25)
+                w.epa_center[w.t, 0] = total * f64(0.25)
                 least = wp.min(least, _attach(w, k[0], k[1], k[3], 1, 3, 2))
                 least = wp.min(least, _attach(w, k[0], k[4], k[1], 2, 3, 0))
                 least = wp.min(least, _attach(w, k[0], k[3], k[4], 0, 3, 1))
@@ -381,7 +381,7 @@ def _around_tetrahedron(w: wp.ref[World], s: Simplex):
     _start(w)
     for i in range(s.n):
         _add_vertex(w, s, i)
-    w.epa_centre[w.t, 0] = (s.point[0] + s.point[1] + s.point[2] + s.point[3]) * f64(0.25)
+    w.epa_center[w.t, 0] = (s.point[0] + s.point[1] + s.point[2] + s.point[3]) * f64(0.25)
     status = int(BUILT)
     out = s
     faces = int(4)

@@ -249,7 +249,7 @@ class _Weights:
 
     def __init__(self, model: mujoco.MjModel, pairs: list[tuple[int, int, int]], *, posed: bool) -> None:
         model, data = copy.copy(model), mujoco.MjData(model)
-        model.body_mass[:], model.body_ipos[:] = 1.0, 0.0  # Jacobians go by centres of mass, and would round by them
+        model.body_mass[:], model.body_ipos[:] = 1.0, 0.0  # Jacobians go by centers of mass, and would round by them
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         jac = np.zeros((2, model.nbody, 3, model.nv))

@@ -72,8 +72,8 @@ def inertial_frame(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat33:
 
 
 @wp.func(inline=True)
-def centre_of_mass(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec3:
-    """Centre of mass of a body, from the origin of the sweep."""
+def center_of_mass(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec3:
+    """Center of mass of a body, from the origin of the sweep."""
     return w.xpos[w.t, b] + w.xmat[w.t, b] * theta_vec3(w.th, m.o_ipos + 3 * b)
 
 
@@ -81,7 +81,7 @@ def centre_of_mass(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec3:
 def fluid_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     """The drag on a body as a spatial force."""
     rot = inertial_frame(m, w, b)
-    c = centre_of_mass(m, w, b)
+    c = center_of_mass(m, w, b)
     wind = theta_vec3(w.th, m.o_wind)
     vel = w.velocity[w.t, b]
     back = wp.transpose(rot)

@@ -1,4 +1,4 @@
-"""MuJoCo's soft constraint: impedance, reference acceleration, regularisation. Pure functions, safe for ``wp.grad``."""
+"""MuJoCo's soft constraint: impedance, reference acceleration, regularization. Pure functions, safe for ``wp.grad``."""
 
 # mypy: ignore-errors
 # kernel code: Warp reads these functions with types of its own
@@ -130,6 +130,6 @@ def damping(solref: vec2, solimp: vec5, h: f64, refsafe: int) -> f64:
 
 
 @wp.func(inline=False)
-def regularisation(d: f64, invweight: f64) -> f64:
+def regularization(d: f64, invweight: f64) -> f64:
     """R = (1 − d) / d · A, with A the approximate inverse inertia."""
     return wp.max(MINVAL, (ONE - d) * invweight / d)

@@ -3,7 +3,7 @@
 A mesh is its convex hull, as in MuJoCo. Vertices are numbered within the hull, in the order of ``mesh_graph``; they
 are in the frame of the geom (``geom_pos``, ``geom_mat``), into which the compiler moves them. Of the columns of a
 geom, ``geom_hull`` is where its vertices start in ``hull_vert`` (-1 without a mesh) and ``geom_nhull`` is how many they
-are; ``hull_edgeadr`` is where the neighbours of a vertex start in ``hull_edge``, a list of vertices that ends with -1.
+are; ``hull_edgeadr`` is where the neighbors of a vertex start in ``hull_edge``, a list of vertices that ends with -1.
 ``hull_polyadr`` is where in ``hull_poly`` the list of the polygons at a vertex starts; of a polygon, ``poly_vert`` has
 ``poly_num`` vertices from ``poly_adr`` on, counterclockwise from outside.
 """
@@ -47,9 +47,9 @@ def _add_hull(model: mujoco.MjModel, mesh: int, lists: dict[str, list[Any]]) -> 
     first = model.mesh_vertadr[mesh]
     vertices = model.mesh_vert[first : first + model.mesh_vertnum[mesh]]
     ids, edges = hull_graph(model, mesh)
-    for neighbours in edges:
+    for neighbors in edges:
         lists["hull_edgeadr"].append(len(lists["hull_edge"]))
-        lists["hull_edge"].extend([*neighbours, -1])
+        lists["hull_edge"].extend([*neighbors, -1])
     lists["hull_id"].extend(ids)
     lists["hull_vert"].extend(vertices[ids])
     _add_polygons(model, mesh, ids, lists)
@@ -75,9 +75,9 @@ def _add_polygons(model: mujoco.MjModel, mesh: int, ids: np.ndarray, lists: dict
 
 
 def hull_graph(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, list[list[int]]]:
-    """Return which vertices of a mesh are its hull's, and the neighbours of each of them within the hull.
+    """Return which vertices of a mesh are its hull's, and the neighbors of each of them within the hull.
 
-    A mesh without a hull (too few vertices) has all its vertices and no neighbours.
+    A mesh without a hull (too few vertices) has all its vertices and no neighbors.
     """
     start = int(model.mesh_graphadr[mesh])
     if start < 0:
@@ -86,8 +86,8 @@ def hull_graph(model: mujoco.MjModel, mesh: int) -> tuple[np.ndarray, list[list[
     count = int(model.mesh_graph[start])
     addresses, ids = model.mesh_graph[start + 2 : start + 2 + 2 * count].reshape(2, count)
     edges = model.mesh_graph[start + 2 + 2 * count :]
-    neighbours = []
+    neighbors = []
     for address in addresses.tolist():
         end = address + int(np.argmax(edges[address:] < 0))
-        neighbours.append(edges[address:end].tolist())
-    return ids.copy(), neighbours
+        neighbors.append(edges[address:end].tolist())
+    return ids.copy(), neighbors

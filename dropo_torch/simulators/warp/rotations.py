@@ -28,7 +28,7 @@ def rotation(axis: vec3, angle: f64) -> mat33:
 
 @wp.func(inline=False)
 def quat_matrix(q: vec4) -> mat33:
-    """Rotation of the quaternion (w, x, y, z), which need not be normalised; the zero quaternion is identity."""
+    """Rotation of the quaternion (w, x, y, z), which need not be normalized; the zero quaternion is identity."""
     n = wp.length(q)
     unit = vec4(ONE, ZERO, ZERO, ZERO)
     if n > MINVAL:
@@ -57,7 +57,7 @@ def quat_mul(a: vec4, b: vec4) -> vec4:
 
 @wp.func(inline=False)
 def quat_integrate(q: vec4, r: vec3) -> vec4:
-    """q turned by the local rotation vector ``r``, normalised."""
+    """q turned by the local rotation vector ``r``, normalized."""
     angle = wp.length(r)
     s = HALF
     if angle > f64(1.0e-8):

@@ -1,6 +1,6 @@
 """Scalar constraint rows: friction loss, limits and equalities of joints and of tendons.
 
-A row has at most three dofs, or its J combines those of one or two tendons. Its force f minimises MuJoCo's cost at
+A row has at most three dofs, or its J combines those of one or two tendons. Its force f minimizes MuJoCo's cost at
 J a − aref: quadratic (equality), one-sided (limit) or Huber's (friction loss).
 """
 
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.impedance import regularisation
+from dropo_torch.simulators.warp.impedance import regularization
 from dropo_torch.simulators.warp.parts import num_tendons
 from dropo_torch.simulators.warp.rotations import chart_rate, quat_log
 from dropo_torch.simulators.warp.soft import Soft, soft_adjoint, softness
@@ -221,7 +221,7 @@ def _add_row(
     if weighed != 0:
         soft = row_softness(m, w, n)
         w.row_aref[w.t, n] = -soft.b * row_dot(m, w, n, w.qvel, r) - soft.k * soft.imp * x
-        w.row_d[w.t, n] = ONE / regularisation(soft.imp, soft.weight)
+        w.row_d[w.t, n] = ONE / regularization(soft.imp, soft.weight)
 
 
 @wp.func(inline=False)
@@ -293,7 +293,7 @@ def rows_adjoint(m: wp.ref[Tables], w: wp.ref[World], r: int, nrow: int):
         soft = row_softness(m, w, n)
         v = row_dot(m, w, n, w.qvel, r)
         jar = row_dot(m, w, n, w.acc, r) + soft.b * v + soft.k * soft.imp * soft.x
-        d = ONE / regularisation(soft.imp, soft.weight)
+        d = ONE / regularization(soft.imp, soft.weight)
         w.row_d[w.t, n] = d
         state = row_state(w, n, jar)
         if state != 0:

@@ -78,7 +78,7 @@ class WarpSimulator(Simulator):
     def rollout(self, states: Numbers, controls: Numbers, values: Numbers) -> torch.Tensor:
         """Return the states after each transition ``(T, K, lag, nq + nv)``, differentiable in all three arguments.
 
-        A quaternion in ``states`` need not be normalised; those returned are. See :meth:`Simulator.rollout`.
+        A quaternion in ``states`` need not be normalized; those returned are. See :meth:`Simulator.rollout`.
         """
         states, controls, values = self.tensors(states, controls, values)
         origin = states.device

@@ -12,8 +12,8 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.ellipsoid import ellipsoid_slope, ellipsoid_slope_power, fluid_centre, fluid_frame
-from dropo_torch.simulators.warp.fluid import box_slope_power, box_slopes, centre_of_mass, inertial_frame
+from dropo_torch.simulators.warp.ellipsoid import ellipsoid_slope, ellipsoid_slope_power, fluid_center, fluid_frame
+from dropo_torch.simulators.warp.fluid import box_slope_power, box_slopes, center_of_mass, inertial_frame
 from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.spatial import (
     add_at,
@@ -57,7 +57,7 @@ def box_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
     """Minus the slope of the drag on the body's inertia box in its velocity V."""
     rot = inertial_frame(m, w, b)
     back = wp.transpose(rot)
-    c = centre_of_mass(m, w, b)
+    c = center_of_mass(m, w, b)
     v = w.velocity[w.t, b]
     turn, move = box_slopes(
         back * ang(v), back * (at(v, c) - theta_vec3(w.th, m.o_wind)), theta_vec3(w.th, m.o_inertia + 3 * b),
@@ -82,7 +82,7 @@ def ellipsoids_slope(m: wp.ref[Tables], w: wp.ref[World], b: int) -> mat66:
         g = m.fluid_geom[i]
         rot = fluid_frame(m, w, b, g)
         back = wp.transpose(rot)
-        c = fluid_centre(m, w, b, g)
+        c = fluid_center(m, w, b, g)
         local = mat66()
         for k in range(6):
             x = unit(k)
@@ -247,7 +247,7 @@ def fluid_slopes_adjoint(m: wp.ref[Tables], w: wp.ref[World]):
 def _box_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int):
     rot = inertial_frame(m, w, b)
     back = wp.transpose(rot)
-    c = centre_of_mass(m, w, b)
+    c = center_of_mass(m, w, b)
     v = w.velocity[w.t, b]
     dual = w.dual[w.t, b]
     u = w.total[w.t, b]
@@ -279,7 +279,7 @@ def _ellipsoids_slope_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int):
         g = m.fluid_geom[i]
         rot = fluid_frame(m, w, b, g)
         back = wp.transpose(rot)
-        c = fluid_centre(m, w, b, g)
+        c = fluid_center(m, w, b, g)
         wbar, vbar, lwbar, lvbar, uwbar, uvbar, _s, _d, _l, _m, _i, denbar, visbar, _y = wp.grad(ellipsoid_slope_power)(
             back * ang(v), back * (at(v, c) - wind), back * ang(dual), back * at(dual, c), back * ang(u),
             back * at(u, c), m.fluid_size[i], m.fluid_drag[i], m.fluid_lift[i], m.fluid_mass[i], m.fluid_inertia[i],

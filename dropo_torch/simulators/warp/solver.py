@@ -1,6 +1,6 @@
 """Newton's method for the constrained acceleration, with a factor that keeps the tree's sparsity.
 
-Minimises ½ aᵀMa + aᵀ(c − τ) + Σ s(J a − aref). With pyramidal cones the cost is piecewise quadratic: a full
+Minimizes ½ aᵀMa + aᵀ(c − τ) + Σ s(J a − aref). With pyramidal cones the cost is piecewise quadratic: a full
 step that stays on one piece is exact, so the iteration ends after finitely many.
 """
 

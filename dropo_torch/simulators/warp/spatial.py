@@ -85,7 +85,7 @@ def pull(f: vec3, p: vec3, torque: vec3) -> vec6:
 
 @wp.func(inline=False)
 def inertia_about_origin(mass: f64, c: vec3, rot: mat33, moments: vec3) -> vec10:
-    """Spatial inertia of a body with principal ``moments`` along the columns of ``rot``, centred at ``c``."""
+    """Spatial inertia of a body with principal ``moments`` along the columns of ``rot``, centered at ``c``."""
     r0 = rot[:, 0]
     r1 = rot[:, 1]
     r2 = rot[:, 2]

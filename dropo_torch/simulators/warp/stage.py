@@ -14,8 +14,8 @@ from __future__ import annotations
 import warp as wp
 
 from dropo_torch.simulators.warp.contact import contacts_adjoint, fills_in, make_contacts
-from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, fluid_centre, fluid_frame
-from dropo_torch.simulators.warp.fluid import box_power, centre_of_mass, inertial_frame
+from dropo_torch.simulators.warp.ellipsoid import ellipsoid_power, fluid_center, fluid_frame
+from dropo_torch.simulators.warp.fluid import box_power, center_of_mass, inertial_frame
 from dropo_torch.simulators.warp.forces import add_forces, add_thrust, forces_adjoint
 from dropo_torch.simulators.warp.frames import before_link, beyond, body_frame_adjoint, link_frame_adjoint
 from dropo_torch.simulators.warp.kinematics import inertial_forces, sweep_in, sweep_out
@@ -165,7 +165,7 @@ def carry_out(m: wp.ref[Tables], w: wp.ref[World]):
 
 @wp.func(inline=True)
 def bodies_adjoint(m: wp.ref[Tables], w: wp.ref[World], softening: int, posed: int):
-    """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and centre of mass.
+    """Each body's ⟨Λ, I A + V ×* I V⟩: its gradient in Λ, A, V and in mass, moments and center of mass.
 
     ``softening`` 1 leaves out V, and 3 all bodies whose velocity products are not taken implicitly; both leave out
     gravity compensation, drag and wrenches.
@@ -212,9 +212,9 @@ def bodies_adjoint(m: wp.ref[Tables], w: wp.ref[World], softening: int, posed: i
 
 @wp.func(inline=True)
 def _inertia_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, x: vec6, y: vec6, z: vec6, v: vec6):
-    """Gradient of ⟨x, I y⟩ + ⟨z, I v⟩ in mass, moments and centre of mass."""
+    """Gradient of ⟨x, I y⟩ + ⟨z, I v⟩ in mass, moments and center of mass."""
     rot = w.xmat[w.t, b]
-    c = centre_of_mass(m, w, b)
+    c = center_of_mass(m, w, b)
     xc = at(x, c)
     yc = at(y, c)
     zc = at(z, c)
@@ -234,7 +234,7 @@ def _fluid_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, dual: vec6, v: v
     """Gradient of −λ · (drag on the body)."""
     rot = inertial_frame(m, w, b)
     back = wp.transpose(rot)
-    c = centre_of_mass(m, w, b)
+    c = center_of_mass(m, w, b)
     wind = theta_vec3(w.th, m.o_wind)
     x = theta_vec3(w.th, m.o_inertia + 3 * b)
     wbar, vbar, lwbar, lvbar, xbar, massbar, denbar, visbar = wp.grad(box_power)(
@@ -264,7 +264,7 @@ def _ellipsoids_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, dual: vec6,
         g = m.fluid_geom[i]
         rot = fluid_frame(m, w, b, g)
         back = wp.transpose(rot)
-        c = fluid_centre(m, w, b, g)
+        c = fluid_center(m, w, b, g)
         wbar, vbar, lwbar, lvbar, _s, _d, _l, _m, _i, denbar, visbar = wp.grad(ellipsoid_power)(
             back * ang(v), back * (at(v, c) - wind), back * ang(dual), back * at(dual, c), m.fluid_size[i],
             m.fluid_drag[i], m.fluid_lift[i], m.fluid_mass[i], m.fluid_inertia[i], w.th[m.o_density],

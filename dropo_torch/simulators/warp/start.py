@@ -15,7 +15,7 @@ _NO_DRIVER = b"Could not find or load the NVIDIA CUDA driver"
 
 
 def start_warp() -> None:
-    """Initialise Warp.
+    """Initialize Warp.
 
     Its C code writes straight to the process's standard error; what it says there is passed on, but for the line
     that a CPU-only machine always gets.

@@ -43,8 +43,8 @@ from dropo_torch.simulators.warp.types import (
 
 
 @wp.func(inline=True)
-def geom_centre(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
-    """Centre of a geom, from the origin of the sweep."""
+def geom_center(m: wp.ref[Tables], w: wp.ref[World], g: int) -> vec3:
+    """Center of a geom, from the origin of the sweep."""
     b = m.geom_body[g]
     return w.xpos[w.t, b] + w.xmat[w.t, b] * geom_position(m, w, g)
 
@@ -166,7 +166,7 @@ def _add_convex(m: wp.ref[Tables], w: wp.ref[World], n: int, k: int, margin: f64
 
 @wp.func(inline=True)
 def _extent(m: wp.ref[Tables], w: wp.ref[World], g: int, direction: vec3) -> f64:
-    """How far the bounding box of a geom reaches in a direction from the geom's centre."""
+    """How far the bounding box of a geom reaches in a direction from the geom's center."""
     local = wp.transpose(m.geom_mat[g]) * (wp.transpose(w.xmat[w.t, m.geom_body[g]]) * direction)
     half = m.geom_half[g]
     spread = half[0] * wp.abs(local[0]) + half[1] * wp.abs(local[1]) + half[2] * wp.abs(local[2])
@@ -175,7 +175,7 @@ def _extent(m: wp.ref[Tables], w: wp.ref[World], g: int, direction: vec3) -> f64
 
 @wp.func(inline=True)
 def _may_touch(m: wp.ref[Tables], w: wp.ref[World], g1: int, g2: int, apart: vec3, margin: f64) -> bool:
-    """Whether the bounding boxes of two geoms overlap, or nearly so, as seen along the line of their centres."""
+    """Whether the bounding boxes of two geoms overlap, or nearly so, as seen along the line of their centers."""
     length = wp.length(apart)
     near = bool(True)
     if length > MINVAL and not has_geoms(m):  # the boxes are those of the sizes in the model
@@ -221,7 +221,7 @@ def _add_formula(
             radius = wp.where(kind <= collide.PLANE_CAPSULE, size2[0], ZERO)
             if kind == collide.PLANE_CAPSULE:
                 hint = axis
-            elif kind == collide.PLANE_BOX:  # the first four corners on the plane's side of the centre
+            elif kind == collide.PLANE_BOX:  # the first four corners on the plane's side of the center
                 possible = wp.dot(normal, rot * collide.corner(i, size2)) <= ZERO and number - n < 4
             elif kind == collide.PLANE_CYLINDER:  # the near rim, then the far one and two points near
                 possible = i == 0 or number > n
@@ -252,7 +252,7 @@ def _add_formula(
     const double* bounds = &wp::index(bound, 0);
     const int* one = &wp::index(geom1, 0);
     const int* two = &wp::index(geom2, 0);
-    const wp::vec_t<3, double>* c = &wp::index(centre, t, 0);
+    const wp::vec_t<3, double>* c = &wp::index(center, t, 0);
     int* list = &wp::index(near, t, 0);
     int n = 0;
     for (int k = 0; k < count; ++k) {
@@ -267,7 +267,7 @@ def _add_formula(
 """)
 def _near_pairs(
     kind: Ints, geom1: Ints, geom2: Ints, bound: Reals, theta: Reals, o_margin: int, count: int, last_plane: int,
-    centre: Vec3s2, near: Ints2, t: int,
+    center: Vec3s2, near: Ints2, t: int,
 ) -> int:  # fmt: skip
     """List the pairs whose bounding spheres are within the margin, and all of planes; return their number."""
 
@@ -277,12 +277,12 @@ def find_contacts(m: wp.ref[Tables], w: wp.ref[World]) -> int:
     """List the contacts of a configuration and return their number."""
     for i in range(m.ntouching):
         g = m.touching[i]
-        w.centre[w.t, g] = geom_centre(m, w, g)
+        w.center[w.t, g] = geom_center(m, w, g)
     close = int(0)
     if m.npair > 0:
         close = _near_pairs(
             m.pair_kind, m.pair_geom1, m.pair_geom2, m.pair_bound, w.th, m.o_pair_margin, m.npair,
-            collide.PLANE_ELLIPSOID, w.centre, w.near, w.t,
+            collide.PLANE_ELLIPSOID, w.center, w.near, w.t,
         )  # fmt: skip
     n = int(0)
     for i in range(close):
@@ -291,8 +291,8 @@ def find_contacts(m: wp.ref[Tables], w: wp.ref[World]) -> int:
         margin = w.th[m.o_pair_margin + k]
         g1 = m.pair_geom1[k]
         g2 = m.pair_geom2[k]
-        c1 = w.centre[w.t, g1]
-        c2 = w.centre[w.t, g2]
+        c1 = w.center[w.t, g1]
+        c2 = w.center[w.t, g2]
         normal = vec3()
         near = bool(True)
         if kind <= collide.PLANE_ELLIPSOID:
@@ -363,8 +363,8 @@ def geometry_adjoint(
     if length > MINVAL:
         ybar = (t1bar - t1 * wp.dot(t1, t1bar)) / length
     nbar = nbar - ybar * along - hint * wp.dot(n, ybar)
-    c1 = geom_centre(m, w, g1)
-    c2 = geom_centre(m, w, g2)
+    c1 = geom_center(m, w, g1)
+    c2 = geom_center(m, w, g2)
     size1 = geom_size(m, w, g1)
     size = geom_size(m, w, g2)
     size1bar = vec3()

@@ -2,7 +2,7 @@
 
 ``parents`` has two rows: the parent of each dof in the tree, and the dof before it. A matrix without entries beyond
 those of the tree has none in its factor either, if the last dof is eliminated first; ``dense`` 1 says that it has some.
-These are the innermost loops of all: they are written in C++, on bare memory, where the compiler vectorises them.
+These are the innermost loops of all: they are written in C++, on bare memory, where the compiler vectorizes them.
 """
 
 # mypy: ignore-errors

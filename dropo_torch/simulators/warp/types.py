@@ -169,7 +169,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "row_x": (f64, "row"),  # position less margin
     "row_aref": (f64, "row"), "row_d": (f64, "row"), "row_loss": (f64, "row"),  # D = 1/R
     "row_jar": (f64, "row"), "row_dir": (f64, "row"),  # J a − aref, J step
-    "centre": (vec3, "geom"), "near": (wp.int32, "pair"),  # of the geoms that may touch; pairs that are close
+    "center": (vec3, "geom"), "near": (wp.int32, "pair"),  # of the geoms that may touch; pairs that are close
     # contacts; the frame has rows n, t1, t2, and what is along J stands along these, then about them
     "con_pair": (wp.int32, "contact"), "con_which": (wp.int32, "contact"), "con_dist": (f64, "contact"),
     "con_point": (vec3, "contact"), "con_frame": (mat33, "contact"), "con_hint": (vec3, "contact"),
@@ -181,7 +181,7 @@ SCRATCH: dict[str, tuple[Any, str]] = {
     "con_corner": (vec3, "convex"), "con_facing": (vec3, "convex"),
     "con_single": (vec3, "convex3"), "con_curve": (vec6, "convex2"),
     # the polytope of EPA
-    "epa_state": (wp.int32, "convex_few"), "epa_centre": (vec3, "convex_few"),
+    "epa_state": (wp.int32, "convex_few"), "epa_center": (vec3, "convex_few"),
     "epa_point": (vec3, "epa_vertex"), "epa_one": (vec3, "epa_vertex"), "epa_two": (vec3, "epa_vertex"),
     "epa_vertex1": (wp.int32, "epa_vertex"), "epa_vertex2": (wp.int32, "epa_vertex"),
     "epa_corners": (vec3i, "epa_face"), "epa_beside": (vec3i, "epa_face"), "epa_near": (vec3, "epa_face"),
@@ -228,7 +228,7 @@ World: Any = _struct(
         "ctrl": Reals2,
         "ctrl_bar": Reals2,
         **dict.fromkeys(("t", "rc", "rb"), wp.int32),
-        "applied": wp.int32,  # whether the last nv controls are generalised forces
+        "applied": wp.int32,  # whether the last nv controls are generalized forces
         "wrenched": wp.int32,  # whether wrenches on the bodies stand before them
     },
 )

@@ -41,7 +41,7 @@ class Worlds:
             starts: initial states ``(R, nq + nv)``.
             controls: controls of every logged step ``(R, S, nu)``, and what else acts in it, behind them.
             skip: physics steps of a logged step.
-            applied: whether generalised forces stand at the end, and
+            applied: whether generalized forces stand at the end, and
             wrenched: whether wrenches on the bodies do after the controls, see :class:`Batch`.
         """
         out = np.empty((*controls.shape[:2], starts.shape[1]))

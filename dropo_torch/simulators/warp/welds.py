@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.impedance import regularisation
+from dropo_torch.simulators.warp.impedance import regularization
 from dropo_torch.simulators.warp.kinematics import packed
 from dropo_torch.simulators.warp.parts import num_welds
 from dropo_torch.simulators.warp.rotations import quat_matrix, quat_mul
@@ -150,7 +150,7 @@ def weld_softness(m: wp.ref[Tables], w: wp.ref[World], e: int, error: vec6, part
 @wp.func(inline=False)
 def stiffen(soft: Soft) -> f64:
     """D of rows of this softness."""
-    return ONE / regularisation(soft.imp, soft.weight)
+    return ONE / regularization(soft.imp, soft.weight)
 
 
 @wp.func(inline=True)

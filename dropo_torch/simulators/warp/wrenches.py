@@ -1,4 +1,4 @@
-"""Wrenches on bodies from outside, among a step's inputs: forces at the centres of mass, and torques.
+"""Wrenches on bodies from outside, among a step's inputs: forces at the centers of mass, and torques.
 
 In the world's axes, six numbers for each body as in ``xfrc_applied``; behind the controls, and before what is applied
 to degrees of freedom.
@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import warp as wp
 
-from dropo_torch.simulators.warp.fluid import centre_of_mass
+from dropo_torch.simulators.warp.fluid import center_of_mass
 from dropo_torch.simulators.warp.spatial import add_at, ang, at, join, vec3_at, wrench
 from dropo_torch.simulators.warp.types import Tables, World, vec3, vec6
 
@@ -26,7 +26,7 @@ def wrench_column(m: wp.ref[Tables], w: wp.ref[World], b: int) -> int:
 def outer_wrench(m: wp.ref[Tables], w: wp.ref[World], b: int) -> vec6:
     """The wrench on a body as a spatial force."""
     i = wrench_column(m, w, b)
-    return wrench(vec3_at(w.ctrl, w.rc, i), centre_of_mass(m, w, b)) + join(vec3_at(w.ctrl, w.rc, i + 3), vec3())
+    return wrench(vec3_at(w.ctrl, w.rc, i), center_of_mass(m, w, b)) + join(vec3_at(w.ctrl, w.rc, i + 3), vec3())
 
 
 @wp.func(inline=True)
@@ -35,7 +35,7 @@ def outer_wrench_adjoint(m: wp.ref[Tables], w: wp.ref[World], b: int, dual: vec6
     i = wrench_column(m, w, b)
     f = vec3_at(w.ctrl, w.rc, i)
     torque = vec3_at(w.ctrl, w.rc, i + 3)
-    c = centre_of_mass(m, w, b)
+    c = center_of_mass(m, w, b)
     u = at(dual, c)
     w.f_dual[w.t, b] = w.f_dual[w.t, b] - wrench(f, c) - join(torque, vec3())
     w.f_pose[w.t, b] = w.f_pose[w.t, b] + join(wp.cross(f, u) + wp.cross(torque, ang(dual)), vec3())
