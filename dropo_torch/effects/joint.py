@@ -321,6 +321,7 @@ class Armature(AddedToJoint):
     sentence = "a rotor's or gear's inertia at {target}, on top of the links'"
     field = "dof_armature"
     quantity = ("armature", "kg·m²", "kg", 20.0)
+    shares = (0.0, 0.2)  # where a rotor is most of the inertia, what a small one would change misleads
 
     def scale(self, signals: Signals, dof: int) -> float:
         return float(signals.inertia[dof])
