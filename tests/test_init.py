@@ -254,6 +254,21 @@ def swung(names: Sequence[str], *, of: str = "{}", rates: bool = False) -> dict[
     return {of.format(name): w * np.cos(w * t) if rates else np.sin(w * t) for name, w in waves.items()}
 
 
+#: A leg whose joints and actuators have words in common.
+LEG = """<mujoco><worldbody><body><joint name="hip_flex" axis="0 1 0"/><geom size=".1"/>
+  <body><joint name="knee_flex" axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
+  <actuator><motor name="hip_motor" joint="hip_flex"/><motor name="knee_motor" joint="knee_flex"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("names", [("hip_flex_tau", "knee_flex_tau"), ("knee_flex_tau", "hip_flex_tau")])
+def test_a_word_that_all_joints_have_says_nothing(names: tuple[str, str], tmp_path: Path) -> None:
+    joints = {"hip_flex_q": 1.0, "knee_flex_q": 1.7}
+    t = 0.02 * np.arange(200)
+    frame = {"time": t, **{n: np.sin(w * t) for n, w in joints.items()}, **dict(zip(names, (t, -t), strict=True))}
+    found = matched(tmp_path, frame, LEG)
+    assert (found["hip_motor"], found["knee_motor"]) == ("hip_flex_tau", "knee_flex_tau")
+
+
 LABELS = ("base_yaw", "shoulder", "elbow")
 
 

@@ -22,6 +22,8 @@ LEAST, SURE = 0.3, 0.75
 #: What a name loses by each word that is none of the place's, and a column by never moving: of two with the joint's
 #: number, the arm's is the joint's, and not its finger's.
 FOREIGN, STILL = 0.02, 0.02
+#: What a name is worth that is all of what a place is known as besides.
+ALIAS = 0.8
 #: Shares of motion that a velocity must explain to be its position's, and to be so whatever it is called.
 LIKE, SAME = 0.5, 0.9
 #: Factors between a sensor's unit and the model's; the second kind are those of lengths.
@@ -283,7 +285,7 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
         numbered = words.numbers[-1] == place.numbers[-1]
     if numbered is False:
         return -2.0
-    score = _likeness_of_words(said, known, others, words.axis)
+    score = _likeness_of_words(said, known, set(place.aliases), words.axis)
     if not words.role and score < SURE and (said or not words.axis):  # a bare name must be the joint's
         return 0.0
     if not said and not numbered and score == 0.0 and not words.axis:
@@ -295,18 +297,18 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
     return 0.5 if not said or not known else 0.35
 
 
-def _likeness_of_words(said: set[str], known: set[str], others: set[str], axis: str) -> float:
+def _likeness_of_words(said: set[str], known: set[str], aliases: set[str], axis: str) -> float:
     """How alike the words of a column and of a joint are, up to 1."""
+    besides = ALIAS * len(said & aliases) / len(said) if said else 0.0
     if said and known:
         if "".join(sorted(said)) == "".join(sorted(known)) or said == known:
             return 1.0
         share = len(said & known) / max(len(said), len(known))
         near = difflib.SequenceMatcher(None, "".join(sorted(said)), "".join(sorted(known))).ratio()
-        if share or near > 0.75:
-            return max(0.4 + 0.6 * share if share else 0.0, near if near > 0.75 else 0.0)
-    if said and said & others:
-        return 0.8
-    if axis and not said and axis in others | {w[-1] for w in known if len(w) > 2 and w[:-1] == "root"}:
+        besides = max(besides, 0.4 + 0.6 * share if share else 0.0, near if near > 0.75 else 0.0)
+    if besides:
+        return besides
+    if axis and not said and axis in known | aliases | {w[-1] for w in known if len(w) > 2 and w[:-1] == "root"}:
         return 0.7
     return 0.0
 
