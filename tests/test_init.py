@@ -257,7 +257,8 @@ def swung(names: Sequence[str], *, of: str = "{}", rates: bool = False) -> dict[
 #: A leg whose joints and actuators have words in common.
 LEG = """<mujoco><worldbody><body><joint name="hip_flex" axis="0 1 0"/><geom size=".1"/>
   <body><joint name="knee_flex" axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
-  <actuator><motor name="hip_motor" joint="hip_flex"/><motor name="knee_motor" joint="knee_flex"/></actuator></mujoco>"""
+  <actuator><motor name="hip_motor" joint="hip_flex"/><motor name="knee_motor" joint="knee_flex"/></actuator>
+</mujoco>"""
 
 
 @pytest.mark.parametrize("names", [("hip_flex_tau", "knee_flex_tau"), ("knee_flex_tau", "hip_flex_tau")])
