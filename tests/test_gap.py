@@ -32,7 +32,7 @@ from dropo_torch.effects import VOCABULARY, Placed, Quantity, Setting, find_effe
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, given, outcome, prepare
+from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, given, name, outcome, prepare
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
@@ -464,8 +464,8 @@ def test_hidden_effects_are_named(names: tuple[str, ...]) -> None:
     assert {(e.effect, e.target) for e in gap.effects} == {(e.name, e.target) for e in case.effects}
     for truth in case.effects:
         (told,) = [e for e in gap.effects if e.effect == truth.name]
-        for name, value in truth.parameters.items():
-            strength = told.parameters[name]
+        for number, value in truth.parameters.items():
+            strength = told.parameters[number]
             assert strength.value == pytest.approx(value, rel=0.05)
             half = 0.5 * (strength.high - strength.low)
             assert strength.low - half <= value <= strength.high + half
@@ -589,6 +589,21 @@ def test_number_is_absurd_that_pushes_beyond_its_bound(missing: float, is_absurd
     found = list(absurd(scene.evidence, refit(scene.evidence, begin), Rules().sound))
     assert [p.key for p, _ in found] == [("joint_damping", "hinge")] * is_absurd
     assert all("damping of -0.01 N·m·s/rad" in reason for _, reason in found)
+
+
+def test_a_number_that_is_at_a_bound_on_all_windows_takes_no_name() -> None:
+    """The search judges on some windows; on all of them, what it named may end at a bound."""
+    case = simulate_truth(CART_POLE, [Effect("joint_damping", "hinge", {"damping": -0.03})], 3, **SIZE)
+    scene, few = prepare(load(case)), [VOCABULARY["joint_damping"]]
+    searched_for = name(scene, effects=few)
+    at_bound = Hypothesis((case.declared["pole_mass"],), (placed("joint_damping", -0.01, target="hinge"),))
+    fitted = refit(scene.evidence, at_bound)
+    naming = dataclasses.replace(
+        searched_for, gap=True, named=True, refused="", final=fitted, ties=((),), shares=(1.0,)
+    )
+    gap = outcome.make_result(scene, naming, 0.0)
+    assert gap.verdict == "unnamed"
+    assert "damping of -0.01 N·m·s/rad" in gap.refused
 
 
 def test_what_named_effects_leave_is_said_first() -> None:

@@ -33,7 +33,7 @@ from dropo_torch.gap.result import (
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
-from dropo_torch.gap.sound import has_skill
+from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows
@@ -150,10 +150,12 @@ def _checked(scene: Scene, naming: Naming, fitted: _Fitted, report: Report) -> _
 
 
 def _refuted(naming: Naming, fitted: _Fitted, checked: _Checked, rules: Rules) -> Naming | None:
-    """What was found, without names, where unseen data refute these; else ``None``."""
+    """What was found, without names, where unseen data or the bounds of physics refute these; else ``None``."""
     after, given, constant = checked.after, checked.given, checked.constant
-    if not naming.named:
+    if fitted.last is None:
         return None
+    for _, reason in absurd(fitted.last.evidence, fitted.last.fit, rules.sound):  # on all windows, it may be elsewhere
+        return _nameless(naming, reason)
     if not has_skill(after, checked.floor, constant, rules.sound):
         return _without_names(naming, UNSKILLED, after, constant)
     if remains(fitted.rest.cost, rules) and after.rollout_rmse > given.rollout_rmse:
@@ -309,7 +311,11 @@ def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Nami
     if naming.family:
         names = "friction, inertia, offset and delay of all joints"
     sizes = f"open loop {after.rollout_rmse:.3g} against {rival:.3g}"
-    reason = f"with {names}, which would account for most of the misfit, {why} ({sizes})"
+    return _nameless(naming, f"with {names}, which would account for most of the misfit, {why} ({sizes})")
+
+
+def _nameless(naming: Naming, reason: str) -> Naming:
+    """What was found, without names, for a reason."""
     return replace(
         naming, final=naming.base, named=False, ties=(), shares=(), left_out=(), partial=False, refused=reason
     )
