@@ -35,7 +35,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, given, name, outcome, prepare
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
-from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, cost_of, robust_factors
+from dropo_torch.gap.evidence import Cost, Evidence, Linearization, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
 from dropo_torch.gap.locate import guilty, middles, regime, slopes
 from dropo_torch.gap.log import cut_windows
@@ -1056,7 +1056,7 @@ def test_what_the_step_leaves_is_no_noise() -> None:
 
 def test_capped_windows_of_noise_are_noise() -> None:
     chi2, caps = np.full((40, 10), 1.0), np.linspace(0.1, 1, 40)
-    linear = Linearisation(np.zeros((40, 10, 2)), np.ones((40, 10)), np.zeros((40, 10)), 0.0)
+    linear = Linearization(np.zeros((40, 10, 2)), np.ones((40, 10)), np.zeros((40, 10)), 0.0)
     cost = cost_of(np.sqrt(0.8 * chi2), linear, 320.0, caps)
     assert cost.reduced == pytest.approx(1)
     assert cost.excess == pytest.approx(0)
@@ -1094,7 +1094,7 @@ def test_true_model_leaves_the_noise_alone(names: tuple[str, ...], rough: bool) 
     """χ² per degree of freedom is near 1 although every start is noisy; as measured they would dominate."""
     scene, case = scene_of(*names), hidden(*names)
     evidence = Evidence(scene.twin, scene.evidence.windows, np.array(case.noise), scene.begin.variant, rough=rough)
-    starts = evidence.linearise(true(case).variant)
+    starts = evidence.linearize(true(case).variant)
     residuals, _ = evidence.residuals([true(case).variant])
     cost = cost_of(evidence.project(residuals[0], starts), starts, evidence.degrees(starts))
     assert cost.reduced == pytest.approx(1, abs=5 * np.sqrt(2 / cost.degrees))
@@ -1104,7 +1104,7 @@ def test_true_model_leaves_the_noise_alone(names: tuple[str, ...], rough: bool) 
 def test_projection_is_one() -> None:
     """P² = P, and what the starts change to first order is gone."""
     evidence = scene_of().evidence
-    starts = evidence.linearise(scene_of().begin.variant)
+    starts = evidence.linearize(scene_of().begin.variant)
     vectors = np.random.default_rng(0).standard_normal((len(evidence.windows), evidence.num_rows))
     once = evidence.project(vectors, starts)
     assert evidence.project(once, starts) == pytest.approx(once, abs=1e-12)
@@ -1113,7 +1113,7 @@ def test_projection_is_one() -> None:
 
 def test_diverged_windows_stay_finite() -> None:
     evidence = scene_of().evidence
-    starts = evidence.linearise(scene_of().begin.variant)
+    starts = evidence.linearize(scene_of().begin.variant)
     lost = np.full((len(evidence.windows), evidence.num_rows), np.nan)
     assert np.isfinite(evidence.project(lost, starts)).all()
     assert (evidence.project(lost, starts) ** 2).sum() > 1e6
@@ -1126,7 +1126,7 @@ def test_no_hypothesis_gains_by_diverging(robust: bool, finer: float) -> None:
     scene = scene_of("joint_damping")
     evidence = dataclasses.replace(scene.evidence, noise=finer * scene.noise, robust=robust)
     diverging = scene.begin.with_effects([Placed(find_effect("joint_stiffness"), "hinge", (-1e7, 0.0))])
-    linear = evidence.linearise(scene.begin.variant)
+    linear = evidence.linearize(scene.begin.variant)
     begin, there = (refit(evidence, h, linear=linear, iterations=0) for h in (scene.begin, diverging))
     assert not np.isfinite(evidence.residuals([diverging.variant])[0]).all()
     assert there.loss >= begin.loss
@@ -1329,7 +1329,7 @@ def test_refit_stays_in_bounds(begin: tuple[float, float]) -> None:
     parameters = {"pole_mass": {**CART_POLE.declared["pole_mass"], "bounds": [0.3, 0.4]}}
     scene = prepare(load(hidden(), parameters=parameters))
     hypothesis = Hypothesis(begin[:1], (Placed(find_effect("joint_friction"), "rail", begin[1:]),))
-    limits, linear = limits_of(hypothesis, scene.twin), scene.evidence.linearise(scene.begin.variant)
+    limits, linear = limits_of(hypothesis, scene.twin), scene.evidence.linearize(scene.begin.variant)
     fitted = refit(scene.evidence, hypothesis, linear=linear)
     assert fitted.hypothesis.vector[0] == pytest.approx(0.4, rel=1e-9)
     assert np.all((limits.low <= fitted.hypothesis.vector) & (fitted.hypothesis.vector <= limits.high))
@@ -1457,14 +1457,14 @@ def spoilt(size: float, share: float, windows: int = 40, rows: int = 12) -> Refi
     """A fit that leaves noise in its windows, and residuals of ``size`` in a share of them."""
     residual = np.random.default_rng(0).standard_normal((windows, rows))
     residual[: round(share * windows)] *= size
-    starts = Linearisation(np.zeros((windows, rows, 0)), np.ones((windows, rows)), np.zeros((windows, rows)), 0.0)
+    starts = Linearization(np.zeros((windows, rows, 0)), np.ones((windows, rows)), np.zeros((windows, rows)), 0.0)
     cost = cost_of(residual, starts, windows * rows, tail=Rules().weighed.tail * rows)
     return Refit(Hypothesis(()), cost, residual, residual[None], starts, np.ones(1), np.ones(windows))
 
 
 def test_robust_cost_is_that_of_noise_for_noise_and_a_logarithm_far_off() -> None:
     rows = 12
-    starts = Linearisation(np.zeros((1, rows, 0)), np.ones((1, rows)), np.zeros((1, rows)), 0.0)
+    starts = Linearization(np.zeros((1, rows, 0)), np.ones((1, rows)), np.zeros((1, rows)), 0.0)
     tail = Rules().weighed.tail * rows
     costs = [cost_of(np.full((1, rows), a), starts, rows, tail=tail).chi2 for a in (1.0, 1e4, 1e5, 1e6)]
     assert costs[0] == pytest.approx(rows)
@@ -1499,7 +1499,7 @@ def linear_fit(rng: np.random.Generator, shared: float = 0.0) -> Refit:
     values = np.linalg.solve(flat @ flat.T, flat @ error.ravel())
     residual = error - np.einsum("q,qwn->wn", values, slope)
     cost = Cost((residual**2).sum(1), np.zeros(W), W * N - Q)
-    starts = Linearisation(np.zeros((W, N, 0)), np.ones((W, N)), np.zeros((W, N)), 0.0)
+    starts = Linearization(np.zeros((W, N, 0)), np.ones((W, N)), np.zeros((W, N)), 0.0)
     return Refit(Hypothesis(tuple(values)), cost, residual, slope, starts, np.ones(Q), np.ones(W))
 
 

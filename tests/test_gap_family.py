@@ -23,7 +23,7 @@ from dropo_torch.effects import VOCABULARY, Placed
 from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap import family as members
-from dropo_torch.gap.evidence import Cost, Linearisation
+from dropo_torch.gap.evidence import Cost, Linearization
 from dropo_torch.gap.family import base_family, not_needed, pushing, shares_of, without_steps
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.limbs import alike, by_limbs, joint_of
@@ -219,7 +219,7 @@ def test_the_family_is_the_last_resort(truth: dict[str, Triple], is_family: bool
 def test_a_family_leaves_little_that_is_wrong(left: float, reduced: float, enough: bool) -> None:
     def fitted(excess: float, degrees: float) -> Refit:
         empty = np.zeros((1, 0))
-        linear = Linearisation(np.zeros((1, 0, 0)), empty, empty, 0.0)
+        linear = Linearization(np.zeros((1, 0, 0)), empty, empty, 0.0)
         cost = Cost(np.array([excess + degrees]), np.zeros(1), degrees)
         return Refit(Hypothesis((), ()), cost, empty, np.zeros((0, 1, 0)), linear, np.zeros(0), np.ones(1))
 

@@ -57,11 +57,11 @@ class Signals:
         timestep: seconds of one logged transition.
         position: measured positions of each joint coordinate, 1 and 99 percentile, ``(nq, 2)``; NaN if not observed.
         speed: root mean square of each degree of freedom's velocity, ``(nv,)``.
-        force: typical generalised force on each degree of freedom, ``(nv,)``.
+        force: typical generalized force on each degree of freedom, ``(nv,)``.
         inertia: diagonal of the mass matrix at the typical configuration, ``(nv,)``.
         command: largest absolute command, ``(nu,)``.
         column: standard deviation of each observed column, ``(n,)``.
-        linear_speed: root mean square speed of each body's centre, ``(nbody,)``.
+        linear_speed: root mean square speed of each body's center, ``(nbody,)``.
         angular_speed: root mean square angular velocity of each body, ``(nbody,)``.
         contacts: geoms that touch something somewhere in the log, ``(ngeom,)`` bool.
     """
@@ -223,7 +223,7 @@ class Effect(abc.ABC):
     def force(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        """Return generalised forces ``(R, nv)`` at states ``(R, nq)`` and ``(R, nv)``."""
+        """Return generalized forces ``(R, nv)`` at states ``(R, nq)`` and ``(R, nv)``."""
         return np.zeros_like(velocity)
 
     def recall(
@@ -243,7 +243,7 @@ class Effect(abc.ABC):
         return self.force(setting, target, values, position, velocity), memory
 
     def wrench(self, setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray:
-        """Return constant world-frame forces and torques on the bodies' centres ``(nbody, 6)``, of values ``(p,)``."""
+        """Return constant world-frame forces and torques on the bodies' centers ``(nbody, 6)``, of values ``(p,)``."""
         return np.zeros((setting.model.nbody, 6))
 
     def settled(self, command: torch.Tensor, values: torch.Tensor, step: float) -> torch.Tensor:

@@ -19,7 +19,7 @@ class BodyEffect(Effect):
     """An effect of one moving body.
 
     Attributes:
-        turning: whether it also shows in a body that only turns about its centre.
+        turning: whether it also shows in a body that only turns about its center.
     """
 
     kind = "body"
@@ -51,7 +51,7 @@ def _rotation(quaternion: np.ndarray) -> np.ndarray:
 
 
 def add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: np.ndarray) -> None:
-    """Weld a point mass at ``position`` in a body's frame: its mass, centre and inertia follow."""
+    """Weld a point mass at ``position`` in a body's frame: its mass, center and inertia follow."""
     own, center = float(model.body_mass[body]), model.body_ipos[body].copy()
     axes = _rotation(model.body_iquat[body])
     total = own + mass
@@ -71,7 +71,7 @@ def add_point_mass(model: mujoco.MjModel, body: int, mass: float, position: np.n
 
 
 def unmark_simple(model: mujoco.MjModel, body: int) -> None:
-    """Tell MuJoCo that a body's centre and axes are no longer those of its frame."""
+    """Tell MuJoCo that a body's center and axes are no longer those of its frame."""
     model.body_sameframe[body] = int(mujoco.mjtSameFrame.mjSAMEFRAME_NONE)
 
 
@@ -92,7 +92,7 @@ class Payload(BodyEffect):
         return (Quantity("mass", "kg", 0.0, 0.0, 5 * own, own), *places)
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        """Begin with a small mass at the body's centre and at the ends of its longest side."""
+        """Begin with a small mass at the body's center and at the ends of its longest side."""
         body = body_number(setting.model, target)
         low, high = self.extent(setting, body)
         longest, mass = int(np.argmax(high - low)), 0.05 * setting.model.body_mass[body]
@@ -104,7 +104,7 @@ class Payload(BodyEffect):
         return by_product(start, values)
 
     def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
-        """Begin with masses, where they are in reach, that shift the centre of mass as far."""
+        """Begin with masses, where they are in reach, that shift the center of mass as far."""
         if simpler.effect.name != CenterOfMass.name:
             return []
         body = body_number(setting.model, simpler.target)
@@ -121,10 +121,10 @@ class Payload(BodyEffect):
 
 
 class CenterOfMass(BodyEffect):
-    """A centre of mass that sits elsewhere than in the model."""
+    """A center of mass that sits elsewhere than in the model."""
 
     name = "center_of_mass"
-    sentence = "the centre of mass of {target} sits elsewhere than in the model"
+    sentence = "the center of mass of {target} sits elsewhere than in the model"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         low, high = self.extent(setting, body_number(setting.model, target))

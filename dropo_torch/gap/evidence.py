@@ -28,7 +28,7 @@ LOST = 1e3
 
 
 @dataclass(frozen=True)
-class Linearisation:
+class Linearization:
     """A hypothesis to first order in its windows' initial states.
 
     Attributes:
@@ -54,7 +54,7 @@ class Linearisation:
         """Which windows count at all, ``(W,)`` bool."""
         return np.asarray((self.weights > 0).any(-1))
 
-    def select(self, rows: np.ndarray) -> Linearisation:
+    def select(self, rows: np.ndarray) -> Linearization:
         """Return that of some of the windows."""
         return replace(self, basis=self.basis[rows], weights=self.weights[rows], shift=self.shift[rows])
 
@@ -123,7 +123,7 @@ class Evidence:
         seen = found[np.isfinite(found)]
         return np.maximum(np.where(np.isfinite(found), found, seen.max(initial=0.0)), LOST)
 
-    def tail(self, linear: Linearisation) -> float | None:
+    def tail(self, linear: Linearization) -> float | None:
         """χ² of a window from which on the cost grows slowly; ``None`` where it never does."""
         return self.rules.weighed.tail * self.degrees(linear) / len(self.windows) if self.robust else None
 
@@ -170,17 +170,17 @@ class Evidence:
         found, _ = near.residuals([v.eased(setting) for v in others], moved, pushes)
         return found - at
 
-    def linearise(self, variant: Variant) -> Linearisation:
+    def linearize(self, variant: Variant) -> Linearization:
         """Return how a hypothesis' residuals depend on the initial states."""
         found = self._statistical(variant) if self.rough else self._where_needed(variant)
         return self.counting(found, variant)
 
-    def counting(self, linear: Linearisation, variant: Variant) -> Linearisation:
+    def counting(self, linear: Linearization, variant: Variant) -> Linearization:
         """Return a linearization without windows in which commands act that a hypothesis cannot know from the log."""
         known = self.twin.knows(variant, self.windows)
         return linear if known.all() else replace(linear, weights=linear.weights * known[:, None])
 
-    def _where_needed(self, variant: Variant) -> Linearisation:
+    def _where_needed(self, variant: Variant) -> Linearization:
         """By differences, but statistically the windows far off beside the others, where stops or contacts may be why.
 
         There, noise on the initial state that no derivative sees may move an impact from one step to the next.
@@ -198,16 +198,16 @@ class Evidence:
             values[far] = getattr(bent, name)
         return replace(linear, **arrays)
 
-    def _differences(self, variant: Variant) -> tuple[Linearisation, np.ndarray]:
+    def _differences(self, variant: Variant) -> tuple[Linearization, np.ndarray]:
         """The linearization, and the residuals ``(W, N)`` at the measured initial states."""
         m = self.chart.size
         (residual,), (known,) = self.residuals([variant])
         changes = self.changes(variant, residual, [variant] * m, np.eye(m)[:, None])
         basis, _ = np.linalg.qr(np.moveaxis(np.nan_to_num(changes), 0, -1))
         weights = known.astype(float)
-        return Linearisation(basis, weights, np.zeros(weights.shape), 0.0), residual
+        return Linearization(basis, weights, np.zeros(weights.shape), 0.0), residual
 
-    def _statistical(self, variant: Variant, pairs: int = PAIRS) -> Linearisation:
+    def _statistical(self, variant: Variant, pairs: int = PAIRS) -> Linearization:
         """Regress the residuals on draws of noise on the initial states; what is left over adds to the noise."""
         m = self.chart.size
         half = np.random.default_rng(SEED).standard_normal((pairs, m))
@@ -223,31 +223,31 @@ class Evidence:
         weights = known[0] / np.sqrt(1 + 1.5 * variance)
         basis, _ = np.linalg.qr(slope * weights[..., None])
         shift = np.where(variance > 0, center - found[0], 0.0)
-        return Linearisation(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
+        return Linearization(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
 
-    def project(self, residuals: np.ndarray, linear: Linearisation) -> np.ndarray:
+    def project(self, residuals: np.ndarray, linear: Linearization) -> np.ndarray:
         """Return the part ``(..., W, N)`` of residuals that no initial states explain; what diverges is lost."""
         finite = np.isfinite(residuals).all(-1, keepdims=True)
         found = _beside(linear, np.where(finite, residuals + linear.shift, 0.0))
         return found if finite.all() else np.where(finite, found, self.lost[:, None] * (linear.weights > 0))
 
-    def project_slope(self, slope: np.ndarray, linear: Linearisation) -> np.ndarray:
+    def project_slope(self, slope: np.ndarray, linear: Linearization) -> np.ndarray:
         """Return :meth:`project` of derivatives ``(..., W, N)``; none where a window diverges."""
         return _beside(linear, np.where(np.isfinite(slope).all(-1, keepdims=True), slope, 0.0))
 
-    def degrees(self, linear: Linearisation) -> float:
+    def degrees(self, linear: Linearization) -> float:
         """Return the degrees of freedom that the windows have beside their initial states, as if all were counted."""
         counted = float(linear.counted.sum())
         known = float((linear.weights > 0).sum()) - counted * self.chart.size
         return known * len(self.windows) / max(counted, 1.0)
 
-    def cost(self, projected: np.ndarray, linear: Linearisation, numbers: int = 0) -> Cost:
+    def cost(self, projected: np.ndarray, linear: Linearization, numbers: int = 0) -> Cost:
         """Return the cost of projected residuals ``(W, N)`` to which some numbers were fitted."""
         degrees, tail = self.degrees(linear) - numbers, self.tail(linear)
         return cost_of(projected, linear, degrees, self.caps, tail, self.rules.weighed)
 
 
-def _beside(linear: Linearisation, vectors: np.ndarray) -> np.ndarray:
+def _beside(linear: Linearization, vectors: np.ndarray) -> np.ndarray:
     """Return the part of weighted vectors ``(..., W, N)`` outside the span of the basis."""
     weighted = vectors * linear.weights
     (*others, num_w, size), basis = weighted.shape, linear.basis
@@ -309,7 +309,7 @@ class Cost:
 
 
 def cost_of(
-    projected: np.ndarray, linear: Linearisation, degrees: float, caps: np.ndarray | float = 1.0,
+    projected: np.ndarray, linear: Linearization, degrees: float, caps: np.ndarray | float = 1.0,
     tail: float | None = None, weighed: Weighed | None = None,
 ) -> Cost:  # fmt: skip
     """Return the cost of projected residuals ``(W, N)``.

@@ -11,7 +11,7 @@ from scipy import stats
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.evidence import Cost, Evidence, Linearisation, robust_factors, robust_loss
+from dropo_torch.gap.evidence import Cost, Evidence, Linearization, robust_factors, robust_loss
 from dropo_torch.gap.log import blocks_of
 from dropo_torch.gap.rules import remains
 from dropo_torch.gap.twin import Twin
@@ -127,17 +127,17 @@ class Refit:
         cost: its misfit.
         residual: projected residuals, ``(W, N)``.
         slope: projected derivatives by all numbers, in units of their scale, ``(q, W, N)``.
-        linear: the linearisation in the initial states.
+        linear: the linearization in the initial states.
         scale: the numbers' scales, ``(q,)``.
         factor: factors of the windows' residuals that the robust cost ended with, ``(W,)``.
-        loss: what the fit minimised.
+        loss: what the fit minimized.
     """
 
     hypothesis: Hypothesis
     cost: Cost
     residual: np.ndarray
     slope: np.ndarray
-    linear: Linearisation
+    linear: Linearization
     scale: np.ndarray
     factor: np.ndarray
     loss: float = 0.0
@@ -172,7 +172,7 @@ def beside(
 
 
 def refit(
-    evidence: Evidence, hypothesis: Hypothesis, *, linear: Linearisation | None = None, iterations: int = 12,
+    evidence: Evidence, hypothesis: Hypothesis, *, linear: Linearization | None = None, iterations: int = 12,
     slopes: bool = True,
 ) -> Refit:  # fmt: skip
     """Fit all numbers of a hypothesis by Levenberg-Marquardt on projected residuals.
@@ -182,14 +182,14 @@ def refit(
     Args:
         evidence: the windows.
         hypothesis: where to begin.
-        linear: the linearisation to use; by default at the hypothesis, and again at the result if that is far away.
+        linear: the linearization to use; by default at the hypothesis, and again at the result if that is far away.
         iterations: the most steps that make it better; others only shorten the next, and cost little.
         slopes: whether the result needs its derivatives; without them they may be zero.
     """
     limits = limits_of(hypothesis, evidence.twin)
-    relinearise = linear is None
+    relinearize = linear is None
     variant = hypothesis.variant
-    linear = evidence.linearise(variant) if linear is None else evidence.counting(linear, variant)
+    linear = evidence.linearize(variant) if linear is None else evidence.counting(linear, variant)
     here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
     begin, damping, sloped, taken = here, DAMPING, False, 0
     while taken < iterations and damping <= MOST_DAMPING:
@@ -208,8 +208,8 @@ def refit(
         here, residuals, sloped = there, found, False
         if gain < 1e-6 * here.loss + 0.01:
             break
-    if relinearise and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
-        again = evidence.linearise(here.hypothesis.variant)
+    if relinearize and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
+        again = evidence.linearize(here.hypothesis.variant)
         return refit(evidence, here.hypothesis, linear=again, iterations=4, slopes=slopes)
     return _sloped(evidence, here, limits, residuals) if slopes and not sloped else here
 
@@ -219,7 +219,7 @@ def _distance(vector: np.ndarray, other: Hypothesis, limits: Limits) -> float:
 
 
 def _at(
-    evidence: Evidence, hypothesis: Hypothesis, linear: Linearisation, limits: Limits, vector: np.ndarray
+    evidence: Evidence, hypothesis: Hypothesis, linear: Linearization, limits: Limits, vector: np.ndarray
 ) -> tuple[Refit, np.ndarray]:
     """A hypothesis at other numbers, its derivatives not taken yet, and its residuals ``(W, N)`` as they are."""
     there = hypothesis.at(np.clip(vector, limits.low, limits.high))
@@ -238,7 +238,7 @@ def _sloped(evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarr
 
 
 def _fitted(
-    evidence: Evidence, hypothesis: Hypothesis, residuals: np.ndarray, slope: np.ndarray, linear: Linearisation,
+    evidence: Evidence, hypothesis: Hypothesis, residuals: np.ndarray, slope: np.ndarray, linear: Linearization,
     scale: np.ndarray,
 ) -> Refit:  # fmt: skip
     """A hypothesis with its whitened residuals ``(W, N)`` and its projected derivatives."""

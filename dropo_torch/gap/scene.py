@@ -194,7 +194,7 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
     odds = []
     for rows in np.array_split(np.arange(len(windows)), max(1, -(-len(windows) // MOST))):
         part = evidence.on(windows.select(rows))
-        linear = part.linearise(base.variant)
+        linear = part.linearize(base.variant)
         chi2 = (part.project(part.residuals([base.variant])[0][0], linear) ** 2).sum(-1) / rules.sound.rest
         degrees = np.maximum((linear.weights > 0).sum(-1) - part.chart.size, 1)
         odds.append(np.where(linear.counted, stats.chi2.logsf(chi2, degrees), 0.0))
@@ -216,7 +216,7 @@ def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, sin
         evidence = _cut(whole, train, since, length, FEW)
         if not len(evidence.windows):
             continue
-        rough = evidence.linearise(begin.variant).roughness
+        rough = evidence.linearize(begin.variant).roughness
         if rough < cut.rough and (not touches or _end_error(evidence, begin) < cut.astray):
             return _cut(whole, train, since, length, rough=rough > cut.bent)
     return _cut(whole, train, since, min(cut.lengths[-1], longest))

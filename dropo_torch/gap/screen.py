@@ -58,7 +58,7 @@ class Focus:
 
     @cached_property
     def factor(self) -> np.ndarray:
-        """Factors of the residuals under which least squares is what the fit minimised, ``(W·N,)``."""
+        """Factors of the residuals under which least squares is what the fit minimized, ``(W·N,)``."""
         return np.repeat(self.evidence.caps * self.fitted.factor, self.fitted.residual.shape[1])
 
     @cached_property

@@ -118,7 +118,7 @@ def separation(motion: Evidence, true: Hypothesis, rival: Refit, share: float = 
     """
     limits, log = limits_of(rival.hypothesis, motion.twin), rival.weighted(1.0)[0]
     free, start, cost = np.flatnonzero(limits.free), rival.hypothesis.vector, share * log @ log.T
-    linear, shown = motion.linearise(true.variant), motion.residuals([true.variant])[0][0]
+    linear, shown = motion.linearize(true.variant), motion.residuals([true.variant])[0][0]
     vector, least = start, np.inf
     for _ in range(ADAPTED):
         there = rival.hypothesis.at(vector)

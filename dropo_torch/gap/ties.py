@@ -81,7 +81,7 @@ def _one_for_two(ground: Ground, state: State, tied: Sequence[tuple[Refit, ...]]
     """A fit in which what ties with one named effect stands in the place of two, and explains the log as well.
 
     Tried are ties of both, ties of one that are at the target of the other, and those beside which less than half of
-    the other is needed: a payload ties with an inertia beside a shifted centre of mass, and needs neither.
+    the other is needed: a payload ties with an inertia beside a shifted center of mass, and needs neither.
     """
     hypothesis = state.current.hypothesis
     for one, other in permutations(range(len(tied)), 2):
