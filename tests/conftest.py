@@ -76,6 +76,7 @@ WHOLE = {
                          "test_the_center_of_a_tossed_box_is_found_by_a_marker_and_a_gyroscope",
                          "test_the_command_writes_what_it_always_writes"),
     "test_sweep.py": ("test_the_noise_of_every_measurement_is_found",),
+    "test_unseen_robots.py": ("test_a_log_is_what_the_truth_predicts_to_the_noise",),
     "test_view.py": ("test_a_video_has_a_pane_for_each_simulation",
                      "test_in_a_browser_time_moves_by_keys_and_cursors_with_it"),
     "test_warp_backend.py": ("test_the_library_does_not_need_warp",),
