@@ -23,6 +23,8 @@ STEP, LEAST_MOVE = 1e-3, 2e-5
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
+#: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
+HELD = 1e-4
 #: Move, relative to a parameter's scale, after which the initial states are linearised again.
 FAR = 0.03
 #: Half-width of a 90 % interval in standard errors.
@@ -255,7 +257,8 @@ def newton_step(here: Refit, limits: Limits, caps: np.ndarray | float, damping: 
         return np.zeros(0)
     flat, residual = here.weighted(caps)
     low, high = limits.moves(here.hypothesis.vector)
-    step = bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, RIDGE, np.ones(len(flat)))
+    ridge = RIDGE if damping <= DAMPING else HELD * damping
+    step = bounded_step(flat @ flat.T, -(flat @ residual), low, high, damping, ridge, np.ones(len(flat)))
     return np.clip(step, -LONGEST, LONGEST)
 
 
