@@ -239,7 +239,7 @@ def test_numbers_that_multiply_move_what_acts_as_predicted(name: str, target: st
     assert np.array_equal(effect.settle(a, a), a)
 
 
-def test_an_amount_that_vanishes_leaves_its_place_where_it_is() -> None:
+def test_an_amount_that_vanishes_moves_its_place_as_predicted() -> None:
     effect = find_effect("payload")
     for gone in (0.0, -0.1):
         assert effect.settle(np.array([0.1, 0.0, 0.0, -0.1]), np.array([gone, 0.0, 0.0, -0.2]))[3] == pytest.approx(

@@ -241,7 +241,7 @@ def _move(columns: np.ndarray, residual: np.ndarray, plan: _Plan) -> np.ndarray:
 def nearer(focus: Focus, origin: Hypothesis, candidate: Candidate) -> Placed:
     """Return a candidate with the numbers, from those begun with to the predicted, that explain most.
 
-    A prediction goes too far where numbers act by their product, as the mass and the place of a payload do.
+    A prediction goes too far where an effect does less and less the larger it is, such as friction that holds a joint.
     """
     begin, end = np.array(candidate.start.values), np.array(candidate.placed.values)
     between = [candidate.placed.at(begin + share * (end - begin)) for share in ALONG]
