@@ -77,7 +77,7 @@ class Integration(WorldEffect):
     FINER = 8
     #: By how much coarser a step serves for differences: still finer than the model's, with the better integrator.
     EASED = 4
-    shares = (1 / FINER,)
+    shares = (1 / FINER, 0.25, 0.5)
     steps = True
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:

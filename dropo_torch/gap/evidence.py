@@ -141,7 +141,7 @@ class Evidence:
         initial = None
         if moved is not None:
             change = np.broadcast_to(moved * self.noise, (*shape, self.chart.size))
-            initial = self.chart.move(measured[:, 0], change)
+            initial = self.chart.move(self.windows.begins, change)
         columns, valid = self.twin.predict(variants, self.windows, initial, pushes)
         with np.errstate(invalid="ignore"):
             residual = self.chart.difference(measured, columns) / self.noise

@@ -16,6 +16,7 @@ from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import Alike, Rules, as_good, chance_of, clears
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, left_by, screen
+from dropo_torch.gap.starts import begun
 from dropo_torch.gap.twin import Windows
 from dropo_torch.support.report import Report
 
@@ -88,6 +89,7 @@ class State:
         family: whether the hypothesis is the base family, at all joints where it is needed.
         few: windows that refits use, at most.
         rivals: hypotheses that left no more than noise, either, as it was when this one was chosen.
+        starts: of windows that do not begin as measured: episode, step and columns, ``(k, 2 + n)``.
     """
 
     noise: np.ndarray
@@ -103,6 +105,7 @@ class State:
     family: bool = False
     few: int = FEW
     rivals: tuple[Hypothesis, ...] = ()
+    starts: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -126,8 +129,13 @@ class Ground:
     few: int = FEW
 
     def at(self, state: State) -> Ground:
-        """Return the ground with the noise, the windows and the caps that a state has found."""
-        return replace(self, few=state.few).on(state.noise, state.since, state.caps)
+        """Return the ground with the noise, the windows with their starts, and the caps that a state has found."""
+        return replace(self, few=state.few).on(state.noise, state.since, state.caps).begun(state.starts)
+
+    def begun(self, starts: np.ndarray | None) -> Ground:
+        """Return the ground with windows that begin where a state has found; see :attr:`State.starts`."""
+        windows = self.evidence.windows
+        return replace(self, evidence=replace(self.evidence, windows=replace(windows, starts=begun(windows, starts))))
 
     def on(self, noise: np.ndarray, since: np.ndarray, caps: np.ndarray | float = 1.0) -> Ground:
         """Return the ground with another noise, and without windows that start before some steps, ``(E,)``."""

@@ -30,10 +30,11 @@ from dropo_torch.gap.result import (
     Score,
     Strength,
 )
-from dropo_torch.gap.rules import Rules, remains
+from dropo_torch.gap.rules import Rules, remains, significant
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.sound import absurd, has_skill
+from dropo_torch.gap.starts import straightened
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.twin import Windows
@@ -284,6 +285,10 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
     and beside a finer step where that is better, for what the model's own step leaves passes for noise.
     """
     own = refit(evidence, hypothesis, iterations=6)
+    windows = straightened(evidence, own.hypothesis.variant) if significant(own.cost, evidence.rules) else None
+    if windows is not None:
+        evidence = replace(evidence, windows=windows)
+        own = refit(evidence, own.hypothesis, iterations=6)
     final = resolved(evidence, own, anew=True)
     noise = noise_beside(final.evidence, short, final.fit)
     if moved(noise, evidence.noise, evidence.rules):

@@ -37,6 +37,8 @@ STEP_FIELD = "opt.timestep"
 MOVES = 4
 #: Iterations of a fit with the derivatives of a finer step.
 ANEW = 8
+#: Loss up to which a finer step that fits worse than the model's own is not told from it: χ² at 99 %.
+UNTOLD = 6.6
 
 
 @dataclass(frozen=True)
@@ -325,8 +327,9 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
     """Return a fit as it would be under an endlessly fine step, where a finer one explains the log better.
 
     Dry friction, ripples and stops are resolved by a step only to first order in it, which with little noise is more
-    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated; as much
-    as this adds stays uncertain. A log that was simulated with the model's own step stays with it.
+    than the standard errors. So the numbers are fitted under a fourth and an eighth of it, and extrapolated, unless the
+    fourth explains the log better: then it was simulated with about that step. As much as this adds stays uncertain.
+    Where the log does not tell a finer step from the model's own one, what lies between them does.
 
     Args:
         evidence: the windows, with the weights of the fit.
@@ -335,17 +338,20 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
             what a coarse step distorts may be far from where it is with a finer one. Such fits are not extrapolated.
     """
     vector, finest = fitted.hypothesis.vector, finest_step(evidence, fitted.hypothesis)
-    own = Resolved(fitted, evidence, np.zeros(len(vector)))
     if finest is None:
-        return own
+        return Resolved(fitted, evidence, np.zeros(len(vector)))
     finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
     anew = anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules)
     if anew:
         finer, coarser = (_anew(last) for last in (finer, coarser))
-    fine, limits = finer.fit, limits_of(fitted.hypothesis, evidence.twin)
+    fine = finer.fit
     if fine.loss >= fitted.loss:
-        return own
+        untold = fine.loss < fitted.loss + UNTOLD
+        return Resolved(fitted, evidence, np.abs(fine.hypothesis.vector - vector) * untold)
     change = fine.hypothesis.vector - coarser.fit.hypothesis.vector
+    if coarser.fit.loss < fine.loss:
+        return replace(coarser, error=2 * np.abs(change))
+    limits = limits_of(fitted.hypothesis, evidence.twin)
     ahead = fine.hypothesis.vector if anew else fine.hypothesis.vector + change
     there = fine.hypothesis.at(np.clip(ahead, limits.low, limits.high))
     return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change))
@@ -373,7 +379,20 @@ def change_of_step(evidence: Evidence, fitted: Refit) -> np.ndarray | None:
 
 def half_widths(last: Resolved) -> np.ndarray:
     """Return half-widths of the 90 % intervals of all numbers ``(q,)``, in their units."""
-    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes), last.error)
+    error = last.error + _of_named_step(last.evidence, last.fit)
+    return np.hypot(Z90 * standard_errors(last.fit, last.evidence.windows.episodes), error)
+
+
+def _of_named_step(evidence: Evidence, fitted: Refit) -> np.ndarray:
+    """By how much numbers ``(q,)`` change with twice the step that a hypothesis names: as much as without any."""
+    names = [p.effect.name for p in fitted.hypothesis.placed]
+    if "integration" not in names:
+        return np.zeros(len(fitted.scale))
+    index = names.index("integration")
+    own = fitted.hypothesis.placed[index]
+    twice = fitted.hypothesis.instead(index, own.at(2 * np.array(own.values)))
+    there = _nearest(evidence, fitted, twice).fit.hypothesis.vector
+    return np.where(limits_of(fitted.hypothesis, evidence.twin).free, np.abs(there - fitted.hypothesis.vector), 0.0)
 
 
 def _anew(last: Resolved) -> Resolved:
@@ -384,17 +403,21 @@ def _anew(last: Resolved) -> Resolved:
 
 def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
     """A fit moved to where it is best under another step, by the derivatives that it has."""
-    finer, limits = replace(evidence, twin=evidence.twin.finer(step)), limits_of(fitted.hypothesis, evidence.twin)
-    best, trial = None, fitted.hypothesis
+    return _nearest(replace(evidence, twin=evidence.twin.finer(step)), fitted, fitted.hypothesis)
+
+
+def _nearest(evidence: Evidence, fitted: Refit, trial: Hypothesis) -> Resolved:
+    """A hypothesis near a fitted one moved to where it is best, by the derivatives of that one."""
+    best, limits = None, limits_of(trial, evidence.twin)
     for _ in range(MOVES):
-        found, _ = finer.residuals([trial.variant])
-        there = _fitted(finer, trial, found[0], fitted.slope, fitted.linear, fitted.scale)
+        found, _ = evidence.residuals([trial.variant])
+        there = _fitted(evidence, trial, found[0], fitted.slope, fitted.linear, fitted.scale)
         if best is not None and there.loss >= best.loss:
             break
         best = there
-        move = newton_step(best, limits, finer.caps, LEAST_DAMPING)
+        move = newton_step(best, limits, evidence.caps, LEAST_DAMPING)
         if np.abs(move).max(initial=0.0) < LEAST_MOVE:
             break
         trial = trial.at(np.clip(trial.vector + move * limits.scale, limits.low, limits.high))
     assert best is not None
-    return Resolved(best, finer, np.zeros(len(fitted.scale)))
+    return Resolved(best, evidence, np.zeros(len(fitted.scale)))

@@ -16,7 +16,8 @@ from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.rules import Rules
+from dropo_torch.gap.rules import Rules, significant
+from dropo_torch.gap.starts import merged, straightened, table_of
 from dropo_torch.gap.twin import Windows
 
 #: Times that the variance components are weighted anew.
@@ -28,17 +29,41 @@ RENEWALS = 3
 def renewed(ground: Ground, state: State) -> State:
     """Return a state with the noise beside its hypothesis, and on the windows whose commands that knows.
 
-    Windows that it does not know show more than noise, so the noise is told anew once they are gone.
+    Windows that it does not know show more than noise, so the noise is told anew once they are gone. Where simulations
+    bend in the noise of their initial states, these are found first.
     """
+    here, starts = restarted(ground, state.current, state.starts)
+    if starts is not state.starts:
+        ground, state = _refitted(here, replace(state, starts=starts))
     for _ in range(RENEWALS):
         since = known_since(ground, state.current.hypothesis, state.since)
         noise = noise_beside(ground.evidence, ground.short, state.current)
         if np.array_equal(since, state.since) and not moved(noise, state.noise, ground.rules):
             break
-        here, base = with_base(ground.on(noise, since), state.base.hypothesis)
-        current = here.refit(state.current.hypothesis, iterations=6) if state.current.hypothesis.placed else base
-        ground, state = here, replace(state, noise=noise, since=since, caps=here.caps, base=base, current=current)
+        ground, state = _refitted(ground.on(noise, since), replace(state, noise=noise, since=since))
     return state
+
+
+def _refitted(ground: Ground, state: State) -> tuple[Ground, State]:
+    """What a state has, fitted again on a changed ground."""
+    here, base = with_base(ground, state.base.hypothesis)
+    current = here.refit(state.current.hypothesis, iterations=6) if state.current.hypothesis.placed else base
+    return here, replace(state, caps=here.caps, base=base, current=current)
+
+
+def restarted(ground: Ground, fitted: Refit, starts: np.ndarray | None) -> tuple[Ground, np.ndarray | None]:
+    """Return a ground whose windows begin where they fit best, if something is left and some of them bend.
+
+    Args:
+        ground: what the search stands on.
+        fitted: the hypothesis so far, on its windows.
+        starts: those that were found before; see :attr:`State.starts`.
+    """
+    windows = straightened(ground.part, fitted.hypothesis.variant) if significant(fitted.cost, ground.rules) else None
+    if windows is None:
+        return ground, starts
+    starts = merged(starts, table_of(windows))
+    return ground.begun(starts), starts
 
 
 def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:

@@ -28,7 +28,7 @@ from dropo_torch.gap.family import fitted_family, has_family, shares_of, whole_f
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
-from dropo_torch.gap.renew import noise_beside, renewed, with_base
+from dropo_torch.gap.renew import noise_beside, renewed, restarted, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, family_accounts, may_leave, remains, significant
 from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
@@ -188,6 +188,9 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
     base = ground.refit(begin)
     noise = noise_beside(ground.evidence, ground.short, base)
     ground, base = with_base(ground.on(noise, since), base.hypothesis)
+    ground, starts = restarted(ground, base, None)
+    if starts is not None:
+        ground, base = with_base(ground, base.hypothesis)
     missing = significant(base.cost, ground.rules)
     if not missing:
         ground.report("what is left looks like noise", 0.0)
@@ -195,7 +198,7 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
         ranked, focus = ground.screened(base), ground.focus(base)
         degrees = focus.evidence.degrees(focus.fitted.linear)
         first = Screening(tuple(ranked), focus.residual, focus.slope, degrees)
-    return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few)
+    return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few, starts=starts)
 
 
 def step(ground: Ground, state: State) -> State:

@@ -196,14 +196,14 @@ def _faster(begins: Windows, setting: Setting, factor: float) -> Windows:
     """The same starts with velocities so many times as large."""
     measured = begins.measured.copy()
     measured[:, 0, setting.observation.index >= setting.model.nq] *= factor
-    return replace(begins, measured=measured, rates=factor * begins.rates)
+    return replace(begins, measured=measured, rates=factor * begins.rates, starts=None)
 
 
 def _played(twin: Twin, true: Hypothesis, begins: Windows, row: int) -> Windows:
     """Windows of motions that go on from the starts of others, so many of each in a row; none of one that diverges."""
     length = begins.length
     path = np.repeat(begins.measured[:, :1], row * length + 1, axis=1)
-    shown = twin.predict([true.variant], replace(begins, measured=path))[0][0]
+    shown = twin.predict([true.variant], replace(begins, measured=path, starts=None))[0][0]
     rates = np.gradient(shown, twin.setting.signals.timestep, axis=1)
     rates[:, 0] = begins.rates
     at = length * np.arange(row)

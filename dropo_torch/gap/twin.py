@@ -37,6 +37,7 @@ class Windows:
         steps: logged step of each window's start within its episode, ``(W,)``.
         commands: commands of every episode at every logged step, the last one repeated, ``(E, N, nu)``.
         unseen: positions at the starts that no column has, dead-reckoned from their velocities, ``(W, k)``.
+        starts: observed columns from which they are simulated, ``(W, n)``; by default as they were measured.
     """
 
     measured: np.ndarray
@@ -45,10 +46,16 @@ class Windows:
     steps: np.ndarray
     commands: np.ndarray
     unseen: np.ndarray | None = None
+    starts: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of windows."""
         return len(self.measured)
+
+    @property
+    def begins(self) -> np.ndarray:
+        """Observed columns from which they are simulated, ``(W, n)``."""
+        return self.measured[:, 0] if self.starts is None else self.starts
 
     @property
     def length(self) -> int:
@@ -57,9 +64,10 @@ class Windows:
 
     def select(self, rows: np.ndarray | slice) -> Windows:
         """Return the given windows."""
-        unseen = None if self.unseen is None else self.unseen[rows]
-        own = {k: getattr(self, k)[rows] for k in ("measured", "rates", "episodes", "steps")}
-        return replace(self, **own, unseen=unseen)
+        given = [
+            k for k in ("measured", "rates", "episodes", "steps", "unseen", "starts") if getattr(self, k) is not None
+        ]
+        return replace(self, **{k: getattr(self, k)[rows] for k in given})
 
 
 class Twin:
@@ -134,7 +142,7 @@ class Twin:
             variants: the hypotheses, K of them.
             windows: the stretches of the log.
             starts: observed columns at the starts as the sensors would show them, ``(W, n)`` for all variants or
-                ``(K, W, n)``; the measured ones by default.
+                ``(K, W, n)``; the windows' own by default.
             pushes: generalized forces in every logged step, ``(K, L, nv)``, the same in all windows; none by default.
 
         Returns:
@@ -145,7 +153,7 @@ class Twin:
             return self._predict_apart(twins, variants, windows, starts, pushes)
         num_k, num_w, length = len(variants), len(windows), windows.length
         variants = [replace(v, placed=self.effects(v)) for v in variants]
-        shown = windows.measured[:, 0] if starts is None else starts
+        shown = windows.begins if starts is None else starts
         shown = np.broadcast_to(shown, (num_k, num_w, shown.shape[-1]))
         out = np.full((num_k, num_w, length + 1, shown.shape[-1]), np.nan)
         valid = np.ones(out.shape, dtype=bool)

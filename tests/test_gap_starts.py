@@ -1,0 +1,109 @@
+"""Windows that bend in the noise of their initial states begin where they fit the log best."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+import dropo_torch as dropo
+from dropo_torch.gap import Hypothesis, find_gap, prepare
+from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.refit import refit
+from dropo_torch.gap.scene import _cut
+from dropo_torch.gap.starts import begun, merged, straightened, table_of
+
+BALL = """<mujoco><option timestep="0.001"/><worldbody>
+  <geom name="floor" type="plane" size="5 5 .1" solref="-4000 -6"/>
+  <body name="ball" pos="0 0 .3"><joint name="x" type="slide" axis="1 0 0" damping="0.01"/>
+    <joint name="z" type="slide" axis="0 0 1"/><geom name="shell" type="sphere" size=".05" mass=".2" solref="-4000 -6"/>
+  </body></worldbody></mujoco>"""
+NOISE = np.array([5e-4, 5e-4, 0.08, 0.08])
+
+
+TRUE = Hypothesis(())
+
+
+def write_ball(folder: Path, damping: float = 0.01) -> Path:
+    """Write the log of a ball that bounces, seen with noisy velocities, and its config; return the config's path.
+
+    Args:
+        folder: where to.
+        damping: of the ball in the log; the model has 0.01.
+    """
+    rng, model, rows = np.random.default_rng(0), mujoco.MjModel.from_xml_string(BALL), []
+    model.dof_damping[0] = damping
+    for episode in range(12):
+        data = mujoco.MjData(model)
+        data.qpos[:], data.qvel[:] = (0, rng.uniform(0.0, 0.3)), rng.uniform(-0.5, 0.5, 2)
+        for row in range(90):
+            rows.append([episode, row / 100, *data.qpos, *data.qvel])
+            mujoco.mj_step(model, data, 10)
+    log = np.array(rows)
+    log[:, 2:] += NOISE * rng.standard_normal((len(log), 4))
+    np.savetxt(folder / "log.csv", log, delimiter=",", header="episode,t,x,z,vx,vz", comments="")
+    (folder / "ball.xml").write_text(BALL)
+    config = folder / "ball.yaml"
+    config.write_text(
+        "model: ball.xml\ndata: {path: log.csv, time: t, episode: episode, observations: [x, z, vx, vz], actions: []}\n"
+        "frame_skip: 10\nobservation: [x.position, z.position, x.velocity, z.velocity]\n"
+    )
+    return config
+
+
+@pytest.fixture(scope="module")
+def bouncing(tmp_path_factory: pytest.TempPathFactory) -> Evidence:
+    """The ball's log in windows with an impact or two each."""
+    problem = dropo.make_problem(dropo.load_config(write_ball(tmp_path_factory.mktemp("ball"))), general=True)
+    scene = prepare(problem)
+    return _cut(dataclasses.replace(scene.evidence, noise=NOISE), scene.train, scene.since, 30, rough=False)
+
+
+def test_true_model_leaves_noise_where_impacts_bend_windows(bouncing: Evidence) -> None:
+    bent = refit(bouncing, TRUE, iterations=0)
+    windows = straightened(bouncing, TRUE.variant)
+    assert windows is not None
+    straight = refit(dataclasses.replace(bouncing, windows=windows), TRUE, iterations=0)
+    assert bent.cost.reduced > 2
+    assert straight.cost.reduced < 1.15
+    assert straight.typical.max() < 2
+    moved = (windows.starts != windows.measured[:, 0]).any(-1)
+    assert 0 < moved.sum() < len(windows)  # the others begin as they were measured, to the last bit
+    np.testing.assert_allclose(straight.typical[~moved], bent.typical[~moved], rtol=1e-12)
+    assert (np.abs(windows.starts - windows.measured[:, 0]) < 5 * NOISE).all()
+
+
+def test_windows_of_a_simulation_without_impacts_stay(bouncing: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(type(bouncing.twin.setting), "has_impacts", False)
+    assert straightened(bouncing, TRUE.variant) is None
+
+
+def test_starts_are_known_by_episode_and_step(bouncing: Evidence) -> None:
+    windows, rng = bouncing.windows, np.random.default_rng(1)
+    assert table_of(windows) is None
+    assert begun(windows, None) is None
+    starts = windows.measured[:, 0].copy()
+    starts[[3, 5]] += rng.normal(size=(2, 4))
+    table = table_of(dataclasses.replace(windows, starts=starts))
+    assert table is not None
+    assert len(table) == 2
+    some = windows.select(np.array([7, 5, 0, 3]))
+    np.testing.assert_array_equal(begun(some, table), starts[[7, 5, 0, 3]])
+    newer = table[:1] + np.array([0, 0, 1, 1, 1, 1])
+    np.testing.assert_array_equal(merged(table, newer), np.concatenate([newer, table[1:]]))
+    assert merged(table, None) is table
+    assert merged(None, newer) is newer
+
+
+@pytest.mark.parametrize(("damping", "named"), [(0.01, []), (0.4, [("joint_damping", "x")])])
+def test_noise_beside_impacts_is_no_gap_and_hides_none(
+    damping: float, named: list[tuple[str, str]], tmp_path: Path
+) -> None:
+    gap = find_gap(dropo.make_problem(dropo.load_config(write_ball(tmp_path, damping)), general=True))
+    assert [(e.effect, e.target) for e in gap.effects] == named
+    assert gap.reduced[1] < 1.2
+    for effect in gap.effects:
+        assert effect.parameters["damping"].value == pytest.approx(damping - 0.01, rel=0.1)
