@@ -38,7 +38,7 @@ def write_ball(folder: Path, damping: float = 0.01) -> Path:
     model.dof_damping[0] = damping
     for episode in range(12):
         data = mujoco.MjData(model)
-        data.qpos[:], data.qvel[:] = (0, rng.uniform(0.0, 0.3)), rng.uniform(-0.5, 0.5, 2)
+        data.qpos[:], data.qvel[:] = (0, rng.uniform(0.0, 0.3)), rng.uniform(-0.5, 0.5, 2) * (4, 1)
         for row in range(90):
             rows.append([episode, row / 100, *data.qpos, *data.qvel])
             mujoco.mj_step(model, data, 10)

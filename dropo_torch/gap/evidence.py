@@ -172,7 +172,7 @@ class Evidence:
 
     def linearize(self, variant: Variant) -> Linearization:
         """Return how a hypothesis' residuals depend on the initial states."""
-        found = self._statistical(variant) if self.rough else self._where_needed(variant)
+        found = self._as_far_as_known(variant) if self.rough else self._where_needed(variant)
         return self.counting(found, variant)
 
     def counting(self, linear: Linearization, variant: Variant) -> Linearization:
@@ -185,7 +185,7 @@ class Evidence:
 
         There, noise on the initial state that no derivative sees may move an impact from one step to the next.
         """
-        linear, residual = self._differences(variant)
+        linear, _, residual = self._by_differences(variant)
         if not self.twin.setting.has_impacts:
             return linear
         chi2 = (self.project(residual, linear) ** 2).sum(-1)
@@ -198,14 +198,33 @@ class Evidence:
             values[far] = getattr(bent, name)
         return replace(linear, **arrays)
 
-    def _differences(self, variant: Variant) -> tuple[Linearization, np.ndarray]:
-        """The linearization, and the residuals ``(W, N)`` at the measured initial states."""
+    def _by_differences(self, variant: Variant) -> tuple[Linearization, np.ndarray, np.ndarray]:
+        """The linearization, derivatives ``(W, N, m)``, and residuals ``(W, N)`` at the windows' starts."""
         m = self.chart.size
         (residual,), (known,) = self.residuals([variant])
         changes = self.changes(variant, residual, [variant] * m, np.eye(m)[:, None])
-        basis, _ = np.linalg.qr(np.moveaxis(np.nan_to_num(changes), 0, -1))
+        slope = np.moveaxis(np.nan_to_num(changes), 0, -1)
         weights = known.astype(float)
-        return Linearization(basis, weights, np.zeros(weights.shape), 0.0), residual
+        linear = Linearization(np.linalg.qr(slope)[0], weights, np.zeros(weights.shape), 0.0)
+        return linear, slope, np.nan_to_num(residual, nan=LOST)
+
+    def _as_far_as_known(self, variant: Variant) -> Linearization:
+        """Differences along what a window leaves open of its initial state, and what draws of it leave beside these.
+
+        The whole window tells its initial state more precisely than the one row that was measured there; what the
+        simulation bends within that adds to the noise.
+        """
+        linear, slope, here = self._by_differences(variant)
+        _, sizes, axes = np.linalg.svd(slope, full_matrices=False)
+        open_ = np.swapaxes(axes, 1, 2) / np.maximum(sizes, 1.0)[:, None]  # (W, m, m), no wider than the noise
+        half = np.random.default_rng(SEED).standard_normal((PAIRS, slope.shape[-1]))
+        draws = np.concatenate([half, -half])
+        moved = np.concatenate([np.moveaxis(open_, -1, 0), np.einsum("wmk,dk->dwm", open_, draws)])
+        found, _ = self.residuals([variant] * len(moved), moved)
+        changes = np.nan_to_num(found, nan=LOST) - here
+        along, left = np.moveaxis(changes[: len(open_[0])], 0, -1), changes[len(open_[0]) :]
+        left = left - np.einsum("wnk,dk->dwn", along, draws)
+        return _bent(along, left, linear.weights, len(draws))
 
     def _statistical(self, variant: Variant, pairs: int = PAIRS) -> Linearization:
         """Regress the residuals on draws of noise on the initial states; what is left over adds to the noise."""
@@ -217,13 +236,8 @@ class Evidence:
         center = found[1:].mean(0)
         flat = found[1:] - center
         slope = np.einsum("dk,dwn->wnk", np.linalg.pinv(draws).T, flat)
-        left = flat - np.einsum("wnk,dk->dwn", slope, draws)
-        variance = (left**2).sum(0) / (len(draws) - m)
-        variance[variance < 0.01] = 0.0
-        weights = known[0] / np.sqrt(1 + 1.5 * variance)
-        basis, _ = np.linalg.qr(slope * weights[..., None])
-        shift = np.where(variance > 0, center - found[0], 0.0)
-        return Linearization(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
+        left = flat - np.einsum("wnk,dk->dwn", slope, draws) + center - found[0]
+        return _bent(slope, left, known[0], len(draws) - m)
 
     def project(self, residuals: np.ndarray, linear: Linearization) -> np.ndarray:
         """Return the part ``(..., W, N)`` of residuals that no initial states explain; what diverges is lost."""
@@ -245,6 +259,17 @@ class Evidence:
         """Return the cost of projected residuals ``(W, N)`` to which some numbers were fitted."""
         degrees, tail = self.degrees(linear) - numbers, self.tail(linear)
         return cost_of(projected, linear, degrees, self.caps, tail, self.rules.weighed)
+
+
+def _bent(slope: np.ndarray, left: np.ndarray, known: np.ndarray, degrees: int) -> Linearization:
+    """The linearization with slopes ``(W, N, k)``, where ``(D, W, N)`` is left of draws, of so many degrees."""
+    center = left.mean(0)
+    variance = ((left - center) ** 2).sum(0) / degrees
+    variance[variance < 0.01] = 0.0
+    weights = known / np.sqrt(1 + 1.5 * variance)
+    basis, _ = np.linalg.qr(slope * weights[..., None])
+    shift = np.where(variance > 0, center, 0.0)
+    return Linearization(basis, weights, np.clip(shift, -LOST, LOST), float((variance > 1).mean()))
 
 
 def _beside(linear: Linearization, vectors: np.ndarray) -> np.ndarray:
