@@ -28,7 +28,6 @@ from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.screen import all_candidates
-from dropo_torch.gap.starts import straightened
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
@@ -217,9 +216,7 @@ def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, sin
         evidence = _cut(whole, train, since, length, FEW)
         if not len(evidence.windows):
             continue
-        windows = straightened(evidence, begin.variant)
-        evidence = evidence if windows is None else replace(evidence, windows=windows)
-        rough = evidence.linearize(begin.variant).roughness
+        rough = evidence.roughness(begin.variant)
         if rough < cut.rough and (not touches or _end_error(evidence, begin) < cut.astray):
             return _cut(whole, train, since, length, rough=rough > cut.bent)
     return _cut(whole, train, since, min(cut.lengths[-1], longest))

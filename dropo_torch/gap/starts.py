@@ -17,7 +17,7 @@ from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.twin import Windows
 
 #: Gauss-Newton steps, at most; shares of a step that are tried; the difference step, in units of the noise.
-STEPS, SHARES, DIFFERENCE = 5, (1.0, 0.5, 0.2), 0.3
+STEPS, SHARES, DIFFERENCE = 12, (1.0, 0.5, 0.2), 0.3
 #: A window bends if a linear step leaves more or less than it promises by this factor; a step helps if it gains this
 #: share.
 BENDS, GAINS = 1.05, 0.01
