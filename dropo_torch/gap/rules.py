@@ -168,6 +168,8 @@ class Cut:
         rough: share of residuals whose variance, over noise on the initial states, stays unexplained, up to which a
             length will do.
         bent: the share from which on windows are linearized statistically.
+        gained: share of that of longer windows which shorter ones must have less than, to be taken where neither is
+            below ``rough``.
         astray: typical error at a window's end, relative to the motion, from which on contacts come at other times than
             measured.
     """
@@ -177,6 +179,7 @@ class Cut:
     enough: int = 10
     rough: float = 0.03
     bent: float = 0.001
+    gained: float = 0.5
     astray: float = 0.08
 
 
