@@ -305,6 +305,40 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     assert bool(judged) == looked
 
 
+@pytest.mark.parametrize(("next_one", "is_family"), [(50.0, False), (500.0, True)])
+def test_the_family_is_none_where_one_effect_more_leaves_less(
+    next_one: float, is_family: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A delay at all joints hides a payload, of which every member of the family would take a part."""
+
+    def fit(excess: float, left: float) -> Any:
+        return SimpleNamespace(cost=SimpleNamespace(excess=excess, left_of=lambda _: left), hypothesis=hypothesis)
+
+    hypothesis: Any = SimpleNamespace(placed=(object(),))
+    tried = [fit(next_one, 0.1)]
+    for name, made in {
+        "has_family": True, "significant": True, "one_kind": True, "leaves_too_much": False, "nearer": None,
+        "fitted_family": fit(100.0, 0.3), "whole_family": fit(100.0, 0.3), "sound": tried,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(members, name, lambda *_, made=made: made)
+    ground: Any = SimpleNamespace(
+        rules=Rules(), screened=lambda _: [], focus=lambda _: None, refits=lambda *_: (tried, None)
+    )
+    first: Any = Ended(current=fit(1000.0, 0.5))
+    before: Any = SimpleNamespace(base=SimpleNamespace(cost=None, hypothesis=None))
+    assert members.with_family(ground, before, first).family == is_family
+
+
+@dataclasses.dataclass(frozen=True)
+class Ended:
+    """As much of a state as the family looks at."""
+
+    current: Any
+    done: bool = False
+    family: bool = False
+    refused: str = ""
+
+
 LEG = """
 <body name="{n}_thigh" pos="{x} 0 0"><joint name="{n}_hip" axis="0 {s} 0" damping=".1" range="-{r} 1"/>
   <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.2" mass=".5"/>
