@@ -329,6 +329,29 @@ def test_the_family_is_none_where_one_effect_more_leaves_less(
     assert members.with_family(ground, before, first).family == is_family
 
 
+def test_a_delay_at_all_joints_and_a_payload_are_found_together(tmp_path: Path) -> None:
+    """The payload explains most by itself, with wrong numbers; the delays then show as a family, and not one by one."""
+    spec, late, rng = mujoco.MjSpec.from_string(leg()), 4, np.random.default_rng(3)
+    spec.bodies[-1].add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], pos=[0.02, 0, -0.2], mass=0.5)
+    model = spec.compile()
+    data, time = mujoco.MjData(model), 0.005 * np.arange(ROWS + 1)
+    phase = 2 * np.pi * (0.3 * time + 0.15 * time**2)
+    targets = 0.5 * np.sin(phase[:, None] * rng.uniform(0.8, 1.2, 3) + rng.uniform(0, 6, 3))
+    rows = []
+    for i in range(len(targets)):
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = targets[max(i - late, 0)]
+        mujoco.mj_step(model, data, 2)
+    observations = np.array(rows) + rng.standard_normal((len(rows), 6)) * np.repeat(NOISE, 3)
+    path = record(tmp_path, 0)
+    np.savez(tmp_path / "leg.npz", observations=observations, actions=targets, terminals=np.arange(len(rows)) == ROWS)
+    gap = find_gap(dropo.make_problem(dropo.load_config(path), general=True))
+    found = {e.effect: {k: s.value for k, s in e.parameters.items()} for e in gap.effects}
+    assert set(found) == {"actuator_delay", "payload"}
+    assert list(found["actuator_delay"].values()) == pytest.approx([0.02] * 3, abs=1e-4)
+    assert found["payload"]["mass"] == pytest.approx(0.5, rel=0.02)
+
+
 @dataclasses.dataclass(frozen=True)
 class Ended:
     """As much of a state as the family looks at."""

@@ -274,7 +274,7 @@ class Rules:
     Attributes:
         gate: excess in standard deviations of χ² from which on something is missing.
         least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
-        most: share of the excess that an effect removes without that pairs or families are tried in its place.
+        most: share of the excess that an effect removes without that pairs are tried in its place.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         misjudged: share that few numbers may leave where it is no more than ``sound.rest``: so much may be wrong with
             the estimate of the noise.
