@@ -546,6 +546,31 @@ def test_the_only_pose_is_that_of_the_only_free_body_and_a_gyroscope_turns_as_it
     assert columns["flap.velocity"].std() == pytest.approx(table[:, 9].std(), rel=0.05)
 
 
+PLANAR = """
+<mujoco><worldbody><body name="body0">
+  <joint name="rootx" type="slide" axis="1 0 0"/><joint name="rootz" type="slide" axis="0 0 1"/>
+  <joint name="rooty" axis="0 1 0"/><geom size=".1" mass="1"/>
+  <body><joint name="hip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".3"/></body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("base", ["base_", "torso_", ""])
+def test_columns_of_the_base_are_the_joints_by_which_all_of_a_robot_moves(tmp_path: Path, base: str) -> None:
+    """Whatever a planar base is called, its axes and its pitch tell which is which, in any order."""
+    names = [f"{base}{n}" for n in ("z", "pitch", "x")] + ["hip_q"]
+    names += [f"{base}{n}_vel" for n in ("z", "pitch", "x")] + ["hip_dq"]
+    files = written(tmp_path, dict(zip(names, np.random.default_rng(0).standard_normal((8, 9)), strict=True)), PLANAR)
+    columns, places = (
+        read_columns(files[1], ["rootx", "rootz", "rooty", "hip"]),
+        places_of(mujoco.MjModel.from_xml_string(PLANAR)),
+    )
+    found = match_columns(columns, places, np.arange(9) == 0, ())
+    label = {m.column.entry: m.place.label for m in found.matches}
+    for name, joint in (("x", "rootx"), ("z", "rootz"), ("pitch", "rooty")):
+        assert label[f"{base}{name}"] == f"{joint}.position"
+        assert label[f"{base}{name}_vel"] == f"{joint}.velocity"
+
+
 DROP = """
 <mujoco><option timestep=".001"/>
   <worldbody><geom type="plane" size="9 9 1" solref=".01 .3"/>
