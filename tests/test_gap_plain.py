@@ -603,3 +603,11 @@ def test_contacts_that_flicker_hide_no_derivative(start: float) -> None:
     friction = Placed(find_effect("contact_friction"), "block", (start,))
     fitted = refit(pushed().evidence, pushed().begin.with_effects([friction]))
     assert fitted.hypothesis.placed[0].values[0] == pytest.approx(0.36, abs=0.003)
+
+
+@pytest.mark.parametrize(("mask", "first"), [((), 0), (("rail.velocity", "pole.velocity"), 2)])
+def test_open_loop_begins_where_derived_velocities_have_rows_on_both_sides(mask: tuple[str, ...], first: int) -> None:
+    scene = scene_of(RAIL, lambda _: None, lambda time, phases: np.sin(3 * time + phases[0])[:, None], mask=mask)
+    held = cut_held(scene.evidence, scene.held, scene.begin)
+    assert held.rollouts.steps.min() == first
+    assert min(held.rows) == first
