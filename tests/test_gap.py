@@ -213,6 +213,26 @@ def test_a_mass_that_is_another_is_no_load(tmp_path: Path, monkeypatch: pytest.M
     assert given.as_own(problem, better) is None
 
 
+@pytest.mark.parametrize(("numbers", "is_simpler"), [(1, False), (4, True)])
+def test_masses_of_several_bodies_that_are_others_are_no_load(numbers: int, is_simpler: bool, tmp_path: Path) -> None:
+    """A load on one body makes up for the masses of others, but has more numbers than these."""
+    problem = as_given(hidden(), tmp_path)
+    parameters = problem.config.parameters or {}
+    model = problem.space.model
+    assert model is not None
+    carriage = next(n for i in range(1, model.nbody) if (n := model.body(i).name) != parameters["pole_mass"]["name"])
+    cart = {"field": "body_mass", "name": carriage, "bounds": [0.1, 10.0]}
+    config = problem.config.model_copy(update={"parameters": {**parameters, "cart_mass": cart}})
+    (named,) = found(("joint_damping",)).effects
+    strengths = dict.fromkeys("abcd"[:numbers], next(iter(named.parameters.values())))
+    load = dataclasses.replace(named, effect="payload", target=carriage, parameters=strengths)
+    plain = given.as_own(
+        dataclasses.replace(problem, config=config), dataclasses.replace(found(("joint_damping",)), effects=(load,))
+    )
+    assert (plain is not None) == is_simpler
+    assert plain is None or set(plain.config.parameters or ()) == {"cart_mass", "pole_mass"}
+
+
 # --- the whole ------------------------------------------------------------------------------------------------
 
 

@@ -305,6 +305,63 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     assert bool(judged) == looked
 
 
+@pytest.mark.parametrize(("next_one", "is_family"), [(50.0, False), (500.0, True)])
+def test_the_family_is_none_where_one_effect_more_leaves_less(
+    next_one: float, is_family: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A delay at all joints hides a payload, of which every member of the family would take a part."""
+
+    def fit(excess: float, left: float) -> Any:
+        return SimpleNamespace(cost=SimpleNamespace(excess=excess, left_of=lambda _: left), hypothesis=hypothesis)
+
+    hypothesis: Any = SimpleNamespace(placed=(object(),))
+    tried = [fit(next_one, 0.1)]
+    for name, made in {
+        "has_family": True, "significant": True, "one_kind": True, "leaves_too_much": False, "nearer": None,
+        "fitted_family": fit(100.0, 0.3), "whole_family": fit(100.0, 0.3), "sound": tried,
+    }.items():  # fmt: skip
+        monkeypatch.setattr(members, name, lambda *_, made=made: made)
+    ground: Any = SimpleNamespace(
+        rules=Rules(), screened=lambda _: [], focus=lambda _: None, refits=lambda *_: (tried, None)
+    )
+    first: Any = Ended(current=fit(1000.0, 0.5))
+    before: Any = SimpleNamespace(base=SimpleNamespace(cost=None, hypothesis=None))
+    assert members.with_family(ground, before, first).family == is_family
+
+
+def test_a_delay_at_all_joints_and_a_payload_are_found_together(tmp_path: Path) -> None:
+    """The payload explains most by itself, with wrong numbers; the delays then show as a family, and not one by one."""
+    spec, late, rng = mujoco.MjSpec.from_string(leg()), 4, np.random.default_rng(3)
+    spec.bodies[-1].add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[0.005, 0, 0], pos=[0.02, 0, -0.2], mass=0.5)
+    model = spec.compile()
+    data, time = mujoco.MjData(model), 0.005 * np.arange(ROWS + 1)
+    phase = 2 * np.pi * (0.3 * time + 0.15 * time**2)
+    targets = 0.5 * np.sin(phase[:, None] * rng.uniform(0.8, 1.2, 3) + rng.uniform(0, 6, 3))
+    rows = []
+    for i in range(len(targets)):
+        rows.append(np.concatenate([data.qpos, data.qvel]))
+        data.ctrl[:] = targets[max(i - late, 0)]
+        mujoco.mj_step(model, data, 2)
+    observations = np.array(rows) + rng.standard_normal((len(rows), 6)) * np.repeat(NOISE, 3)
+    path = record(tmp_path, 0)
+    np.savez(tmp_path / "leg.npz", observations=observations, actions=targets, terminals=np.arange(len(rows)) == ROWS)
+    gap = find_gap(dropo.make_problem(dropo.load_config(path), general=True))
+    found = {e.effect: {k: s.value for k, s in e.parameters.items()} for e in gap.effects}
+    assert set(found) == {"actuator_delay", "payload"}
+    assert list(found["actuator_delay"].values()) == pytest.approx([0.02] * 3, abs=1e-4)
+    assert found["payload"]["mass"] == pytest.approx(0.5, rel=0.02)
+
+
+@dataclasses.dataclass(frozen=True)
+class Ended:
+    """As much of a state as the family looks at."""
+
+    current: Any
+    done: bool = False
+    family: bool = False
+    refused: str = ""
+
+
 LEG = """
 <body name="{n}_thigh" pos="{x} 0 0"><joint name="{n}_hip" axis="0 {s} 0" damping=".1" range="-{r} 1"/>
   <geom type="capsule" size=".02" fromto="0 0 0 0 0 -.2" mass=".5"/>

@@ -91,6 +91,16 @@ LEGS = f"""
   <worldbody>{"".join(LEG.format(n=n) for n in range(3))}</worldbody>
   <actuator>{"".join(f'<motor joint="{joint}{n}"/>' for n in range(3) for joint in ("hip", "knee"))}</actuator>
 </mujoco>"""
+PUSHED = """
+<mujoco><option timestep="0.002" cone="elliptic" integrator="implicitfast"/>
+  <worldbody><geom name="table" type="plane" size="9 9 1" friction=".4"/>
+    <body pos="0 0 .03">
+      <joint name="x" type="slide" axis="1 0 0"/><joint name="y" type="slide" axis="0 1 0"/>
+      <joint name="z" type="slide" axis="0 0 1"/>
+      <geom name="block" type="box" size=".05 .05 .03" mass=".6" friction=".4"/>
+    </body></worldbody>
+  <actuator><motor name="push" joint="x"/><motor name="side" joint="y"/></actuator>
+</mujoco>"""
 NOISE = {"position": 1e-4, "velocity": 1e-3}
 Change = Callable[[mujoco.MjModel], None]
 
@@ -564,3 +574,40 @@ def test_what_is_observed_or_an_orientation_is_not_reckoned() -> None:
     assert parse_observation(free, None).reckoned == ()
     assert [r.position for r in parse_observation(free, ["qpos[2:]", "qvel"]).reckoned] == [0, 1]
     assert [r.position for r in parse_observation(free, ["qvel"]).reckoned] == [0, 1, 2]
+
+
+@functools.cache
+def pushed() -> Scene:
+    """A block that is pushed over a table with a friction of 0.36 in place of 0.4; noise presses it into the table."""
+
+    def slippery(truth: mujoco.MjModel) -> None:
+        truth.geom_friction[:, 0] = 0.36
+
+    def resting(data: mujoco.MjData, rng: np.random.Generator) -> None:
+        data.qpos[2] = -1.1e-5
+
+    def forces(time: np.ndarray, phases: np.ndarray) -> np.ndarray:
+        return np.stack([4 * np.sin(4 * time + phases[0]), 3.5 * np.sin(3 * time + phases[1])], axis=1)
+
+    return scene_of(PUSHED, slippery, forces, begin=resting)
+
+
+def test_windows_are_no_shorter_where_that_makes_nothing_more_linear() -> None:
+    """Noise on the height bends a window from its first step on; in a short one, friction does not add up."""
+    assert pushed().evidence.windows.length == 30
+
+
+@pytest.mark.parametrize("start", [0.32, 0.4])
+def test_contacts_that_flicker_hide_no_derivative(start: float) -> None:
+    """A small step of a number shows only that contacts open and close at other times, by the same however small."""
+    friction = Placed(find_effect("contact_friction"), "block", (start,))
+    fitted = refit(pushed().evidence, pushed().begin.with_effects([friction]))
+    assert fitted.hypothesis.placed[0].values[0] == pytest.approx(0.36, abs=0.003)
+
+
+@pytest.mark.parametrize(("mask", "first"), [((), 0), (("rail.velocity", "pole.velocity"), 2)])
+def test_open_loop_begins_where_derived_velocities_have_rows_on_both_sides(mask: tuple[str, ...], first: int) -> None:
+    scene = scene_of(RAIL, lambda _: None, lambda time, phases: np.sin(3 * time + phases[0])[:, None], mask=mask)
+    held = cut_held(scene.evidence, scene.held, scene.begin)
+    assert held.rollouts.steps.min() == first
+    assert min(held.rows) == first

@@ -546,6 +546,60 @@ def test_the_only_pose_is_that_of_the_only_free_body_and_a_gyroscope_turns_as_it
     assert columns["flap.velocity"].std() == pytest.approx(table[:, 9].std(), rel=0.05)
 
 
+PLANAR = """
+<mujoco><worldbody><body name="body0">
+  <joint name="rootx" type="slide" axis="1 0 0"/><joint name="rootz" type="slide" axis="0 0 1"/>
+  <joint name="rooty" axis="0 1 0"/><geom size=".1" mass="1"/>
+  <body><joint name="hip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 0 0 -.2" size=".02" mass=".3"/></body>
+</body></worldbody></mujoco>"""
+
+
+@pytest.mark.parametrize("base", ["base_", "torso_", ""])
+def test_columns_of_the_base_are_the_joints_by_which_all_of_a_robot_moves(tmp_path: Path, base: str) -> None:
+    """Whatever a planar base is called, its axes and its pitch tell which is which, in any order."""
+    names = [f"{base}{n}" for n in ("z", "pitch", "x")] + ["hip_q"]
+    names += [f"{base}{n}_vel" for n in ("z", "pitch", "x")] + ["hip_dq"]
+    files = written(tmp_path, dict(zip(names, np.random.default_rng(0).standard_normal((8, 9)), strict=True)), PLANAR)
+    columns, places = (
+        read_columns(files[1], ["rootx", "rootz", "rooty", "hip"]),
+        places_of(mujoco.MjModel.from_xml_string(PLANAR)),
+    )
+    found = match_columns(columns, places, np.arange(9) == 0, ())
+    label = {m.column.entry: m.place.label for m in found.matches}
+    for name, joint in (("x", "rootx"), ("z", "rootz"), ("pitch", "rooty")):
+        assert label[f"{base}{name}"] == f"{joint}.position"
+        assert label[f"{base}{name}_vel"] == f"{joint}.velocity"
+
+
+DROP = """
+<mujoco><option timestep=".001"/>
+  <worldbody><geom type="plane" size="9 9 1" solref=".01 .3"/>
+    <body name="ball" pos="0 0 .3"><freejoint name="ball"/>
+      <geom type="sphere" size=".05" mass=".2" solref=".01 .3"/></body>
+  </worldbody></mujoco>"""
+
+
+def test_derived_velocities_are_compared_nowhere_where_something_touches(
+    tmp_path: Path, log: tuple[np.ndarray, ...]
+) -> None:
+    """An impact within a row makes a difference of positions no velocity."""
+    model, rng = mujoco.MjModel.from_xml_string(DROP), np.random.default_rng(0)
+    data, rows = mujoco.MjData(model), []
+    data.qvel[:] = [0.3, 0.2, 0, 1, -2, 0.5]
+    for _ in range(200):
+        rows.append([data.time, *data.qpos[:3] + 3e-4 * rng.standard_normal(3), *data.qpos[3:]])
+        mujoco.mj_step(model, data, 10)
+    names = ("t", *(f"ball_p{axis}" for axis in "xyz"), *(f"ball_q{axis}" for axis in "wxyz"))
+    frame = dict(zip(names, np.array(rows).T, strict=True))
+    found = dropo.propose_config(*written(tmp_path, frame, DROP), out=tmp_path / "robot.yaml")
+    assert found.document["mask"] == [f"ball.velocity[{kind}{axis}]" for kind in "vw" for axis in "xyz"]
+    assert "they say where windows begin, and are compared nowhere" in found.draft.notes
+    t, q, _, u = log
+    frame = {"t": t, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]}  # nothing touches
+    found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
+    assert "mask" not in found.document
+
+
 def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
     """A column that is nothing of the model's, and a hole in another, are no silent matter."""
     t, q, v, u = log

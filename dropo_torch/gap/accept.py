@@ -169,9 +169,10 @@ def is_done(ground: Ground, state: State) -> bool:
 def add(ground: Ground, state: State) -> State:
     """Accept the one or two effects, or the family, that remove the most; where nothing does, the search is done.
 
-    Pairs and families are tried where no single effect removes most of what is left, unless what was accepted before
-    accounts for the gap: of the little that it leaves, not several more are found at once. One of them takes the place
-    of the best single effect where it leaves much less, or where that alone would end the search.
+    Pairs are tried where no single effect removes most of what is left, and families where the best one leaves more
+    than noise, unless what was accepted before accounts for the gap: of the little that it leaves, not several more are
+    found at once. One of them takes the place of the best single effect where it leaves much less, or where that alone
+    would end the search.
     """
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
@@ -189,8 +190,9 @@ def add(ground: Ground, state: State) -> State:
         return replace(state, done=True)
     best = simplest(singles, rules)
     rivals = [r for r in singles if not significant(r.cost, rules)]
-    if best.cost.left_of(current.cost) > 1 - rules.most and not accounts(current, state.base, rules):
-        best, state = _among_several(ground, state, alive, best)
+    if significant(best.cost, rules) and not accounts(current, state.base, rules):
+        most = best.cost.left_of(current.cost) <= 1 - rules.most
+        best, state = _among_several(ground, state, alive, best, pairs=not most)
     worse = is_hopeless(best, current, rules) or not matters(ground, state.base, best, current)
     if worse or not beats(ground, best, current):
         return replace(state, done=True)
@@ -207,14 +209,16 @@ def reconsidered(ground: Ground, state: State) -> State:
     return replace(state, current=simplest(fitted, ground.rules) if fitted else state.current, rivals=())
 
 
-def _among_several(ground: Ground, state: State, alive: Sequence[Candidate], best: Refit) -> tuple[Refit, State]:
-    """The best pair or family where it leaves much less than the best single effect, or where that is hopeless."""
+def _among_several(
+    ground: Ground, state: State, alive: Sequence[Candidate], best: Refit, *, pairs: bool
+) -> tuple[Refit, State]:
+    """The best pair, if asked, or family where it leaves much less than the best single effect, or that is hopeless."""
     rules, current = ground.rules, state.current
-    pairs, state = paired(ground, state, alive)
+    two, state = paired(ground, state, alive) if pairs else ([], state)
     families = promising_families(ground.focus(current), alive, rules.tried)
     found, state = ground.refits(state, current, families, "refitting families")
     several = sound(ground, found)
-    for tried in (simplest(r, rules) for r in (pairs, several) if r):
+    for tried in (simplest(r, rules) for r in (two, several) if r):
         clearer = tried.cost.left_of(best.cost) < rules.tried.clearer
         if clearer or (is_hopeless(best, current, rules) and not is_hopeless(tried, current, rules)):
             best = tried

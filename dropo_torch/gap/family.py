@@ -15,12 +15,13 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
-from dropo_torch.gap.accept import SOFT, extend, with_soft_friction
+from dropo_torch.gap.accept import SOFT, extend, sound, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
+from dropo_torch.gap.screen import nearer
 from dropo_torch.gap.sound import absurd
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
@@ -51,7 +52,8 @@ def with_family(ground: Ground, state: State, found: State) -> State:
 
     At several joints several members must be needed: what sits at one joint, or is of one kind, the search names one by
     one. Where the first effects are not one effect at several joints already, it must leave next to nothing of what
-    they leave. What ends at a bound of physics is no member.
+    they leave. What ends at a bound of physics is no member. Where it leaves more than noise, and one effect more
+    beside the first ones leaves less, the search goes on with these.
 
     Args:
         ground: what the search stands on.
@@ -73,9 +75,24 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     if fitted.cost.left_of(cost) > most:
         return found
     whole = whole_family(ground, fitted)
-    if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)]:
+    if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)] or is_surpassed(ground, best, whole):
         return found
     return replace(found, current=whole, family=True, done=True, refused="")
+
+
+def is_surpassed(ground: Ground, found: State, whole: Refit) -> bool:
+    """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more.
+
+    What several joints lack, such as a delay, may hide what one body lacks, of which every member would take a part.
+    """
+    current = found.current
+    if found.done or not current.hypothesis.placed or not significant(whole.cost, ground.rules):
+        return False
+    alive = [c for c in ground.screened(current) if not c.dead][: ground.rules.tried.refits]
+    focus = ground.focus(current)
+    groups = [(nearer(focus, current.hypothesis, c),) for c in alive]
+    singles, _ = ground.refits(found, current, groups, STAGE)
+    return any(r.cost.excess < whole.cost.excess for r in sound(ground, singles))
 
 
 def has_family(ground: Ground) -> bool:

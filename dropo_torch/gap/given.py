@@ -120,17 +120,28 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
     """Return a problem in which masses that the config has make up for what was named at their bodies, if they do.
 
     What sits on a body has more numbers than the mass of the body itself, which may just be another than the model's.
-    A mass and its center together have as many: they are no simpler answer.
+    Where several bodies' are, names at one of them stand for all: so all masses are tried, unless these are more
+    numbers than what was named has. A mass and its center together have as many: they are no simpler answer.
 
     Args:
         problem: the model, its parameters, and the log.
         gap: what explains the log in the model as given.
     """
     bodies = {e.target for e in gap.effects if e.effect in MASSIVE}
-    parameters = problem.config.parameters or {}
-    free = [n for n, p in parameters.items() if p.get("field") == "body_mass" and p.get("name") in bodies]
-    if not free:
+    if not bodies:
         return None
+    parameters = problem.config.parameters or {}
+    masses = {n: p.get("name") for n, p in parameters.items() if p.get("field") == "body_mass"}
+    own, every = [n for n, body in masses.items() if body in bodies], list(masses)
+    named = sum(len(e.parameters) for e in gap.effects)
+    for free in (own, every if len(own) < len(every) <= named else []):
+        if free and (plain := _as_good(problem, free, gap)) is not None:
+            return plain
+    return None
+
+
+def _as_good(problem: Problem, free: Sequence[str], gap: Gap) -> Problem | None:
+    """A problem in which some parameters are free, if with these it leaves no more than what was named."""
     plain = as_given(problem, free)
     scene = prepare(plain)
     left = refit(scene.evidence, scene.begin, slopes=False).cost.reduced

@@ -19,6 +19,8 @@ from dropo_torch.optimizers.least_squares import bounded_step
 
 #: Difference step and the smallest move that is worth another iteration, relative to a parameter's scale.
 STEP, LEAST_MOVE = 1e-3, 2e-5
+#: Longer difference step, where the simulation is rough, and times by which the short one must show more to jump.
+LONG_STEP, JUMPS = 0.1, 2.0
 #: Damping at first, at least, and at most.
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
 #: Ridge of a step, and its longest move relative to a parameter's scale.
@@ -232,13 +234,28 @@ def _at(
 
 
 def _sloped(evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarray) -> Refit:
-    """The same with its derivatives ``(q, W, N)``, none by discrete numbers, from its residuals ``(W, N)``."""
-    moved, steps = beside(here.hypothesis, limits, np.flatnonzero(limits.free), STEP)
-    slope = np.zeros_like(here.slope)
-    if moved:
-        changes = evidence.changes(here.hypothesis.variant, residuals, [h.variant for h in moved])
-        slope[limits.free] = evidence.project_slope(changes / steps[:, None, None], here.linear)
+    """The same with its derivatives ``(q, W, N)``, none by discrete numbers, from its residuals ``(W, N)``.
+
+    Where contacts flicker, a window jumps by as much as its noise however little a number moves, and a short difference
+    shows nothing else: such windows have the longer one.
+    """
+    slope, columns = np.zeros_like(here.slope), np.flatnonzero(limits.free)
+    if columns.size:
+        slope[columns] = _differences(evidence, here, limits, residuals, columns, STEP)
+    if columns.size and evidence.rough:
+        longer = _differences(evidence, here, limits, residuals, columns, LONG_STEP)
+        jumps = np.linalg.norm(slope[columns], axis=-1) > JUMPS * np.linalg.norm(longer, axis=-1)
+        slope[columns] = np.where(jumps[..., None], longer, slope[columns])
     return replace(here, slope=slope)
+
+
+def _differences(
+    evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarray, columns: np.ndarray, step: float
+) -> np.ndarray:
+    """Derivatives by some numbers ``(c, W, N)``, each moved by a step in its scale, from residuals ``(W, N)``."""
+    moved, steps = beside(here.hypothesis, limits, columns, step)
+    changes = evidence.changes(here.hypothesis.variant, residuals, [h.variant for h in moved])
+    return evidence.project_slope(changes / steps[:, None, None], here.linear)
 
 
 def _fitted(

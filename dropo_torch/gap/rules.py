@@ -168,6 +168,8 @@ class Cut:
         rough: share of residuals whose variance, over noise on the initial states, stays unexplained, up to which a
             length will do.
         bent: the share from which on windows are linearized statistically.
+        gained: share of that of longer windows which shorter ones must have less than, to be taken where neither is
+            below ``rough``.
         astray: typical error at a window's end, relative to the motion, from which on contacts come at other times than
             measured.
     """
@@ -177,6 +179,7 @@ class Cut:
     enough: int = 10
     rough: float = 0.03
     bent: float = 0.001
+    gained: float = 0.5
     astray: float = 0.08
 
 
@@ -271,7 +274,7 @@ class Rules:
     Attributes:
         gate: excess in standard deviations of χ² from which on something is missing.
         least_reduced: χ² per degree of freedom below which nothing is, since the noise itself is only estimated.
-        most: share of the excess that an effect removes without that pairs or families are tried in its place.
+        most: share of the excess that an effect removes without that pairs are tried in its place.
         accounted: share of the first excess that the named effects must remove together, or nothing has a name.
         misjudged: share that few numbers may leave where it is no more than ``sound.rest``: so much may be wrong with
             the estimate of the noise.

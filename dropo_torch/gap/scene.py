@@ -209,17 +209,26 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
 
 
 def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, since: np.ndarray) -> Evidence:
-    """The longest windows in whose initial states the simulation is still nearly linear."""
-    cut = whole.rules.cut
+    """The longest windows in whose initial states the simulation is still nearly linear.
+
+    Where none are, as where noise presses what rests on a table into it, the longest than which no shorter ones are
+    much more linear: these would show less of all that adds up, and gain nothing.
+    """
+    cut, bent, least = whole.rules.cut, dict[int, float](), np.inf
     longest, touches = longest_episode(train), bool(whole.twin.setting.signals.contacts.any())
     for length in (length for length in _lengths(whole, train) if length <= longest):
         evidence = _cut(whole, train, since, length, FEW)
         if not len(evidence.windows):
             continue
         rough = evidence.roughness(begin.variant)
-        if rough < cut.rough and (not touches or _end_error(evidence, begin) < cut.astray):
+        least = min(least, rough)
+        if touches and not _end_error(evidence, begin) < cut.astray:
+            continue
+        if rough < cut.rough:
             return _cut(whole, train, since, length, rough=rough > cut.bent)
-    return _cut(whole, train, since, min(cut.lengths[-1], longest))
+        bent[length] = rough
+    chosen = (length for length, rough in bent.items() if cut.gained * rough <= least)
+    return _cut(whole, train, since, next(chosen, min(cut.lengths[-1], longest)))
 
 
 def _lengths(whole: Evidence, train: Trajectories) -> tuple[int, ...]:

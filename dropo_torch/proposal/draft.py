@@ -32,6 +32,8 @@ CURED = (
 ROUNDS = 8
 #: A power that noise does not have: times that of the highest quarter of frequencies.
 ABOVE_NOISE = 12.0
+#: What is said of derived velocities that are masked.
+UNCOMPARED = "they say where windows begin, and are compared nowhere"
 #: Share of what a row adds to a position that its noise may make before it is filtered, and a filter's margin.
 NOISY, MARGIN = 0.02, 3.0
 
@@ -149,7 +151,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
     document = {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}
     if some:
         document["mask"] = [p.label for p in reading.places if p.entry in rates]
-        notes += ["they say where windows begin, and are compared nowhere"]
+        notes += [UNCOMPARED]
     return document, notes, smooth
 
 

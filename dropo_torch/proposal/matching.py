@@ -34,6 +34,8 @@ SPANS = (1, 4, 16)
 #: Relative distance from a factor within which a unit is named.
 UNIT = 0.3
 _AXES = ("x", "y", "z")
+#: What the body is called by which all of a robot moves, whatever its name in the model.
+BASE = frozenset(("base", "root", "floating", "torso", "trunk", "pelvis", "chassis"))
 #: What columns of commands are called after where they say nothing else.
 DRIVES = frozenset(
     (
@@ -265,7 +267,7 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
     if place.kind == "command" and not _commands(words, place):
         return -2.0
     known, others = set(place.words), set(place.words) | set(place.aliases)
-    said = set(words.objects)
+    said = set(words.objects) - (BASE if place.is_base else set())
     if place.axis:
         fits = words.axis == place.axis and words.quaternion == (place.measure == "quaternion")
         if not fits or (place.kind == "velocity" and words.angular != place.angular):

@@ -39,6 +39,7 @@ class Place:
         takes: of a command, what it is: ``position``, ``velocity`` or ``effort``.
         optional: whether a log may lack it, as nothing depends on it.
         partner: of a velocity, the place of its position, by label; of a command, that of its joint.
+        is_base: whether it is of slides and hinges by which all of a robot moves, as in a plane.
     """
 
     label: str
@@ -56,6 +57,7 @@ class Place:
     takes: Literal["position", "velocity", "effort"] = "effort"
     optional: bool = False
     partner: str = ""
+    is_base: bool = False
 
 
 def places_of(model: mujoco.MjModel) -> tuple[Place, ...]:
@@ -83,6 +85,7 @@ def _of_joint(model: mujoco.MjModel, j: int) -> tuple[list[Place], list[Place]]:
             f"{name}.position", "position", "angle" if turns else "length", f"{name}.position", first, j, words,
             numbers, aliases=(*aliases, {"x": "roll", "y": "pitch", "z": "yaw"}[axis] if turns else axis),
             limits=(low, high) if model.jnt_limited[j] else None, optional=not turns and _moves_nothing(model, j),
+            is_base=_is_base(model, j),
         )  # fmt: skip
         label = f"{name}.velocity"
         velocity = replace(
@@ -112,6 +115,13 @@ def _of_joint(model: mujoco.MjModel, j: int) -> tuple[list[Place], list[Place]]:
         component(f"velocity[w{axis}]", "angle", axis, dof + skip + i, moving=True) for i, axis in enumerate("xyz")
     ]
     return own, [*rates, *(replace(p, angular=True) for p in turning)]
+
+
+def _is_base(model: mujoco.MjModel, j: int) -> bool:
+    """Whether a joint is one of several, slides among them, by which a body moves that hangs on nothing."""
+    own = np.flatnonzero(model.jnt_bodyid == model.jnt_bodyid[j])
+    slides = model.jnt_type[own] == mujoco.mjtJoint.mjJNT_SLIDE
+    return len(own) > 1 and bool(slides.any()) and int(model.body_parentid[model.jnt_bodyid[j]]) == 0
 
 
 def _moves_nothing(model: mujoco.MjModel, j: int) -> bool:

@@ -18,12 +18,12 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
 from dropo_torch.problem import make_problem
-from dropo_torch.proposal.candidates import Candidate, all_candidates
+from dropo_torch.proposal.candidates import Candidate, all_candidates, touching_groups
 from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
-from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
+from dropo_torch.proposal.draft import UNCOMPARED, Draft, Reading, as_read, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
@@ -139,7 +139,7 @@ def propose_config(
     robot = _robot(compiled, path, Path(out), columns)
     reading = _reading(robot, columns, dt, review)
     tell("examining the log", 0.1)
-    draft = _drafted(reading, robot)
+    draft = _masked(_drafted(reading, robot), reading)
     document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
     tell("estimating the noise", 0.2)
     noise, candidates, document = _with_noise(document, draft, reading.base)
@@ -227,6 +227,21 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
         f"rows {reading.clock.dt:.6g} s apart are no whole number of the model's steps of {robot.step:g} s: "
         f"{Path(reading.model).name} is the model with steps of {reading.timestep:g} s"
     )
+
+
+def _masked(draft: Draft, reading: Reading) -> Draft:
+    """The draft in which velocities that are derived are compared nowhere, where something touches in the log.
+
+    An impact within a row makes a difference of positions no velocity: neither that before it nor that after it.
+    """
+    logged, options = draft.logged, draft.document["data"].get("preprocess", {})
+    if logged.model is None or not options or options.get("velocities") or reading.matching.of("marker"):
+        return draft
+    told, log = logged.observation, logged.trajectories
+    rates = [label for label, at in zip(told.labels, told.index, strict=True) if at >= logged.model.nq]
+    if not rates or not touching_groups(logged.model, told.states(log.observations, log.unseen)):
+        return draft
+    return replace(draft, document=draft.document | {"mask": rates}, notes=(*draft.notes, UNCOMPARED))
 
 
 def _chosen(candidates: Sequence[Candidate], found: Information, review: Review | None) -> Choice:
