@@ -8,7 +8,7 @@ P = I − QQᵀ from the QR factors of ∂r/∂x₀. What is left, P r, is compa
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -23,6 +23,8 @@ from dropo_torch.support.rows import evenly
 #: Antithetic pairs of noise on the initial states by which rough windows are linearized, and a few that are far off;
 #: their seed.
 PAIRS, MORE, SEED = 16, 48, 11
+#: Share of the windows that may be odd; where more are, it is not the noise of their initial states.
+ODD = 0.3
 #: Whitened residual of a window whose simulation diverged, at least.
 LOST = 1e3
 
@@ -185,21 +187,34 @@ class Evidence:
         return linear if known.all() else replace(linear, weights=linear.weights * known[:, None])
 
     def _where_needed(self, variant: Variant) -> Linearization:
-        """By differences, but statistically the windows far off beside the others, where stops or contacts may be why.
+        """By differences, but by draws the windows far off beside the others, where stops or contacts may be why.
 
-        There, noise on the initial state that no derivative sees may move an impact from one step to the next.
+        There, noise on the initial state that no derivative sees may move an impact from one step to the next. Where
+        windows begin as fits them best, those count that have more than chance lets them have beside the others, and
+        draws of what they leave open.
         """
         linear, _, residual = self._by_differences(variant)
         if not self.twin.setting.has_impacts:
             return linear
         chi2 = (self.project(residual, linear) ** 2).sum(-1)
-        far = np.flatnonzero(chi2 > self.rules.sound.wrong * max(float(np.median(chi2)), float(self.num_rows)))
-        if not far.size:
+        far = chi2 > self.rules.sound.wrong * max(float(np.median(chi2)), float(self.num_rows))
+        linear = self._replaced(linear, np.flatnonzero(far), lambda part: part._statistical(variant, MORE))
+        if self.windows.starts is None:
             return linear
-        bent = self.select(far)._statistical(variant, MORE)
+        odd = ~far & ~are_calm(chi2, (linear.weights > 0).sum(-1) - self.chart.size, self.rules.weighed)
+        few = odd.mean() <= ODD
+        return self._replaced(linear, np.flatnonzero(odd & few), lambda part: part._as_far_as_known(variant))
+
+    def _replaced(
+        self, linear: Linearization, rows: np.ndarray, better: Callable[[Evidence], Linearization]
+    ) -> Linearization:
+        """A linearization with a better one of some windows."""
+        if not rows.size:
+            return linear
+        bent = better(self.select(rows))
         arrays = {name: getattr(linear, name).copy() for name in ("basis", "weights", "shift")}
         for name, values in arrays.items():
-            values[far] = getattr(bent, name)
+            values[rows] = getattr(bent, name)
         return replace(linear, **arrays)
 
     def _by_differences(self, variant: Variant) -> tuple[Linearization, np.ndarray, np.ndarray]:
@@ -381,3 +396,17 @@ def caps_of(chi2: np.ndarray, degrees: float, cap: float) -> np.ndarray:
     """Return factors ``(W,)`` by which no window has more than its share ``cap`` of χ², however bad it is."""
     most = max(cap * float(chi2.sum()), 10 * degrees / len(chi2))
     return np.sqrt(np.minimum(1.0, most / np.maximum(chi2, 1e-300)))
+
+
+def are_calm(chi2: np.ndarray, degrees: np.ndarray, weighed: Weighed) -> np.ndarray:
+    """Return which windows have no more than chance lets them have beside the median one, ``(W,)`` bool.
+
+    Args:
+        chi2: of the windows, ``(W,)``.
+        degrees: degrees of freedom of each, ``(W,)``.
+        weighed: thresholds.
+    """
+    reduced = chi2 / np.maximum(degrees, 1)
+    told = degrees > 0
+    typical = np.median(reduced[told]) if told.any() else np.inf
+    return np.asarray(told & (reduced <= typical * (1 + weighed.calm * np.sqrt(2 / np.maximum(degrees, 1)))))

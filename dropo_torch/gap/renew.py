@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from dropo_torch.gap.evidence import Evidence, caps_of
+from dropo_torch.gap.evidence import Evidence, are_calm, caps_of
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
@@ -126,7 +126,8 @@ def noise_left(fitted: Refit, noise: np.ndarray, rules: Rules) -> np.ndarray:
     m, rows = len(noise), fitted.residual.shape[1]
     sharp = (fitted.linear.weights > rules.weighed.sharp) & fitted.linear.counted[:, None]
     usable = sharp & np.isfinite(fitted.residual)
-    usable &= _calm(np.where(usable, fitted.residual, 0.0), usable.sum(1) - m, rules)[:, None]
+    chi2 = (np.where(usable, fitted.residual, 0.0) ** 2).sum(-1)
+    usable &= are_calm(chi2, usable.sum(1) - m, rules.weighed)[:, None]
     count = usable.reshape(-1, rows // m, m).sum((0, 1))
     fitted_share = len(fitted.hypothesis.vector) / max(float(usable.sum()), 1.0)
     relative = np.ones(m)
@@ -140,17 +141,3 @@ def noise_left(fitted: Refit, noise: np.ndarray, rules: Rules) -> np.ndarray:
         sums, degrees = (x.reshape(-1, rows // m, m).sum((0, 1)) for x in (squares, free))
         relative = relative * np.sqrt(np.maximum(sums / np.maximum(degrees, 1e-9), 1e-12))
     return np.where((count >= rules.weighed.rows) & (degrees >= rules.weighed.rows / 2), noise * relative, np.inf)
-
-
-def _calm(residual: np.ndarray, degrees: np.ndarray, rules: Rules) -> np.ndarray:
-    """Return which windows have no more than chance lets them have beside the median one, ``(W,)`` bool.
-
-    Args:
-        residual: of the windows, ``(W, N)``.
-        degrees: degrees of freedom of each, ``(W,)``.
-        rules: thresholds.
-    """
-    reduced = (residual**2).sum(-1) / np.maximum(degrees, 1)
-    told = degrees > 0
-    typical = np.median(reduced[told]) if told.any() else np.inf
-    return told & (reduced <= typical * (1 + rules.weighed.calm * np.sqrt(2 / np.maximum(degrees, 1))))
