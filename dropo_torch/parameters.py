@@ -23,6 +23,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.errors import InputError, choices
+from dropo_torch.models.constants import derive
 from dropo_torch.models.load import CENTERS, load_model
 from dropo_torch.support.given import check_keys
 
@@ -246,7 +247,7 @@ class ParameterSpace:
         model = copy.copy(self.model)
         self.write_into(model, vector)
         try:
-            mujoco.mj_setConst(model, mujoco.MjData(model))
+            derive(model)
         except mujoco.FatalError:
             _check_centers(self.model, self)
             raise

@@ -83,7 +83,7 @@ def test_fit_is_the_function_whatever_is_imported_before(first: str) -> None:
 #: Modules and folders of the package: each imports what stands before it, its own folder aside. The more exact entry
 #: counts: a MuJoCo model is loaded by what parameters need, and written with parameters' values.
 LAYERS = (
-    "errors", "support", "models.load", "models.bundled", "models",
+    "errors", "support", "models.constants", "models.load", "models.bundled", "models",
     "parameters", "models.export", "data",
     "distribution", "likelihood", "simulators",
     "evaluator", "initial_noise", "objective", "excitation",

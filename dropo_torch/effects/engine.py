@@ -12,6 +12,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Method, Placed, Setting, apply_all
+from dropo_torch.models.constants import derive
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED
@@ -167,7 +168,7 @@ class VariantEngine:
             raise ModelRefused("a mass or an inertia is negative")
         try:
             with quiet_mujoco():
-                mujoco.mj_setConst(model, self._data)
+                derive(model, self._data)
         except mujoco.FatalError as error:
             raise ModelRefused(str(error)) from None
         return model

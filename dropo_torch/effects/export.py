@@ -10,6 +10,7 @@ import numpy as np
 
 from dropo_torch.effects.base import Placed, applied
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive
 from dropo_torch.models.export import read_spec, write_inertials
 from dropo_torch.models.load import quiet_mujoco, unsimplify
 from dropo_torch.parameters import ParameterSpace
@@ -51,7 +52,7 @@ def write_model(
     model = applied(model, [p for p in placed if p.effect.in_mjcf])
     try:
         with quiet_mujoco():
-            mujoco.mj_setConst(model, mujoco.MjData(model))
+            derive(model)
             spec.copy_back(model)
             _copy_rest(spec, model)
             text = spec.to_xml()

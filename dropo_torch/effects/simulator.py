@@ -29,6 +29,7 @@ from dropo_torch.effects.filters import (
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, Entry
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import Numbers, Simulator
 from dropo_torch.simulators.hidden import filter_memory
@@ -208,7 +209,7 @@ def apply_native(model: mujoco.MjModel, effects: EffectSet) -> mujoco.MjModel:
     """Return a copy of a model with the fixed native effects in it, and its derived constants."""
     out = applied(model, effects.at(np.empty(0)))
     try:
-        mujoco.mj_setConst(out, mujoco.MjData(out))
+        derive(out)
     except mujoco.FatalError as error:
         places = ", ".join(e.place for e in effects.entries)
         raise InputError(

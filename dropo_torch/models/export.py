@@ -9,6 +9,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive
 from dropo_torch.parameters import ParameterSpace, read_field
 
 #: MJCF is written with six significant digits.
@@ -31,7 +32,7 @@ def export_model(source: str | Path, space: ParameterSpace, values: np.ndarray, 
     space.write_into(model, values)
     wanted = [(space.names[column], target, target.read(model)) for column, target in space.targets]
     try:
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        derive(model)
         spec.copy_back(model)
         path.write_text(spec.to_xml(), encoding="utf-8")
     except (ValueError, mujoco.FatalError) as error:

@@ -12,6 +12,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import put_weights
 from dropo_torch.support.child import limit_memory, read_in_child
 
 
@@ -72,7 +73,9 @@ def _loaded(path: Path, general: bool) -> mujoco.MjModel:
         return mujoco.MjModel.from_xml_path(str(path))
     spec = mujoco.MjSpec.from_file(str(path))
     unsimplify(spec)
-    return spec.compile()
+    model = spec.compile()
+    put_weights(model)
+    return model
 
 
 def try_binary(path: str) -> bytes:

@@ -21,6 +21,7 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.placing import EffectSet, Entry, plain_setting
 from dropo_torch.effects.simulator import LONGEST_HISTORY, apply_native, finer_steps, overlap
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive_all
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace, read_field
 
@@ -66,7 +67,7 @@ class RowFields:
         for field in space.fields:
             batch.expand(field)
         if space.fields:
-            batch.set_const()  # what it derives becomes each simulation's own, too
+            derive_all(batch, batch.model)  # what it derives becomes each simulation's own, too
         own = [f for f in sorted(mujoco.batch.MODEL_FIELDS) if batch.expanded(f) is not None]
         self._fields = {f: batch.expand(f) for f in own if read_field(batch.model, f).dtype.kind == "f"}
         self._shared = {f: read_field(batch.model, f).copy() for f in self._fields}
@@ -82,7 +83,7 @@ class RowFields:
             own[ids] = fresh.get(field, self._shared[field])
         try:
             with quiet_mujoco():
-                self._batch.set_const(ids.astype(np.int32))
+                derive_all(self._batch, self._batch.model, ids)
         except mujoco.batch.SimulationError as error:
             row = int(np.flatnonzero(ids == error.ids[0])[0])
             raise _refused(self._space, values[row], self._batch.error(int(error.ids[0]))) from None

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import mujoco
 import torch
 import warp as wp
 
 from dropo_torch.effects.placing import EffectSet
 from dropo_torch.effects.simulator import check_backend
+from dropo_torch.models.constants import derive
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.rl.effects import inside_model, no_effects
 from dropo_torch.rl.stepper import BatchStepper
@@ -44,7 +44,7 @@ class WarpStepper(BatchStepper):
         effects = effects or no_effects(space, frame_skip)
         check_backend("warp", effects, space)
         model, self._finer, _ = inside_model(space, effects)
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        derive(model)
         self.num_envs, self.frame_skip, self.num_states = num_envs, frame_skip, model.nq + model.nv
         self._engine = Engine(
             model, space.on(model), skip=frame_skip * self._finer,

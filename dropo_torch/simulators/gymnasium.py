@@ -12,6 +12,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive
 from dropo_torch.models.load import quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
@@ -94,7 +95,7 @@ class MujocoEnvAdapter:
         self._parameters.write_into(model, self._parameters.vector(values))
         mujoco.mj_resetData(model, self._data)
         with quiet_mujoco():
-            mujoco.mj_setConst(model, self._data)
+            derive(model, self._data)
 
     def set_state(self, state: np.ndarray) -> None:
         """Reset the physics and set positions and velocities."""

@@ -11,6 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive_all
 from dropo_torch.models.load import load_model, quiet_mujoco, show_divergence
 from dropo_torch.parameters import ParameterSpace, read_field, unmark_frames
 from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
@@ -116,7 +117,7 @@ class MujocoSimulator(Simulator):
         self.parameters.write({f: constants.expand(f) for f in self.parameters.fields}, vectors)
         try:
             with quiet_mujoco():
-                constants.set_const()
+                derive_all(constants, self.model)
         except mujoco.batch.SimulationError as error:
             failed[error.ids] = True
         self._tiled = None if failed.any() else (vectors.copy(), repeats)

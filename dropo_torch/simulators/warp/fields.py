@@ -14,6 +14,7 @@ import mujoco
 import numpy as np
 import torch
 
+from dropo_torch.models.constants import slide_alone
 from dropo_torch.models.contacts import mixing
 from dropo_torch.parameters import ParameterSpace, read_field
 from dropo_torch.simulators.warp.couplings import equality_bodies, has_dofs, welds
@@ -265,7 +266,7 @@ class _Weights:
             self.arms[k].index_add_(0, torch.tensor(model.ten_J_colind[own]).long(), torch.tensor(data.ten_J[own]))
         self.related = torch.from_numpy(_related(model))
         self.moving = torch.tensor([has_dofs(model, b) for b in range(model.nbody)])
-        self.simple = torch.tensor(model.body_simple == 2)
+        self.simple = torch.tensor((model.body_simple == 2) | slide_alone(model))
         self.dof_body = torch.tensor(model.dof_bodyid, dtype=torch.long)
         self.bodies = torch.tensor([[model.geom_bodyid[g] for g in pair[:2]] for pair in pairs]).long().reshape(-1, 2)
         self.welded = torch.from_numpy(equality_bodies(model, welds(model))).long()
@@ -293,11 +294,12 @@ class _Weights:
         inverse = torch.cholesky_inverse(torch.linalg.cholesky_ex(matrix).L)
         body = torch.einsum("kbij,kjl,kbil->kb", linear, inverse, linear) / 3
         light = 1 / mass.clamp(min=_MINVAL)
-        body = torch.where(self.moving, torch.where(self.simple, light, body), torch.zeros_like(body))
+        simple = self.simple & (section("ipos") == 0).all(-1)
+        body = torch.where(self.moving, torch.where(simple, light, body), torch.zeros_like(body))
         turning = torch.einsum("kbij,kjl,kbil->kb", angular, inverse, angular) / 3
-        turning = torch.where(self.moving & ~self.simple, turning, torch.zeros_like(turning))
+        turning = torch.where(self.moving & ~simple, turning, torch.zeros_like(turning))
         dof = torch.diagonal(inverse, dim1=1, dim2=2) @ self.average
-        dof = torch.where(self.simple[self.dof_body], light[:, self.dof_body], dof)
+        dof = torch.where(simple[:, self.dof_body], light[:, self.dof_body], dof)
         weld = torch.stack([weights[:, self.welded].sum(-1) for weights in (body, turning)], dim=-1)
         tendon = torch.einsum("ti,kij,tj->kt", self.arms, inverse, self.arms)
         return torch.cat([body[:, self.bodies].sum(-1), dof, weld.flatten(1), tendon], dim=1)

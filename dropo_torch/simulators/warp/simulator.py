@@ -11,6 +11,7 @@ import torch
 import warp as wp
 
 from dropo_torch.errors import InputError
+from dropo_torch.models.constants import derive
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.base import DIVERGED, Numbers, Simulator
 from dropo_torch.simulators.hidden import POSE, prescribed_bodies
@@ -60,7 +61,7 @@ class WarpSimulator(Simulator):
             if value < 1:
                 raise InputError(f"{option}: {value} given; expected 1 or more")
         model = copy.copy(model)
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        derive(model)
         self.parameters, self.frame_skip, self.history = parameters, frame_skip, history
         self.num_states = model.nq + model.nv
         self.num_controls = model.nu + POSE * len(prescribed_bodies(model))
