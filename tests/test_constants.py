@@ -18,20 +18,20 @@ from dropo_torch.simulators.warp.simulator import WarpSimulator
 
 SLIDE = '<joint type="slide" axis="{}" armature="0.3" pos="{}"/>'
 GEOM = '<geom size=".1" mass="2" pos="{}"/>'
+CENTERED, ALONG = GEOM.format("0 0 0"), SLIDE.format("1 0 0", "0 0 0")
 #: A body of each kind, beside what decides whether MuJoCo compiles it as one that only slides.
 BODIES = {
-    "one slide": SLIDE.format("1 0 0", "0 0 0") + GEOM.format("0 0 0"),
-    "two slides": SLIDE.format("1 0 0", "0 0 0") + SLIDE.format("0 0 -1", "0 0 0") + GEOM.format("0 0 0"),
-    "slide off an axis": SLIDE.format("1 1 0", "0 0 0") + GEOM.format("0 0 0"),
-    "slide beside the frame": SLIDE.format("1 0 0", "0 .1 0") + GEOM.format("0 0 0"),
-    "center beside the frame": SLIDE.format("1 0 0", "0 0 0") + GEOM.format("0 0 .1"),
-    "slide and hinge": SLIDE.format("1 0 0", "0 0 0") + '<joint axis="0 0 1"/>' + GEOM.format("0 0 0"),
-    "body of its own": SLIDE.format("1 0 0", "0 0 0") + GEOM.format("0 0 0") + "<body>" + GEOM.format("0 0 0") + "</body>",
-    "on a fixed one": GEOM.format("0 0 0") + "<body>" + SLIDE.format("0 1 0", "0 0 0") + GEOM.format("0 0 0") + "</body>",
-    "on a slide": SLIDE.format("1 0 0", "0 0 0") + GEOM.format("0 0 0") + "<body>" + SLIDE.format("0 1 0", "0 0 0")
-    + GEOM.format("0 0 0") + "</body>",
-    "free": "<freejoint/>" + GEOM.format("0 0 0"),
-}  # fmt: skip
+    "one slide": ALONG + CENTERED,
+    "two slides": ALONG + SLIDE.format("0 0 -1", "0 0 0") + CENTERED,
+    "slide off an axis": SLIDE.format("1 1 0", "0 0 0") + CENTERED,
+    "slide beside the frame": SLIDE.format("1 0 0", "0 .1 0") + CENTERED,
+    "center beside the frame": ALONG + GEOM.format("0 0 .1"),
+    "slide and hinge": ALONG + '<joint axis="0 0 1"/>' + CENTERED,
+    "body of its own": f"{ALONG}{CENTERED}<body>{CENTERED}</body>",
+    "on a fixed one": f"{CENTERED}<body>{ALONG}{CENTERED}</body>",
+    "on a slide": f"{ALONG}{CENTERED}<body>{SLIDE.format('0 1 0', '0 0 0')}{CENTERED}</body>",
+    "free": f"<freejoint/>{CENTERED}",
+}
 WEIGHTS = ("body_invweight0", "dof_invweight0")
 #: A carriage that rests against a wall, and one on springs that a weld holds.
 PRESSED = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>

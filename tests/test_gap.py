@@ -627,6 +627,23 @@ def test_a_number_that_is_at_a_bound_on_all_windows_takes_no_name() -> None:
     assert "damping of -0.01 N·m·s/rad" in gap.refused
 
 
+def test_a_member_of_a_family_that_is_at_a_bound_takes_its_own_name_only() -> None:
+    missing = [("hinge", -0.03), ("rail", 2.0)]
+    effects = [Effect("joint_damping", joint, {"damping": value}) for joint, value in missing]
+    case = simulate_truth(CART_POLE, effects, 3, **SIZE)
+    scene = prepare(load(case))
+    both = Hypothesis(
+        (case.declared["pole_mass"],),
+        (placed("joint_damping", -0.01, target="hinge"), placed("joint_damping", 2.0, target="rail")),
+    )
+    naming = dataclasses.replace(
+        name(scene, effects=[VOCABULARY["armature"]]), gap=True, named=True, family=True, refused="",
+        final=refit(scene.evidence, both), ties=((), ()), shares=(1.0, 0.5),
+    )  # fmt: skip
+    gap = outcome.make_result(scene, naming, 0.0)
+    assert [(e.effect, e.target) for e in gap.effects] == [("joint_damping", "rail")]
+
+
 def test_what_named_effects_leave_is_said_first() -> None:
     """Friction beside an integration gap, which the vocabulary lacks: friction has its name, and the step is blamed."""
     truth = Effect("joint_friction", "rail", {"friction": 2.0})

@@ -155,8 +155,8 @@ def _refuted(naming: Naming, fitted: _Fitted, checked: _Checked, rules: Rules) -
     after, given, constant = checked.after, checked.given, checked.constant
     if fitted.last is None:
         return None
-    for _, reason in absurd(fitted.last.evidence, fitted.last.fit, rules.sound):  # on all windows, it may be elsewhere
-        return _nameless(naming, reason)
+    if found := list(absurd(fitted.last.evidence, fitted.last.fit, rules.sound)):  # on all windows, it may be elsewhere
+        return _spared(naming, found)
     if not has_skill(after, checked.floor, constant, rules.sound):
         return _without_names(naming, UNSKILLED, after, constant)
     if remains(fitted.rest.cost, rules) and after.rollout_rmse > given.rollout_rmse:
@@ -317,6 +317,18 @@ def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Nami
         names = "friction, inertia, offset and delay of all joints"
     sizes = f"open loop {after.rollout_rmse:.3g} against {rival:.3g}"
     return _nameless(naming, f"with {names}, which would account for most of the misfit, {why} ({sizes})")
+
+
+def _spared(naming: Naming, absurd: Sequence[tuple[Placed, str]]) -> Naming:
+    """What was found without what is at a bound of physics: a family without these members, other names not at all."""
+    out = {placed.key for placed, _ in absurd}
+    placed = naming.final.hypothesis.placed
+    kept = [k for k, p in enumerate(placed) if p.key not in out]
+    if not naming.family or not kept:
+        return _nameless(naming, absurd[0][1])
+    rest = replace(naming.final.hypothesis, placed=tuple(placed[k] for k in kept))
+    ties, shares = tuple(naming.ties[k] for k in kept), tuple(naming.shares[k] for k in kept)
+    return replace(naming, final=refit(naming.evidence, rest, iterations=6), ties=ties, shares=shares)
 
 
 def _nameless(naming: Naming, reason: str) -> Naming:
