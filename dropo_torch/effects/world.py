@@ -75,8 +75,8 @@ class Integration(WorldEffect):
 
     #: How many times finer the step becomes, and its integrator.
     FINER = 8
-    #: By how much coarser a step serves for differences: still finer than the model's, with the better integrator.
-    EASED = 4
+    #: How many times finer a step serves for differences, with the better integrator.
+    EASED = 2
     shares = (1 / FINER, 0.25, 0.5)
     steps = True
 
@@ -85,8 +85,8 @@ class Integration(WorldEffect):
         return (Quantity("timestep", "s", step, step / self.FINER, step, step, discrete=True),)
 
     def eased(self, setting: Setting, values: tuple[float, ...]) -> tuple[float, ...]:
-        finer = round(setting.model.opt.timestep / values[0])
-        return values if finer % (2 * self.EASED) else (self.EASED * values[0],)
+        step = float(setting.model.opt.timestep)
+        return values if round(step / values[0]) % self.EASED else (step / self.EASED,)
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         if values[0] == model.opt.timestep:
