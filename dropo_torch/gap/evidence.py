@@ -174,12 +174,8 @@ class Evidence:
 
     def linearize(self, variant: Variant) -> Linearization:
         """Return how a hypothesis' residuals depend on the initial states."""
-        found = self._as_far_as_known(variant) if self.rough else self._where_needed(variant)
+        found = self._statistical(variant) if self.rough else self._where_needed(variant)
         return self.counting(found, variant)
-
-    def roughness(self, variant: Variant) -> float:
-        """Return the share of residuals that noise on the initial states bends by more than they have noise."""
-        return self._statistical(variant).roughness
 
     def counting(self, linear: Linearization, variant: Variant) -> Linearization:
         """Return a linearization without windows in which commands act that a hypothesis cannot know from the log."""

@@ -220,7 +220,7 @@ def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, sin
         evidence = _cut(whole, train, since, length, FEW)
         if not len(evidence.windows):
             continue
-        rough = evidence.roughness(begin.variant)
+        rough = evidence.linearize(begin.variant).roughness
         least = min(least, rough)
         if touches and not _end_error(evidence, begin) < cut.astray:
             continue

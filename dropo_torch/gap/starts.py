@@ -30,7 +30,7 @@ def straightened(evidence: Evidence, variant: Variant) -> Windows | None:
         evidence: windows, each with its measured start or one that was found before.
         variant: the hypothesis under which they are simulated.
     """
-    if not evidence.twin.setting.has_impacts:
+    if evidence.rough or not evidence.twin.setting.has_impacts:
         return None
     starts, active = evidence.windows.begins.copy(), np.arange(len(evidence.windows))
     found = starts.copy()
