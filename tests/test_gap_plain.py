@@ -216,7 +216,7 @@ def test_noise_before_a_stop_is_no_rest(seed: int) -> None:
     truth = Hypothesis((), (friction, Placed(VOCABULARY["joint_damping"], "b", (0.05,))))
     windows = cut_windows(scene.train, scene.setting.observation, 8, stride=1)
     every = replace(scene.evidence.on(windows), rough=False)
-    by_differences = every._differences(truth.variant)[0]
+    by_differences = every._by_differences(truth.variant)[0]
     before = refit(every, truth, linear=by_differences, iterations=0, slopes=False).cost
     after = refit(every, truth, iterations=0, slopes=False).cost
     assert before.reduced > 1.5

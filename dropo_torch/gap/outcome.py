@@ -285,10 +285,7 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
     and beside a finer step where that is better, for what the model's own step leaves passes for noise.
     """
     own = refit(evidence, hypothesis, iterations=6)
-    windows = straightened(evidence, own.hypothesis.variant) if significant(own.cost, evidence.rules) else None
-    if windows is not None:
-        evidence = replace(evidence, windows=windows)
-        own = refit(evidence, own.hypothesis, iterations=6)
+    evidence, own = _straight(evidence, own)
     final = resolved(evidence, own, anew=True)
     noise = noise_beside(final.evidence, short, final.fit)
     if moved(noise, evidence.noise, evidence.rules):
@@ -307,6 +304,16 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
         own = refit(evidence, own.hypothesis, iterations=6)
         final = resolved(evidence, own, anew=True)
     return final, rest, with_own_step
+
+
+def _straight(evidence: Evidence, own: Refit) -> tuple[Evidence, Refit]:
+    """Windows that begin where they fit best, and the fit on them, if that leaves nothing where something is left."""
+    windows = straightened(evidence, own.hypothesis.variant) if significant(own.cost, evidence.rules) else None
+    if windows is None:
+        return evidence, own
+    straight = replace(evidence, windows=windows)
+    there = refit(straight, own.hypothesis, iterations=6)
+    return (evidence, own) if significant(there.cost, evidence.rules) else (straight, there)
 
 
 def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Naming:

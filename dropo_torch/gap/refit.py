@@ -408,8 +408,9 @@ def _of_named_step(evidence: Evidence, fitted: Refit) -> np.ndarray:
     index = names.index("integration")
     own = fitted.hypothesis.placed[index]
     twice = fitted.hypothesis.instead(index, own.at(2 * np.array(own.values)))
-    there = _nearest(evidence, fitted, twice).fit.hypothesis.vector
-    return np.where(limits_of(fitted.hypothesis, evidence.twin).free, np.abs(there - fitted.hypothesis.vector), 0.0)
+    limits = limits_of(twice, evidence.twin)
+    there = _nearest(evidence, fitted, twice, limits).fit.hypothesis.vector
+    return np.where(limits.free, np.abs(there - fitted.hypothesis.vector), 0.0)
 
 
 def _anew(last: Resolved) -> Resolved:
@@ -420,12 +421,13 @@ def _anew(last: Resolved) -> Resolved:
 
 def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
     """A fit moved to where it is best under another step, by the derivatives that it has."""
-    return _nearest(replace(evidence, twin=evidence.twin.finer(step)), fitted, fitted.hypothesis)
+    finer = replace(evidence, twin=evidence.twin.finer(step))
+    return _nearest(finer, fitted, fitted.hypothesis, limits_of(fitted.hypothesis, evidence.twin))
 
 
-def _nearest(evidence: Evidence, fitted: Refit, trial: Hypothesis) -> Resolved:
-    """A hypothesis near a fitted one moved to where it is best, by the derivatives of that one."""
-    best, limits = None, limits_of(trial, evidence.twin)
+def _nearest(evidence: Evidence, fitted: Refit, trial: Hypothesis, limits: Limits) -> Resolved:
+    """A hypothesis near a fitted one moved to where it is best, by the derivatives of that one, within its limits."""
+    best = None
     for _ in range(MOVES):
         found, _ = evidence.residuals([trial.variant])
         there = _fitted(evidence, trial, found[0], fitted.slope, fitted.linear, fitted.scale)

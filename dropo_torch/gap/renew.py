@@ -32,9 +32,7 @@ def renewed(ground: Ground, state: State) -> State:
     Windows that it does not know show more than noise, so the noise is told anew once they are gone. Where simulations
     bend in the noise of their initial states, these are found first.
     """
-    here, starts = restarted(ground, state.current, state.starts)
-    if starts is not state.starts:
-        ground, state = _refitted(here, replace(state, starts=starts))
+    ground, state = restarted(ground, state)
     for _ in range(RENEWALS):
         since = known_since(ground, state.current.hypothesis, state.since)
         noise = noise_beside(ground.evidence, ground.short, state.current)
@@ -51,19 +49,24 @@ def _refitted(ground: Ground, state: State) -> tuple[Ground, State]:
     return here, replace(state, caps=here.caps, base=base, current=current)
 
 
-def restarted(ground: Ground, fitted: Refit, starts: np.ndarray | None) -> tuple[Ground, np.ndarray | None]:
-    """Return a ground whose windows begin where they fit best, if something is left and some of them bend.
+def restarted(ground: Ground, state: State) -> tuple[Ground, State]:
+    """Return ground and state with windows that begin where they fit best, if that leaves nothing where something is.
+
+    Where something is left all the same, windows begin as they were: under a hypothesis that is wrong, the best start
+    makes up for what it lacks, and others would be compared from there.
 
     Args:
         ground: what the search stands on.
-        fitted: the hypothesis so far, on its windows.
-        starts: those that were found before; see :attr:`State.starts`.
+        state: with a fitted hypothesis.
     """
-    windows = straightened(ground.part, fitted.hypothesis.variant) if significant(fitted.cost, ground.rules) else None
+    if not significant(state.current.cost, ground.rules):
+        return ground, state
+    windows = straightened(ground.part, state.current.hypothesis.variant)
     if windows is None:
-        return ground, starts
-    starts = merged(starts, table_of(windows))
-    return ground.begun(starts), starts
+        return ground, state
+    starts = merged(state.starts, table_of(windows))
+    here, there = _refitted(ground.begun(starts), replace(state, starts=starts))
+    return (ground, state) if significant(there.current.cost, ground.rules) else (here, there)
 
 
 def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:

@@ -34,6 +34,8 @@ from dropo_torch.gap.rules import accounts, family_accounts, may_leave, remains,
 from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
 from dropo_torch.support.checkpoint import Checkpoint
 
+#: The screening before there is one.
+NOTHING = Screening((), np.zeros(0), np.zeros((0, 0)), 0.0)
 #: Why what a log is too short for has no name.
 UNSURE = "what explains most of it may do so by chance, for this log has too few stretches that show it"
 #: Why what needs many numbers, and is still not right, has none.
@@ -188,17 +190,16 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
     base = ground.refit(begin)
     noise = noise_beside(ground.evidence, ground.short, base)
     ground, base = with_base(ground.on(noise, since), base.hypothesis)
-    ground, starts = restarted(ground, base, None)
-    if starts is not None:
-        ground, base = with_base(ground, base.hypothesis)
-    missing = significant(base.cost, ground.rules)
+    bare = State(noise, since, ground.caps, base, NOTHING, base, few=ground.few)
+    ground, state = restarted(ground, bare)
+    base, missing = state.base, significant(state.base.cost, ground.rules)
     if not missing:
         ground.report("what is left looks like noise", 0.0)
     if first is None:
         ranked, focus = ground.screened(base), ground.focus(base)
         degrees = focus.evidence.degrees(focus.fitted.linear)
         first = Screening(tuple(ranked), focus.residual, focus.slope, degrees)
-    return State(noise, since, ground.caps, base, first, base, done=not missing, few=ground.few, starts=starts)
+    return replace(state, first=first, done=not missing)
 
 
 def step(ground: Ground, state: State) -> State:
