@@ -305,9 +305,9 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     assert bool(judged) == looked
 
 
-@pytest.mark.parametrize(("next_one", "is_family"), [(50.0, False), (500.0, True)])
+@pytest.mark.parametrize(("left", "next_one", "is_family"), [(0.1, 50.0, False), (0.1, 500.0, True), (0.5, 50.0, True)])
 def test_the_family_is_none_where_one_effect_more_leaves_less(
-    next_one: float, is_family: bool, monkeypatch: pytest.MonkeyPatch
+    left: float, next_one: float, is_family: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A delay at all joints hides a payload, of which every member of the family would take a part."""
 
@@ -324,9 +324,9 @@ def test_the_family_is_none_where_one_effect_more_leaves_less(
     ground: Any = SimpleNamespace(
         rules=Rules(), screened=lambda _: [], focus=lambda _: None, refits=lambda *_: (tried, None)
     )
-    first: Any = Ended(current=fit(1000.0, 0.5))
-    before: Any = SimpleNamespace(base=SimpleNamespace(cost=None, hypothesis=None))
-    assert members.with_family(ground, before, first).family == is_family
+    base = SimpleNamespace(cost=None, hypothesis=None)
+    first: Any = Ended(current=fit(1000.0, left), base=base)
+    assert members.with_family(ground, SimpleNamespace(base=base), first).family == is_family  # type: ignore[arg-type]
 
 
 def test_a_delay_at_all_joints_and_a_payload_are_found_together(tmp_path: Path) -> None:
@@ -360,6 +360,7 @@ class Ended:
     done: bool = False
     family: bool = False
     refused: str = ""
+    base: Any = None
 
 
 LEG = """

@@ -84,9 +84,12 @@ def is_surpassed(ground: Ground, found: State, whole: Refit) -> bool:
     """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more.
 
     What several joints lack, such as a delay, may hide what one body lacks, of which every member would take a part.
+    That is looked for where the first ones explain most of the gap.
     """
     current = found.current
     if found.done or not current.hypothesis.placed or not significant(whole.cost, ground.rules):
+        return False
+    if current.cost.left_of(found.base.cost) > 1 - ground.rules.most:
         return False
     alive = [c for c in ground.screened(current) if not c.dead][: ground.rules.tried.refits]
     focus = ground.focus(current)
