@@ -169,10 +169,10 @@ def is_done(ground: Ground, state: State) -> bool:
 def add(ground: Ground, state: State) -> State:
     """Accept the one or two effects, or the family, that remove the most; where nothing does, the search is done.
 
-    Pairs are tried where no single effect removes most of what is left, and families where the best one leaves more
-    than noise, unless what was accepted before accounts for the gap: of the little that it leaves, not several more are
-    found at once. One of them takes the place of the best single effect where it leaves much less, or where that alone
-    would end the search.
+    Pairs and families are tried where no single effect removes most of what is left, and families of which there may be
+    many places where the best one leaves more than noise, unless what was accepted before accounts for the gap: of the
+    little that it leaves, not several more are found at once. One of them takes the place of the best single effect
+    where it leaves much less, or where that alone would end the search.
     """
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
@@ -212,10 +212,15 @@ def reconsidered(ground: Ground, state: State) -> State:
 def _among_several(
     ground: Ground, state: State, alive: Sequence[Candidate], best: Refit, *, pairs: bool
 ) -> tuple[Refit, State]:
-    """The best pair, if asked, or family where it leaves much less than the best single effect, or that is hopeless."""
+    """The best pair or family where it leaves much less than the best single effect, or where that is hopeless.
+
+    Without ``pairs``, where the best single effect removes most, only families of which there may be many are tried.
+    """
     rules, current = ground.rules, state.current
     two, state = paired(ground, state, alive) if pairs else ([], state)
     families = promising_families(ground.focus(current), alive, rules.tried)
+    if not pairs:
+        families = [f for f in families if len(f[0].effect.targets(ground.setting)) >= MANY]
     found, state = ground.refits(state, current, families, "refitting families")
     several = sound(ground, found)
     for tried in (simplest(r, rules) for r in (two, several) if r):
