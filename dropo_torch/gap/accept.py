@@ -214,7 +214,8 @@ def _among_several(
 ) -> tuple[Refit, State]:
     """The best pair or family where it leaves much less than the best single effect, or where that is hopeless.
 
-    Without ``pairs``, where the best single effect removes most, only families of which there may be many are tried.
+    Without ``pairs``, where the best single effect removes most, only families of which there may be many are tried,
+    and must leave next to nothing of what it leaves.
     """
     rules, current = ground.rules, state.current
     two, state = paired(ground, state, alive) if pairs else ([], state)
@@ -224,7 +225,7 @@ def _among_several(
     found, state = ground.refits(state, current, families, "refitting families")
     several = sound(ground, found)
     for tried in (simplest(r, rules) for r in (two, several) if r):
-        clearer = tried.cost.left_of(best.cost) < rules.tried.clearer
+        clearer = tried.cost.left_of(best.cost) < (rules.tried.clearer if pairs else rules.family.clearer[0])
         if clearer or (is_hopeless(best, current, rules) and not is_hopeless(tried, current, rules)):
             best = tried
     return best, state
