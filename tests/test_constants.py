@@ -33,7 +33,7 @@ BODIES = {
     "free": f"<freejoint/>{CENTERED}",
 }
 WEIGHTS = ("body_invweight0", "dof_invweight0")
-#: A carriage that rests against a wall, and one on springs that a weld holds.
+#: A carriage between a wall that it touches and a limit of its joint.
 PRESSED = """<mujoco><option timestep="0.002" integrator="implicitfast"/><worldbody>
   <geom name="wall" type="plane" pos="0.3 0 0" zaxis="-1 0 0" size="1 1 .1"/>
   <body name="carriage" pos="0 0 1"><joint name="x" type="slide" axis="1 0 0" limited="true" range="-0.2 5"/>
