@@ -324,7 +324,7 @@ def extensions(ground: Ground, own: Placed) -> list[tuple[Placed, ...]]:
 def refines(ground: Ground, state: State, better: Refit) -> bool:
     """Return whether an effect that contains an accepted one explains enough more to stand in its place.
 
-    Where the model's own step is part of what both leave, a finer one tells: it may even be that the own step makes
+    Where the model's own step may be part of what both leave, a finer one tells: it may even be that the own step makes
     the wrong one of two the better.
     """
     rules, own, here = ground.rules, state.current, better
@@ -333,6 +333,9 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
     more = here.cost.left_of(own.cost) <= (rules.most if larger else 1 - rules.most)
     if not more or gained < min(least, rules.most * own.cost.above(here.cost)):
         if not more and not remains(own.cost, rules):
+            return False
+        change = change_of_step(ground.part, here)
+        if change is not None and _least_beside(ground, here, change).left_of(own.cost) > 1 - rules.most:
             return False
         own, here = (resolved(ground.part, r, anew=True).fit for r in (own, here))
         if here.cost.left_of(own.cost) > 1 - rules.most:

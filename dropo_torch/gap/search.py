@@ -222,13 +222,14 @@ def step(ground: Ground, state: State) -> State:
         found = everywhere(ground, found)
     elif significant(found.current.cost, ground.rules):
         found = extend(ground, found)
-    if not is_done(ground, found) and len(found.current.hypothesis.placed) > 1:
+    done = is_done(ground, found)
+    if not done and len(found.current.hypothesis.placed) > 1:
         found = swap(ground, found)
     if found.current.hypothesis != accepted:
         found = renewed(ground, found)
-        ground = ground.at(found)
+        done = is_done(ground.at(found), found)
     number = state.number + 1
-    return replace(found, number=number, done=is_done(ground, found) or number >= ground.rules.effects)
+    return replace(found, number=number, done=done or number >= ground.rules.effects)
 
 
 def conclude(ground: Ground, state: State) -> Ended:
