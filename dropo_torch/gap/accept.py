@@ -6,14 +6,11 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.evidence import Cost
 from dropo_torch.gap.ground import FEWER, Ground, State
-from dropo_torch.gap.refit import ANEW, Refit, change_of_step, refit, resolved
+from dropo_torch.gap.refit import ANEW, Refit, change_of_step, least_beside, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import (
     accounts,
@@ -101,7 +98,7 @@ def is_of_step(ground: Ground, fitted: Refit) -> bool:
     the others.
     """
     rules, change = ground.rules, change_of_step(ground.part, fitted)
-    if change is not None and significant(_least_beside(ground, fitted, change), rules):
+    if change is not None and significant(least_beside(ground.part, fitted, change), rules):
         return False
     last = resolved(ground.part, fitted, anew=True)
     most = last.fit.cost.left_of(fitted.cost) <= 1 - rules.most
@@ -111,13 +108,6 @@ def is_of_step(ground: Ground, fitted: Refit) -> bool:
         return False
     again = refit(last.evidence, last.fit.hypothesis, iterations=ANEW, slopes=False)
     return not significant(again.cost, rules)
-
-
-def _least_beside(ground: Ground, fitted: Refit, change: np.ndarray) -> Cost:
-    """The least that a finer step can leave, by how much it changes the residuals ``(W, N)`` of a fit."""
-    own = fitted.residual * np.reshape(ground.part.caps, (-1, 1))
-    share = min(1.0, float(np.linalg.norm(change)) / max(float(np.linalg.norm(own)), 1e-300))
-    return ground.part.cost(fitted.residual * (1 - share), fitted.linear, len(fitted.scale))
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:
@@ -335,7 +325,7 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
         if not more and not remains(own.cost, rules):
             return False
         change = change_of_step(ground.part, here)
-        if change is not None and _least_beside(ground, here, change).left_of(own.cost) > 1 - rules.most:
+        if change is not None and least_beside(ground.part, here, change).left_of(own.cost) > 1 - rules.most:
             return False
         own, here = (resolved(ground.part, r, anew=True).fit for r in (own, here))
         if here.cost.left_of(own.cost) > 1 - rules.most:

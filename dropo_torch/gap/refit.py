@@ -23,6 +23,8 @@ STEP, LEAST_MOVE = 1e-3, 2e-5
 LONG_STEP, JUMPS = 0.1, 2.0
 #: Damping at first, at least, and at most.
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
+#: Gain in loss that is worth another iteration: beside noise alone, and as a share of what is more than noise.
+LEAST_GAIN, SHARE = 0.01, 1e-3
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
@@ -212,7 +214,7 @@ def refit(
             continue
         gain, damping, taken = here.loss - there.loss, max(damping / 8, LEAST_DAMPING), taken + 1
         here, residuals, sloped = there, found, False
-        if gain < 1e-6 * here.loss + 0.01:
+        if gain < LEAST_GAIN + SHARE * max(here.cost.misfit, 0.0):
             break
     if relinearize and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
         again = evidence.linearize(here.hypothesis.variant)
@@ -359,8 +361,11 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
         return Resolved(fitted, evidence, np.zeros(len(vector)))
     finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
     anew = anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules)
-    if anew:
-        finer, coarser = (_anew(last) for last in (finer, coarser))
+    if anew := anew and step_may_explain(evidence, fitted):
+        finer = _anew(finer)
+        coarser = _nearest(
+            coarser.evidence, finer.fit, finer.fit.hypothesis, limits_of(fitted.hypothesis, evidence.twin)
+        )
     fine = finer.fit
     if fine.loss >= fitted.loss:
         untold = fine.loss < fitted.loss + UNTOLD
@@ -392,6 +397,19 @@ def change_of_step(evidence: Evidence, fitted: Refit) -> np.ndarray | None:
     finer = replace(evidence, twin=evidence.twin.finer(finest))
     own, there = (e.project(e.residuals([fitted.hypothesis.variant])[0][0], fitted.linear) for e in (evidence, finer))
     return np.asarray((there - own) * np.reshape(evidence.caps, (-1, 1)))
+
+
+def step_may_explain(evidence: Evidence, fitted: Refit) -> bool:
+    """Return whether a finer step may take a part that counts of what a fit leaves, by how much it changes that."""
+    change = change_of_step(evidence, fitted)
+    return change is None or least_beside(evidence, fitted, change).left_of(fitted.cost) < evidence.rules.most
+
+
+def least_beside(evidence: Evidence, fitted: Refit, change: np.ndarray) -> Cost:
+    """Return the least that a finer step can leave, by how much it changes the residuals ``(W, N)`` of a fit."""
+    own = fitted.residual * np.reshape(evidence.caps, (-1, 1))
+    share = min(1.0, float(np.linalg.norm(change)) / max(float(np.linalg.norm(own)), 1e-300))
+    return evidence.cost(fitted.residual * (1 - share), fitted.linear, len(fitted.scale))
 
 
 def half_widths(last: Resolved) -> np.ndarray:

@@ -29,6 +29,7 @@ from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
 from dropo_torch.support.report import Report
+from dropo_torch.support.threads import single_thread
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -103,6 +104,7 @@ def open_loop(scene: Scene, hypothesis: Hypothesis, seconds: float) -> tuple[flo
     return open_loop_error(scene.evidence, scene.held, hypothesis, seconds)
 
 
+@single_thread()
 def find_gap(
     problem: Problem,
     *,

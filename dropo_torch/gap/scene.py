@@ -34,6 +34,7 @@ from dropo_torch.problem import Problem
 from dropo_torch.shooting.posing import posed
 from dropo_torch.simulators.hidden import refuse_prescribed
 from dropo_torch.support.rows import evenly
+from dropo_torch.support.threads import single_thread
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
@@ -86,6 +87,7 @@ class Scene:
         return None if self.problem.objective.noise is not None else self.short
 
 
+@single_thread()
 def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     """Cut the log, estimate its noise, and choose windows.
 
