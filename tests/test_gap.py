@@ -29,6 +29,7 @@ from benchmarks.hidden.truths import Before, Case, Effect, make_case, make_recor
 from dropo_torch.commands.cli import main
 from dropo_torch.config import load_config
 from dropo_torch.effects import VOCABULARY, Placed, Quantity, Setting, find_effect
+from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
@@ -41,7 +42,16 @@ from dropo_torch.gap.locate import guilty, middles, regime, slopes
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import Diverges, FreeForces, _relative_noise, free_forces
 from dropo_torch.gap.outcome import _notes
-from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, limits_of, refit, resolved, standard_errors
+from dropo_torch.gap.refit import (
+    Hypothesis,
+    Refit,
+    half_widths,
+    limits_of,
+    refit,
+    resolved,
+    standard_errors,
+    step_may_explain,
+)
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, Sound, Tried, accounts, allowance, clears, most_left, significant
@@ -1598,6 +1608,55 @@ def test_log_of_the_own_step_stays_with_it() -> None:
     last = resolved(here, own)
     assert last.fit is own
     assert not last.error.any()
+
+
+def repeated(evidence: Evidence, variant: Variant, noise: float) -> Evidence:
+    """The windows as a simulation with the model's own step has them, with noise that is so many times as large."""
+    path, _ = evidence.twin.predict([variant], evidence.windows)
+    measured = path[0] + noise * evidence.noise * np.random.default_rng(0).standard_normal(path[0].shape)
+    windows = dataclasses.replace(evidence.windows, measured=measured)
+    return dataclasses.replace(evidence, windows=windows, noise=noise * evidence.noise)
+
+
+def test_a_step_that_noise_hides_widens_intervals() -> None:
+    case, evidence = sharp()
+    hidden = repeated(evidence, true(case).variant, 300.0)
+    own = refit(hidden, true(case))
+    last = resolved(hidden, own)
+    finer = refit(
+        dataclasses.replace(hidden, twin=hidden.twin.finer(evidence.twin.setting.signals.timestep / 8)), true(case)
+    )
+    if last.fit is own:
+        assert (last.error >= 0.5 * np.abs(finer.hypothesis.vector - own.hypothesis.vector)).all()
+    assert last.error.max() > 0
+
+
+def test_numbers_beside_a_named_step_are_as_unsure_as_it() -> None:
+    case, evidence = sharp()
+    finer = Placed(find_effect("integration"), None, (evidence.twin.setting.signals.timestep / 8,))
+    named = refit(evidence, true(case).with_effects([finer]))
+    last = resolved(evidence, named)
+    assert last.fit is named
+    coarser = true(case).with_effects([finer.at((evidence.twin.setting.signals.timestep / 4,))])
+    change = np.abs(refit(evidence, coarser).hypothesis.vector - named.hypothesis.vector)
+    assert change[:-1].max() > 0
+    assert (half_widths(last)[:-1] > 0.9 * change[:-1]).all()
+
+
+@pytest.mark.parametrize(("size", "anew"), [(5.0, True), (300.0, False)])
+def test_a_step_that_explains_next_to_nothing_of_a_misfit_is_not_fitted_anew(
+    size: float, anew: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside a push that the model lacks, which grows over each window up to so many times the noise."""
+    case, evidence = sharp()
+    push = size * evidence.noise * np.linspace(0, 1, evidence.windows.length + 1)[:, None] ** 3
+    windows = dataclasses.replace(evidence.windows, measured=evidence.windows.measured + push)
+    wrong, done = dataclasses.replace(evidence, windows=windows), []
+    fitted = refit(wrong, true(case))
+    assert step_may_explain(wrong, fitted) == anew
+    monkeypatch.setattr("dropo_torch.gap.refit._anew", lambda last: done.append(last) or last)
+    resolved(wrong, fitted, anew=True)
+    assert bool(done) == anew
 
 
 def test_number_without_influence_is_not_known() -> None:
