@@ -24,7 +24,7 @@ LONG_STEP, JUMPS = 0.1, 2.0
 #: Damping at first, at least, and at most.
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
 #: Gain in loss that is worth another iteration: beside noise alone, and as a share of what is more than noise.
-LEAST_GAIN, SHARE = 0.01, 1e-3
+LEAST_GAIN, SHARE = 0.01, 1e-4
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
