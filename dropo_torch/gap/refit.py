@@ -23,8 +23,10 @@ STEP, LEAST_MOVE = 1e-3, 2e-5
 LONG_STEP, JUMPS = 0.1, 2.0
 #: Damping at first, at least, and at most.
 DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
-#: Gain in loss that is worth another iteration: beside noise alone, and as a share of what is more than noise.
-LEAST_GAIN, SHARE = 0.01, 1e-4
+#: Gain in loss that is worth another iteration, and its share in the loss.
+LEAST_GAIN, LEAST_SHARE = 0.01, 1e-6
+#: Share of what is more than noise that must be gained at least once in so many iterations.
+SHARE, FEW_GAINS = 1e-4, 2
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
@@ -199,7 +201,7 @@ def refit(
     variant = hypothesis.variant
     linear = evidence.linearize(variant) if linear is None else evidence.counting(linear, variant)
     here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
-    begin, damping, sloped, taken = here, DAMPING, False, 0
+    begin, damping, sloped, taken, small = here, DAMPING, False, 0, 0
     while taken < iterations and damping <= MOST_DAMPING:
         if not sloped:
             here, sloped = _sloped(evidence, here, limits, residuals), True
@@ -214,7 +216,8 @@ def refit(
             continue
         gain, damping, taken = here.loss - there.loss, max(damping / 8, LEAST_DAMPING), taken + 1
         here, residuals, sloped = there, found, False
-        if gain < LEAST_GAIN + SHARE * max(here.cost.misfit, 0.0):
+        small = small + 1 if gain < SHARE * here.cost.misfit else 0
+        if gain < LEAST_GAIN + LEAST_SHARE * here.loss or small == FEW_GAINS:
             break
     if relinearize and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
         again = evidence.linearize(here.hypothesis.variant)
