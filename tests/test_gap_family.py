@@ -30,7 +30,7 @@ from dropo_torch.gap.limbs import alike, by_limbs, joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.rules import Rules, family_accounts
 from dropo_torch.gap.scene import prepare
-from dropo_torch.gap.search import Naming, resort, start
+from dropo_torch.gap.search import Naming, leaves_wrong, resort, start
 from dropo_torch.report.gap_words import answer, by_joint
 
 Triple = tuple[float, ...]
@@ -194,18 +194,29 @@ def test_what_only_makes_up_for_the_step_is_no_member() -> None:
     assert {p.key for p in without_steps(ground, whole).hypothesis.placed} == {p.key for p in placed[:2]}
 
 
+@pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(
     ("truth", "is_family"),
     [({"damping": DAMPING, "friction": FRICTION, "rotor": ROTOR}, True), ({"friction": (0, 0.4, 0)}, False)],
 )
-def test_the_family_is_the_last_resort(truth: dict[str, Triple], is_family: bool, tmp_path: Path) -> None:
-    """Where no search has names, what all joints lack has them, and what one joint lacks has none."""
+def test_the_family_is_the_last_resort(truth: dict[str, Triple], is_family: bool, named: bool, tmp_path: Path) -> None:
+    """Where no search has names, or one that leaves what is wrong, what all joints lack has them.
+
+    What one joint lacks has none.
+    """
     scene = prepare(dropo.make_problem(dropo.load_config(record(tmp_path, 11, **truth)), general=True))
     ground = Ground(scene.evidence, tuple(VOCABULARY.values()), short=scene.noisy)
     begun = start(ground, scene.begin)
     nameless = Naming(ground.at(begun).evidence, begun.base, begun.first, begun.base, gap=True, refused="no")
+    if named:
+        rubbing = Placed(VOCABULARY["joint_friction"], "knee", (0.1,))
+        final = ground.at(begun).refit(begun.base.hypothesis.with_effects([rubbing]))
+        nameless = dataclasses.replace(nameless, named=True, final=final)
+        assert leaves_wrong(nameless, ground) == is_family
+        assert not leaves_wrong(dataclasses.replace(nameless, partial=True), ground)
     naming = resort(ground, nameless)
-    assert naming.named == naming.family == is_family
+    assert naming.family == is_family
+    assert naming.named == (is_family or named)
     if is_family:
         assert naming.refused == ""
         assert {p.effect.name for p in naming.final.hypothesis.placed} >= {"armature", "joint_soft_friction"}

@@ -106,6 +106,7 @@ class Family:
             at three or more.
         hopeless: times that share which all members together may leave for those that are needed to be looked for; dry
             friction that creeps at rest, or changes along the range, then makes it smaller.
+        instead: share of what named effects leave below which it takes their place in the end, where this is wrong.
         joints: the least that the model has.
         rest: share of the first excess that the family may leave even if this is more than ``sound.wrong``: with much
             motion and little noise, the last hundredth of a real robot's misfit is.
@@ -118,6 +119,7 @@ class Family:
     left: float = 3e-3
     clearer: tuple[float, float] = (0.05, 0.4)
     hopeless: float = 6.0
+    instead: float = 0.5
     joints: int = 2
     rest: float = 0.02
     members: int = 2

@@ -24,7 +24,7 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, outstanding, prepare, searched
-from dropo_torch.gap.search import Ended, Naming, believed, kept, resort, search, start, with_ties
+from dropo_torch.gap.search import Ended, Naming, believed, kept, leaves_wrong, resort, search, start, with_ties
 from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
@@ -209,7 +209,7 @@ def _name(
             if decided(last):
                 return last
         elif not searches.doubts(last):
-            return with_ties(found[-1])
+            return searches.told(found[-1])
         elif (sure := searches.sure_of(found[-1], [other for _, other in waiting])) is not None:
             return sure
     return searches.best(found, len(waiting))
@@ -258,6 +258,13 @@ class _Searches:
         """Whether names leave a rest where there are contacts."""
         touches = bool(self.scene.setting.signals.contacts.any())
         return touches and remains(naming.final.cost, self.ground.rules)
+
+    def told(self, ended: Ended) -> Naming:
+        """Return what a search named with what ties with it, or the base family where that leaves what is wrong."""
+        naming = ended.naming
+        if self.has_time and leaves_wrong(naming, self.ground):
+            naming = resort(ended.ground, naming)
+        return naming if naming.family else with_ties(ended)
 
     def sure_of(self, ended: Ended, others: Sequence[Evidence]) -> Naming | None:
         """Return what a search named, if it leaves nothing in one of the other choices of windows."""

@@ -298,6 +298,8 @@ def continued(ground: Ground, state: State, unfinished: str) -> Ended:
 def resort(ground: Ground, naming: Naming) -> Naming:
     """Return the base family, if it accounts for a gap for which no search has names; else what was found.
 
+    Also where there are names that leave what is wrong, if it leaves far less.
+
     Args:
         ground: what the searches stood on.
         naming: what one of them found.
@@ -306,13 +308,25 @@ def resort(ground: Ground, naming: Naming) -> Naming:
         return naming
     evidence = replace(naming.evidence, caps=1.0)
     here, base = with_base(replace(ground, evidence=evidence), naming.base.hypothesis)
-    if (whole := whole_family(here, fitted_family(here, base.hypothesis))) is None:
+    whole = whole_family(here, fitted_family(here, base.hypothesis))
+    if whole is None or (naming.named and not leaves_far_less(here, whole, naming.final.hypothesis)):
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
     state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.few)
     state = renewed(here, replace(state, attempts=naming.attempts))
     found = conclude_family(here.at(state), state, replace(naming, evidence=here.at(state).evidence, base=state.base))
     return found if found.named else naming
+
+
+def leaves_wrong(naming: Naming, ground: Ground) -> bool:
+    """Return whether names that are no base family leave what is wrong, throughout the log."""
+    wrong = naming.final.cost.reduced > ground.rules.sound.wrong
+    return naming.named and not naming.family and not naming.partial and wrong
+
+
+def leaves_far_less(ground: Ground, whole: Refit, rival: Hypothesis) -> bool:
+    """Return whether the base family leaves far less than named effects do that are fitted to the same windows."""
+    return whole.cost.left_of(ground.refit(rival).cost) < ground.rules.family.instead
 
 
 def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
