@@ -58,7 +58,7 @@ from dropo_torch.gap.result import NamedEffect, Score, Strength
 from dropo_torch.gap.rules import Rules, Sound, Tried, accounts, allowance, clears, most_left, significant
 from dropo_torch.gap.scene import outstanding, searched, short_windows
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, screen
-from dropo_torch.gap.search import Ended, Naming, believed, start
+from dropo_torch.gap.search import Ended, Naming, believed, instead_of_one, leaves_wrong, start
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.symbolic import describe
 from dropo_torch.gap.time_left import TimeLeft
@@ -1303,6 +1303,27 @@ def test_names_that_leave_nothing_are_believed_before_others(
         monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: sure)
         assert gap_package.name(scene).final is sure.naming.final
         assert len(list(waiting)) == 1
+
+
+@pytest.mark.whole
+def test_one_effect_that_explains_most_may_stand_for_two() -> None:
+    """A lag removes 0.98 of what a delay and damping make, and no effect beside it removes most of the rest."""
+    (spec,) = select(cases(738766, "all"), "motion-servo_arm-joint_damping-actuator_delay-quiet", None)
+    scene = prepare(load(spec.make()))
+    ground = Ground(scene.evidence, tuple(VOCABULARY.values()), short=scene.noisy)
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    wrong, damping = Placed(find_effect("actuator_lag"), "elbow_servo", (0.03,)), find_effect("joint_damping")
+    current = ground.refit(scene.begin.with_effects([wrong]))
+    named = Naming(ground.evidence, state.base, state.first, current, gap=True, named=True)
+    assert leaves_wrong(named, ground)
+    found = instead_of_one(Ended(ground, dataclasses.replace(state, current=current), named)).naming
+    assert not leaves_wrong(found, ground)
+    told = {p.effect.name for p in found.final.hypothesis.placed}
+    assert told in ({"actuator_delay", "joint_damping"}, {"actuator_delay", "actuator_damping"})
+    two = ground.refit(current.hypothesis.with_effects([Placed(damping, "elbow", (0.01,))]))
+    of_two = Ended(ground, dataclasses.replace(state, current=two), named)
+    assert instead_of_one(of_two) is of_two
 
 
 @pytest.mark.whole

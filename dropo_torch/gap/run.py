@@ -24,7 +24,18 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, outstanding, prepare, searched
-from dropo_torch.gap.search import Ended, Naming, believed, kept, leaves_wrong, resort, search, start, with_ties
+from dropo_torch.gap.search import (
+    Ended,
+    Naming,
+    believed,
+    instead_of_one,
+    kept,
+    leaves_wrong,
+    resort,
+    search,
+    start,
+    with_ties,
+)
 from dropo_torch.gap.sound import has_skill
 from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error, scores
 from dropo_torch.problem import Problem
@@ -260,11 +271,13 @@ class _Searches:
         return touches and remains(naming.final.cost, self.ground.rules)
 
     def told(self, ended: Ended) -> Naming:
-        """Return what a search named with what ties with it, or the base family where that leaves what is wrong."""
-        naming = ended.naming
-        if self.has_time and leaves_wrong(naming, self.ground):
-            naming = resort(ended.ground, naming)
-        return naming if naming.family else with_ties(ended)
+        """Return what a search named with what ties with it; two effects or the base family where it is wrong."""
+        if self.has_time and leaves_wrong(ended.naming, self.ground):
+            ended = instead_of_one(ended)
+        if self.has_time and leaves_wrong(ended.naming, self.ground):
+            naming = resort(ended.ground, ended.naming)
+            return naming if naming.family else with_ties(ended)
+        return with_ties(ended)
 
     def sure_of(self, ended: Ended, others: Sequence[Evidence]) -> Naming | None:
         """Return what a search named, if it leaves nothing in one of the other choices of windows."""

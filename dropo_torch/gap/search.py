@@ -19,6 +19,7 @@ from dropo_torch.gap.accept import (
     imitates,
     is_done,
     nonsense,
+    paired,
     prune,
     reconsidered,
     swap,
@@ -293,6 +294,23 @@ def continued(ground: Ground, state: State, unfinished: str) -> Ended:
         state = step(ground.at(state), state)
     ended = conclude(ground.at(state), state)
     return replace(ended, naming=replace(ended.naming, unfinished=unfinished))
+
+
+def instead_of_one(ended: Ended) -> Ended:
+    """Return where a search ends that begins with two effects in the place of one that leaves what is wrong.
+
+    One that explains most of a gap, such as a lag, may stand for two, such as a delay and friction: pairs are not
+    tried beside it. They take its place if they remove most of what it leaves.
+    """
+    ground, state = ended.ground, ended.state
+    alive = [c for c in state.first.ranked if not c.dead]
+    if len(state.current.hypothesis.placed) != 1 or len(state.current.hypothesis.placed[0].values) != 1:
+        return ended
+    found, tried = paired(ground, replace(state, current=state.base), alive)
+    if not found or found[0].cost.left_of(state.current.cost) > 1 - ground.rules.most:
+        return ended
+    better = continued(ground, replace(tried, current=found[0], done=False), ended.naming.unfinished)
+    return better if better.naming.named else ended
 
 
 def resort(ground: Ground, naming: Naming) -> Naming:
