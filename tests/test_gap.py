@@ -1429,6 +1429,31 @@ def test_ripple_between_those_that_are_tried_is_ranked_first(poles: int) -> None
     assert ground.screened(ground.refit(scene.begin))[0].key == ("joint_cogging", "elbow")
 
 
+def largest_force(problem: Problem, actuator: str) -> float:
+    """Of an actuator of the model as given, at the states and commands of a log."""
+    log, model = problem.trajectories, problem.space.model
+    assert model is not None
+    data, forces = mujoco.MjData(model), []
+    for state, command in zip(problem.observation.states(log.observations), log.actions, strict=True):
+        data.qpos[:], data.qvel[:], data.ctrl[:] = state[: model.nq], state[model.nq :], command
+        mujoco.mj_forward(model, data)
+        forces.append(abs(data.actuator(actuator).force[0]))
+    return max(forces)
+
+
+def test_a_limit_that_binds_seldom_is_ranked_first() -> None:
+    """Far from where the search for it begins: one such number does nothing on this log, the next only harm."""
+    plain = load(simulate_truth(SERVO_ARM, [], 3, episodes=6, transitions=200))
+    truth = 0.7 * largest_force(plain, "elbow_servo")
+    limit = Effect("actuator_saturation", "elbow_servo", {"limit": truth})
+    scene = prepare(load(simulate_truth(SERVO_ARM, [limit], 3, episodes=6, transitions=200)))
+    names = ("joint_damping", "joint_friction", "armature", "actuator_gain", "actuator_saturation")
+    ground = Ground(scene.evidence, tuple(VOCABULARY[n] for n in names))
+    best = start(ground, scene.begin).first.ranked[0]
+    assert best.key == ("actuator_saturation", "elbow_servo")
+    assert best.placed.values[0] == pytest.approx(truth, rel=0.05)
+
+
 class Echo(SensorEffect):
     """A sensor that shows a share of what it showed before, and knows nothing of what was before a window."""
 

@@ -28,6 +28,8 @@ STEP = 2e-3
 DAMPING, RIDGE, FAINT = 1e-6, 1e-10, 1e-9
 #: Shares of the way from where a candidate begins to where it is predicted that are tried, too.
 ALONG = (0.75, 0.5, 0.25, 0.125)
+#: Times that a start is looked for between one that does nothing and one that does harm.
+HALVINGS = 4
 #: Candidates that one batch of simulations holds.
 BATCH = 24
 
@@ -135,10 +137,64 @@ def screen(
     for rows in parts(len(waiting), BATCH):
         found += _predict(focus, waiting[rows], tried.dead)
         on_progress(rows.stop / len(candidates))
+    found += _between(focus, found, tried.dead)
     best: dict[tuple[str, str | None], Candidate] = {}
     for candidate in sorted(found, key=lambda c: (c.dead, c.chi2)):
         best.setdefault(candidate.key, candidate)
     return list(best.values())
+
+
+def _between(focus: Focus, found: Sequence[Candidate], least: float) -> list[Candidate]:
+    """Predict from starts between one that does nothing in these windows and the next one, which only does harm.
+
+    A limit of force that binds in one window of many acts below the largest force there, and does harm not far below.
+    """
+    apart, more = _apart(focus, found), list[Candidate]()
+    for _ in range(HALVINGS):
+        middle = [harmful.at([_middle(idle, harmful.values[0])]) for idle, harmful in apart]
+        tried = [c for rows in parts(len(middle), BATCH) for c in _predict(focus, middle[rows], least)]
+        more += tried
+        left = [(ends, c) for ends, c in zip(apart, tried, strict=True) if not _helps(c, focus)]
+        apart = [(c.start.values[0], ends[1]) if c.dead else (ends[0], c.start) for ends, c in left]
+    return more
+
+
+def _apart(focus: Focus, found: Sequence[Candidate]) -> list[tuple[float, Placed]]:
+    """Number that does nothing and start that does harm, beside each other, of each candidate that never helps.
+
+    Starts may do nothing, and so does the neutral number of a limit; friction or a delay acts from zero on.
+    """
+    groups: dict[tuple[str, str | None], list[Candidate]] = {}
+    for c in found:
+        if c.placed.effect.shares and len(c.placed.values) == 1:
+            groups.setdefault(c.key, []).append(c)
+    apart = []
+    for members in groups.values():
+        first = members[0].start
+        limit = first.effect.quantities(focus.evidence.twin.setting, first.target)[0]
+        harmful = [c.start for c in members if not c.dead]
+        if limit.discrete or not harmful or any(_helps(c, focus) for c in members):
+            continue
+
+        def strength(number: float, neutral: float = limit.neutral) -> float:
+            return abs(number - neutral)
+
+        weakest = min(harmful, key=lambda p: strength(p.values[0]))
+        idle = [c.start.values[0] for c in members if c.dead] + [limit.neutral] * (limit.neutral >= limit.high)
+        weaker = [number for number in idle if strength(number) < strength(weakest.values[0])]
+        if weaker:
+            apart.append((max(weaker, key=strength), weakest))
+    return apart
+
+
+def _helps(candidate: Candidate, focus: Focus) -> bool:
+    """Whether a candidate is predicted to leave less than the fitted hypothesis."""
+    return not candidate.dead and candidate.chi2 < float(focus.residual @ focus.residual)
+
+
+def _middle(one: float, other: float) -> float:
+    """Return the geometric mean of two numbers of one sign, otherwise their mean."""
+    return float(np.sign(one) * np.sqrt(one * other)) if one * other > 0 else 0.5 * (one + other)
 
 
 @dataclass(frozen=True)
