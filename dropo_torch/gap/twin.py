@@ -26,6 +26,10 @@ from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.hidden import filters_known
 
 
+#: Bytes of filtered commands that are kept; of the last candidate, in any case.
+KEPT = 2**27
+
+
 @dataclass(frozen=True)
 class Windows:
     """Stretches of a log, each simulated from its own start.
@@ -267,7 +271,7 @@ class Twin:
             self._commands, self._filtered = windows.commands, {}
         key = tuple((p.key, p.values) for p in variant.placed if p.effect.has("command"))
         if key not in self._filtered:
-            if len(self._filtered) > 64:
+            if sum(known.nbytes for known in self._filtered.values()) > KEPT:
                 self._filtered.clear()
             filters = placed_filters(variant.placed, "command", self.setting)
             step = float(self.setting.model.opt.timestep)
