@@ -25,7 +25,6 @@ from dropo_torch.effects.path import SensedPath
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.simulators.hidden import filters_known
 
-
 #: Bytes of filtered commands that are kept; of the last candidate, in any case.
 KEPT = 2**27
 
