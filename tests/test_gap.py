@@ -61,6 +61,7 @@ from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, s
 from dropo_torch.gap.search import Ended, Naming, believed, instead_of_one, leaves_wrong, start
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.symbolic import describe
+from dropo_torch.gap.ties import as_good
 from dropo_torch.gap.time_left import TimeLeft
 from dropo_torch.gap.twin import Windows, secants
 from dropo_torch.gap.verify import cut_held, hold_out, rollout_floor, score, scores
@@ -359,6 +360,20 @@ def test_a_step_is_named_where_it_is_no_small_part_of_the_gap(step: float, frict
     assert accept.is_of_step(ground, without)
     assert not accept.is_of_step(ground, state.base)
     assert accept.step_shows(ground, state.base)
+
+
+def test_what_only_a_finer_step_parts_are_no_ties() -> None:
+    """Friction that is larger near rest, and plain friction: a step that is too coarse for it hides the peak."""
+    peaked, plain = find_effect("joint_stribeck"), find_effect("joint_friction")
+    law = {"coulomb": 0.06, "static": 0.094, "velocity": 0.49}
+    scene = prepare(load(simulate_truth(TORQUE_ARM, [Effect("joint_stribeck", "elbow", law)], 4, **SIZE)))
+    ground = Ground(scene.evidence, (peaked, plain), short=scene.noisy, few=16)
+    state = start(ground, scene.begin)
+    ground = ground.at(state)
+    rival = ground.refit(scene.begin.with_effects([Placed(plain, "elbow", (0.06,))]))
+    own = ground.refit(rival.hypothesis.instead(0, Placed(peaked, "elbow", (0.06, 0.066, 0.9))))
+    assert ground.as_good(rival, own)
+    assert not as_good(ground, dataclasses.replace(state, current=own), rival)
 
 
 def test_a_step_that_only_named_effects_show_has_no_name() -> None:

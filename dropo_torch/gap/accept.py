@@ -100,7 +100,7 @@ def is_of_step(ground: Ground, fitted: Refit) -> bool:
     rules, change = ground.rules, change_of_step(ground.part, fitted)
     if change is not None and significant(least_beside(ground.part, fitted, change), rules):
         return False
-    last = resolved(ground.part, fitted, anew=True)
+    last = ground.resolved(fitted)
     most = last.fit.cost.left_of(fitted.cost) <= 1 - rules.most
     if not significant(last.fit.cost, rules):
         return most or significant(fitted.cost, rules)  # of what is no more than noise, a finer step must leave less
@@ -327,7 +327,7 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
         change = change_of_step(ground.part, here)
         if change is not None and least_beside(ground.part, here, change).left_of(own.cost) > 1 - rules.most:
             return False
-        own, here = (resolved(ground.part, r, anew=True).fit for r in (own, here))
+        own, here = (ground.resolved(r).fit for r in (own, here))
         if here.cost.left_of(own.cost) > 1 - rules.most:
             return False
     return beats(ground, here, own)

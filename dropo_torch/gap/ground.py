@@ -12,7 +12,7 @@ import numpy as np
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.log import parts_of, since_known, spread
-from dropo_torch.gap.refit import Hypothesis, Refit, refit
+from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, refit, resolved
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import Alike, Rules, as_good, chance_of, clears
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, left_by, screen
@@ -168,6 +168,17 @@ class Ground:
         if key not in self._known:
             self._known[key] = refit(self.part, hypothesis, iterations=iterations)
         return self._known[key]
+
+    def resolved(self, fitted: Refit) -> Resolved:
+        """Return a fit of these windows as it would be under an endlessly fine step; see :func:`resolved`."""
+        key = (fitted.hypothesis.vector.tobytes(), tuple(p.key for p in fitted.hypothesis.placed))
+        if key not in self._resolved:
+            self._resolved[key] = resolved(self.part, fitted, anew=True)
+        return self._resolved[key]
+
+    @cached_property
+    def _resolved(self) -> dict[tuple, Resolved]:
+        return {}
 
     @cached_property
     def _known(self) -> dict[tuple, Refit]:

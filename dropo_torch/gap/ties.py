@@ -10,8 +10,8 @@ from itertools import permutations
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.accept import nonsense
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import Refit
-from dropo_torch.gap.rules import Alike, significant
+from dropo_torch.gap.refit import Refit, step_may_explain
+from dropo_torch.gap.rules import Alike, remains, significant
 from dropo_torch.gap.screen import Candidate, Focus, left_by, nearer
 
 #: Iterations of their fits on few windows: a tie with more numbers than needed settles slowly.
@@ -138,7 +138,19 @@ def as_good(ground: Ground, state: State, rival: Refit) -> bool:
     """Return whether a rival hypothesis explains the log as well as the one that was found."""
     current = state.current
     as_clear = ground.clears(state.base, rival) or not ground.clears(state.base, current)
-    return as_clear and ground.as_good(rival, current)
+    return as_clear and ground.as_good(rival, current) and not parted_by_step(ground, current, rival)
+
+
+def parted_by_step(ground: Ground, own: Refit, rival: Refit) -> bool:
+    """Return whether a finer step explains most of what a hypothesis leaves, but not beside a rival for it.
+
+    Friction that is larger near rest, for one, explains little more than plain friction before the step resolves it.
+    """
+    if not remains(own.cost, ground.rules) or not step_may_explain(ground.part, own):
+        return False
+    fine = ground.resolved(own).fit
+    most = fine.cost.left_of(own.cost) <= 1 - ground.rules.most
+    return most and not ground.as_good(ground.resolved(rival).fit, fine)
 
 
 def canonical(

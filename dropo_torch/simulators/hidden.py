@@ -144,9 +144,8 @@ def filters_known(memory: int, frame_skip: int, lengths: np.ndarray) -> np.ndarr
 
 def control_range(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Lowest and highest control that acts, ``(nu,)`` each."""
-    limited = model.actuator_ctrllimited.astype(bool) & ~bool(
-        model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
-    )
+    clamps = not model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CLAMPCTRL
+    limited = model.actuator_ctrllimited.astype(bool) & clamps
     low, high = model.actuator_ctrlrange.T
     return np.where(limited, low, -np.inf), np.where(limited, high, np.inf)
 

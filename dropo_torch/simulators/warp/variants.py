@@ -107,11 +107,10 @@ class Variants:
     Args:
         space: parameters, whose fields may vary within one engine.
         num_threads: threads of a CPU, 0 for all processors.
-        device: Warp's name of the device.
     """
 
-    def __init__(self, space: ParameterSpace, *, num_threads: int = 0, device: str = "cpu") -> None:
-        self._space, self._device, self._threads = space, device, num_threads
+    def __init__(self, space: ParameterSpace, *, num_threads: int = 0) -> None:
+        self._space, self._threads = space, num_threads
         self._engines: dict[bytes, Engine | None] = {}
         self._tabled: tuple[str, ...] = ()
         self._free = _in_theta(space)
@@ -149,7 +148,7 @@ class Variants:
         if remarks(model) or model.na:  # it stands in for MuJoCo with these very options, and without activations
             return None
         try:
-            return Engine(model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device=self._device)
+            return Engine(model, self._space, skip=1, chunk_size=4096, num_threads=self._threads, device="cpu")
         except InputError:
             return None
 
