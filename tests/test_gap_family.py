@@ -305,6 +305,7 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     monkeypatch.setattr(members, "significant", lambda *_: True)
     monkeypatch.setattr(members, "one_kind", lambda _: False)
     monkeypatch.setattr(members, "extend", lambda _, found: found)
+    monkeypatch.setattr(members, "is_of_step", lambda *_: False)
     monkeypatch.setattr(members, "leaves_too_much", lambda *_: False)
     monkeypatch.setattr(members, "fitted_family", lambda *_: whole)
     monkeypatch.setattr(members, "whole_family", lambda _, fit: judged.append(fit))
@@ -328,7 +329,8 @@ def test_the_family_is_none_where_one_effect_more_leaves_less(
     hypothesis: Any = SimpleNamespace(placed=(object(),))
     tried = [fit(next_one, 0.1)]
     for name, made in {
-        "has_family": True, "significant": True, "one_kind": True, "leaves_too_much": False, "nearer": None,
+        "has_family": True, "significant": True, "one_kind": True, "is_of_step": False, "leaves_too_much": False,
+        "nearer": None,
         "fitted_family": fit(100.0, 0.3), "whole_family": fit(100.0, 0.3), "sound": tried,
     }.items():  # fmt: skip
         monkeypatch.setattr(members, name, lambda *_, made=made: made)
@@ -338,6 +340,17 @@ def test_the_family_is_none_where_one_effect_more_leaves_less(
     base = SimpleNamespace(cost=None, hypothesis=None)
     first: Any = Ended(current=fit(1000.0, left), base=base)
     assert members.with_family(ground, SimpleNamespace(base=base), first).family == is_family  # type: ignore[arg-type]
+
+
+def test_what_is_of_the_models_own_step_asks_for_no_family(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Inertia, friction and delay of every joint make up for what a coarse step does to stiff servos."""
+    for name in ("has_family", "significant", "one_kind", "is_of_step"):
+        monkeypatch.setattr(members, name, lambda *_: True)
+    monkeypatch.setattr(members, "fitted_family", lambda *_: pytest.fail("a family was fitted"))
+    cost = SimpleNamespace(left_of=lambda _: 0.5)
+    first: Any = SimpleNamespace(current=SimpleNamespace(cost=cost, hypothesis=None), done=False)
+    before: Any = SimpleNamespace(base=SimpleNamespace(cost=None, hypothesis=None))
+    assert members.with_family(SimpleNamespace(rules=Rules()), before, first) is first  # type: ignore[arg-type]
 
 
 def test_a_delay_at_all_joints_and_a_payload_are_found_together(tmp_path: Path) -> None:

@@ -600,6 +600,29 @@ def test_derived_velocities_are_compared_nowhere_where_something_touches(
     assert "mask" not in found.document
 
 
+SERVO = """
+<mujoco><option timestep=".002" integrator="implicitfast"/>
+  <worldbody><body name="arm"><joint name="arm" axis="0 1 0" armature=".02" damping=".3"/>
+    <geom type="capsule" fromto="0 0 0 0 0 -.1" size=".01" mass=".1"/></body></worldbody>
+  <actuator><position name="arm" joint="arm" kp="18" kv=".4"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("steps", "masked"), [(16, True), (5, False)])
+def test_derived_velocities_are_compared_nowhere_where_a_servo_follows_within_a_row(
+    tmp_path: Path, steps: int, masked: bool
+) -> None:
+    """Rows of 32 ms, and a joint whose velocity has settled to a third of a step of its command after 30 ms."""
+    model, rng = mujoco.MjModel.from_xml_string(SERVO), np.random.default_rng(2)
+    data, rows = mujoco.MjData(model), []
+    for _ in range(1200 // steps * 4):
+        data.ctrl[0] = 0.6 * np.sin(3 * data.time) + 0.4 * np.sin(7.1 * data.time)
+        rows.append([data.time, data.qpos[0] + 5e-4 * rng.standard_normal(), data.ctrl[0]])
+        mujoco.mj_step(model, data, steps)
+    frame = dict(zip(("t", "arm_pos", "arm_target"), np.array(rows).T, strict=True))
+    found = dropo.propose_config(*written(tmp_path, frame, SERVO), out=tmp_path / "robot.yaml")
+    assert found.document.get("mask") == (["arm.velocity"] if masked else None)
+
+
 def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
     """A column that is nothing of the model's, and a hole in another, are no silent matter."""
     t, q, v, u = log

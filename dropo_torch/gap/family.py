@@ -15,7 +15,7 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
-from dropo_torch.gap.accept import SOFT, extend, sound, with_soft_friction
+from dropo_torch.gap.accept import SOFT, extend, is_of_step, sound, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of
@@ -50,10 +50,11 @@ def base_family(setting: Setting, known: Sequence[Effect] | None = None) -> list
 def with_family(ground: Ground, state: State, found: State) -> State:
     """Put the base family in the place of the first effects found, where these leave much and it leaves far less.
 
-    At several joints several members must be needed: what sits at one joint, or is of one kind, the search names one by
-    one. Where the first effects are not one effect at several joints already, it must leave next to nothing of what
-    they leave. What ends at a bound of physics is no member. Where it leaves more than noise, and one effect more
-    beside the first ones leaves less, the search goes on with these.
+    At several joints several members must be needed: what sits at one joint, or is of one kind, the search names
+    one by one. What a coarse step does to stiff servos is no member, although inertia, friction and delay of every
+    joint together make up for it. Where the first effects are not one effect at several joints already, it must
+    leave next to nothing of what they leave. What ends at a bound of physics is no member. Where it leaves more
+    than noise, and one effect more beside the first ones leaves less, the search goes on with these.
 
     Args:
         ground: what the search stands on.
@@ -67,6 +68,8 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     best = found if found.done or kind else extend(ground, found)  # what contains the first effects may be the truth
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
+        return found
+    if is_of_step(ground, best.current):
         return found
     most = rules.hopeless * rules.clearer[int(kind)]
     if leaves_too_much(ground, state.base.hypothesis, best.current.hypothesis, most):

@@ -230,18 +230,38 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
 
 
 def _masked(draft: Draft, reading: Reading) -> Draft:
-    """The draft in which velocities that are derived are compared nowhere, where something touches in the log.
+    """The draft in which velocities that are derived are compared nowhere, where velocities jump or bend within a row.
 
-    An impact within a row makes a difference of positions no velocity: neither that before it nor that after it.
+    An impact within a row makes a difference of positions no velocity: neither that before it nor that after it. Nor is
+    it one where commands change from row to row and a joint follows them within a row.
     """
     logged, options = draft.logged, draft.document["data"].get("preprocess", {})
     if logged.model is None or not options or options.get("velocities") or reading.matching.of("marker"):
         return draft
     told, log = logged.observation, logged.trajectories
     rates = [label for label, at in zip(told.labels, told.index, strict=True) if at >= logged.model.nq]
-    if not rates or not touching_groups(logged.model, told.states(log.observations, log.unseen)):
+    if not rates:
+        return draft
+    row = draft.document["frame_skip"] * reading.timestep
+    bend = logged.model.nu > 0 and quickest(logged.model) < row
+    if not bend and not touching_groups(logged.model, told.states(log.observations, log.unseen)):
         return draft
     return replace(draft, document=draft.document | {"mask": rates}, notes=(*draft.notes, UNCOMPARED))
+
+
+def quickest(model: mujoco.MjModel) -> float:
+    """Return the least time constant of a joint's velocity, s: its inertia by its damping and that of its servos."""
+    damping = model.dof_damping.copy()
+    for i in np.flatnonzero(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)):
+        joint = model.actuator_trnid[i, 0]
+        if model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
+            own = max(-float(model.actuator_biasprm[i, 2]), 0.0) * float(model.actuator_gear[i, 0]) ** 2
+            damping[model.jnt_dofadr[joint]] += own
+    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    mujoco.mj_forward(model, data)
+    mujoco.mj_fullM(model, data, inertia)
+    damped = damping > 0
+    return float(np.min(np.diag(inertia)[damped] / damping[damped], initial=math.inf))
 
 
 def _chosen(candidates: Sequence[Candidate], found: Information, review: Review | None) -> Choice:
