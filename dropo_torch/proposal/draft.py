@@ -34,8 +34,11 @@ ROUNDS = 8
 ABOVE_NOISE = 12.0
 #: What is said of derived velocities that are masked.
 UNCOMPARED = "they say where windows begin, and are compared nowhere"
-#: Share of what a row adds to a position that its noise may make before it is filtered, and a filter's margin.
-NOISY, MARGIN = 0.02, 3.0
+#: Share of what a row adds to a position that its noise may make before it is filtered.
+NOISY = 0.02
+#: Margins of a filter over the highest frequency at which positions show more than noise: of positions that are
+#: compared, which it must leave as they are, and of those from which velocities are derived that are compared nowhere.
+MARGIN, UNCOMPARED_MARGIN = 3.0, 1.2
 
 
 @dataclass(frozen=True)
@@ -271,7 +274,8 @@ def _preprocess(
     if groups:
         options["quaternions"] = list(groups.values())
     noisy = derive if velocities else positions
-    smooth = make_filter(noisy, clock, len(columns), columns.parts) if noisy else None
+    margin = UNCOMPARED_MARGIN if derive else MARGIN
+    smooth = make_filter(noisy, clock, len(columns), columns.parts, margin) if noisy else None
     if smooth is not None:
         options["cutoff"] = smooth.cutoff
         notes.append(f"positions are noisy: a filter at {smooth.cutoff:g} Hz, above which the log shows noise alone")
@@ -352,7 +356,9 @@ class Filter:
         return math.sqrt(power * ((2 * math.pi * self.cutoff) ** 2 / 3 if of_rate else 1.0))
 
 
-def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int]) -> Filter | None:
+def make_filter(
+    positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int], margin: float
+) -> Filter | None:
     """Return the filter above whose frequency positions show noise alone; ``None`` where noise does not matter."""
     from scipy import signal
 
@@ -374,7 +380,7 @@ def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequ
         density[m.place.label] = float(np.median(power[-len(power) // 4 :]))
         above = np.flatnonzero(power[1:] > ABOVE_NOISE * density[m.place.label]) + 1
         highest = max(highest, float(frequency[above.max()]) if above.size else 0.0)
-    cutoff = float(f"{MARGIN * max(highest, 4 / (dt * rows)):.2g}")
+    cutoff = float(f"{margin * max(highest, 4 / (dt * rows)):.2g}")
     return Filter(cutoff, density) if is_noisy and cutoff <= 0.4 / dt else None
 
 
