@@ -337,8 +337,7 @@ def test_a_rest_of_the_own_step_hides_no_small_effect_and_needs_none(
 
     monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
     bare, fine = fitted(500), {True: fitted(without), False: fitted(finer)}
-    monkeypatch.setattr(accept, "resolved", lambda _, r, **__: SimpleNamespace(fit=fine[r is bare]))
-    ground = SimpleNamespace(rules=Rules(), part=None)
+    ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda r: SimpleNamespace(fit=fine[r is bare]))
     assert accept.matters(ground, fitted(180_000), fitted(own), bare) == enough
     assert not accept.matters(ground, fitted(180_000), fitted(400), bare)
 
