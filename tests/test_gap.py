@@ -420,8 +420,8 @@ def test_of_what_is_no_more_than_noise_a_finer_step_must_leave_less(
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
     monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
-    monkeypatch.setattr(accept, "resolved", lambda *_, **__: SimpleNamespace(fit=leaving(finer)))
-    assert accept.is_of_step(SimpleNamespace(rules=Rules(), part=None), leaving(1.08)) == of_step
+    ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda _: SimpleNamespace(fit=leaving(finer)))
+    assert accept.is_of_step(ground, leaving(1.08)) == of_step
 
 
 @pytest.mark.parametrize(("stale", "fitted", "of_step"), [(20.0, 1.0, True), (20.0, 15.0, False), (300.0, 1.0, False)])
@@ -436,9 +436,9 @@ def test_what_a_finer_step_mostly_explains_is_fitted_there(
 
     last = SimpleNamespace(fit=leaving(stale), evidence=None)
     monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
-    monkeypatch.setattr(accept, "resolved", lambda *_, **__: last)
     monkeypatch.setattr(accept, "refit", lambda *_, **__: leaving(fitted))
-    assert accept.is_of_step(SimpleNamespace(rules=Rules(), part=None), leaving(500.0)) == of_step
+    ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda _: last)
+    assert accept.is_of_step(ground, leaving(500.0)) == of_step
 
 
 def test_many_numbers_that_leave_more_than_the_step_imitate() -> None:
