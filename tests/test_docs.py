@@ -112,6 +112,7 @@ def test_every_benchmark_begins(
     path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """With all that it imports; one that is a program says how it is used."""
+    monkeypatch.syspath_prepend(str(path.parent))  # as Python does for a program
     program = load_example(path)
     if hasattr(program, "main"):
         monkeypatch.setattr(sys, "argv", [path.name, "--help"])
