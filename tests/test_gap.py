@@ -7,6 +7,7 @@ import copy
 import dataclasses
 import functools
 import json
+import math
 import tempfile
 import time
 from collections.abc import Callable
@@ -33,7 +34,21 @@ from dropo_torch.effects.engine import Variant
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.effects.sensor import SensorEffect
 from dropo_torch.errors import InputError
-from dropo_torch.gap import Gap, Scene, accept, add, find_gap, find_gap_as_given, given, name, outcome, prepare
+from dropo_torch.gap import (
+    Gap,
+    Scene,
+    accept,
+    add,
+    find_gap,
+    find_gap_as_given,
+    given,
+    name,
+    outcome,
+    own_step,
+    prepare,
+)
+from dropo_torch.gap import refit as refitting
+from dropo_torch.gap import search as searching
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearization, cost_of, robust_factors
@@ -335,7 +350,7 @@ def test_a_rest_of_the_own_step_hides_no_small_effect_and_needs_none(
     def fitted(reduced: float) -> SimpleNamespace:
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
-    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(own_step, "change_of_step", lambda *_: None)
     bare, fine = fitted(500), {True: fitted(without), False: fitted(finer)}
     ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda r: SimpleNamespace(fit=fine[r is bare]))
     assert accept.matters(ground, fitted(180_000), fitted(own), bare) == enough
@@ -356,8 +371,8 @@ def test_a_step_is_named_where_it_is_no_small_part_of_the_gap(step: float, frict
     assert without.cost.reduced > 10
     assert not significant(whole.cost, ground.rules)
     assert accept.matters(ground, state.base, whole, without) == named
-    assert accept.is_of_step(ground, without)
-    assert not accept.is_of_step(ground, state.base)
+    assert own_step.is_of_step(ground, without)
+    assert not own_step.is_of_step(ground, state.base)
     assert accept.step_shows(ground, state.base)
 
 
@@ -419,9 +434,9 @@ def test_of_what_is_no_more_than_noise_a_finer_step_must_leave_less(
     def leaving(reduced: float) -> SimpleNamespace:
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
-    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(own_step, "change_of_step", lambda *_: None)
     ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda _: SimpleNamespace(fit=leaving(finer)))
-    assert accept.is_of_step(ground, leaving(1.08)) == of_step
+    assert own_step.is_of_step(ground, leaving(1.08)) == of_step
 
 
 @pytest.mark.parametrize(("stale", "fitted", "of_step"), [(20.0, 1.0, True), (20.0, 15.0, False), (300.0, 1.0, False)])
@@ -435,10 +450,10 @@ def test_what_a_finer_step_mostly_explains_is_fitted_there(
         return SimpleNamespace(cost=cost, hypothesis=Hypothesis(()), linear=None)
 
     last = SimpleNamespace(fit=leaving(stale), evidence=None)
-    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
-    monkeypatch.setattr(accept, "refit", lambda *_, **__: leaving(fitted))
+    monkeypatch.setattr(own_step, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(own_step, "refit", lambda *_, **__: leaving(fitted))
     ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda _: last)
-    assert accept.is_of_step(ground, leaving(500.0)) == of_step
+    assert own_step.is_of_step(ground, leaving(500.0)) == of_step
 
 
 def test_many_numbers_that_leave_more_than_the_step_imitate() -> None:
@@ -1892,6 +1907,61 @@ def test_answer_so_far_is_given_when_the_time_is_over(
     monkeypatch.undo()
     on = search(hidden(*TWO), FEW, checkpoint=store, resume=True)
     assert lasting(on) == lasting(found(TWO))
+
+
+@pytest.mark.parametrize(("shrinks", "move", "times"), [(0.5, 1.0, 9), (0.01, 1.0, 2), (0.5, 1e-3, 2)])
+def test_a_fit_goes_on_as_long_as_another_linearization_of_the_initial_states_helps(
+    shrinks: float, move: float, times: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A heavy load of a walking robot: each linearization goes a part of the way, and one after the other all of it."""
+    made = list[float]()
+
+    def descent(evidence: Any, hypothesis: Hypothesis, linear: float, *_: Any) -> SimpleNamespace:
+        made.append(linear)
+        moved = hypothesis.at(hypothesis.vector + (1.0 if len(made) == 1 else move))
+        begin = SimpleNamespace(hypothesis=hypothesis, cost=SimpleNamespace(misfit=100.0))
+        return SimpleNamespace(begin=begin, here=SimpleNamespace(hypothesis=moved), gain=100 * shrinks, sloped=True)
+
+    monkeypatch.setattr(refitting, "_descent", descent)
+    monkeypatch.setattr(refitting, "limits_of", lambda *_: refitting.Limits(-np.ones(1), np.ones(1), np.ones(1)))
+    evidence = SimpleNamespace(twin=None, linearize=lambda variant: variant.declared[0])
+    refit(evidence, Hypothesis((0.0,)))
+    assert len(made) == times
+    assert len(set(made)) == times
+    refit(evidence, Hypothesis((0.0,)), linear=-7.0)
+    assert made[times:] == [-7.0]
+
+
+@pytest.mark.parametrize(("left", "explained"), [(50.0, False), (3.0, True)])
+def test_a_search_that_has_most_of_the_gap_ends_later(
+    left: float, explained: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next effect of a walking robot takes minutes, and shorter windows would have to find the first one again."""
+
+    @dataclasses.dataclass(frozen=True)
+    class Found:
+        base: Any
+        current: Any
+        done: bool = False
+
+    def fitted(reduced: float) -> SimpleNamespace:
+        return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
+
+    def step(ground: Ground, state: Found) -> Found:
+        ground.report("refitting", 0.0)
+        return dataclasses.replace(state, done=True)
+
+    monkeypatch.setattr(searching, "start_anywhere", lambda *_: Found(fitted(94.0), fitted(left)))
+    monkeypatch.setattr(searching, "step", step)
+    monkeypatch.setattr(
+        searching, "conclude", lambda _, state: Ended(None, state, Naming(None, None, None, None, True))
+    )
+    ground = Ground(SimpleNamespace(twin=None, rules=Rules()), ())
+    monkeypatch.setattr(Ground, "at", lambda self, _: self)
+    over = time.monotonic() - 1
+    ended = searching.search(ground, Hypothesis(()), end=over, latest=math.inf)
+    assert (ended.state.done, bool(ended.naming.unfinished)) == (explained, not explained)
+    assert not searching.search(ground, Hypothesis(()), end=over).state.done
 
 
 @pytest.mark.parametrize("given", ["0", "-3", "nan", "inf", "soon"])

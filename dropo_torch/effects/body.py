@@ -92,12 +92,16 @@ class Payload(BodyEffect):
         return (Quantity("mass", "kg", 0.0, 0.0, 5 * own, own), *places)
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        """Begin with a small mass at the body's center and at the ends of its longest side."""
+        """Begin with a small mass at the body's center and at the ends of its longest side, or with a large one there.
+
+        Where a fit follows mass × distance, a large mass far from where it sits is many small steps from a small one.
+        """
         body = body_number(setting.model, target)
         low, high = self.extent(setting, body)
-        longest, mass = int(np.argmax(high - low)), 0.05 * setting.model.body_mass[body]
-        starts = np.tile([mass, *setting.model.body_ipos[body]], (3, 1))
-        starts[1:, 1 + longest] = low[longest], high[longest]
+        longest, own = int(np.argmax(high - low)), float(setting.model.body_mass[body])
+        starts = np.tile([0.05 * own, *setting.model.body_ipos[body]], (4, 1))
+        starts[1:3, 1 + longest] = low[longest], high[longest]
+        starts[3, 0] = 0.2 * own
         return list(starts)
 
     def settle(self, start: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -31,8 +31,9 @@ SHARE, FEW_GAINS = 1e-4, 2
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
 HELD = 1e-4
-#: Move, relative to a parameter's scale, after which the initial states are linearised again.
-FAR = 0.03
+#: Move, relative to a parameter's scale, after which the initial states are linearised again; how often, and in how
+#: many steps each time. After the first, only while what is more than noise still falls by this share.
+FAR, LINEARIZATIONS, AGAIN, LEAST_SHRUNK = 0.03, 8, 4, 0.05
 #: Half-width of a 90 % interval in standard errors.
 Z90 = 1.6449
 #: Degrees of freedom that show a variance.
@@ -197,9 +198,38 @@ def refit(
         slopes: whether the result needs its derivatives; without them they may be zero.
     """
     limits = limits_of(hypothesis, evidence.twin)
-    relinearize = linear is None
-    variant = hypothesis.variant
-    linear = evidence.linearize(variant) if linear is None else evidence.counting(linear, variant)
+    first = evidence.linearize(hypothesis.variant) if linear is None else linear
+    last = _descent(evidence, hypothesis, first, limits, iterations)
+    for number in range(LINEARIZATIONS if linear is None else 0):
+        moved = _distance(last.here.hypothesis.vector, last.begin.hypothesis, limits) > FAR
+        if not moved or (number and last.gain < LEAST_SHRUNK * last.begin.cost.misfit):
+            break
+        again = evidence.linearize(last.here.hypothesis.variant)
+        last = _descent(evidence, last.here.hypothesis, again, limits, AGAIN)
+    if slopes and not last.sloped:
+        return _sloped(evidence, last.here, limits, last.residuals)
+    return last.here
+
+
+@dataclass(frozen=True)
+class _Descent:
+    """A fit with one linearization in the initial states: where it begins and ends, and residuals there ``(W, N)``."""
+
+    begin: Refit
+    here: Refit
+    residuals: np.ndarray
+    sloped: bool
+
+    @property
+    def gain(self) -> float:
+        """How much of the loss is gone."""
+        return self.begin.loss - self.here.loss
+
+
+def _descent(
+    evidence: Evidence, hypothesis: Hypothesis, linear: Linearization, limits: Limits, iterations: int
+) -> _Descent:
+    linear = evidence.counting(linear, hypothesis.variant)
     here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
     begin, damping, sloped, taken, small = here, DAMPING, False, 0, 0
     while taken < iterations and damping <= MOST_DAMPING:
@@ -219,10 +249,7 @@ def refit(
         small = small + 1 if gain < SHARE * here.cost.misfit else 0
         if gain < LEAST_GAIN + LEAST_SHARE * here.loss or small == FEW_GAINS:
             break
-    if relinearize and _distance(here.hypothesis.vector, begin.hypothesis, limits) > FAR:
-        again = evidence.linearize(here.hypothesis.variant)
-        return refit(evidence, here.hypothesis, linear=again, iterations=4, slopes=slopes)
-    return _sloped(evidence, here, limits, residuals) if slopes and not sloped else here
+    return _Descent(begin, here, residuals, sloped)
 
 
 def _distance(vector: np.ndarray, other: Hypothesis, limits: Limits) -> float:

@@ -255,7 +255,7 @@ class _Searches:
         if self.checkpoint is not None:
             known = f"{self.scene.problem.fingerprint} {self.ground.rules} {[e.name for e in self.ground.effects]}"
             path = kept(self.checkpoint.with_stem(f"{self.checkpoint.stem}{suffix}"), known)
-        return search(ground, self.scene.begin, path, resume=self.resume, end=end)
+        return search(ground, self.scene.begin, path, resume=self.resume, end=end, latest=self.end)
 
     def over_rare(self, nothing: Naming) -> Naming:
         """Search the windows that show something where others show nothing, if there are any."""

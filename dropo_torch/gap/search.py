@@ -109,7 +109,7 @@ def kept(path: Path, fingerprint: str) -> Checkpoint:
 
 def search(
     ground: Ground, begin: Hypothesis, checkpoint: Checkpoint | None = None, *, resume: bool = False,
-    end: float = math.inf,
+    end: float = math.inf, latest: float = -math.inf,
 ) -> Ended:  # fmt: skip
     """Find what is missing, beginning from the declared parameters' values.
 
@@ -119,6 +119,7 @@ def search(
         checkpoint: where the state is kept between rounds, ``None`` for nowhere.
         resume: go on from there, if there is one.
         end: when no more effects are looked for, by ``time.monotonic``; what was found until then is judged.
+        latest: the same, if it is later, where what was found until then is most of the gap.
 
     Raises:
         InputError: a checkpoint that is damaged, or of another search.
@@ -135,9 +136,11 @@ def search(
         state, twin.simulated_transitions = content["state"], content["simulated_transitions"]
     else:
         state = keep(start_anywhere(ground, begin))
-    hurried, unfinished = replace(ground, report=until(ground.report, end)), ""
+    unfinished = ""
     try:
         while not state.done:
+            most = state.current.cost.left_of(state.base.cost) <= 1 - ground.rules.most
+            hurried = replace(ground, report=until(ground.report, max(end, latest) if most else end))
             state = keep(step(hurried.at(state), state))
     except OutOfTime as error:
         unfinished = f"{error}, with {len(state.current.hypothesis.placed)} effects accepted"
