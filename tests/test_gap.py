@@ -1942,13 +1942,15 @@ def test_a_search_that_has_most_of_the_gap_ends_later(
     class Found:
         base: Any
         current: Any
+        number: int = 0
         done: bool = False
 
     def fitted(reduced: float) -> SimpleNamespace:
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
-    def step(ground: Ground, state: Found) -> Found:
-        ground.report("refitting", 0.0)
+    def step(ground: Ground, state: Found, on_found: Callable[[Any], None]) -> Found:
+        on_found(dataclasses.replace(state, number=1))
+        ground.report("swapping", 0.0)
         return dataclasses.replace(state, done=True)
 
     monkeypatch.setattr(searching, "start_anywhere", lambda *_: Found(fitted(94.0), fitted(left)))
@@ -1961,7 +1963,9 @@ def test_a_search_that_has_most_of_the_gap_ends_later(
     over = time.monotonic() - 1
     ended = searching.search(ground, Hypothesis(()), end=over, latest=math.inf)
     assert (ended.state.done, bool(ended.naming.unfinished)) == (explained, not explained)
-    assert not searching.search(ground, Hypothesis(()), end=over).state.done
+    hurried = searching.search(ground, Hypothesis(()), end=over).state
+    assert not hurried.done
+    assert hurried.number == 1, "what was found before the swap is judged"
 
 
 @pytest.mark.parametrize("given", ["0", "-3", "nan", "inf", "soon"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -136,13 +137,15 @@ def search(
         state, twin.simulated_transitions = content["state"], content["simulated_transitions"]
     else:
         state = keep(start_anywhere(ground, begin))
-    unfinished = ""
+    found, unfinished = [state], ""
     try:
         while not state.done:
             most = state.current.cost.left_of(state.base.cost) <= 1 - ground.rules.most
             hurried = replace(ground, report=until(ground.report, max(end, latest) if most else end))
-            state = keep(step(hurried.at(state), state))
+            state = keep(step(hurried.at(state), state, found.append))
+            found.append(state)
     except OutOfTime as error:
+        state = found[-1]
         unfinished = f"{error}, with {len(state.current.hypothesis.placed)} effects accepted"
     ended = conclude(ground.at(state), state)
     return replace(ended, naming=replace(ended.naming, unfinished=unfinished))
@@ -206,8 +209,14 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
     return replace(state, first=first, done=not missing)
 
 
-def step(ground: Ground, state: State) -> State:
-    """Accept one or two more effects, and swap those accepted before for better ones."""
+def step(ground: Ground, state: State, on_found: Callable[[State], None] = lambda state: None) -> State:
+    """Accept one or two more effects, and swap those accepted before for better ones.
+
+    Args:
+        ground: what the search stands on.
+        state: with the effects accepted before.
+        on_found: called with the state as it is before anything is swapped.
+    """
     found = add(ground, state)
     if not found.done:
         rest = significant(found.current.cost, ground.rules)
@@ -221,6 +230,8 @@ def step(ground: Ground, state: State) -> State:
     found = renewed(ground, found)
     if not np.array_equal(found.noise, state.noise):
         found = reconsidered(ground.at(found), found)
+    number = state.number + 1
+    on_found(replace(found, number=number))
     ground, accepted = ground.at(found), found.current.hypothesis
     if ground.evidence.robust and not is_done(ground, found):
         found = everywhere(ground, found)
@@ -232,7 +243,6 @@ def step(ground: Ground, state: State) -> State:
     if found.current.hypothesis != accepted:
         found = renewed(ground, found)
         done = is_done(ground.at(found), found)
-    number = state.number + 1
     return replace(found, number=number, done=done or number >= ground.rules.effects)
 
 
