@@ -44,7 +44,6 @@ from dropo_torch.gap import (
     given,
     name,
     outcome,
-    own_step,
     prepare,
 )
 from dropo_torch.gap import refit as refitting
@@ -350,7 +349,7 @@ def test_a_rest_of_the_own_step_hides_no_small_effect_and_needs_none(
     def fitted(reduced: float) -> SimpleNamespace:
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
-    monkeypatch.setattr(own_step, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
     bare, fine = fitted(500), {True: fitted(without), False: fitted(finer)}
     ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda r: SimpleNamespace(fit=fine[r is bare]))
     assert accept.matters(ground, fitted(180_000), fitted(own), bare) == enough
@@ -371,8 +370,8 @@ def test_a_step_is_named_where_it_is_no_small_part_of_the_gap(step: float, frict
     assert without.cost.reduced > 10
     assert not significant(whole.cost, ground.rules)
     assert accept.matters(ground, state.base, whole, without) == named
-    assert own_step.is_of_step(ground, without)
-    assert not own_step.is_of_step(ground, state.base)
+    assert accept.is_of_step(ground, without)
+    assert not accept.is_of_step(ground, state.base)
     assert accept.step_shows(ground, state.base)
 
 
@@ -434,9 +433,9 @@ def test_of_what_is_no_more_than_noise_a_finer_step_must_leave_less(
     def leaving(reduced: float) -> SimpleNamespace:
         return SimpleNamespace(cost=Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3), hypothesis=Hypothesis(()))
 
-    monkeypatch.setattr(own_step, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
     ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda _: SimpleNamespace(fit=leaving(finer)))
-    assert own_step.is_of_step(ground, leaving(1.08)) == of_step
+    assert accept.is_of_step(ground, leaving(1.08)) == of_step
 
 
 @pytest.mark.parametrize(("stale", "fitted", "of_step"), [(20.0, 1.0, True), (20.0, 15.0, False), (300.0, 1.0, False)])
@@ -450,10 +449,10 @@ def test_what_a_finer_step_mostly_explains_is_fitted_there(
         return SimpleNamespace(cost=cost, hypothesis=Hypothesis(()), linear=None)
 
     last = SimpleNamespace(fit=leaving(stale), evidence=None)
-    monkeypatch.setattr(own_step, "change_of_step", lambda *_: None)
-    monkeypatch.setattr(own_step, "refit", lambda *_, **__: leaving(fitted))
+    monkeypatch.setattr(accept, "change_of_step", lambda *_: None)
+    monkeypatch.setattr(accept, "refit", lambda *_, **__: leaving(fitted))
     ground = SimpleNamespace(rules=Rules(), part=None, resolved=lambda _: last)
-    assert own_step.is_of_step(ground, leaving(500.0)) == of_step
+    assert accept.is_of_step(ground, leaving(500.0)) == of_step
 
 
 def test_many_numbers_that_leave_more_than_the_step_imitate() -> None:
@@ -1909,9 +1908,12 @@ def test_answer_so_far_is_given_when_the_time_is_over(
     assert lasting(on) == lasting(found(TWO))
 
 
-@pytest.mark.parametrize(("shrinks", "move", "times"), [(0.5, 1.0, 9), (0.01, 1.0, 2), (0.5, 1e-3, 2)])
-def test_a_fit_goes_on_as_long_as_another_linearization_of_the_initial_states_helps(
-    shrinks: float, move: float, times: int, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("contacts", "shrinks", "move", "times"),
+    [(True, 0.5, 1.0, 9), (True, 0.01, 1.0, 2), (True, 0.5, 1e-3, 2), (False, 0.5, 1.0, 2)],
+)
+def test_beside_contacts_a_fit_goes_on_as_long_as_another_linearization_of_the_initial_states_helps(
+    contacts: bool, shrinks: float, move: float, times: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A heavy load of a walking robot: each linearization goes a part of the way, and one after the other all of it."""
     made = list[float]()
@@ -1924,7 +1926,9 @@ def test_a_fit_goes_on_as_long_as_another_linearization_of_the_initial_states_he
 
     monkeypatch.setattr(refitting, "_descent", descent)
     monkeypatch.setattr(refitting, "limits_of", lambda *_: refitting.Limits(-np.ones(1), np.ones(1), np.ones(1)))
-    evidence = SimpleNamespace(twin=None, linearize=lambda variant: variant.declared[0])
+    touching = np.array([contacts])
+    twin = SimpleNamespace(setting=SimpleNamespace(signals=SimpleNamespace(contacts=touching)))
+    evidence = SimpleNamespace(twin=twin, linearize=lambda variant: variant.declared[0])
     refit(evidence, Hypothesis((0.0,)))
     assert len(made) == times
     assert len(set(made)) == times

@@ -10,8 +10,7 @@ from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import FEWER, Ground, State
-from dropo_torch.gap.own_step import is_of_step
-from dropo_torch.gap.refit import Refit, change_of_step, least_beside, refit, resolved
+from dropo_torch.gap.refit import ANEW, Refit, change_of_step, least_beside, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import (
     accounts,
@@ -89,6 +88,26 @@ def step_shows(ground: Ground, base: Refit) -> bool:
     """
     change = change_of_step(ground.part, base)
     return change is None or float((change**2).sum()) > ground.rules.gate * base.cost.sigma
+
+
+def is_of_step(ground: Ground, fitted: Refit) -> bool:
+    """Return whether all that a hypothesis leaves is of the model's own step: a finer one leaves no more than noise.
+
+    Where a finer step explains most of it with the derivatives of the own one, by numbers and by initial states, but
+    not all, it has its own: what a coarse step distorts, such as friction that is larger near rest, is not found by
+    the others.
+    """
+    rules, change = ground.rules, change_of_step(ground.part, fitted)
+    if change is not None and significant(least_beside(ground.part, fitted, change), rules):
+        return False
+    last = ground.resolved(fitted)
+    most = last.fit.cost.left_of(fitted.cost) <= 1 - rules.most
+    if not significant(last.fit.cost, rules):
+        return most or significant(fitted.cost, rules)  # of what is no more than noise, a finer step must leave less
+    if not most:
+        return False
+    again = refit(last.evidence, last.fit.hypothesis, iterations=ANEW, slopes=False)
+    return not significant(again.cost, rules)
 
 
 def sound(ground: Ground, fitted: Sequence[Refit]) -> list[Refit]:

@@ -15,11 +15,10 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
-from dropo_torch.gap.accept import SOFT, extend, sound, with_soft_friction
+from dropo_torch.gap.accept import SOFT, extend, is_of_step, sound, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of
-from dropo_torch.gap.own_step import is_of_step
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
 from dropo_torch.gap.screen import nearer

@@ -31,9 +31,10 @@ SHARE, FEW_GAINS = 1e-4, 2
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
 HELD = 1e-4
-#: Move, relative to a parameter's scale, after which the initial states are linearised again; how often, and in how
-#: many steps each time. After the first, only while what is more than noise still falls by this share.
-FAR, LINEARIZATIONS, AGAIN, LEAST_SHRUNK = 0.03, 8, 4, 0.05
+#: Move, relative to a parameter's scale, after which the initial states are linearised again, and steps that follow.
+#: Beside contacts, how often, while what is more than noise falls by this share: what a change of the initial state
+#: explains there is another thing for every load.
+FAR, AGAIN, LINEARIZATIONS, LEAST_SHRUNK = 0.03, 4, 8, 0.05
 #: Half-width of a 90 % interval in standard errors.
 Z90 = 1.6449
 #: Degrees of freedom that show a variance.
@@ -200,7 +201,8 @@ def refit(
     limits = limits_of(hypothesis, evidence.twin)
     first = evidence.linearize(hypothesis.variant) if linear is None else linear
     last = _descent(evidence, hypothesis, first, limits, iterations)
-    for number in range(LINEARIZATIONS if linear is None else 0):
+    times = LINEARIZATIONS if evidence.twin.setting.signals.contacts.any() else 1
+    for number in range(times if linear is None else 0):
         moved = _distance(last.here.hypothesis.vector, last.begin.hypothesis, limits) > FAR
         if not moved or (number and last.gain < LEAST_SHRUNK * last.begin.cost.misfit):
             break

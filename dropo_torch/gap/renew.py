@@ -15,7 +15,6 @@ from dropo_torch.gap.evidence import Evidence, are_calm, caps_of
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
-from dropo_torch.gap.own_step import is_of_step
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
 from dropo_torch.gap.rules import Rules, significant
 from dropo_torch.gap.starts import merged, straightened, table_of
@@ -53,8 +52,8 @@ def _refitted(ground: Ground, state: State) -> tuple[Ground, State]:
 def restarted(ground: Ground, state: State) -> tuple[Ground, State]:
     """Return ground and state with windows that begin where they fit best, if that leaves nothing where something is.
 
-    Where something is left all the same that is not of the model's own step, windows begin as they were: under a
-    hypothesis that is wrong, the best start makes up for what it lacks, and others would be compared from there.
+    Where something is left all the same, windows begin as they were: under a hypothesis that is wrong, the best start
+    makes up for what it lacks, and others would be compared from there.
 
     Args:
         ground: what the search stands on.
@@ -67,8 +66,7 @@ def restarted(ground: Ground, state: State) -> tuple[Ground, State]:
         return ground, state
     starts = merged(state.starts, table_of(windows))
     here, there = _refitted(ground.begun(starts), replace(state, starts=starts))
-    of_step = there.current.hypothesis.placed and is_of_step(here, there.current)
-    return (here, there) if of_step or not significant(there.current.cost, ground.rules) else (ground, state)
+    return (ground, state) if significant(there.current.cost, ground.rules) else (here, there)
 
 
 def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:
