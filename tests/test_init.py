@@ -27,6 +27,7 @@ from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
 from dropo_torch.proposal.matching import match_columns, motion, unit_name
 from dropo_torch.proposal.places import places_of
+from dropo_torch.proposal.propose import quickest
 from dropo_torch.proposal.words import read_name
 
 DEG = 180 / math.pi
@@ -598,7 +599,7 @@ def test_derived_velocities_are_compared_nowhere_where_something_touches(
     frame = dict(zip(names, np.array(rows).T, strict=True))
     found = dropo.propose_config(*written(tmp_path, frame, DROP), out=tmp_path / "robot.yaml")
     assert found.document["mask"] == [f"ball.velocity[{kind}{axis}]" for kind in "vw" for axis in "xyz"]
-    assert "they say where windows begin, and are compared nowhere" in found.draft.notes
+    assert "derived velocities say where windows begin, and are compared nowhere" in found.draft.notes
     t, q, _, u = log
     frame = {"t": t, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]}  # nothing touches
     found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
@@ -626,6 +627,24 @@ def test_derived_velocities_are_compared_nowhere_where_a_servo_follows_within_a_
     frame = dict(zip(("t", "arm_pos", "arm_target"), np.array(rows).T, strict=True))
     found = dropo.propose_config(*written(tmp_path, frame, SERVO), out=tmp_path / "robot.yaml")
     assert found.document.get("mask") == (["arm.velocity"] if masked else None)
+
+
+def test_a_servo_is_as_quick_through_a_tendon_as_at_its_joint() -> None:
+    """Of a moment of 1.5: with a damping of 0.3 + 0.4 · 1.5² = 1.2 N m s/rad, inertia / 1.2."""
+    tendon = '<tendon><fixed name="cable"><joint joint="arm" coef="1.5"/></fixed></tendon></mujoco>'
+    through = SERVO.replace('joint="arm" kp', 'tendon="cable" kp').replace("</mujoco>", tendon)
+    at_joint = SERVO.replace('kv=".4"', 'kv=".4" gear="1.5"')
+    inertia = 0.02 + 0.1 * 0.05**2 + _capsule_inertia(mujoco.MjModel.from_xml_string(SERVO))
+    for xml in (through, at_joint):
+        assert quickest(mujoco.MjModel.from_xml_string(xml)) == pytest.approx(inertia / 1.2)
+
+
+def _capsule_inertia(model: mujoco.MjModel) -> float:
+    """Inertia of the arm's only body about its center of mass, about the axis of its joint."""
+    turn = np.zeros(9)
+    mujoco.mju_quat2Mat(turn, model.body_iquat[1])
+    axis = turn.reshape(3, 3)[1]
+    return float((model.body_inertia[1] * axis**2).sum())
 
 
 def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:

@@ -33,7 +33,7 @@ ROUNDS = 8
 #: A power that noise does not have: times that of the highest quarter of frequencies.
 ABOVE_NOISE = 12.0
 #: What is said of derived velocities that are masked.
-UNCOMPARED = "they say where windows begin, and are compared nowhere"
+UNCOMPARED = "derived velocities say where windows begin, and are compared nowhere"
 #: Share of what a row adds to a position that its noise may make before it is filtered.
 NOISY = 0.02
 #: Margins of a filter over the highest frequency at which positions show more than noise: of positions that are

@@ -250,16 +250,15 @@ def _masked(draft: Draft, reading: Reading) -> Draft:
 
 
 def quickest(model: mujoco.MjModel) -> float:
-    """Return the least time constant of a joint's velocity, s: its inertia by its damping and that of its servos."""
-    damping = model.dof_damping.copy()
-    for i in np.flatnonzero(model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)):
-        joint = model.actuator_trnid[i, 0]
-        if model.jnt_type[joint] in (int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)):
-            own = max(-float(model.actuator_biasprm[i, 2]), 0.0) * float(model.actuator_gear[i, 0]) ** 2
-            damping[model.jnt_dofadr[joint]] += own
-    data, inertia = mujoco.MjData(model), np.zeros((model.nv, model.nv))
+    """Return the least time constant of a joint's velocity, s: its inertia by its damping and that of its servos.
+
+    Servos act through the moments that they have where the model rests, by joints or tendons.
+    """
+    data, inertia, moments = mujoco.MjData(model), np.zeros((model.nv, model.nv)), np.zeros((model.nu, model.nv))
     mujoco.mj_forward(model, data)
     mujoco.mj_fullM(model, data, inertia)
+    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
+    damping = model.dof_damping + np.maximum(-model.actuator_biasprm[:, 2], 0.0) @ moments**2
     damped = damping > 0
     return float(np.min(np.diag(inertia)[damped] / damping[damped], initial=math.inf))
 
