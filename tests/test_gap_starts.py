@@ -10,11 +10,15 @@ import numpy as np
 import pytest
 
 import dropo_torch as dropo
-from dropo_torch.gap import Hypothesis, find_gap, prepare
+from dropo_torch.effects.engine import Variant
+from dropo_torch.gap import Hypothesis, find_gap, prepare, renew
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.scene import _cut
+from dropo_torch.gap.search import NOTHING
 from dropo_torch.gap.starts import begun, merged, straightened, table_of
+from dropo_torch.gap.twin import Windows
 
 BALL = """<mujoco><option timestep="0.001"/><worldbody>
   <geom name="floor" type="plane" size="5 5 .1" solref="-4000 -6"/>
@@ -96,6 +100,26 @@ def test_starts_are_known_by_episode_and_step(bouncing: Evidence) -> None:
     np.testing.assert_array_equal(merged(table, newer), np.concatenate([newer, table[1:]]))
     assert merged(table, None) is table
     assert merged(None, newer) is newer
+
+
+@pytest.mark.parametrize("damping", [0.01, 0.4])
+def test_of_a_hypothesis_that_is_wrong_anyhow_few_windows_begin_anew(
+    damping: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    scene, asked = prepare(dropo.make_problem(dropo.load_config(write_ball(tmp_path, damping)), general=True)), []
+
+    def watched(evidence: Evidence, variant: Variant) -> Windows | None:
+        asked.append(len(evidence.windows))
+        return straightened(evidence, variant)
+
+    monkeypatch.setattr(renew, "straightened", watched)
+    evidence = _cut(dataclasses.replace(scene.evidence, noise=NOISE), scene.train, scene.since, 30, rough=False)
+    ground, since = Ground(evidence, ()), np.zeros(12, dtype=int)
+    base = ground.refit(scene.begin)
+    begun_anew, _ = renew.restarted(ground, State(NOISE, since, 1.0, base, NOTHING, base))
+    is_wrong = damping != 0.01
+    assert (begun_anew.evidence.windows.starts is None) == is_wrong
+    assert asked == ([FEWER] if is_wrong else [FEWER, len(ground.part.windows)])
 
 
 @pytest.mark.parametrize(("damping", "named"), [(0.01, []), (0.4, [("joint_damping", "x")])])

@@ -159,10 +159,11 @@ def is_done(ground: Ground, state: State) -> bool:
 def add(ground: Ground, state: State) -> State:
     """Accept the one or two effects, or the family, that remove the most; where nothing does, the search is done.
 
-    Pairs and families are tried where no single effect removes most of what is left, and families of which there may be
-    many places where the best one leaves more than noise, unless what was accepted before accounts for the gap: of the
-    little that it leaves, not several more are found at once. One of them takes the place of the best single effect
-    where it leaves much less, or where that alone would end the search.
+    Pairs and families are tried where no single effect removes most of what is left, or accounts for the gap beside
+    what was accepted before, and families of which there may be many places where the best one leaves more than noise,
+    unless what was accepted before accounts for the gap: of the little that it leaves, not several more are found at
+    once. One of them takes the place of the best single effect where it leaves much less, or where that alone would end
+    the search.
     """
     rules, current = ground.rules, state.current
     ranked = ground.screened(current) if state.number else state.first.ranked
@@ -182,7 +183,8 @@ def add(ground: Ground, state: State) -> State:
     rivals = [r for r in singles if not significant(r.cost, rules)]
     if significant(best.cost, rules) and not accounts(current, state.base, rules):
         most = best.cost.left_of(current.cost) <= 1 - rules.most
-        best, state = _among_several(ground, state, alive, best, pairs=not most)
+        last = state.number > 0 and accounts(best, state.base, rules)
+        best, state = _among_several(ground, state, alive, best, pairs=not (most or last))
     worse = is_hopeless(best, current, rules) or not matters(ground, state.base, best, current)
     if worse or not beats(ground, best, current):
         return replace(state, done=True)

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.gap.evidence import Evidence, are_calm, caps_of
-from dropo_torch.gap.ground import Ground, State
+from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.log import since_known
 from dropo_torch.gap.noise import Diverges, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
@@ -59,14 +59,23 @@ def restarted(ground: Ground, state: State) -> tuple[Ground, State]:
         ground: what the search stands on.
         state: with a fitted hypothesis.
     """
-    if not significant(state.current.cost, ground.rules):
+    hypothesis = state.current.hypothesis
+    if not significant(state.current.cost, ground.rules) or _is_wrong_anyhow(ground.part.few(FEWER), hypothesis):
         return ground, state
-    windows = straightened(ground.part, state.current.hypothesis.variant)
+    windows = straightened(ground.part, hypothesis.variant)
     if windows is None:
         return ground, state
     starts = merged(state.starts, table_of(windows))
     here, there = _refitted(ground.begun(starts), replace(state, starts=starts))
     return (ground, state) if significant(there.current.cost, ground.rules) else (here, there)
+
+
+def _is_wrong_anyhow(few: Evidence, hypothesis: Hypothesis) -> bool:
+    """Whether a few windows show more than noise wherever they begin: then all of them do, and cost more to ask."""
+    windows = straightened(few, hypothesis.variant)
+    if windows is None:
+        return False
+    return significant(refit(replace(few, windows=windows), hypothesis, iterations=6, slopes=False).cost, few.rules)
 
 
 def with_base(ground: Ground, hypothesis: Hypothesis) -> tuple[Ground, Refit]:

@@ -326,9 +326,13 @@ def near(cost: Cost, rules: Rules) -> float:
 
 
 def beyond_free(hypothesis: Hypothesis, rules: Rules) -> int:
-    """Return how many numbers named effects have more than are free; an effect at many places counts once."""
-    sizes = {p.effect.name: 0 for p in hypothesis.placed}
-    for p in hypothesis.placed:
+    """Return how many numbers named effects have more than are free; an effect at many places counts once.
+
+    A finer step of the simulation, one of a few, imitates nothing and does not count.
+    """
+    placed = [p for p in hypothesis.placed if not p.effect.steps]
+    sizes = {p.effect.name: 0 for p in placed}
+    for p in placed:
         sizes[p.effect.name] = 1 if len(p.values) == 1 else sizes[p.effect.name] + len(p.values)
     return max(0, sum(sizes.values()) - rules.free)
 

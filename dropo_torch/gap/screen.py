@@ -83,6 +83,16 @@ class Focus:
         """The misfit of the fitted hypothesis."""
         return self.evidence.cost(self.fitted.residual, self.fitted.linear)
 
+    def beside(self, variants: Sequence[Variant]) -> np.ndarray:
+        """Return residuals of hypotheses near the fitted one, ``(K, W, N)``.
+
+        Where that has a finer step, what they change is taken from a coarser one; see :meth:`Evidence.changes`.
+        """
+        own = self.fitted.hypothesis
+        if not any(p.effect.steps for p in own.placed):
+            return self.evidence.residuals(variants)[0]
+        return self.simulated + self.evidence.changes(own.variant, self.simulated, variants)
+
 
 @dataclass(frozen=True)
 class Candidate:
@@ -257,7 +267,7 @@ def _predict(focus: Focus, part: Sequence[Placed], least: float) -> Iterator[Can
         rows = slice(len(variants), len(variants) + len(own))
         variants += own
         plans.append(_Plan(placed, hypothesis.variant, moving, limits.of(columns), steps, rows))
-    found, _ = evidence.residuals(variants)
+    found = focus.beside(variants)
     before, shared = focus.residual, focus.slope
     for plan in plans:
         size = len(plan.steps)

@@ -215,7 +215,7 @@ def step(ground: Ground, state: State, on_found: Callable[[State], None] = lambd
     Args:
         ground: what the search stands on.
         state: with the effects accepted before.
-        on_found: called with the state as it is before anything is swapped.
+        on_found: called with the state once something is accepted, and again before anything is swapped.
     """
     found = add(ground, state)
     if not found.done:
@@ -227,10 +227,11 @@ def step(ground: Ground, state: State, on_found: Callable[[State], None] = lambd
         return replace(renewed(ground, found), number=1)
     if found.done:
         return found
+    number = state.number + 1
+    on_found(replace(found, number=number))
     found = renewed(ground, found)
     if not np.array_equal(found.noise, state.noise):
         found = reconsidered(ground.at(found), found)
-    number = state.number + 1
     on_found(replace(found, number=number))
     ground, accepted = ground.at(found), found.current.hypothesis
     if ground.evidence.robust and not is_done(ground, found):

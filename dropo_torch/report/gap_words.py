@@ -217,7 +217,8 @@ def _answer(gap: Gap) -> tuple[str, list[str]]:
         if gap.refused:
             return f"Something is missing that has no name yet: {gap.refused}; {shows(gap)}.", []
         if gap.unfinished:
-            return f"Something is missing, and the time for the search was over before it had a name; {shows(gap)}.", []
+            late = f"the time for the search was over before it had a name{_closest(gap)}"
+            return f"Something is missing, and {late}; {shows(gap)}.", []
         return f"Something is missing that {unexplained}{_closest(gap)}; {shows(gap)}.", []
     if gap.own_step is not None:
         own, finer = (short(x) for x in gap.own_step)
@@ -254,7 +255,7 @@ def corrected(gap: Gap) -> list[str]:
 
 
 def _closest(gap: Gap) -> str:
-    """What would explain most of a gap that has no name, if it is most, as it goes on from "explains"."""
+    """What would explain most of a gap that has no name, if it is most, in brackets."""
     whole = (r for r in gap.ranking if r.round == 0)  # later rounds tell what is left of what the ones before have left
     best = min(whole, key=lambda r: r.left if np.isfinite(r.left) else np.inf, default=None)
     if best is None or not best.left < CLOSE:
