@@ -18,6 +18,8 @@ import yaml
 import dropo_torch as dropo
 from benchmarks.init.systems import ROBOTS
 from dropo_torch.commands.cli import main
+from dropo_torch.gap import find_gap
+from dropo_torch.gap.given import as_given
 from dropo_torch.parameters import ParameterSpace
 from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
@@ -604,6 +606,45 @@ def test_derived_velocities_are_compared_nowhere_where_something_touches(
     frame = {"t": t, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]}  # nothing touches
     found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
     assert "mask" not in found.document
+
+
+RAIL = """
+<mujoco><option timestep=".002" integrator="implicitfast"/>
+  <worldbody><body name="cart">
+    <joint name="slider" type="slide" axis="1 0 0" range="-.4 .4" damping="2" frictionloss="1.5" solreflimit=".03 1"/>
+    <geom type="box" size=".1 .05 .04" mass="1.5" contype="0"/>
+    <body name="pole"><joint name="hinge" axis="0 1 0" damping=".004"/>
+      <geom type="capsule" fromto="0 0 0 0 0 -.5" size=".01" mass=".3" contype="0"/></body></body></worldbody>
+  <actuator><motor name="push" joint="slider"/></actuator></mujoco>"""
+COUNTS = np.array([2e-4, 2 * np.pi / 2048])
+
+
+def rolled(folder: Path, force: float) -> tuple[Path, Path]:
+    """Write the log of a cart whose encoders count, and which meets the ends of its rail if the force is large."""
+    model, rng, rows = mujoco.MjModel.from_xml_string(RAIL), np.random.default_rng(12), []
+    for episode in range(4):
+        data, phase = mujoco.MjData(model), rng.uniform(0, 6, 2)
+        data.qpos[:] = rng.uniform(-0.2, 0.2), rng.uniform(-0.5, 0.5)
+        for _ in range(500):
+            wave = np.sin(2 * np.pi * 0.4 * data.time + phase[0]) + 0.6 * np.sin(2 * np.pi * 0.9 * data.time + phase[1])
+            data.ctrl[0] = force * wave - 10 * data.qpos[0]
+            rows.append([episode, data.time, *np.round(data.qpos / COUNTS) * COUNTS, data.ctrl[0]])
+            mujoco.mj_step(model, data, 5)
+    frame = dict(zip(("episode", "t", "slider", "hinge", "push"), np.array(rows).T, strict=True))
+    return written(folder, frame, RAIL)
+
+
+@pytest.mark.parametrize(("force", "strikes"), [(7.0, True)])
+def test_a_right_model_is_right_although_encoders_count_and_stops_are_struck(
+    tmp_path: Path, force: float, strikes: bool
+) -> None:
+    found = dropo.propose_config(*rolled(tmp_path, force), out=tmp_path / "robot.yaml")
+    assert found.document.get("mask") == (["slider.velocity", "hinge.velocity"] if strikes else None)
+    if strikes:  # else positions are smoothed where velocities are derived from them
+        assert (np.array(found.document["noise"][:2]) >= 0.999 * COUNTS / np.sqrt(12)).all()
+    (tmp_path / "robot.yaml").write_text(found.text)
+    problem = dropo.make_problem(dropo.load_config(tmp_path / "robot.yaml"), general=True)
+    assert find_gap(as_given(problem)).verdict == "no gap"
 
 
 SERVO = """

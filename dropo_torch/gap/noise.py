@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import stats
 
+from dropo_torch.data.resolution import resolution
 from dropo_torch.effects.engine import Variant
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
@@ -30,6 +31,8 @@ QUIET_ROUNDS, ROUNDS = 8, 16
 QUIET, CALM = 0.25, 0.98
 #: Windows that tell the noise, at least.
 ENOUGH = 5
+#: By how much a uniform distribution is wider than its standard deviation.
+UNIFORM = 12**0.5
 #: Least degrees of freedom that a feature is taken to have in a window.
 LEAST_DEGREES = 0.3
 
@@ -60,7 +63,8 @@ class Diverges(InputError):
 def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarray | None = None) -> FreeForces:
     """Estimate the noise and the forces that are missing.
 
-    Masked columns are not compared, but the windows start where they say; their noise is told as if they were.
+    Masked columns are not compared, but the windows start where they say; their noise is told as if they were. Of a
+    sensor that counts, slow motion shows less than its resolution leaves open, which is the least that its noise is.
 
     Args:
         twin: simulates windows.
@@ -74,7 +78,10 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     sizes = np.maximum(feature_sizes(twin.setting, windows.measured), 1e-12)
     evidence = Evidence(twin, windows, GUESS * sizes if noise is None else noise, variant, rough=False)
     found = _free_forces(evidence, sizes, known=noise is not None)
-    if noise is not None or not twin.setting.masked:
+    if noise is not None:
+        return found
+    found = replace(found, noise=np.maximum(found.noise, _rounding(evidence)))
+    if not twin.setting.masked:
         return found
     whole = _free_forces(replace(evidence, whole=True), sizes, known=False)
     told = evidence.chart.known(np.ones(twin.setting.observation.size, dtype=bool))
@@ -82,6 +89,14 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     for column, error in twin.setting.derived:  # errors that follow on each other do not show in short windows
         noise[evidence.chart.plain.index(column)] = error
     return replace(found, noise=noise, unsure=np.where(told, found.unsure, whole.unsure))
+
+
+def _rounding(evidence: Evidence) -> np.ndarray:
+    """The standard deviation of what the resolution of each feature's column rounds off, ``(m,)``; 0 without one."""
+    chart, measured = evidence.chart, evidence.windows.measured
+    found = np.zeros(chart.size)
+    found[: len(chart.plain)] = [resolution(measured[..., c].ravel()) / UNIFORM for c in chart.plain]
+    return found / chart.scale
 
 
 def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeForces:

@@ -18,7 +18,7 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
 from dropo_torch.problem import make_problem
-from dropo_torch.proposal.candidates import Candidate, all_candidates, touching_groups
+from dropo_torch.proposal.candidates import Candidate, all_candidates, reaches_stops, touching_groups
 from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
@@ -232,8 +232,8 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
 def _masked(draft: Draft, reading: Reading) -> Draft:
     """The draft in which velocities that are derived are compared nowhere, where velocities jump or bend within a row.
 
-    An impact within a row makes a difference of positions no velocity: neither that before it nor that after it. Nor is
-    it one where commands change from row to row and a joint follows them within a row.
+    An impact within a row, on another body or a stop, makes a difference of positions no velocity: neither that before
+    it nor that after it. Nor is it one where commands change from row to row and a joint follows them within a row.
     """
     logged, options = draft.logged, draft.document["data"].get("preprocess", {})
     if logged.model is None or not options or options.get("velocities") or reading.matching.of("marker"):
@@ -244,7 +244,8 @@ def _masked(draft: Draft, reading: Reading) -> Draft:
         return draft
     row = draft.document["frame_skip"] * reading.timestep
     bend = logged.model.nu > 0 and quickest(logged.model) < row
-    if not bend and not touching_groups(logged.model, told.states(log.observations, log.unseen)):
+    states = told.states(log.observations, log.unseen)
+    if not bend and not touching_groups(logged.model, states) and not reaches_stops(logged.model, states):
         return draft
     return replace(draft, document=draft.document | {"mask": rates}, notes=(*draft.notes, UNCOMPARED))
 

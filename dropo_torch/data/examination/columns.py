@@ -9,6 +9,7 @@ from dropo_torch.data.examination.finding import Finding, confidence, first_rows
 from dropo_torch.data.examination.prediction import skills
 from dropo_torch.data.examination.record import Coordinate, Pair, Record
 from dropo_torch.data.examination.rules import Rules
+from dropo_torch.data.resolution import resolution
 
 DEGREE = float(np.pi / 180)
 #: Steps of a column from which on one of them is unlike the others, those beside a row that count, and rows that a
@@ -164,11 +165,9 @@ def quantised(record: Record, rules: Rules) -> list[Finding]:
         size = np.abs(record.steps[:, column])
         if len(values) < 3 or len(values) > len(size) / 4:
             continue
-        gaps = np.diff(values)
-        quantum = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
-        whole = np.abs(gaps / quantum - np.round(gaps / quantum)) < 0.02
+        quantum = resolution(values)
         typical = float(np.median(size[size > 0])) if (size > 0).any() else 0.0
-        if whole.mean() > 0.95 and quantum >= rules.quantum * typical > 0:
+        if quantum >= rules.quantum * typical > 0:
             columns.append(column)
             quanta.append(quantum)
     if not columns:
