@@ -126,6 +126,8 @@ def test_some_velocities_are_derived_beside_those_that_are_measured():
     exact = np.gradient(preprocess(sine_recording(), Preprocess(dt=0.01)).observations[:, 0], 0.01)
     inside = slice(20, len(raw) - 20)
     assert np.std((smooth[:, 2] - exact)[inside]) < 0.2 * np.std((raw[:, 2] - exact)[inside])
+    trimmed = preprocess(rec, Preprocess(**options, cutoff=13)).observations
+    np.testing.assert_allclose(trimmed[:, :2], raw[8 : 8 + len(trimmed), :2], atol=1e-12)  # as measured
     with pytest.raises(InputError, match="derive has no meaning without velocities"):
         Preprocess(dt=0.01, derive=["q"])
 

@@ -49,7 +49,8 @@ class Preprocess:
             bandwidth) and below ``1 / (2 dt)``.
         order: order of the Butterworth filter, which runs forwards and backwards.
         trim: seconds left out at both ends of each episode, where the filter sees one side only; by
-            default ``1 / cutoff``, and 0 without filter. 0 is right for a robot at rest there.
+            default ``1 / cutoff``, and 0 without filter; with ``derive``, in whole steps. 0 is right for a robot
+            at rest there.
         positions: signals of the first columns of the result; by default every observation that is not in
             ``velocities``.
         velocities: signals that measure velocities, taken as the last columns; by default the velocities
@@ -390,6 +391,8 @@ class _Episode:
         assert self.part.time is not None
         options, length = self.options, float(self.part.time[-1] - self.part.time[0])
         trim = 1 / options.cutoff if options.cutoff is not None and options.trim is None else options.trim or 0.0
+        if options.derive:  # positions are not filtered: samples that are dt apart stay as they are
+            trim = float(np.ceil(trim / options.dt - _EDGE)) * options.dt
         early = [self.delays.get(name, 0.0) for name in self.part.action_names]
         low = max([s.time[0] + trim for s in signals] + [-delay for delay in early] + [options.start or 0.0])
         if self.part.sparse:  # as every signal, commands begin with their first sample

@@ -213,7 +213,8 @@ def _among_several(
     two, state = paired(ground, state, alive) if pairs else ([], state)
     families = promising_families(ground.focus(current), alive, rules.tried)
     if not pairs:
-        families = [f for f in families if len(f[0].effect.targets(ground.setting)) >= MANY]
+        by_step = best.hypothesis.placed[-1].effect.steps  # a family, such as of late sensors, may do what a step does
+        families = [f for f in families if len(f[0].effect.targets(ground.setting)) >= MANY and not by_step]
     found, state = ground.refits(state, current, families, "refitting families")
     several = sound(ground, found)
     for tried in (simplest(r, rules) for r in (two, several) if r):

@@ -27,9 +27,6 @@ AWAY = 0.5
 STILL = 1e-3
 #: Rows at which contacts are looked for.
 SAMPLES = 300
-#: Rows in which a joint is farthest to either side; kinds of constraints that are stops.
-_ENDS = (np.argmin, np.argmax)
-_LIMITS = (mujoco.mjtConstraint.mjCNSTR_LIMIT_JOINT, mujoco.mjtConstraint.mjCNSTR_LIMIT_TENDON)
 
 
 @dataclass(frozen=True)
@@ -280,18 +277,6 @@ def touching_groups(model: mujoco.MjModel, states: np.ndarray) -> list[list[int]
     for g in sorted(deciding):
         groups.setdefault(root(g), []).append(g)
     return [g for g in groups.values() if np.ptp(model.geom_friction[g, 0]) == 0]
-
-
-def reaches_stops(model: mujoco.MjModel, states: np.ndarray) -> bool:
-    """Return whether joints or tendons are at their limits anywhere in the log."""
-    farthest = {pick(states[:, model.jnt_qposadr[j]]) for j in np.flatnonzero(model.jnt_limited) for pick in _ENDS}
-    data = mujoco.MjData(model)
-    for row in sorted({*evenly(len(states), SAMPLES).tolist(), *map(int, farthest)}):
-        data.qpos[:] = states[row, : model.nq]
-        mujoco.mj_fwdPosition(model, data)
-        if np.isin(data.efc_type[: data.nefc], _LIMITS).any():
-            return True
-    return False
 
 
 def decides(model: mujoco.MjModel, first: int, second: int) -> list[int]:

@@ -36,9 +36,9 @@ ABOVE_NOISE = 12.0
 UNCOMPARED = "derived velocities say where windows begin, and are compared nowhere"
 #: Share of what a row adds to a position that its noise may make before it is filtered.
 NOISY = 0.02
-#: Margins of a filter over the highest frequency at which positions show more than noise: of positions that are
-#: compared, which it must leave as they are, and of those from which velocities are derived that are compared nowhere.
-MARGIN, UNCOMPARED_MARGIN = 3.0, 1.2
+#: Margin of a filter, for velocities that are compared nowhere, over the highest frequency at which positions show more
+#: than noise.
+MARGIN = 1.2
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         source = {k: v for k, v in source.items() if k not in ("episode", "breaks")}
         return {"model": reading.model, "data": source, "frame_skip": skip, "observation": whole_arrays}, notes, None
     if derived:
-        velocities = []
+        velocities, some = [], positions
     names = ", ".join(dict.fromkeys(p.label for p in lacking))
     notes += [f"velocities are derived from positions: {names} not logged"] if names else []
     source["observations"] = [m.entry for m in positions + velocities]
@@ -149,7 +149,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
             if clock.even or columns.apart
             else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
         )
-    rates = _rates(positions if derived else some, reading.places)
+    rates = _rates(some, reading.places)
     entries = [m.place.entry for m in positions] + rates + [m.place.entry for m in velocities]
     document = {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}
     if some:
@@ -263,7 +263,7 @@ def _preprocess(
     """Options that resample a log, what they are for, and the filter among them."""
     options: dict[str, Any] = {"dt": float(f"{step:.9g}")}
     notes: list[str] = []
-    if velocities:
+    if velocities or derive:
         options["velocities"] = [m.column.entry for m in velocities]
     if derive:
         options["derive"] = [m.column.entry for m in derive]
@@ -273,9 +273,7 @@ def _preprocess(
             groups.setdefault(m.place.joint, []).append(m.column.entry)
     if groups:
         options["quaternions"] = list(groups.values())
-    noisy = derive if velocities else positions
-    margin = UNCOMPARED_MARGIN if derive else MARGIN
-    smooth = make_filter(noisy, clock, len(columns), columns.parts, margin) if noisy else None
+    smooth = make_filter(derive, clock, len(columns), columns.parts) if derive else None
     if smooth is not None:
         options["cutoff"] = smooth.cutoff
         notes.append(f"positions are noisy: a filter at {smooth.cutoff:g} Hz, above which the log shows noise alone")
@@ -356,9 +354,7 @@ class Filter:
         return math.sqrt(power * ((2 * math.pi * self.cutoff) ** 2 / 3 if of_rate else 1.0))
 
 
-def make_filter(
-    positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int], margin: float
-) -> Filter | None:
+def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int]) -> Filter | None:
     """Return the filter above whose frequency positions show noise alone; ``None`` where noise does not matter."""
     from scipy import signal
 
@@ -380,7 +376,7 @@ def make_filter(
         density[m.place.label] = float(np.median(power[-len(power) // 4 :]))
         above = np.flatnonzero(power[1:] > ABOVE_NOISE * density[m.place.label]) + 1
         highest = max(highest, float(frequency[above.max()]) if above.size else 0.0)
-    cutoff = float(f"{margin * max(highest, 4 / (dt * rows)):.2g}")
+    cutoff = float(f"{MARGIN * max(highest, 4 / (dt * rows)):.2g}")
     return Filter(cutoff, density) if is_noisy and cutoff <= 0.4 / dt else None
 
 

@@ -18,12 +18,12 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
 from dropo_torch.problem import make_problem
-from dropo_torch.proposal.candidates import Candidate, all_candidates, reaches_stops, touching_groups
+from dropo_torch.proposal.candidates import Candidate, all_candidates
 from dropo_torch.proposal.choice import Choice, choose
 from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
-from dropo_torch.proposal.draft import UNCOMPARED, Draft, Reading, as_read, is_whole, make_draft
+from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
 from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
@@ -139,7 +139,7 @@ def propose_config(
     robot = _robot(compiled, path, Path(out), columns)
     reading = _reading(robot, columns, dt, review)
     tell("examining the log", 0.1)
-    draft = _masked(_drafted(reading, robot), reading)
+    draft = _drafted(reading, robot)
     document = draft.document | {"seed": seed} | ({"threads": threads} if threads else {})
     tell("estimating the noise", 0.2)
     noise, candidates, document = _with_noise(document, draft, reading.base)
@@ -227,41 +227,6 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
         f"rows {reading.clock.dt:.6g} s apart are no whole number of the model's steps of {robot.step:g} s: "
         f"{Path(reading.model).name} is the model with steps of {reading.timestep:g} s"
     )
-
-
-def _masked(draft: Draft, reading: Reading) -> Draft:
-    """The draft in which velocities that are derived are compared nowhere, where velocities jump or bend within a row.
-
-    An impact within a row, on another body or a stop, makes a difference of positions no velocity: neither that before
-    it nor that after it. Nor is it one where commands change from row to row and a joint follows them within a row.
-    """
-    logged, options = draft.logged, draft.document["data"].get("preprocess", {})
-    if logged.model is None or not options or options.get("velocities") or reading.matching.of("marker"):
-        return draft
-    told, log = logged.observation, logged.trajectories
-    rates = [label for label, at in zip(told.labels, told.index, strict=True) if at >= logged.model.nq]
-    if not rates:
-        return draft
-    row = draft.document["frame_skip"] * reading.timestep
-    bend = logged.model.nu > 0 and quickest(logged.model) < row
-    states = told.states(log.observations, log.unseen)
-    if not bend and not touching_groups(logged.model, states) and not reaches_stops(logged.model, states):
-        return draft
-    return replace(draft, document=draft.document | {"mask": rates}, notes=(*draft.notes, UNCOMPARED))
-
-
-def quickest(model: mujoco.MjModel) -> float:
-    """Return the least time constant of a joint's velocity, s: its inertia by its damping and that of its servos.
-
-    Servos act through the moments that they have where the model rests, by joints or tendons.
-    """
-    data, inertia, moments = mujoco.MjData(model), np.zeros((model.nv, model.nv)), np.zeros((model.nu, model.nv))
-    mujoco.mj_forward(model, data)
-    mujoco.mj_fullM(model, data, inertia)
-    mujoco.mju_sparse2dense(moments, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind)
-    damping = model.dof_damping + np.maximum(-model.actuator_biasprm[:, 2], 0.0) @ moments**2
-    damped = damping > 0
-    return float(np.min(np.diag(inertia)[damped] / damping[damped], initial=math.inf))
 
 
 def _chosen(candidates: Sequence[Candidate], found: Information, review: Review | None) -> Choice:
