@@ -347,6 +347,87 @@ def test_a_joints_number_is_not_its_fingers(tmp_path: Path) -> None:
     assert [found[f"joint{i}.position"] for i in (1, 2, 3)] == [f"position[panda_joint{i}]" for i in (1, 2, 3)]
 
 
+# --- columns that are called after actuators ---
+
+PUSHER = """<mujoco><worldbody><body name="carriage"><joint name="finger_x" type="slide" axis="1 0 0"/><geom size=".1"/>
+    <body name="finger"><joint name="finger_y" type="slide" axis="0 1 0"/><geom size=".1"/></body></body>
+  <body name="box"><freejoint name="box_free"/><geom size=".1"/></body></worldbody>
+  <actuator><position name="servo_x" joint="finger_x"/><position name="servo_y" joint="finger_y"/></actuator>
+</mujoco>"""
+POSE = [f"box_{part}" for part in ("px", "py", "pz", "qw", "qx", "qy", "qz")]
+TIME = 0.02 * np.arange(200)
+
+
+@pytest.mark.parametrize(
+    "called", ["servo_{}", "Servo-{}", "servo.{}", "servo_{}_mm", "servo_{}_target", "servo_{}_pos_cmd_mm"]
+)
+@pytest.mark.parametrize("rates", [False, True])
+def test_a_column_called_after_an_actuator_is_its_command(called: str, rates: bool, tmp_path: Path) -> None:
+    """Whatever else the words of its name could be, in whatever unit, and whether velocities are logged or not."""
+    commands = [called.format(axis) for axis in "xy"]
+    frame = {"time": TIME} | swung(["finger_x", "finger_y", *POSE, *commands])
+    if rates:
+        frame |= swung(["finger_x", "finger_y"], of="{}_vel", rates=True)
+    found = matched(tmp_path, frame, PUSHER)
+    assert [found.get("servo_x"), found.get("servo_y")] == commands
+    assert not any(label.startswith("box_free.velocity") for label in found)
+
+
+def test_of_two_columns_called_after_an_actuator_the_command_is_it(tmp_path: Path) -> None:
+    frame = {"time": TIME} | swung(["finger_x", "finger_y", *POSE, "servo_x", "servo_x_cmd", "servo_y_cmd", "servo_y"])
+    found = matched(tmp_path, frame, PUSHER)
+    assert (found["servo_x"], found["servo_y"]) == ("servo_x_cmd", "servo_y_cmd")
+
+
+@pytest.mark.parametrize("called", ["servo_{}_nm", "servo_{}_rpm", "servo_{}_pos", "servo_{}_temp", "servo_{}_vel_cmd"])
+def test_what_else_is_measured_of_an_actuator_is_no_target(called: str, tmp_path: Path) -> None:
+    """A torque, a speed or a temperature is not, nor is the command of another kind."""
+    frame = {"time": TIME} | swung(LABELS) | swung("123", of=called)
+    assert not set(matched(tmp_path, frame)) & {"servo_1", "servo_2", "servo_3"}
+
+
+def test_what_is_called_after_actuators_is_measured_where_nothing_else_is(tmp_path: Path) -> None:
+    names = ("hip_motor", "knee_motor")
+    frame = {"time": TIME} | swung(names) | swung(("hip", "knee"), of="{}_vel", rates=True)
+    found = matched(tmp_path, frame, LEG.replace("_flex", ""))
+    assert [found["hip.position"], found["knee.position"]] == list(names)
+    found = matched(tmp_path, frame | swung(("hip", "knee")), LEG.replace("_flex", ""))
+    assert [found["hip_motor"], found["knee_motor"]] == list(names)
+
+
+@pytest.mark.parametrize(("rates", "place"), [(False, "rail"), (True, "rail.velocity")])
+def test_motion_tells_what_a_column_is_that_joint_and_actuator_are_called(
+    rates: bool, place: str, tmp_path: Path
+) -> None:
+    """Beside the joint's position: its velocity if it moves so, and else the command."""
+    xml = CART.replace('name="pusher"', 'name="rail"')
+    other = swung(["rail"], rates=True) if rates else {"rail": np.sin(3 * TIME)}
+    found = matched(tmp_path, {"time": TIME} | swung(["rail_pos"]) | other, xml)
+    assert found == {"rail.position": "rail_pos", place: "rail"}
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_a_velocity_by_part_of_its_name_moves_as_its_position(moves: bool, tmp_path: Path) -> None:
+    xml = PUSHER[: PUSHER.index("<actuator>")] + "</mujoco>"
+    frame = {"time": TIME} | swung(["finger_x", "finger_y", *POSE])
+    t = TIME if moves else TIME[::-1]
+    frame["vx"] = 2.4 * np.cos(2.4 * t) if moves else np.sin(9 * t)
+    found = matched(tmp_path, frame, xml)
+    assert [label for label, column in found.items() if column == "vx"] == ["box_free.velocity[vx]"] * moves
+
+
+@pytest.mark.parametrize(("left", "refused"), [("servo_2_raw", True), ("servo_2_temp", False), ("light", False)])
+def test_targets_are_not_made_up_beside_columns_called_after_servos(
+    left: str, refused: bool, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    frame = {"time": TIME} | swung([*LABELS, left])
+    assert main(["init", *written(tmp_path, frame, ARM), "--out", str(tmp_path / "robot.yaml")]) == (
+        2 if refused else 0
+    )
+    error = capfd.readouterr().err
+    assert ("(targets), although some are called after it: servo_2_raw" in error) == refused
+
+
 # --- rates and episodes ---
 
 

@@ -13,7 +13,7 @@ from scipy.optimize import linear_sum_assignment
 
 from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns, last_part
 from dropo_torch.proposal.places import Place
-from dropo_torch.proposal.words import Words, split
+from dropo_torch.proposal.words import Words, called, split, unit_role
 
 Sureness = Literal["sure", "likely", "guess"]
 
@@ -26,6 +26,8 @@ FOREIGN, STILL = 0.02, 0.02
 ALIAS = 0.8
 #: Shares of motion that a velocity must explain to be its position's, and to be so whatever it is called.
 LIKE, SAME = 0.5, 0.9
+#: Share of motion below which a position speaks against a velocity, where it moves by so many times its noise.
+UNLIKE, SEEN = 0.1, 6.0
 #: Factors between a sensor's unit and the model's; the second kind are those of lengths.
 ANGLES = {1.0: "rad", math.pi / 180: "degrees", math.pi / 30: "rpm"}
 LENGTHS = {1.0: "m", 1e-3: "mm", 1e-2: "cm"}
@@ -122,27 +124,39 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
         taken: columns that are something else, such as the time.
     """
     whole = _whole_state(columns, places, starts)
+    whole += _whole_action(columns, [p for p in places if p.kind == "command"])
     free = [c for c in columns.numeric if c not in taken and not any(m.column is c for m in whole)]
     free = [c for c in free if not _counts(c, starts)]
-    found = {m.place.label: m for m in whole}
-    for kind in ("position", "velocity", "command"):
-        wanted = [p for p in places if p.kind == kind and p.label not in found]
-        if kind == "command":
-            own = _whole_action(columns, wanted)
-            found |= {m.place.label: m for m in own}
-            wanted = [p for p in wanted if p.label not in found]
-        fits = _assigned(wanted, [c for c in free if not _is_taken(c, found)], found, starts)
-        found |= {m.place.label: m for m in fits}
-        if kind == "command":
-            found |= {m.place.label: m for m in _namesakes(places, free, found)}
-        found |= {m.place.label: m for m in _by_family(places, kind, free, found)}
-    found |= {m.place.label: m for m in _in_order(places, free, found)}
-    found |= {m.place.label: m for m in _gyroscope(places, free, found, starts)}
-    found |= {m.place.label: m for m in _numbered_drives(places, free, found)}
+    known = {m.place.label: m for m in whole}
+    own = {m.place.label: m for m in _namesakes(places, [c for c in free if _may_be(c, "command")], known)}
+    found = _found(places, free, known | own, starts)
+    driven = {m.place.partner for m in own.values()} & {p.label for p in places if not p.optional}
+    if driven and not driven & found.keys():  # what is called after drives may be all that is measured of their joints
+        other = _found(places, free, known, starts)
+        found = other if driven & other.keys() else found
     matches = tuple(with_unit(found[p.label], found) for p in places if p.label in found)
     used = [m.column for m in matches] + list(taken)
     unused = tuple(c for c in columns.numeric if c.moves and all(c is not u for u in used) and not _counts(c, starts))
     return Matching(matches, tuple(p for p in places if p.label not in found), unused)
+
+
+def _found(
+    places: Sequence[Place], free: Sequence[Column], known: dict[str, Match], starts: np.ndarray
+) -> dict[str, Match]:
+    """What columns are, by label, with what is known of them already."""
+    found = dict(known)
+    for kind in ("position", "velocity", "command"):
+        wanted = [p for p in places if p.kind == kind and p.label not in found]
+        fits = _assigned(wanted, [c for c in free if not _is_taken(c, found)], found, starts)
+        found |= {m.place.label: m for m in fits}
+        if kind == "command":
+            found |= {m.place.label: m for m in _namesakes(places, free, found)}
+        ordered = _by_family(places, kind, free, found)
+        found |= {m.place.label: m for m in ordered if not _refuted(m.place, m.column, found, starts)}
+    found |= {m.place.label: m for m in _in_order(places, free, found)}
+    found |= {m.place.label: m for m in _gyroscope(places, free, found, starts)}
+    found |= {m.place.label: m for m in _numbered_drives(places, free, found)}
+    return found
 
 
 def _counts(column: Column, starts: np.ndarray) -> bool:
@@ -198,7 +212,7 @@ def _assigned(
     wanted: Sequence[Place], free: Sequence[Column], found: dict[str, Match], starts: np.ndarray
 ) -> list[Match]:
     """The best assignment of columns to places of a kind, by names and motion."""
-    free = [c for c in free if _may_be(c, wanted)] if wanted else []
+    free = [c for c in free if _may_be(c, wanted[0].kind)] if wanted else []
     if not free:
         return []
     words = {c.entry: w for c, w in zip(free, _of_the_body(_with_axes(free, wanted), wanted), strict=True)}
@@ -215,6 +229,8 @@ def _assigned(
             if partner is not None and names[i, j] > -1:
                 shares[i, j] = motion(partner.values, c.values, starts)[0]
                 scores[i, j] += 0.8 * shares[i, j]
+                if _is_partial(words[c.entry], p, names[i, j]) and _refuted(p, c, found, starts):
+                    names[i, j] = scores[i, j] = -2.0
             scores[i, j] += _role_bonus(words[c.entry], p) - 1e-6 * j - 1e-7 * abs(i - j)  # else in order
             scores[i, j] -= FOREIGN * len(set(words[c.entry].objects) - {*p.words, *p.aliases}) + STILL * (not c.moves)
     rows, columns = linear_sum_assignment(np.where(scores < -1, -10.0, scores), maximize=True)
@@ -238,9 +254,38 @@ def _matched(place: Place, column: Column, words: Words, name: float, share: flo
     return Match(place, column, 1.0, sureness, by)
 
 
-def _may_be(column: Column, wanted: Sequence[Place]) -> bool:
-    """Whether a column's role allows it to be one of the places."""
-    role, kind = column.words.role, wanted[0].kind
+def _is_partial(words: Words, place: Place, score: float) -> bool:
+    """Whether a column's name has no word of a velocity, or is the place's in part only."""
+    is_own = bool(words.numbers and place.numbers) or bool(words.objects and score >= SURE)
+    return words.role != "velocity" or not is_own
+
+
+def _refuted(place: Place, column: Column, found: Mapping[str, Match], starts: np.ndarray) -> bool:
+    """Whether a place is the velocity of a known position, and a column does not move as that changes.
+
+    One whose name has no word of velocities must move so.
+    """
+    partner = found.get(place.partner) if place.kind == "velocity" else None
+    if partner is None:
+        return False
+    share, _ = motion(partner.values, column.values, starts)
+    if column.words.role != "velocity":
+        return share <= LIKE
+    return share < UNLIKE and column.moves and _moves_visibly(partner.values, starts)
+
+
+def _moves_visibly(position: np.ndarray, starts: np.ndarray) -> bool:
+    """Whether a position changes within rows by more than its noise."""
+    runs, span = np.cumsum(starts), SPANS[-1]
+    change = (position[span:] - position[:-span])[runs[span:] == runs[:-span]]
+    noise = np.diff(position, 4)[runs[4:] == runs[:-4]] / math.sqrt(70)
+    change, noise = change[np.isfinite(change)], noise[np.isfinite(noise)]
+    return bool(change.size and noise.size and np.std(change) > SEEN * np.std(noise))
+
+
+def _may_be(column: Column, kind: str) -> bool:
+    """Whether a column's role allows it to be one of a kind of places."""
+    role = column.words.role
     if kind == "position":
         return role in ("position", "")
     if kind == "velocity":
@@ -413,9 +458,9 @@ def _ordered(wanted: Sequence[Place], family: Sequence[Column], found: dict[str,
 def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Column]]:
     """Columns that may be of a kind of places and belong together: by array, kind, unit and what is commanded."""
     groups: dict[tuple, list[Column]] = {}
-    for c in (c for c in free if wanted and _may_be(c, wanted)):
+    for c in (c for c in free if wanted and _may_be(c, wanted[0].kind)):
         w = c.words
-        is_bare = not w.role and not (c.label and last_part(c.array) in STATES)
+        is_bare = not w.role and not _is_state(c)
         is_other = wanted[0].kind == "command" and not _commands(w, wanted[0])
         if not (is_bare or is_other or w.axis or w.quaternion):
             groups.setdefault((c.array if c.index is not None else "", w.role, w.commanded, w.scale), []).append(c)
@@ -432,14 +477,60 @@ def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, 
 
 
 def _namesakes(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
-    """Commands of actuators after which a column is called, without a word of its kind, and no joint is."""
-    joints = {p.label.rpartition(".")[0] for p in places if p.kind == "position"}
-    called = {c.label or c.entry: c for c in reversed(free) if not _is_taken(c, found)}
-    wanted = [p for p in places if p.kind == "command" and p.label not in found]
+    """Commands of actuators after which a column is called, and no joint is whose position is yet to be found.
+
+    Of several columns of a name, the one that is called a command is it.
+    """
+    joints = {p.label.rpartition(".")[0] for p in places if p.kind == "position" and p.label not in found}
+    wanted = [p for p in places if p.kind == "command"]
+    named: dict[str, Column] = {}
+    left = [c for c in free if not _is_state(c) and not _is_taken(c, found)]
+    for c in sorted(left, key=lambda c: c.words.role != "command"):
+        place = _namesake(c, wanted)
+        if place is not None and place.label not in joints:
+            named.setdefault(place.label, c)
     return [
-        Match(p, called[p.label], 1.0, "sure", "the actuator's name")
-        for p in wanted if p.label in called and p.label not in joints
+        Match(p, named[p.label], 1.0, "sure", "the actuator's name")
+        for p in wanted if p.label in named and p.label not in found
     ]  # fmt: skip
+
+
+def _namesake(column: Column, commands: Sequence[Place]) -> Place | None:
+    """The command of the actuator after which a column is called, in a unit of what it takes; ``None`` for none."""
+    name = column.label or column.entry
+    if (same := next((p for p in commands if p.label == name), None)) is not None:
+        return same
+    for said in called(name, column.words):
+        known = [p for p in commands if tuple(split(p.label)) == said]
+        if len(known) == 1:
+            return known[0] if list(said) == split(name) or _suits(column, known[0]) else None
+    return None
+
+
+def _suits(column: Column, place: Place) -> bool:
+    """Whether neither the unit of a column nor what it is a command of is another than an actuator takes."""
+    is_other = column.words.role == "command" and not _commands(column.words, place)
+    return not is_other and unit_role(column.label or column.entry) in ("", place.takes)
+
+
+def _is_state(column: Column) -> bool:
+    """Whether a column has a name in an array of what is measured."""
+    return bool(column.label) and last_part(column.array) in STATES
+
+
+def left_over(matching: Matching) -> list[Column]:
+    """Return unused columns that may be commands, in whose names there is that of an actuator that has none."""
+    positions = [p for p in (*matching.missing, *(m.place for m in matching.matches)) if p.kind == "position"]
+    joints = {p.label.rpartition(".")[0] for p in positions}
+    absent = [p for p in matching.lacks("command") if p.label not in joints]
+    free = [c for c in matching.unused if c.words.role in ("", "command") and not _is_state(c)]
+    return [c for c in free if any(_mentions(c, p) and _suits(c, p) for p in absent)]
+
+
+def _mentions(column: Column, place: Place) -> bool:
+    """Whether an actuator's name is part of a column's."""
+    every, own = split(column.label or column.entry), split(place.label)
+    return bool(own) and any(every[i : i + len(own)] == own for i in range(len(every) - len(own) + 1))
 
 
 def _numbered_drives(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:

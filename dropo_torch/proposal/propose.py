@@ -26,7 +26,14 @@ from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
 from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
-from dropo_torch.proposal.matching import Matching, match_columns, nearest_unit, rows_apart, with_velocity_units
+from dropo_torch.proposal.matching import (
+    Matching,
+    left_over,
+    match_columns,
+    nearest_unit,
+    rows_apart,
+    with_velocity_units,
+)
 from dropo_torch.proposal.places import Place, places_of
 from dropo_torch.proposal.text import config_text
 from dropo_torch.shooting.posing import column_noise, posed
@@ -330,12 +337,13 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
     if lacking:
         raise InputError(f"{columns.source}: {_lacking(lacking, model, free)}{_texts(columns)}")
     absent = matching.lacks("command")
-    told = matching.of("command")
-    if absent and (told or any(p.takes != "position" for p in absent)):
+    told, named = matching.of("command"), [c.entry for c in left_over(matching)]
+    if absent and (told or named or any(p.takes != "position" for p in absent)):
         names = ", ".join(p.label for p in absent[:6]) + (", ..." if len(absent) > 6 else "")
         kind = {"position": "targets", "velocity": "target velocities", "effort": "commanded forces"}[absent[0].takes]
+        though = f", although some are called after it: {', '.join(named[:3])}" if named else ""
         raise InputError(
-            f"{columns.source}: no column is the command of {names} ({kind}); rename one, or use --interactive"
+            f"{columns.source}: no column is the command of {names} ({kind}){though}; rename one, or use --interactive"
             + _choices(absent[0].label, free) + _texts(columns)
         )  # fmt: skip
     if clock.dt is None:

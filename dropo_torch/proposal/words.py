@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -50,6 +51,8 @@ UNITS: dict[str, float] = {
 }  # fmt: skip
 #: Units that count only as a name's last word: they are letters with other meanings, too.
 _LAST = {"m": 1.0, "s": 1.0, "n": 1.0, "mps": 1.0}
+#: Units of velocities, of efforts, and of which names do not tell; others are of positions.
+_RATES, _EFFORTS, _EITHER = _set("dps rpm mmps mps"), _set("nm mnm newton n"), _set("degs rads s")
 #: Units of time stamps → seconds.
 TIME_UNITS = {
     "s": 1.0, "sec": 1.0, "secs": 1.0, "second": 1.0, "seconds": 1.0, "ms": 1e-3, "msec": 1e-3, "millis": 1e-3,
@@ -108,6 +111,30 @@ def object_words(name: str) -> tuple[tuple[str, ...], tuple[int, ...]]:
     parts = split(name)
     kept = tuple(w for w in parts if not w.isdigit() and w not in _EMPTY)
     return kept, tuple(int(w) for w in parts if w.isdigit())
+
+
+def called(name: str, words: Words) -> tuple[tuple[str, ...], ...]:
+    """Return what a column's name may be the name of: all of it, then it without its unit and without its command.
+
+    Args:
+        name: of the column.
+        words: what it says: what stands in a joint's name is neither.
+    """
+    every = split(name)
+    found = [every, _unit(every)[0] if words.scale is not None else every]
+    if words.role == "command":
+        bare = [w for w in (part for word in found[-1] for part in _parts(word)) if w not in _ROLES["command"]]
+        found += [bare, [w for w in bare if _role(w) not in ("position", "velocity", "effort")]]
+    return tuple(dict.fromkeys(tuple(said) for said in found if said))
+
+
+def unit_role(name: str) -> Role:
+    """Return of what kind of column the unit in a name is: position, velocity or effort; empty where it is open."""
+    every = split(name)
+    own = set((Counter(every) - Counter(_unit(every)[0])).elements())
+    if own & _EFFORTS:
+        return "effort"
+    return "velocity" if own & _RATES or ("s" in own and len(own) > 1) else "position" if own - _EITHER else ""
 
 
 def read_name(name: str, joints: Sequence[str] = ()) -> Words:
