@@ -742,6 +742,37 @@ def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -
     assert any(note.endswith("short gaps are bridged: 1 of theta") for note in found.draft.notes)
 
 
+#: Two links with servos, and no ranges.
+SERVOS = """<mujoco><option timestep="0.002"/><default><geom contype="0" conaffinity="0"/></default><worldbody>
+  <body><joint name="lift" axis="0 1 0" damping=".1" armature=".01"/>
+    <geom type="capsule" fromto="0 0 0 0 0 .12" size=".015" mass=".15"/>
+    <body pos="0 0 .12"><joint name="bend" axis="0 1 0" damping=".1" armature=".01"/>
+      <geom type="capsule" fromto="0 0 0 .12 0 0" size=".015" mass=".12"/></body></body></worldbody>
+  <actuator><position name="lift" joint="lift" kp="20" kv=".8"/><position name="bend" joint="bend" kp="20" kv=".8"/>
+  </actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("in_degrees", [("pos",), ("pos", "goal"), ()])
+def test_targets_are_in_degrees_with_their_angles_if_the_model_says_so(
+    in_degrees: tuple[str, ...], tmp_path: Path
+) -> None:
+    """No range and no name tells it; and what the filter leaves of the noise is told in radians."""
+    model = mujoco.MjModel.from_xml_string(SERVOS)
+    t, q, _, u = recorded(
+        model, 20, 10, lambda t: [0.6 * math.sin(7 * t), 0.5 * math.sin(4.1 * t) + 0.2], noise=(2e-3, 0)
+    )
+    turned = {kind: DEG if kind in in_degrees else 1.0 for kind in ("pos", "goal")}
+    frame = {"time": t}
+    for i, name in enumerate(("lift", "bend")):
+        frame |= {f"{name}.pos": turned["pos"] * q[:, i], f"{name}.goal": turned["goal"] * u[:, i]}
+    found = dropo.propose_config(*written(tmp_path, frame, SERVOS), out=tmp_path / "robot.yaml")
+    scale = {f"{name}.{kind}": pytest.approx(1 / DEG) for kind in in_degrees for name in ("lift", "bend")}
+    assert found.document["data"].get("scale", {}) == scale
+    told = [note.endswith("so are the targets lift.goal, bend.goal") for note in found.draft.notes]
+    assert any(told) == ("goal" in in_degrees)
+    assert (found.noise[:2] < 5e-3).all()
+
+
 def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
     """A sensor that reports an error once has a column of numbers; one that mostly does has none."""
     t, q, v, u = log

@@ -104,7 +104,7 @@ def make_draft(reading: Reading) -> Draft:
         document, notes, smooth = _document(reading, derived=True)
         notes += ["angular velocities are in the world's frame: all velocities are derived"]
         logged, findings, cured = _cured(document, reading.base)
-    return Draft(document, logged, findings, (*notes, *cured), smooth)
+    return Draft(document, logged, findings, (*notes, *cured), smooth and _as_cured(smooth, document, reading.matching))
 
 
 def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[str], Filter | None]:
@@ -381,6 +381,14 @@ def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequ
 
 
 # --- what an examination cures ---
+
+
+def _as_cured(smooth: Filter, document: Mapping[str, Any], matching: Matching) -> Filter:
+    """A filter whose noise is in the units in which the config reads the positions."""
+    factors = document["data"].get("scale", {})
+    entries = {m.place.label: m.column.entry for m in matching.of("position")}
+    density = {label: factors.get(entries.get(label), 1.0) ** 2 * of for label, of in smooth.density.items()}
+    return replace(smooth, density=density)
 
 
 def as_read(matching: Matching, places: Sequence[Place], draft: Draft) -> Matching:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import mujoco
 import numpy as np
 
+from dropo_torch.data.examination.commands import is_servo
 from dropo_torch.data.examination.finding import Finding, confidence, first_rows
 from dropo_torch.data.examination.prediction import skills
 from dropo_torch.data.examination.record import Coordinate, Pair, Record
@@ -211,14 +214,21 @@ def units(record: Record, rules: Rules) -> list[Finding]:
     fits = [c for c in outside if _outside(record, c, DEGREE) < 0.05]
     columns = [i for c in angles for i in (c.position, c.velocity) if i is not None]
     as_is, degrees = skills(record, dict.fromkeys(columns, DEGREE))
+    targets = _targets(record, angles)
+    _, both = skills(record, dict.fromkeys(columns, DEGREE), dict.fromkeys(targets, DEGREE)) if targets else (0.0, 0.0)
+    if both - degrees > rules.skill:
+        degrees = both
+    else:
+        targets = []
     evidence = {"turns": reach, "outside": float(len(outside)), "skill": as_is, "skill_in_degrees": degrees}
     decided = degrees - as_is > rules.skill
-    scale = {record.signal(i): DEGREE for i in columns}
+    scale = {record.signal(i): DEGREE for i in columns} | {record.command(j): DEGREE for j in targets}
     within = len(fits) > 0 and len(fits) == len(outside)
     if decided or ((within or reach > rules.many_turns) and as_is < 2 * rules.skill):
         named = [c.position for c in (outside or angles) if c.position is not None]
         sure = decided or (within and as_is < rules.skill)
         what = f"{record.named(named)} reach {reach:.3g} turns if they are radians: the angles are in degrees"
+        what += f", and so are the targets {', '.join(record.command(j) for j in targets)}" if targets else ""
         if outside:
             what += f"; they leave the ranges of {', '.join(c.name for c in outside)}, and in degrees lie within"
         return [Finding(
@@ -226,6 +236,19 @@ def units(record: Record, rules: Rules) -> list[Finding]:
             cure={"data": {"scale": scale}},
         )]  # fmt: skip
     return []
+
+
+def _targets(record: Record, angles: Sequence[Coordinate]) -> list[int]:
+    """Commands that are targets of angles."""
+    model = record.model
+    if model is None:
+        return []
+    dofs = {c.dof for c in angles}
+    return [
+        j
+        for j in range(min(model.nu, record.log.actions.shape[1]))
+        if is_servo(record, j) and int(model.jnt_dofadr[model.actuator_trnid[j, 0]]) in dofs
+    ]
 
 
 def ranges(record: Record, rules: Rules) -> list[Finding]:

@@ -376,7 +376,7 @@ def _units(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
         clear = gain > rules.sure_significance * error and share > rules.command_share
         if not clear or abs(np.log(gain)) < np.log(rules.gain):
             continue
-        degrees = abs(np.log(gain / DEGREE)) < 0.3 and _is_servo(record, j)
+        degrees = abs(np.log(gain / DEGREE)) < 0.3 and is_servo(record, j)
         unit = "in degrees" if degrees else "in another unit"
         factor = DEGREE if degrees else float(f"{gain:.3g}")
         what = f"{record.command(j)} acts {gain:.3g} times as strongly as the model says: it is {unit}"
@@ -388,8 +388,8 @@ def _units(record: Record, plain: Explained, rules: Rules) -> list[Finding]:
     return found
 
 
-def _is_servo(record: Record, actuator: int) -> bool:
-    """Whether an actuator's command is the target of a joint."""
+def is_servo(record: Record, actuator: int) -> bool:
+    """Return whether an actuator's command is the target of a joint."""
     model = record.model
     assert model is not None
     joint = model.actuator_trntype[actuator] == int(mujoco.mjtTrn.mjTRN_JOINT)

@@ -164,8 +164,15 @@ def _misfit(record: Record, reading: Reading) -> np.ndarray | None:
     return np.array([block.sum() for block in np.array_split(off, BLOCKS)])
 
 
-def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
+def skills(
+    record: Record, factors: Mapping[int, float], commands: Mapping[int, float] | None = None
+) -> tuple[float, float]:
     """Return which share of the changes of velocity the model explains: as logged, and with columns scaled.
+
+    Args:
+        record: the log.
+        factors: of observed columns.
+        commands: factors of commands.
 
     Each is the median over degrees of freedom of 1 minus the unexplained over the whole, both cut at outliers. Without
     a model whose velocities are observed, both are 0.
@@ -177,15 +184,17 @@ def skills(record: Record, factors: Mapping[int, float]) -> tuple[float, float]:
     rows = chosen_rows(record, 2 * record.frame_skip)
     scale = np.ones(len(columns))
     scale[list(factors)] = list(factors.values())
+    told = np.ones(record.log.actions.shape[1])
+    told[list(commands or {})] = list((commands or {}).values())
     found = []
-    for factor in (np.ones(len(columns)), scale):
+    for factor, gain in ((np.ones(len(columns)), np.ones(len(told))), (scale, told)):
         full = np.ones(record.observation.log_width)
         full[list(record.observation.log_columns)] = factor
         try:
             states = record.observation.states(record.log.observations[rows] * full)
         except ValueError:  # a zero quaternion
             return 0.0, 0.0
-        ends = simulate(model, states, record.log.actions[rows], record.frame_skip)[:, columns]
+        ends = simulate(model, states, record.log.actions[rows] * gain, record.frame_skip)[:, columns]
         measured, start = record.after[rows] * factor, record.before[rows] * factor
         shares = [
             _explained(measured[:, i] - start[:, i], ends[:, i] - start[:, i])
