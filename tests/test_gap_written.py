@@ -59,6 +59,23 @@ PENDULUM = """
   </worldbody>
 </mujoco>"""
 DRIVEN = PENDULUM.replace("</mujoco>", '<actuator><motor name="drive" joint="swing"/></actuator></mujoco>')
+#: Two jaws that only slide, of which one follows the other, up to its stop.
+GRIPPER = """
+<mujoco>
+  <option timestep="0.002" integrator="implicitfast"/>
+  <worldbody><body name="palm"><geom size=".03" mass=".5" contype="0"/>
+    <body name="left" pos="0 .1 0">
+      <joint name="left" type="slide" axis="0 1 0" limited="true" range="-.02 .02" damping="4" armature=".3"/>
+      <geom type="box" size=".01 .02 .03" mass=".12" contype="0"/>
+    </body>
+    <body name="right" pos="0 -.1 0">
+      <joint name="right" type="slide" axis="0 -1 0" damping="4"/>
+      <geom type="box" size=".01 .02 .03" mass=".2" contype="0"/>
+    </body>
+  </body></worldbody>
+  <equality><joint joint1="right" joint2="left" polycoef="0 1 0 0 0" solref=".01 1"/></equality>
+  <actuator><motor name="grip" joint="left" gear="3"/></actuator>
+</mujoco>"""
 TASK = """
 import mujoco, torch
 from pathlib import Path
@@ -296,6 +313,42 @@ def test_a_model_that_the_compiler_rescales_is_written_as_it_is(flags: str, pass
     before, after = (load_model(tmp_path / f"{n}.xml") for n in ("rig", "model"))
     grown = np.where(np.array(plain().names("body")) == "lower", 0.2, 0.0)
     np.testing.assert_allclose(after.body_mass, before.body_mass + grown, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "moved"),
+    [
+        ("joint_friction", (0.0,), False), ("joint_friction", (0.3,), False), ("inertia", (1.5,), False),
+        ("center_of_mass", (0.0, 0.0, 0.01), True), ("payload", (0.1, 0.0, 0.0, 0.0), True),
+    ],
+)  # fmt: skip
+def test_bodies_that_only_slide_are_written_as_they_are(
+    name: str, values: tuple[float, ...], moved: bool, tmp_path: Path
+) -> None:
+    """Of a body whose center or axes are elsewhere, the weight is another one, as in the search's simulation."""
+    source, path = tmp_path / "gripper.xml", tmp_path / "model.xml"
+    source.write_text(GRIPPER)
+    placed = Placed(find_effect(name), "left", values)
+    write_model(source, [placed], path)
+    written, plain_one = load_model(path), load_model(source)
+    assert written.body("right").simple == plain_one.body("right").simple == 2
+    assert written.body("left").simple == (0 if moved else 2)
+    general = load_model(source, general=True)
+    setting = plain_setting(general, parse_observation(general, None), SKIP)
+    found = VariantEngine(setting, ParameterSpace.empty(general)).model(Variant((), (placed,)))
+    np.testing.assert_allclose(written.body_invweight0, found.body_invweight0, rtol=1e-5)
+    paths, controls = [], np.repeat([1.0, -1.0, 1.0], 150)
+    for model in (found, written, plain_one):
+        data, path_of = mujoco.MjData(model), []
+        for control in controls:
+            data.ctrl[0] = control
+            mujoco.mj_step(model, data)
+            path_of.append(np.concatenate([data.qpos, data.qvel]))
+        paths.append(path_of)
+    np.testing.assert_allclose(paths[0], paths[1], rtol=0, atol=1e-5)
+    assert np.abs(np.array(paths[0])[:, 0]).max() > 0.019
+    if placed.is_neutral(setting):
+        np.testing.assert_allclose(paths[1], paths[2], rtol=0, atol=1e-5)
 
 
 def test_a_step_is_never_a_parameter(tmp_path: Path) -> None:

@@ -47,6 +47,7 @@ def write_model(
     unsimplify(spec)
     write_inertials(spec)
     model = spec.compile()
+    frames = model.body_sameframe.copy()
     if space is not None and values is not None:
         space.write_into(model, values)
     model = applied(model, [p for p in placed if p.effect.in_mjcf])
@@ -55,6 +56,7 @@ def write_model(
             derive(model)
             spec.copy_back(model)
             _copy_rest(spec, model)
+            _simplify(spec, model.body_sameframe == frames)
             text = spec.to_xml()
     except (ValueError, mujoco.FatalError) as error:
         raise InputError(f"export: MJCF cannot express these effects: {' '.join(str(error).split())}") from None
@@ -72,6 +74,12 @@ def _copy_rest(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
             geom.fluid_coefs = model.geom_fluid[geom.id, 1:6]
     for actuator in spec.actuators:
         actuator.biastype = mujoco.mjtBias(int(model.actuator_biastype[actuator.id]))
+
+
+def _simplify(spec: mujoco.MjSpec, kept: np.ndarray) -> None:
+    """Let MuJoCo compile bodies whose frames of inertia are where they were as it does by itself."""
+    for body in spec.bodies[1:]:
+        body.simple = int(kept[body.id])
 
 
 def _compare(path: Path, model: mujoco.MjModel) -> None:
