@@ -5,8 +5,8 @@ from __future__ import annotations
 import abc
 import copy
 import math
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal
 
@@ -64,6 +64,7 @@ class Signals:
         linear_speed: root mean square speed of each body's center, ``(nbody,)``.
         angular_speed: root mean square angular velocity of each body, ``(nbody,)``.
         contacts: geoms that touch something somewhere in the log, ``(ngeom,)`` bool.
+        ripples: angular frequencies over the position at which a joint lacks a force, by its position coordinate.
     """
 
     timestep: float
@@ -76,6 +77,7 @@ class Signals:
     linear_speed: np.ndarray
     angular_speed: np.ndarray
     contacts: np.ndarray
+    ripples: Mapping[int, tuple[float, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

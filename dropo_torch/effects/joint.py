@@ -269,7 +269,8 @@ class JointCogging(JointEffect):
     name = "joint_cogging"
     positional = True
     sentence = "a force at {target} that ripples with its position, as of a motor's magnets or a gear's teeth"
-    #: Ripples of a turn that are tried, and how many of a slide, each half a wave more over the measured range.
+    #: Ripples of a turn that are tried, and how many of a slide, each half a wave more over the measured range; beside
+    #: what the log shows.
     WAVES = 40
     POLES = (2, 3, 4, 5, 6, 7, 8, 10, 12, 14, 16, 18, 20, 24)
     #: Amplitude to begin with, relative to its scale: a large one bends what the screening takes for a line.
@@ -291,7 +292,8 @@ class JointCogging(JointEffect):
             poles = [float(np.pi * n / max(high - low, 1e-9)) for n in range(2, 2 + self.WAVES)]
         else:
             poles = [float(n) for n in self.POLES if n * (high - low) > 2 * np.pi]
-        return [np.array([amplitude, n, 0.0]) for n in poles]
+        shown = setting.signals.ripples.get(setting.coordinate(target), ())
+        return [np.array([amplitude, n, 0.0]) for n in (*poles, *shown)]
 
     @staticmethod
     def _scale(setting: Setting, target: str | None) -> float:

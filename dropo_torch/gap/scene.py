@@ -26,6 +26,7 @@ from dropo_torch.gap.log import (
 )
 from dropo_torch.gap.noise import LENGTH, free_forces
 from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.ripple import ripples
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.screen import all_candidates
 from dropo_torch.gap.twin import Twin, Windows
@@ -112,12 +113,10 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     train, held = hold_out(replace(log, dt=log.dt or problem.simulator.timestep))
     if not np.ptp(train.observations, axis=0).any():
         raise InputError(f"data: nothing moves in {train.source}: no observed column ever changes")
-    setting = make_setting(problem, train)
-    twin = Twin(
-        setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",
-        standing=None if problem.effects is None else problem.effects.at,
-    )  # fmt: skip
-    begin = Hypothesis(tuple(start_values(problem).tolist()))
+    begin, plain = Hypothesis(tuple(start_values(problem).tolist())), make_setting(problem, train)
+    waves = ripples(_twin(problem, plain), train, begin.variant)
+    setting = replace(plain, signals=replace(plain.signals, ripples=waves))
+    twin = _twin(problem, setting)
     given, since = problem.objective.noise, first_steps(twin, train, begin)
     if given is None:
         noise = free_forces(twin, short_windows(setting, train, since), begin.variant).noise
@@ -128,6 +127,14 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     whole = Evidence(twin, shortest, noise, begin.variant, rough=True, rules=rules)
     evidence = _choose_windows(whole, train, begin, since)
     return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
+
+
+def _twin(problem: Problem, setting: Setting) -> Twin:
+    """What simulates a problem's windows, with the effects of its config."""
+    return Twin(
+        setting, problem.space, num_threads=problem.config.threads, warp=problem.config.backend == "warp",
+        standing=None if problem.effects is None else problem.effects.at,
+    )  # fmt: skip
 
 
 def first_steps(twin: Twin, log: Trajectories, begin: Hypothesis) -> np.ndarray:
