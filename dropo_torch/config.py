@@ -139,6 +139,12 @@ class Config(pydantic.BaseModel):
         return bool(self.effects) or any("effect" in p for p in (self.parameters or {}).values())
 
     @property
+    def derives_velocities(self) -> bool:
+        """Whether all velocities of the log are derived from its positions, by ``data: preprocess``."""
+        options = self.data.get("preprocess") if isinstance(self.data, dict) else None
+        return isinstance(options, dict) and options.get("velocities") is None
+
+    @property
     def moves_centres(self) -> bool:
         """Whether bodies' centers of mass or their axes may move: by effects, or as parameters."""
         from dropo_torch.models.load import CENTERS  # imports MuJoCo

@@ -116,7 +116,7 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
         observation = _observation(config, space.model, num_states, width)
         if space.model is None or len(observation.default_state) != space.model.nq + space.model.nv:
             raise InputError("effects: they need a MuJoCo model; this simulator has none")
-        setting = plain_setting(space.model, observation, frame_skip)
+        setting = plain_setting(space.model, observation, frame_skip, differentiated=config.derives_velocities)
         effects = place_effects(config.effects, space, setting, find_effect)
         space = space.with_limits(lowest(effects, space))
         simulator = _with_effects(config, source, effects, space, trajectories)

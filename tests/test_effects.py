@@ -77,13 +77,14 @@ def simulator_of(
     parameters: dict | None = None,
     backend: str = "mujoco",
     skip: int = SKIP,
+    differentiated: bool = False,
 ) -> tuple[Any, int]:
     """A simulator with effects; the cart's damping varies unless other parameters are given."""
     given = parameters or {
         "d": {"field": "dof_damping", "name": model.joint(model.njnt - 1).name, "bounds": [0.0, 1.0]}
     }
     space = ParameterSpace(model, given)
-    setting = plain_setting(model, parse_observation(model, None), skip)
+    setting = plain_setting(model, parse_observation(model, None), skip, differentiated=differentiated)
     found = place_effects(effects, space, setting, find_effect)
     space = space.with_limits(lowest(found, space))
 
@@ -667,6 +668,24 @@ def test_a_late_sensor_shows_the_past() -> None:
     np.testing.assert_allclose(path[:, 1], 1.0 + 0.75 * times, atol=1e-9)  # 1.5 N on 2 kg, as it would be without delay
     path = driven([{"effect": "sensor_delay", "target": "rail.position", "delay": delay}], np.zeros(30), (0.2, 1.0))
     np.testing.assert_allclose(path[:, 0], 0.2 + times, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "values", "both"),
+    [("sensor_delay", {"delay": 3.5 * STEP}, True), ("sensor_scale", {"factor": 1.2}, True),
+     ("sensor_bias", {"bias": 0.2}, False)],
+)  # fmt: skip
+def test_a_velocity_derived_from_a_measured_position_shows_what_that_shows(name: str, values: dict, both: bool) -> None:
+    """As two sensors would; only a constant has no derivative. It is no target of its own."""
+    columns = ("rail.position", "rail.velocity")
+    own = [{"effect": name, "target": column, **values} for column in columns]
+    expected = driven(own[: 1 + both], COMMAND, (0.3, 1.0))
+    found = driven(own[:1], COMMAND, (0.3, 1.0), differentiated=True)
+    np.testing.assert_array_equal(found, expected)
+    assert np.abs(found - driven(own[:1], COMMAND, (0.3, 1.0))).max() > 1e-3 or not both
+    setting = setting_of(general(SLIDE))
+    assert find_effect(name).targets(setting) == [*columns]
+    assert find_effect(name).targets(replace(setting, differentiated=True)) == [*columns[:1]]
 
 
 @pytest.mark.parametrize("late", [(3, 0), (0, 2), (3, 2)])

@@ -351,6 +351,41 @@ def test_bodies_that_only_slide_are_written_as_they_are(
         np.testing.assert_allclose(paths[1], paths[2], rtol=0, atol=1e-5)
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_an_encoder_that_is_late_is_late_in_the_velocity_that_is_derived_from_it(masked: bool, tmp_path: Path) -> None:
+    """One effect explains both columns, and what is written has it as it was found."""
+    late, rng = 0.03, np.random.default_rng(5)
+    model = mujoco.MjModel.from_xml_string(DRIVEN)
+    data, fine, count = mujoco.MjData(model), [], round(late / STEP)
+    data.qpos[0] = 0.5
+    commands = np.repeat(rng.uniform(-2, 2, 60), 10)
+    for step in range(600 * SKIP):
+        data.ctrl[0] = commands[step // SKIP]
+        fine.append(data.qpos[0])
+        mujoco.mj_step(model, data)
+    angles = np.array(fine)[np.maximum(np.arange(600) * SKIP - count, 0)] + 1e-5 * rng.standard_normal(600)
+    rows = np.column_stack([np.arange(600) * SKIP * STEP, angles, commands])[5:]
+    np.savetxt(tmp_path / "log.csv", rows, delimiter=",", header="t,angle,drive", comments="")
+    (tmp_path / "pendulum.xml").write_text(DRIVEN)
+    document = {
+        "model": "pendulum.xml", "frame_skip": SKIP, "threads": 1, "mask": ["swing.velocity"] if masked else [],
+        "data": {
+            "path": "log.csv", "time": "t", "observations": ["angle"], "actions": ["drive"],
+            "preprocess": {"dt": SKIP * STEP, "actions": "hold"},
+        },
+    }  # fmt: skip
+    (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
+    problem = make_problem(load_config(tmp_path / "config.yaml"), general=True)
+    gap = find_gap(problem, effects=[find_effect(n) for n in ("joint_friction", "sensor_delay", "sensor_scale")])
+    assert [(e.effect, e.target) for e in gap.effects] == [("sensor_delay", "swing.position")]
+    assert gap.effects[0].parameters["delay"].value == pytest.approx(late, rel=0.01)
+    (tmp_path / "out").mkdir()
+    add(problem, gap, tmp_path / "out")
+    effects = make_problem(load_config(tmp_path / "out" / "config.yaml")).effects
+    assert effects is not None
+    assert effects.setting.differentiated
+
+
 def test_a_step_is_never_a_parameter(tmp_path: Path) -> None:
     step = {"effect": "integration", "bounds": [STEP / 8, STEP]}
     with pytest.raises(InputError, match=r"parameters.step: timestep of integration is a choice.*give it in effects"):

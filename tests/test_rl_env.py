@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -632,6 +633,29 @@ def test_effects_are_those_of_their_own_simulator(case: str, backend: str) -> No
     np.testing.assert_allclose(found.numpy(), expected, rtol=1e-5, atol=2e-6)
     plain, _ = driven(RandomizedEnv(starting(stretched(), states), num, backend=backend), path["action"].swapaxes(0, 0))
     assert (plain["next", "observation"] - path["next", "observation"]).abs().amax((0, 2))[1:].min() > 1e-3
+
+
+def test_a_velocity_that_is_derived_from_a_late_position_is_late() -> None:
+    delay = {"late": {"effect": "sensor_delay", "name": "slide.position", "bounds": [0, 0.08]}}
+    space = ParameterSpace(CartPole().model, delay)
+    given = [{"effect": "sensor_bias", "target": "hinge.position", "bias": 0.2}]
+    effects = effects_on(space, given, 2, RAIL)
+    effects = dataclasses.replace(effects, setting=dataclasses.replace(effects.setting, differentiated=True))
+    source, states = Rows(("late",), np.array([[0.0], [0.04]])), np.tile([[0.1, 0.05, 0.5, -0.3]], (2, 1))
+    env = RandomizedEnv(starting(stretched(), states), 2, space=space, source=source, effects=effects)
+    td = env.reset()
+    shown, true = [td["observation"]], [env.states]
+    for action in actions_of(env, 10)[:, :1].expand(-1, 2, -1):
+        td = env.step_mdp(env.step(td.set("action", action)))
+        shown.append(td["observation"])
+        true.append(env.states)
+    shown, true = (torch.stack(x).double().numpy() for x in (shown, true))
+    hidden = np.array([0.0, 0.2, 0.0, 0.0])
+    np.testing.assert_allclose(shown[:, 0], true[:, 0] + hidden, atol=1e-6)
+    late = true + hidden
+    late[2:, :, [0, 2]] = true[:-2, :, [0, 2]]
+    np.testing.assert_allclose(shown[2:, 1], late[2:, 1], atol=1e-6)
+    assert np.abs(shown[2:, 1] - true[2:, 1]).min(0)[2] > 0
 
 
 @pytest.mark.parametrize("column", ["slide.position", "hinge.velocity"])

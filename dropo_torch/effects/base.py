@@ -84,7 +84,8 @@ class Signals:
 class Setting:
     """Where effects are looked for: the model as given, the columns of the log (some masked), and its sizes.
 
-    Of columns that are derived, ``derived`` has the errors, ``(column, error)`` each.
+    Of columns that are derived, ``derived`` has the errors, ``(column, error)`` each. Where the log's velocities are
+    ``differentiated`` positions, what a sensor does to a position shows in its velocity, too.
     """
 
     model: mujoco.MjModel
@@ -93,6 +94,7 @@ class Setting:
     frame_skip: int
     masked: frozenset[int] = frozenset()
     derived: tuple[tuple[int, float], ...] = ()
+    differentiated: bool = False
 
     @property
     def has_impacts(self) -> bool:
@@ -169,6 +171,7 @@ class Effect(abc.ABC):
         alone: whether it is looked for by itself; otherwise only in the place of a simpler one, or in the base family.
         known_as: name of the effect of which it is a kind, by which answers call it; none for its own.
         steps: whether it sets the physics step. It is then written first, for others may depend on that.
+        differentiates: whether a velocity that is derived from a measured position shows it as the position does.
     """
 
     name: ClassVar[str]
@@ -179,6 +182,7 @@ class Effect(abc.ABC):
     alone: ClassVar[bool] = True
     known_as: ClassVar[str] = ""
     steps: ClassVar[bool] = False
+    differentiates: ClassVar[bool] = False
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copy, and hand to other processes, by name: whoever takes it must have registered the effect, too."""

@@ -35,9 +35,21 @@ class Filter:
 def filters_of(
     acting: Iterable[tuple[Effect, str | None, torch.Tensor]], method: Literal["command", "sense"], setting: Setting
 ) -> list[Filter]:
-    """Return the effects, each at its target and with its values, that act by a method, in order."""
-    find = setting.command_column if method == "command" else setting.column
-    return [Filter(effect, find(target), values) for effect, target, values in acting if effect.has(method)]
+    """Return the effects, each at its target and with its values, that act by a method, in order.
+
+    Those of a measured position act on the velocity that is derived from it, too, with the same values.
+    """
+    given = [(effect, target, values) for effect, target, values in acting if effect.has(method)]
+    if method == "command":
+        return [Filter(effect, setting.command_column(target), values) for effect, target, values in given]
+    rates = differentiated(setting) if given else {}
+    found = []
+    for effect, target, values in given:
+        column = setting.column(target)
+        found.append(Filter(effect, column, values))
+        if effect.differentiates and column in rates:
+            found.append(Filter(effect, rates[column], values))
+    return found
 
 
 def placed_filters(placed: Iterable[Placed], method: Literal["command", "sense"], setting: Setting) -> list[Filter]:
@@ -147,3 +159,8 @@ def observed_rates(setting: Setting) -> tuple[int, ...]:
     """Return for every observed column the observed one that is its time derivative, or -1."""
     of, places = rate_columns(setting.model), {int(c): i for i, c in enumerate(setting.observation.index)}
     return tuple(places.get(int(of[c]), -1) for c in setting.observation.index)
+
+
+def differentiated(setting: Setting) -> dict[int, int]:
+    """Return the observed columns whose velocities the log has as derivatives, and those velocities' columns."""
+    return {c: rate for c, rate in enumerate(observed_rates(setting)) if rate >= 0} if setting.differentiated else {}

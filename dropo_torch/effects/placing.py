@@ -109,7 +109,9 @@ class EffectSet:
         return max((effect.memory(values) for effect, values in numbers), default=0.0)
 
 
-def plain_setting(model: mujoco.MjModel, observation: Observation, frame_skip: int, size: float = 1.0) -> Setting:
+def plain_setting(
+    model: mujoco.MjModel, observation: Observation, frame_skip: int, size: float = 1.0, *, differentiated: bool = False
+) -> Setting:
     """Return a setting that knows no log: everything moves, touches and has one size."""
     ones = np.full(max(model.nv, model.nu, model.nbody, observation.size), size)
     signals = Signals(
@@ -118,7 +120,7 @@ def plain_setting(model: mujoco.MjModel, observation: Observation, frame_skip: i
         column=ones[: observation.size], linear_speed=ones[: model.nbody],
         angular_speed=ones[: model.nbody], contacts=np.ones(model.ngeom, dtype=bool),
     )  # fmt: skip
-    return Setting(model, observation, signals, frame_skip)
+    return Setting(model, observation, signals, frame_skip, differentiated=differentiated)
 
 
 def place_effects(given: Sequence[Mapping[str, Any]], space: ParameterSpace, setting: Setting, find: Find) -> EffectSet:

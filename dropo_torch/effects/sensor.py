@@ -6,16 +6,17 @@ import numpy as np
 import torch
 
 from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.effects.filters import differentiated
 from dropo_torch.effects.path import SensedPath
 
 
 class SensorEffect(Effect):
-    """An effect of one observed column; columns of quaternions are left out."""
+    """An effect of one observed column; those of quaternions, and velocities derived from others, are left out."""
 
     kind = "sensor"
 
     def targets(self, setting: Setting) -> list[str | None]:
-        left_out = setting.masked.union(*setting.observation.quaternions)
+        left_out = setting.masked.union(differentiated(setting).values(), *setting.observation.quaternions)
         labels = enumerate(setting.observation.labels)
         return [n for c, n in labels if c not in left_out and setting.signals.column[c] > 0]
 
@@ -43,6 +44,7 @@ class SensorScale(SensorEffect):
 
     name = "sensor_scale"
     sentence = "the measurement of {target} is too large or too small by a factor"
+    differentiates = True
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("factor", "-", 1.0, 0.2, 5.0, 0.3),)
@@ -60,6 +62,7 @@ class SensorDelay(SensorEffect):
     name = "sensor_delay"
     sentence = "the measurement of {target} comes late"
     shares = (0.4, 1.5)
+    differentiates = True
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         return (Quantity("delay", "s", 0.0, 0.0, 5 * setting.signals.timestep, setting.signals.timestep),)

@@ -147,7 +147,8 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     )
     masked = masked_columns(observation, problem.config.mask)
     derived = tuple((observation.labels.index(label), error) for label, error in problem.derived.items())
-    return Setting(model, observation, signals, frame_skip, masked, derived)
+    differentiated = problem.sensed is None and problem.config.derives_velocities
+    return Setting(model, observation, signals, frame_skip, masked, derived, differentiated)
 
 
 def start_values(problem: Problem) -> np.ndarray:

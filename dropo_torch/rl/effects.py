@@ -198,8 +198,9 @@ class RowFilters:
         self._acting = effects.having(method)
         self._skip, self._step = setting.frame_skip, float(setting.model.opt.timestep)
         zeros = torch.zeros(num_envs, 0, dtype=torch.float64, device=device)
-        acting = ((e.effect, e.target, zeros.new_zeros(num_envs, len(e.fixed))) for e in self._acting.entries)
-        self._filters = filters_of(acting, method, setting)
+        self._values = [zeros.new_zeros(num_envs, len(e.fixed)) for e in self._acting.entries]
+        acting = zip(self._acting.entries, self._values, strict=True)
+        self._filters = filters_of(((e.effect, e.target, own) for e, own in acting), method, setting)
 
     def __bool__(self) -> bool:
         """Whether there are any."""
@@ -207,8 +208,8 @@ class RowFilters:
 
     def _write(self, rows: torch.Tensor, values: np.ndarray) -> None:
         """Give environments ``rows`` the numbers in parameter vectors ``(k, d)``."""
-        for entry, f in zip(self._acting.entries, self._filters, strict=True):
-            f.values[rows] = torch.from_numpy(entry.values(values)).to(f.values.device)
+        for entry, own in zip(self._acting.entries, self._values, strict=True):
+            own[rows] = torch.from_numpy(entry.values(values)).to(own.device)
 
 
 class Commands(RowFilters):

@@ -160,7 +160,8 @@ def _space_and_effects(config: Config, task: Task) -> tuple[ParameterSpace, Effe
     space = ParameterSpace(task.model, config.parameters) if config.parameters else ParameterSpace.empty(task.model)
     if not config.has_effects:
         return space, None
-    setting = plain_setting(task.model, parse_observation(task.model, config.observation), task.frame_skip)
+    observation, differentiated = parse_observation(task.model, config.observation), config.derives_velocities
+    setting = plain_setting(task.model, observation, task.frame_skip, differentiated=differentiated)
     effects = place_effects(config.effects, space, setting, find_effect)
     return space.with_limits(lowest(effects, space)), effects
 
@@ -196,7 +197,8 @@ def _fingerprint(config: Config, algorithm: str, settings: Settings, training: W
     """A digest of what decides a training's course."""
     task, distribution = training.task, training.source.document()
     learning = settings.model_dump(mode="json", exclude={"checkpoint_seconds"})
-    text = json.dumps([config.fingerprint(*_FITTING), algorithm, learning, distribution], sort_keys=True)
+    given = [config.fingerprint(*_FITTING), config.derives_velocities, algorithm, learning, distribution]
+    text = json.dumps(given, sort_keys=True)
     text += f"{type(task).__name__} {task.name} {task.frame_skip} {task.max_episode_steps}"
     places = (name.rpartition(":")[0] for name in (config.task or "", *config.own_effects))
     code = [config.path(place).read_bytes() for place in places if place.endswith(".py")]
