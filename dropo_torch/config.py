@@ -142,7 +142,10 @@ class Config(pydantic.BaseModel):
     def derives_velocities(self) -> bool:
         """Whether all velocities of the log are derived from its positions, by ``data: preprocess``."""
         options = self.data.get("preprocess") if isinstance(self.data, dict) else None
-        return isinstance(options, dict) and options.get("velocities") is None
+        if not isinstance(options, dict):
+            return False
+        measured = options.get("velocities")
+        return measured is None or (len(measured) == 0 and bool(options.get("derive")))
 
     @property
     def moves_centres(self) -> bool:

@@ -351,8 +351,12 @@ def test_bodies_that_only_slide_are_written_as_they_are(
         np.testing.assert_allclose(paths[1], paths[2], rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("masked", [False, True])
-def test_an_encoder_that_is_late_is_late_in_the_velocity_that_is_derived_from_it(masked: bool, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("masked", "derived"), [(False, {}), (True, {}), (True, {"velocities": [], "derive": ["angle"]})]
+)
+def test_an_encoder_that_is_late_is_late_in_the_velocity_that_is_derived_from_it(
+    masked: bool, derived: dict[str, list[str]], tmp_path: Path
+) -> None:
     """One effect explains both columns, and what is written has it as it was found."""
     late, rng = 0.03, np.random.default_rng(5)
     model = mujoco.MjModel.from_xml_string(DRIVEN)
@@ -371,7 +375,7 @@ def test_an_encoder_that_is_late_is_late_in_the_velocity_that_is_derived_from_it
         "model": "pendulum.xml", "frame_skip": SKIP, "threads": 1, "mask": ["swing.velocity"] if masked else [],
         "data": {
             "path": "log.csv", "time": "t", "observations": ["angle"], "actions": ["drive"],
-            "preprocess": {"dt": SKIP * STEP, "actions": "hold"},
+            "preprocess": {"dt": SKIP * STEP, "actions": "hold"} | derived,
         },
     }  # fmt: skip
     (tmp_path / "config.yaml").write_text(yaml.safe_dump(document))
