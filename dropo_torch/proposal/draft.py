@@ -276,7 +276,9 @@ def _preprocess(
     smooth = make_filter(derive, clock, len(columns), columns.parts) if derive else None
     if smooth is not None:
         options["cutoff"] = smooth.cutoff
-        notes.append(f"positions are noisy: a filter at {smooth.cutoff:g} Hz, above which the log shows noise alone")
+        notes.append(
+            f"velocities are derived through a filter at {smooth.cutoff:g} Hz, above which the log shows noise alone"
+        )
     dt = clock.dt or step
     longest = _longest(clock, len(columns), columns.parts, matching.matches)
     if any(np.isnan(m.column.values).any() for m in matching.matches) or longest > 2.4 * max(dt, step):
