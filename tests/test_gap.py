@@ -1074,6 +1074,26 @@ def test_noise_beside_a_late_sensor_is_that_of_the_log() -> None:
     assert free_forces(scene.twin, scene.short, true(case).variant).noise == pytest.approx(case.noise, rel=0.1)
 
 
+def test_short_windows_tell_no_noise_of_sensors_that_are_late_by_most_of_them() -> None:
+    """What is left to compare, initial states and forces explain whatever it is: that is no sign of little noise."""
+    scene, truth = scene_of(), np.array(hidden().noise)
+    late = [Placed(VOCABULARY["sensor_delay"], c, (0.05,)) for c in scene.setting.observation.labels]
+    wrong = refit(scene.evidence, scene.begin.with_effects(late), iterations=0)
+    free = free_forces(scene.twin, scene.short, wrong.hypothesis.variant)
+    assert np.isinf(free.unsure).all()
+    evidence = dataclasses.replace(scene.evidence, noise=truth)
+    beside = noise_beside(evidence, scene.short, dataclasses.replace(wrong, residual=50 * wrong.residual))
+    assert (beside == truth).all()
+
+
+def test_late_sensors_do_not_stand_for_a_late_command_and_a_coarse_step() -> None:
+    truth = [Effect("integration", None, {"timestep": 0.01}), Effect("actuator_delay", "push", {"delay": 0.043})]
+    gap = search(
+        simulate_truth(coarse(CART_POLE, 0.01), truth, 1, **SIZE), ("actuator_delay", "sensor_delay", "integration")
+    )
+    assert {(e.effect, e.target) for e in gap.effects} == {("actuator_delay", "push"), ("integration", None)}
+
+
 def two_joints(folder: Path, friction: tuple[float, float], seed: int) -> Path:
     """Write a log of an arm with MuJoCo's own ``frictionloss``, and a config with the arm that lacks it."""
     xml = (

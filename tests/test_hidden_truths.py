@@ -107,10 +107,11 @@ def _spring(model: mujoco.MjModel) -> None:
     model.joint("shoulder").stiffness[0], model.qpos_spring[1] = 3.0, 0.4
 
 
-def _servo(model: mujoco.MjModel, gain: float = 1.0, damping: float = 0.0, bias: float = 0.0) -> None:
+def _servo(model: mujoco.MjModel, gain: float = 1.0, damping: float = 0.0, bias: float = 0.0, kp: float = 1.0) -> None:
     servo = model.actuator("elbow_servo")
-    servo.gainprm[0] *= gain
+    servo.gainprm[0] *= gain * kp
     servo.biasprm[:3] *= gain
+    servo.biasprm[1] *= kp
     servo.biasprm[0] += bias
     servo.biasprm[2] -= damping
 
@@ -139,6 +140,7 @@ NATIVE = [
         lambda m: m.body("fore").inertia.__imul__(2.5),
     ),
     (SERVO_ARM, Effect("actuator_gain", "elbow_servo", {"gain": 0.8}), lambda m: _servo(m, gain=0.8)),
+    (SERVO_ARM, Effect("actuator_stiffness", "elbow_servo", {"factor": 0.8}), lambda m: _servo(m, kp=0.8)),
     (SERVO_ARM, Effect("actuator_bias", "elbow_servo", {"force": 1.5}), lambda m: _servo(m, bias=1.5)),
     (SERVO_ARM, Effect("actuator_damping", "elbow_servo", {"damping": 0.9}), lambda m: _servo(m, damping=0.9)),
     (
@@ -307,7 +309,7 @@ def test_the_list_of_cases() -> None:
 
 def test_unusual_cases_follow_the_plain_ones() -> None:
     specs = cases.cases(4)
-    plain, unusual = specs[:95], specs[95:]
+    plain, unusual = specs[:96], specs[96:]
     assert {s.trait for s in plain} == {""}
     assert {s.system for s in plain} <= {s.name for s in CORE}
     assert all(s.name.startswith(f"{s.trait}-") for s in unusual)

@@ -86,6 +86,7 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     "ground_slope": {"puck": (None,), "hopper": (None,)},
     "integration": {s.name: (None,) for s in CORE if s.coarse},
     "actuator_gain": _MOTORS,
+    "actuator_stiffness": {"servo_arm": ("shoulder_servo", "elbow_servo")},
     "actuator_bias": _ACTUATORS,
     "actuator_damping": _ACTUATORS,
     "actuator_delay": _MOTORS,
@@ -437,6 +438,11 @@ def _gain(_t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
     return lambda s: {"gain": 1.0 + 0.5 * sign * s}
 
 
+def _kp(_t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
+    sign = _sign(rng)
+    return lambda s: {"factor": 1.0 + 0.5 * sign * s}
+
+
 def _bias(t: float, _v: float, _c: float, rng: np.random.Generator) -> Draw:
     sign = _sign(rng)
     return lambda s: {"force": 0.4 * sign * s * t}
@@ -593,6 +599,7 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "gravity_tilt": _tilt,
     "ground_slope": _tilt,
     "actuator_gain": _actuator_draw(_gain),
+    "actuator_stiffness": _actuator_draw(_kp),
     "actuator_bias": _actuator_draw(_bias),
     "actuator_damping": _actuator_draw(lambda f, v, c, r: lambda s: {"damping": s * f / v}),
     "actuator_delay": _actuator_draw(lambda f, v, c, r: lambda s: {"delay": 0.05 * s}),

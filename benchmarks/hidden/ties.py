@@ -205,6 +205,8 @@ def _actuator_rivals(system: System, model: mujoco.MjModel) -> Iterator[Rival]:
         force, speed = scale.torque / gear, scale.velocity * gear
         largest = system.commands[number].amplitude
         yield _one("actuator_gain", name, "gain", 1.0, 0.5, 0.05)
+        if _motor_damping(model, number):
+            yield _one("actuator_stiffness", name, "factor", 1.0, 0.5, 0.05)
         yield _one("actuator_bias", name, "force", 0.0, force)
         yield _one("actuator_damping", name, "damping", 0.0, force / speed, -_motor_damping(model, number))
         yield _one("actuator_deadband", name, "width", 0.05 * largest, largest, 0.0)

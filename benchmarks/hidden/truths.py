@@ -358,8 +358,8 @@ def constant_forces(model: mujoco.MjModel, effects: Sequence[Effect]) -> np.ndar
 
 #: Effects of an actuator, whose force is then computed by hand.
 DRIVE = frozenset({
-    "actuator_gain", "actuator_bias", "actuator_damping", "actuator_saturation", "actuator_delay", "actuator_lag",
-    "actuator_deadband", "actuator_backlash", "dropout", "gain_drift",
+    "actuator_gain", "actuator_stiffness", "actuator_bias", "actuator_damping", "actuator_saturation",
+    "actuator_delay", "actuator_lag", "actuator_deadband", "actuator_backlash", "dropout", "gain_drift",
 })  # fmt: skip
 #: Effects of a geom's contacts.
 CONTACT = ("contact_friction", "contact_stiffness", "contact_margin")
@@ -426,6 +426,7 @@ def _drive(plant: Plant, actuator: str, effects: Sequence[Effect]) -> Force:
     path = CommandPath(plant, number, effects)
     x = {e.name: e.parameters for e in effects}
     factor = x.get("actuator_gain", {}).get("gain", 1.0)
+    kp = x.get("actuator_stiffness", {}).get("factor", 1.0)
     constant = x.get("actuator_bias", {}).get("force", 0.0)
     damping = x.get("actuator_damping", {}).get("damping", 0.0)
     limit = x.get("actuator_saturation", {}).get("limit", np.inf)
@@ -435,7 +436,7 @@ def _drive(plant: Plant, actuator: str, effects: Sequence[Effect]) -> Force:
     def force(p: Plant) -> None:
         u = min(max(path(p), low), high)
         length, speed = gear * float(p.middle_q[j]), gear * float(p.middle_v[i])
-        f = factor * (gain * u + bias[0] + bias[1] * length + bias[2] * speed) + constant - damping * speed
+        f = factor * (kp * (gain * u + bias[1] * length) + bias[0] + bias[2] * speed) + constant - damping * speed
         if dropouts and _dropped(p.t, dropouts):
             f = 0.0
         if drift:

@@ -1,4 +1,4 @@
-"""Effects of actuators: gain, offset, delay, lag, dead band, play, saturation."""
+"""Effects of actuators: gain, kp, offset, delay, lag, dead band, play, saturation."""
 
 from __future__ import annotations
 
@@ -51,6 +51,13 @@ def gear(model: mujoco.MjModel, actuator: int) -> float:
     return max(abs(float(model.actuator_gear[actuator, 0])), 1e-9)
 
 
+def is_servo(model: mujoco.MjModel, actuator: int) -> bool:
+    """Return whether an actuator pulls toward a target: its force is of the error between command and length."""
+    fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
+    affine, kp = model.actuator_biastype[actuator] == _AFFINE, model.actuator_gainprm[actuator, 0]
+    return bool(fixed and affine and kp != 0 and model.actuator_biasprm[actuator, 1] == -kp)
+
+
 def unit_of(setting: Setting, target: str | None, turning: str, sliding: str) -> str:
     """Of two units that of an actuator, by whether its force turns or slides what it acts on; none where it does both.
 
@@ -98,6 +105,29 @@ class ActuatorGain(ActuatorEffect):
         i = object_number(model, "actuator", target)
         model.actuator_gainprm[i, :3] *= values[0]
         model.actuator_biasprm[i, :3] *= values[0]
+
+
+class ActuatorStiffness(ActuatorEffect):
+    """A servo that pulls toward its target with another kp than the model's, and brakes with the same kv.
+
+    For servos that have a kv: of others the whole force changes, which is a gain.
+    """
+
+    name = "actuator_stiffness"
+    sentence = "actuator {target} pulls toward its target with another kp than in the model"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m = setting.model
+        numbers = {t: object_number(m, "actuator", t) for t in super().targets(setting)}
+        return [t for t, i in numbers.items() if is_servo(m, i) and m.actuator_biasprm[i, 2] != 0]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("factor", "-", 1.0, 0.05, 10.0, 0.5),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        i = object_number(model, "actuator", target)
+        model.actuator_gainprm[i, 0] *= values[0]
+        model.actuator_biasprm[i, 1] *= values[0]
 
 
 class ActuatorBias(ActuatorEffect):

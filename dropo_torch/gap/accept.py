@@ -219,6 +219,9 @@ def _among_several(
     several = sound(ground, found)
     for tried in (simplest(r, rules) for r in (two, several) if r):
         clearer = tried.cost.left_of(best.cost) < (rules.tried.clearer if pairs else rules.family.clearer[0])
+        if clearer and not pairs:  # a family, such as of late sensors, may do besides what the model's step leaves
+            finer, own = (ground.resolved(r).fit.cost for r in (tried, best))
+            clearer = finer.left_of(own) < rules.family.clearer[0]
         if clearer or (is_hopeless(best, current, rules) and not is_hopeless(tried, current, rules)):
             best = tried
     return best, state

@@ -33,8 +33,8 @@ QUIET, CALM = 0.25, 0.98
 ENOUGH = 5
 #: By how much a uniform distribution is wider than its standard deviation.
 UNIFORM = 12**0.5
-#: Least degrees of freedom that a feature is taken to have in a window.
-LEAST_DEGREES = 0.3
+#: Least degrees of freedom that a feature is taken to have in a window; and in all of them, to tell its noise.
+LEAST_DEGREES, TELLING = 0.3, 5.0
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class FreeForces:
 
     Attributes:
         noise: standard deviation of each feature's measurement, ``(m,)``.
-        unsure: its relative standard error, ``(m,)``; zero where the noise is known.
+        unsure: its relative standard error, ``(m,)``; zero where the noise is known, infinite where nothing tells it.
         forces: mean free force in each window, ``(W, nv)``.
         errors: their standard errors at that noise, ``(W, nv)``.
         windows: the short windows.
@@ -157,7 +157,8 @@ def _relative_noise(
     Only residuals that are ``counted`` tell it, ``(W, N)``: what a late sensor shows first is from before the window.
     By reweighted least squares, each feature weighted by the noise before. Windows in which a force changes too fast,
     at contacts and where dry friction reverses, stand out: the noise begins with that of the quietest windows, and
-    takes in whatever is then no more than chance.
+    takes in whatever is then no more than chance. Nothing tells the noise of a feature whose residuals the forces
+    explain whatever they are, such as of sensors that are late by more than most of a window: it stays the guess.
     """
     repeats, relative, error = residual.shape[1] // m, np.ones(m), np.zeros(m)
     for turn in range(QUIET_ROUNDS + ROUNDS):
@@ -172,8 +173,9 @@ def _relative_noise(
             ratio = np.quantile(chi2 / degrees, QUIET, axis=0) / (stats.chi2.ppf(QUIET, typical) / typical)
         else:
             ratio, error = _of_calm_windows(chi2, degrees)
-        relative = np.clip(relative * np.sqrt(np.maximum(ratio, 1e-16)), 1e-6, 1e4)
-    return relative, error
+        told = degrees.sum(0) >= TELLING
+        relative = np.where(told, np.clip(relative * np.sqrt(np.maximum(ratio, 1e-16)), 1e-6, 1e4), 1.0)
+    return relative, np.where(told, error, np.inf)
 
 
 def _of_calm_windows(chi2: np.ndarray, degrees: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

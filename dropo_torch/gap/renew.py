@@ -107,7 +107,7 @@ def noise_beside(evidence: Evidence, short: Windows | None, fitted: Refit) -> np
 
     Free forces in short windows tell it whether or not the hypothesis is right; what that leaves in the long windows
     tells it more precisely where it is, and it is never larger. A larger one is believed only as far as the short
-    windows leave it open, so that what is missing does not pass for noise.
+    windows leave it open, so that what is missing does not pass for noise; where they tell nothing, not at all.
 
     Args:
         evidence: of the fit, with the noise under which it was made.
@@ -121,7 +121,9 @@ def noise_beside(evidence: Evidence, short: Windows | None, fitted: Refit) -> np
         free = free_forces(evidence.twin, short, fitted.hypothesis.variant)
     except Diverges:  # beside a hypothesis under which nothing can be simulated, there is nothing to see
         return noise
-    return np.where(left < free.noise * (1 + evidence.rules.weighed.agree * free.unsure), left, free.noise)
+    told = np.isfinite(free.unsure)
+    agree = free.noise * (1 + evidence.rules.weighed.agree * np.where(told, free.unsure, 0.0))
+    return np.where(told, np.where(left < agree, left, free.noise), np.minimum(noise, left))
 
 
 def noise_left(fitted: Refit, noise: np.ndarray, rules: Rules) -> np.ndarray:

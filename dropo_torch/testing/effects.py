@@ -47,7 +47,7 @@ RIG = """
     </body>
   </worldbody>
   <actuator>
-    <motor name="lift" joint="shoulder" gear="3"/><position name="bend" joint="elbow" kp="5"/>
+    <motor name="lift" joint="shoulder" gear="3"/><position name="bend" joint="elbow" kp="5" kv=".02"/>
     <motor name="push" joint="rail" gear="2"/>
   </actuator>
 </mujoco>"""
