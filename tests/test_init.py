@@ -28,7 +28,7 @@ from dropo_torch.proposal.columns import read_columns
 from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
 from dropo_torch.proposal.matching import match_columns, motion, unit_name
-from dropo_torch.proposal.places import places_of
+from dropo_torch.proposal.places import known_names, places_of
 from dropo_torch.proposal.words import read_name
 
 DEG = 180 / math.pi
@@ -170,6 +170,36 @@ def test_a_model_of_level_slides_alone_is_matched(tmp_path: Path) -> None:
     assert matched(tmp_path, frame, CART) == {"rail.velocity": "cart_vel", "pusher": "force_cmd"}
 
 
+def test_actual_positions_beside_commands(tmp_path: Path) -> None:
+    """Of columns called ``act``, those are measured beside which there are commands."""
+    sent = {f"j{i}_cmd_deg": v for i, v in zip((1, 2), swung(("a", "b")).values(), strict=True)}
+    shown = {f"j{i}_act_deg": 0.9 * v for i, v in zip((1, 2), sent.values(), strict=True)}
+    rates = {f"j{i}_vel_deg": v for i, v in zip((1, 2), swung(("a", "b"), rates=True).values(), strict=True)}
+    arm = """<mujoco><worldbody><body><joint name="j1" axis="0 1 0"/><geom size=".1"/>
+      <body><joint name="j2" axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
+      <actuator><position name="a1" joint="j1" kp="9"/><position name="a2" joint="j2" kp="9"/></actuator></mujoco>"""
+    assert matched(tmp_path, {**shown, **rates, **sent}, arm) == {
+        "j1.position": "j1_act_deg", "j2.position": "j2_act_deg", "j1.velocity": "j1_vel_deg",
+        "j2.velocity": "j2_vel_deg", "a1": "j1_cmd_deg", "a2": "j2_cmd_deg",
+    }  # fmt: skip
+    only = {"j1_deg": shown["j1_act_deg"], "j2_deg": shown["j2_act_deg"], "j1_act_deg": sent["j1_cmd_deg"]}
+    assert matched(tmp_path, {**only, "j2_act_deg": sent["j2_cmd_deg"]}, arm)["a2"] == "j2_act_deg"
+
+
+def test_actuators_called_as_poses_are(tmp_path: Path) -> None:
+    stage = """<mujoco><worldbody><body><joint name="stage" type="slide" axis="1 0 0"/><geom size=".1"/>
+      <body><joint name="table" axis="0 0 1"/><geom size=".1"/></body></body></worldbody>
+      <actuator><motor name="lin" joint="stage"/><motor name="rot" joint="table"/></actuator></mujoco>"""
+    (a, b), (c, d) = swung(("a", "b")).values(), swung(("a", "b"), rates=True).values()
+    t = 0.02 * np.arange(200)
+    frame = {
+        "time": t, "stage_mm": a, "table_deg": b, "stage_vel_mm": c, "table_vel_deg": d, "lin_force": np.sin(9 * t),
+        "rot_torque": np.sin(7 * t),
+    }  # fmt: skip
+    found = matched(tmp_path, frame, stage)
+    assert (found["lin"], found["rot"]) == ("lin_force", "rot_torque")
+
+
 # --- columns of commands that are called after what they drive ---
 
 ROTORS = "".join(f'<motor name="thrust{i}" site="rotor{i}" gear="0 0 1 0 0 .016"/>' for i in range(1, 5))
@@ -242,7 +272,7 @@ def matched(folder: Path, frame: dict[str, np.ndarray], xml: str = ARM) -> dict[
     """The column of each number of a model, by its label."""
     model = mujoco.MjModel.from_xml_string(xml)
     pd.DataFrame(frame).to_csv(folder / "log.csv", index=False)
-    columns = read_columns(folder / "log.csv", [model.joint(j).name for j in range(model.njnt)])
+    columns = read_columns(folder / "log.csv", known_names(model))
     clock = find_clock(columns, model.opt.timestep)
     starts = clock.starts(len(columns), columns.parts)
     taken = [c for c in (clock.column, clock.episode) if c is not None]

@@ -17,7 +17,7 @@ from dropo_torch.data.formats import open_tables
 from dropo_torch.data.streams import TIME
 from dropo_torch.data.tables import Choice, Table, missing, numbers
 from dropo_torch.errors import InputError
-from dropo_torch.proposal.words import Words, read_name
+from dropo_torch.proposal.words import Words, actual, read_name
 from dropo_torch.support.given import MOST_TEXT
 
 #: Columns of a matrix beyond which it is a picture or a cloud of points, and no state.
@@ -124,12 +124,12 @@ def last_part(array: str) -> str:
     return re.split(r"[./]", array.lower())[-1]
 
 
-def read_columns(path: str | Path, joints: Sequence[str] = ()) -> Columns:
+def read_columns(path: str | Path, known: Sequence[str] = ()) -> Columns:
     """Read all columns of a log.
 
     Args:
         path: the log.
-        joints: names of the model's joints, which may have words that otherwise tell a column's kind.
+        known: names of the model's objects, which may have words that otherwise tell a column's kind.
 
     Raises:
         InputError: a file that cannot be read, or in which nothing has a row a sample.
@@ -138,14 +138,16 @@ def read_columns(path: str | Path, joints: Sequence[str] = ()) -> Columns:
     separator = _separator(path)
     tables = open_tables(path, separator=separator)
     if tables[0].choose is not None:
-        return _of_streams(path, joints)
+        return _of_streams(path, known)
     found = _read(path, tables, separator)
-    return replace(found, columns=tuple(_understood(found.columns, joints)))
+    return replace(found, columns=tuple(_understood(found.columns, known)))
 
 
-def _understood(columns: Sequence[Column], joints: Sequence[str]) -> list[Column]:
+def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]:
     """The columns with what their names say."""
-    return [replace(c, words=read_name(f"{c.array} {c.label}" if c.label else c.entry, joints)) for c in columns]
+    names = [f"{c.array} {c.label}" if c.label else c.entry for c in columns]
+    names = actual(names, [read_name(name, known) for name in names])
+    return [replace(c, words=read_name(name, known)) for c, name in zip(columns, names, strict=True)]
 
 
 def _read(path: Path, tables: list[Table], separator: str | None) -> Columns:
@@ -161,7 +163,7 @@ def _read(path: Path, tables: list[Table], separator: str | None) -> Columns:
     return Columns(path, str(path), tuple(joined), tuple(int(s) for s in starts), group, separator)
 
 
-def _of_streams(path: Path, joints: Sequence[str]) -> Columns:
+def _of_streams(path: Path, known: Sequence[str]) -> Columns:
     """The columns of a bag, interpolated at the stamps of the fastest signal that is measured."""
     stamps = unstamped(path)
     (table,) = open_tables(path, stamps=stamps or None)
@@ -177,7 +179,7 @@ def _of_streams(path: Path, joints: Sequence[str]) -> Columns:
     columns = [
         c for name in usable for c in _of_array(name, np.asarray(found.read(name)), len(found.read(TIME)), found)
     ]
-    columns, time = _understood(columns, joints), np.asarray(found.read(TIME))
+    columns, time = _understood(columns, known), np.asarray(found.read(TIME))
     measured = [c for c in columns if c.words.role in ("position", "velocity", "effort", "")] or columns
     fastest = max(measured, key=lambda c: int(np.isfinite(c.values).sum()))
     rows = np.isfinite(fastest.values)

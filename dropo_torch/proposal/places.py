@@ -12,7 +12,7 @@ from dropo_torch.data.observation import joint_name
 from dropo_torch.effects.actuator import unit_of
 from dropo_torch.effects.base import Setting, object_number
 from dropo_torch.parameters import object_names
-from dropo_torch.proposal.words import object_words
+from dropo_torch.proposal.words import object_words, says_kind
 
 Kind = Literal["position", "velocity", "command", "marker"]
 #: Kinds of a place by what is measured there: an angle, a length, a component of a quaternion; of a command that turns
@@ -58,6 +58,12 @@ class Place:
     optional: bool = False
     partner: str = ""
     is_base: bool = False
+
+
+def known_names(model: mujoco.MjModel) -> list[str]:
+    """Return the names of a model's objects of which columns may speak: joints, and actuators not called by a kind."""
+    joints = [joint_name(model, j) for j in range(model.njnt)]
+    return joints + [name for name in object_names(model, "actuator") if name and not says_kind(name)]
 
 
 def places_of(model: mujoco.MjModel) -> tuple[Place, ...]:

@@ -34,7 +34,7 @@ from dropo_torch.proposal.matching import (
     rows_apart,
     with_velocity_units,
 )
-from dropo_torch.proposal.places import Place, places_of
+from dropo_torch.proposal.places import Place, known_names, places_of
 from dropo_torch.proposal.text import config_text
 from dropo_torch.shooting.posing import column_noise, posed
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
@@ -142,7 +142,7 @@ def propose_config(
     path = Path(model)
     tell("reading the model and the log", 0.0)
     compiled = load_model(path)
-    columns = read_columns(log, [joint_name(compiled, j) for j in range(compiled.njnt)])
+    columns = read_columns(log, known_names(compiled))
     robot = _robot(compiled, path, Path(out), columns)
     reading = _reading(robot, columns, dt, review)
     tell("examining the log", 0.1)

@@ -49,6 +49,8 @@ UNITS: dict[str, float] = {
     "dps": math.pi / 180, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0, "radian": 1.0, "radians": 1.0, "mm": 1e-3,
     "mmps": 1e-3, "cm": 1e-2, "meter": 1.0, "meters": 1.0, "nm": 1.0, "newton": 1.0, "mnm": 1e-3,
 }  # fmt: skip
+#: Of commands the actuator's, of measurements that they are actual ones.
+_ACT = "act"
 #: Units that count only as a name's last word: they are letters with other meanings, too.
 _LAST = {"m": 1.0, "s": 1.0, "n": 1.0, "mps": 1.0}
 #: Units of velocities, of efforts, and of which names do not tell; others are of positions.
@@ -137,26 +139,26 @@ def unit_role(name: str) -> Role:
     return "velocity" if own & _RATES or ("s" in own and len(own) > 1) else "position" if own - _EITHER else ""
 
 
-def read_name(name: str, joints: Sequence[str] = ()) -> Words:
+def read_name(name: str, known: Sequence[str] = ()) -> Words:
     """Return what a column's name says.
 
     Args:
         name: of the column.
-        joints: names of the model's joints: what stands in one of these, such as ``target_x``, says nothing else.
+        known: names of the model's objects: what stands in one of these, such as ``target_x``, says nothing else.
     """
     every = split(name)
-    for own in sorted((split(j) for j in joints if _misleads(j)), key=len, reverse=True):
+    for own in sorted((split(other) for other in known if _misleads(other)), key=len, reverse=True):
         begins = [i for i in range(len(every) - len(own) + 1) if every[i : i + len(own)] == own]
         if begins:
             rest = read_name(" ".join(every[: begins[0]] + every[begins[0] + len(own) :]))
-            known, number = object_words(" ".join(own))
-            return replace(rest, objects=known + rest.objects, numbers=number + rest.numbers)
+            objects, number = object_words(" ".join(own))
+            return replace(rest, objects=objects + rest.objects, numbers=number + rest.numbers)
     words, numbers = [w for w in every if not w.isdigit()], tuple(int(w) for w in every if w.isdigit())
     words = [part for w in words for part in _parts(w)]
     words, scale = _unit(words)
     axis, quaternion, angular = "", False, False
     roles: list[Role] = []
-    objects: list[str] = []
+    said: list[str] = []
     commanded: Role = ""
     if any(_role(word) in ("position", "velocity", "acceleration") for word in words):
         words = [word for word in words if word not in _CURRENT]
@@ -181,20 +183,44 @@ def read_name(name: str, joints: Sequence[str] = ()) -> Words:
         elif word in _ANGULAR or word in _LINEAR:
             angular |= word in _ANGULAR
         elif word not in _EMPTY:
-            objects.append(word)
+            said.append(word)
     if not angular and axis and "velocity" in roles and set(words) & _ANGULAR:
         angular = True
     role, commanded = _decided(roles, commanded)
     if quaternion and role in ("", "other"):
         role = "position"
     turns = bool(set(words) & _TURNS)
-    return Words(role, scale, tuple(objects), numbers, axis, quaternion and not angular, angular, commanded, turns)
+    return Words(role, scale, tuple(said), numbers, axis, quaternion and not angular, angular, commanded, turns)
 
 
-def _misleads(joint: str) -> bool:
-    """Whether a joint's name has words that would say what kind of column it is, were they not its name."""
-    told = read_name(joint)
-    return len(joint) > 1 and bool(told.role or told.quaternion or told.angular or told.scale is not None)
+def _misleads(name: str) -> bool:
+    """Whether an object's name has words that would say what kind of column it is, were they not its name."""
+    told, linear = read_name(name), set(split(name)) & _LINEAR
+    return len(name) > 1 and bool(told.role or told.quaternion or told.angular or linear or told.scale is not None)
+
+
+def says_kind(name: str) -> bool:
+    """Return whether a name has a word of a kind of columns, such as ``position``."""
+    return any(_role(word) in ("position", "velocity", "effort", "command") for word in split(name))
+
+
+def actual(names: Sequence[str], words: Sequence[Words]) -> list[str]:
+    """Return names without ``act`` where that says what was measured: another column has the command.
+
+    Args:
+        names: of columns.
+        words: what they say.
+    """
+    commanded = {
+        (w.objects, w.numbers)
+        for n, w in zip(names, words, strict=True)
+        if w.role == "command" and _ACT not in split(n)
+    }
+    found = []
+    for name, told in zip(names, words, strict=True):
+        is_measured = _ACT in split(name) and (told.objects, told.numbers) in commanded
+        found.append(" ".join(word for word in split(name) if word != _ACT) if is_measured else name)
+    return found
 
 
 def time_unit(name: str) -> float | None:
