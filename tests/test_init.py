@@ -446,6 +446,17 @@ def test_a_velocity_by_part_of_its_name_moves_as_its_position(moves: bool, tmp_p
     assert [label for label, column in found.items() if column == "vx"] == ["box_free.velocity[vx]"] * moves
 
 
+@pytest.mark.parametrize(("lost", "pieces"), [(6, 3), (2, 1)])
+def test_rows_that_are_missing_end_an_episode_where_commands_are_unknown(
+    lost: int, pieces: int, tmp_path: Path
+) -> None:
+    kept = np.delete(np.arange(400), np.r_[150 : 150 + lost, 300 : 300 + lost])
+    pd.DataFrame({"time": 0.01 * kept, "q": np.sin(0.01 * kept)}).to_csv(tmp_path / "log.csv", index=False)
+    columns = read_columns(tmp_path / "log.csv")
+    clock = find_clock(columns, 0.005)
+    assert clock.starts(len(columns), columns.parts).sum() == pieces
+
+
 @pytest.mark.parametrize(("left", "refused"), [("servo_2_raw", True), ("servo_2_temp", False), ("light", False)])
 def test_targets_are_not_made_up_beside_columns_called_after_servos(
     left: str, refused: bool, tmp_path: Path, capfd: pytest.CaptureFixture[str]

@@ -180,7 +180,25 @@ def test_gap_in_the_time_stamps_is_refused():
         preprocess(recording(TIME[keep], {"q": SINE[keep]}), Preprocess(dt=0.01))
 
 
+def test_what_pauses_leave_that_is_too_short_is_left_out():
+    time = 0.01 * np.arange(300)
+    rec = recording(time, {"q": np.sin(time)}, episodes=np.r_[np.zeros(100, int), 1, np.full(199, 2)])
+    with pytest.raises(InputError, match="episode 1: q has 1 samples"):
+        preprocess(rec, Preprocess(dt=0.01))
+    out = preprocess(replace(rec, cut=True), Preprocess(dt=0.01))
+    assert np.bincount(out.episodes).tolist() == [99, 198]
+    with pytest.raises(InputError, match="episode 0: q has 1 samples"):
+        preprocess(replace(rec, cut=True, episodes=np.arange(300)), Preprocess(dt=0.01))
+
+
 # -- commands -------------------------------------------------------------------------------------
+
+
+def test_commands_of_rows_that_are_missing_lie_between_those_that_are_not():
+    """Held from the row before, a command that rises would be late there."""
+    time = np.delete(0.01 * np.arange(200), [50, 90, 91, 140])
+    out = preprocess(recording(time, {"q": np.sin(time)}, {"u": 3 * time}), Preprocess(dt=0.01, max_gap=0.04))
+    np.testing.assert_allclose(out.actions[:, 0], 3 * 0.01 * np.arange(len(out)), atol=1e-9)
 
 
 def test_command_is_held_from_its_stamp_on():

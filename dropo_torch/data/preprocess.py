@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 Actions = Literal["hold", "mean", "position", "velocity"]
 
 _EDGE = 1e-3  # fraction of a step by which a stamp may lie behind the grid and still count for it
+_MISSING = 1.7  # usual sampling intervals between two samples from among which one is missing
 _GAP = 2.5  # steps, or sampling intervals, over which a signal is interpolated unless max_gap says otherwise
 _LEAST_CORRELATION = 0.5
 
@@ -170,6 +171,22 @@ class _Samples:
 
         return Akima1DInterpolator(self.time, self.values)
 
+    @property
+    def filled(self) -> _Samples:
+        """These samples, and between two of them from among which some are missing others, interpolated."""
+        steps = np.diff(self.time)
+        usual = float(np.median(steps))
+        holes = np.flatnonzero(steps > _MISSING * usual)
+        if not holes.size:
+            return self
+        lost = [np.linspace(self.time[i], self.time[i + 1], round(steps[i] / usual) + 1)[1:-1] for i in holes]
+        time = np.sort(np.concatenate([self.time, *lost]))
+        return _Samples(time, self.spline(time))
+
+
+class _TooShort(InputError):
+    """An episode that holds no transition."""
+
 
 def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
     """Return a recording as transitions ``dt`` apart, with observations ``[positions..., velocities...]``.
@@ -177,6 +194,8 @@ def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
     Args:
         recording: samples in time, each episode of which is handled on its own.
         options: what to do.
+
+    What pauses leave of an episode may be too short for a transition: it is left out.
 
     Raises:
         InputError: no time stamps, a missing value or too long a gap, a filter or delay that does not fit,
@@ -194,10 +213,16 @@ def preprocess(recording: Recording, options: Preprocess) -> Trajectories:
         check_values(recording.observations, recording.observation_names, where)
         check_values(recording.actions, recording.action_names, where)
     delays = signal_delays(recording, options)
-    logs = [
-        _Episode(replace(part, source=f"{recording.source}: episode {i}"), options, delays).transitions()
-        for i, part in enumerate(recording.split())
-    ]
+    logs, scraps = [], []
+    for i, part in enumerate(recording.split()):
+        try:
+            logs.append(
+                _Episode(replace(part, source=f"{recording.source}: episode {i}"), options, delays).transitions()
+            )
+        except _TooShort as error:
+            scraps.append(error)
+    if scraps and not (recording.cut and logs):
+        raise scraps[0]
     return replace(concatenate(logs), source=recording.source)
 
 
@@ -282,7 +307,7 @@ def _samples(part: Recording, name: str, delay: float = 0.0, least: int = 2) -> 
     values = part.signal(name)
     present = ~np.isnan(values)
     if present.sum() < least:
-        raise InputError(f"{part.source}: {name} has {present.sum()} samples; at least {least} are needed")
+        raise _TooShort(f"{part.source}: {name} has {present.sum()} samples; at least {least} are needed")
     return _Samples(time=part.time[present] - part.time[0] - delay, values=values[present])
 
 
@@ -365,7 +390,8 @@ class _Episode:
         if steps[longest] > most:
             raise InputError(
                 f"{self.part.source}: {name} has no sample for {steps[longest]:.4g} s from {samples.time[longest]:.6g} "
-                f"s on, and at most {most:.4g} s are interpolated; raise max_gap, or begin an episode there with pause"
+                f"s on, and at most {most:.4g} s are interpolated; raise max_gap, or begin an episode there "
+                "with data: pause"
             )
 
     def _filtered(self, name: str, samples: _Samples, cutoff: float) -> _Samples:
@@ -401,7 +427,7 @@ class _Episode:
         high = min([s.time[-1] - trim for s in signals] + [length - delay for delay in early] + [stop])
         steps = int(np.floor((high - low) / options.dt + _EDGE)) if high > low else 0
         if steps < 1:
-            raise InputError(
+            raise _TooShort(
                 f"{self.part.source}: preprocess leaves no transition of {options.dt:g} s: the recording lasts "
                 f"{length:.4g} s and {low:.4g} s to {high:.4g} s of it are used; see start, stop, trim and delays"
             )
@@ -412,7 +438,7 @@ class _Episode:
         delay = self.delays.get(name, 0.0)
         samples = _samples(self.part, name, delay, least=1 if self.part.sparse else 2)
         if not self.options.command_clock:
-            return samples
+            return samples if self.part.sparse else samples.filled
         return replace(samples, time=self._ticks.put_back(samples.time + delay) - delay)
 
     @cached_property

@@ -262,6 +262,7 @@ def _recording(table: Table, options: ReadOptions) -> Recording:
     return Recording(
         observations, actions, time, episodes, names, action_names, source=table.source, sparse=table.sparse,
         quaternions=tuple(table.orientations(wanted, "observations")),
+        cut=options.pause is not None or bool(options.breaks),
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ class Recording(ByValue):
         rows: row of the file of each sample, ``(N,)``; by default all from 0 on.
         sparse: whether signals have time stamps of their own, so that NaN says only that another has a sample there.
         quaternions: names of four observations each that are a unit quaternion (w, x, y, z).
+        cut: whether episodes begin where rows are missing, so that some may be too short for a transition.
 
     Raises:
         InputError: shapes that do not fit, an infinite value, a name that stands twice, time stamps
@@ -50,6 +51,7 @@ class Recording(ByValue):
     rows: np.ndarray | None = None
     sparse: bool = False
     quaternions: tuple[tuple[str, ...], ...] = ()
+    cut: bool = False
 
     def __post_init__(self) -> None:
         rows = len(self.observations)

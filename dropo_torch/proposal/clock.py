@@ -14,8 +14,9 @@ from dropo_torch.proposal.words import time_unit
 #: Units of time stamps, the likeliest first, and seconds between rows that a robot's log may have.
 UNITS = (1.0, 1e-3, 1e-9, 1e-6)
 FASTEST, SLOWEST = 1.5e-4, 0.6
-#: Steps between stamps beyond which another episode begins.
-GAP = 12.0
+#: Steps between stamps beyond which another episode begins: what was commanded there is unknown. Fewer, if most rows
+#: (which share) are then in pieces that are long enough to compare (of how many rows).
+GAP, SHORT_GAP, MOST, PIECE = 12.0, 3.5, 0.7, 40
 #: Relative deviation of a spacing up to which stamps count as even.
 EVEN = 0.05
 
@@ -82,8 +83,9 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     usual = spacing[(spacing > 0) & ~known[1:]]
     median = float(np.median(usual)) if usual.size else 1.0
     unit, told = _unit_of(column, median, timestep)
-    breaks = tuple((np.flatnonzero(((spacing < 0) | (spacing > GAP * median)) & ~known[1:]) + 1).tolist())
-    within = usual[usual <= GAP * median] / median
+    gap = SHORT_GAP if _leaves_enough(spacing, known, SHORT_GAP * median) else GAP
+    breaks = tuple(_breaks(spacing, known, gap * median).tolist())
+    within = usual[usual <= gap * median] / median
     even = bool((np.abs(within - 1) <= EVEN).all())
     why = [f"time stamps of {column.entry} {told}"]
     if breaks:
@@ -93,6 +95,18 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
         column, unit, float(within.mean()) * median * unit if even else median * unit, even, jitter, episode,
         empty.terminals, breaks, tuple(why),
     )  # fmt: skip
+
+
+def _breaks(spacing: np.ndarray, known: np.ndarray, gap: float) -> np.ndarray:
+    """Rows before which stamps begin anew or leave a gap, where no episode is known to begin."""
+    return np.flatnonzero(((spacing < 0) | (spacing > gap)) & ~known[1:]) + 1
+
+
+def _leaves_enough(spacing: np.ndarray, known: np.ndarray, gap: float) -> bool:
+    """Whether most rows are in long pieces between gaps."""
+    ends = np.union1d(np.flatnonzero(known), _breaks(spacing, known, gap))
+    sizes = np.diff(np.append(ends, len(known)))
+    return bool(sizes[sizes >= PIECE].sum() >= MOST * sizes.sum())
 
 
 def _stamps(column: Column) -> np.ndarray:
