@@ -1,4 +1,4 @@
-"""Effects of actuators: gain, kp, offset, delay, lag, dead band, play, saturation."""
+"""Effects of actuators: gain, kp, offset, delay, lag, activation, dead band, play, saturation."""
 
 from __future__ import annotations
 
@@ -248,6 +248,26 @@ def first_order(signal: torch.Tensor, decay: torch.Tensor, before: torch.Tensor)
         out = torch.cat([out[:, :reach], out[:, reach:] + decay * out[:, :-reach]], 1)
         decay, reach = decay**2, 2 * reach
     return out
+
+
+class ActuatorTimeConstant(ActuatorEffect):
+    """A first-order activation, as a model's own ``dyntype`` has it, with another time constant than the model's."""
+
+    name = "actuator_time_constant"
+    sentence = "the force of actuator {target} builds up with another time constant than in the model"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m, kinds = setting.model, (mujoco.mjtDyn.mjDYN_FILTER, mujoco.mjtDyn.mjDYN_FILTEREXACT)
+        numbers = {t: object_number(m, "actuator", t) for t in super().targets(setting)}
+        return [t for t, i in numbers.items() if int(m.actuator_dyntype[i]) in kinds and m.actuator_dynprm[i, 0] > 0]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        own = float(setting.model.actuator_dynprm[object_number(setting.model, "actuator", target), 0])
+        least = min(own, max(0.1 * own, setting.signals.timestep / setting.frame_skip))  # a shorter one is unstable
+        return (Quantity("time_constant", "s", own, least, 5 * own, 0.5 * own),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.actuator_dynprm[object_number(model, "actuator", target), 0] = values[0]
 
 
 class ActuatorDeadband(ActuatorEffect):
