@@ -814,6 +814,27 @@ def test_targets_are_in_degrees_with_their_angles_if_the_model_says_so(
     assert (found.noise[:2] < 5e-3).all()
 
 
+@pytest.mark.parametrize("ratio", [50, 9])
+def test_angles_of_motors_are_divided_by_their_gears(ratio: int, tmp_path: Path) -> None:
+    """One of 50 is about as many as a radian has degrees; rates that are called rpm are in no other unit."""
+    motors = "".join(f'<motor name="{n}_motor" joint="{n}" gear="{ratio}"/>' for n in ("lift", "bend"))
+    xml = SERVOS[: SERVOS.index("<actuator>")] + f"<actuator>{motors}</actuator></mujoco>"
+    model = mujoco.MjModel.from_xml_string(xml)
+    t, q, v, u = recorded(
+        model, 20, 10, lambda t: [0.9 / ratio * math.sin(7 * t), 0.5 / ratio * math.sin(4.1 * t)], noise=(1e-5, 1e-3)
+    )
+    frame = {"time": t}
+    for i, name in enumerate(("lift", "bend")):
+        frame |= {
+            f"{name}_pos": ratio * q[:, i], f"{name}_rpm": ratio * v[:, i] * 30 / np.pi, f"{name}_motor_torque": u[:, i]
+        }  # fmt: skip
+    found = dropo.propose_config(*written(tmp_path, frame, xml), out=tmp_path / "robot.yaml")
+    scale = found.document["data"]["scale"]
+    assert scale["bend_pos"] == pytest.approx(1 / ratio)
+    assert scale["bend_rpm"] == pytest.approx(1 / ratio)
+    assert any(note.startswith("motor_side") for note in found.draft.notes)
+
+
 def test_text_in_a_few_cells_is_not_measured(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
     """A sensor that reports an error once has a column of numbers; one that mostly does has none."""
     t, q, v, u = log

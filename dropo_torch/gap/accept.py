@@ -11,7 +11,7 @@ from dropo_torch.effects.base import Placed
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, least_beside, refit, resolved
-from dropo_torch.gap.renew import restarted, with_base
+from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import (
     accounts,
     allowance,
@@ -181,11 +181,7 @@ def add(ground: Ground, state: State) -> State:
         return replace(state, done=True)
     best = simplest(singles, rules)
     rivals = [r for r in singles if not significant(r.cost, rules)]
-    if (
-        significant(best.cost, rules)
-        and not accounts(current, state.base, rules)
-        and not _begins_wrong(ground, state, best)
-    ):
+    if significant(best.cost, rules) and not accounts(current, state.base, rules):
         most = best.cost.left_of(current.cost) <= 1 - rules.most
         last = state.number > 0 and accounts(best, state.base, rules)
         best, state = _among_several(ground, state, alive, best, pairs=not (most or last))
@@ -193,12 +189,6 @@ def add(ground: Ground, state: State) -> State:
     if worse or not beats(ground, best, current):
         return replace(state, done=True)
     return replace(state, current=best, rivals=tuple(r.hypothesis for r in rivals if r is not best))
-
-
-def _begins_wrong(ground: Ground, state: State, best: Refit) -> bool:
-    """Return whether what a hypothesis leaves is of where its windows begin: it leaves nothing from better starts."""
-    _, there = restarted(ground, replace(state, current=best))
-    return not significant(there.current.cost, ground.rules)
 
 
 def reconsidered(ground: Ground, state: State) -> State:

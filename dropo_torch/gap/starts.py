@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap.evidence import ODD, SEED, Evidence
+from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.twin import Windows
 
 #: Gauss-Newton steps, at most; shares of a step that are tried; the difference step, in units of the noise.
@@ -21,9 +21,6 @@ STEPS, SHARES, DIFFERENCE = 12, (1.0, 0.5, 0.2), 0.3
 #: A window bends if a linear step leaves more or less than it promises by this factor; a step helps if it gains this
 #: share.
 BENDS, GAINS = 1.05, 0.01
-#: How far a window must stand out beside the median one to be drawn anew; starts that are drawn for it, and from how
-#: many of them it is fitted again.
-FAR, DRAWS, TRIES = 1.5, 32, 2
 
 
 def straightened(evidence: Evidence, variant: Variant) -> Windows | None:
@@ -35,55 +32,17 @@ def straightened(evidence: Evidence, variant: Variant) -> Windows | None:
     """
     if evidence.rough or not evidence.twin.setting.has_impacts:
         return None
-    starts = evidence.windows.begins
-    found = _drawn_anew(evidence, variant, _descended(evidence, variant, starts))
-    return None if np.array_equal(found, starts) else replace(evidence.windows, starts=found)
-
-
-def _descended(evidence: Evidence, variant: Variant, starts: np.ndarray) -> np.ndarray:
-    """Starts with a local minimum of each window's misfit, ``(W, n)``."""
-    active, found = np.arange(len(evidence.windows)), starts.copy()
+    starts, active = evidence.windows.begins.copy(), np.arange(len(evidence.windows))
+    found = starts.copy()
     for number in range(STEPS):
-        part = _begun(evidence, active, found[active])
+        part = evidence.select(active)
+        part = replace(part, windows=replace(part.windows, starts=found[active]))
         moved, better = _step(part, variant, bent=number > 0)
         active = active[better]
         if not active.size:
             break
         found[active] = moved[better]
-    return found
-
-
-def _drawn_anew(evidence: Evidence, variant: Variant, found: np.ndarray) -> np.ndarray:
-    """Starts ``(W, n)``, better ones for the few windows that stand out among the others, if draws come upon them.
-
-    Which foot comes down first, and when, is a matter of the start: a misfit has one minimum for each order of impacts.
-    """
-    every = _begun(evidence, np.arange(len(found)), found)
-    chi2 = _misfit(every, variant)
-    odd = np.flatnonzero(chi2 > FAR * np.median(chi2))
-    if not 0 < odd.size <= ODD * len(chi2):
-        return found
-    part, best, found = every.select(odd), chi2[odd], found.copy()
-    draws = np.random.default_rng(SEED).standard_normal((DRAWS, 1, part.chart.size))
-    drawn = (np.nan_to_num(part.residuals([variant] * DRAWS, draws)[0], nan=np.inf) ** 2).sum(-1)
-    for rank in np.argsort(drawn, axis=0)[:TRIES]:
-        begun = part.chart.move(part.windows.begins, draws[rank, 0] * part.noise)
-        there = _descended(_begun(part, np.arange(len(odd)), begun), variant, begun)
-        left = _misfit(_begun(part, np.arange(len(odd)), there), variant)
-        better = left < (1 - GAINS) * best
-        found[odd[better]], best = there[better], np.minimum(left, best)
-    return found
-
-
-def _begun(evidence: Evidence, rows: np.ndarray, starts: np.ndarray) -> Evidence:
-    """Some windows, which begin elsewhere."""
-    part = evidence.select(rows)
-    return replace(part, windows=replace(part.windows, starts=starts))
-
-
-def _misfit(part: Evidence, variant: Variant) -> np.ndarray:
-    """χ² of each window from where it begins, ``(W,)``; infinite where it diverges."""
-    return np.asarray((np.nan_to_num(part.residuals([variant])[0][0], nan=np.inf) ** 2).sum(-1))
+    return None if np.array_equal(found, starts) else replace(evidence.windows, starts=found)
 
 
 def _step(part: Evidence, variant: Variant, *, bent: bool) -> tuple[np.ndarray, np.ndarray]:

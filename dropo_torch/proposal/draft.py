@@ -25,8 +25,8 @@ from dropo_torch.proposal.places import Place
 WHOLE = 1e-3
 #: Findings of an examination whose cures are taken; others are told.
 CURED = (
-    "degrees", "units", "sign", "order", "wraps", "quaternion_order", "joined", "frame_skip", "delay", "dropouts",
-    "jitter", "next_observations",
+    "degrees", "motor_side", "units", "sign", "order", "wraps", "quaternion_order", "joined", "frame_skip", "delay",
+    "dropouts", "jitter", "next_observations",
 )  # fmt: skip
 #: Examinations at most: each may find what the one before hid.
 ROUNDS = 8
@@ -99,11 +99,11 @@ def make_draft(reading: Reading) -> Draft:
         InputError: a log that cannot be read so.
     """
     document, notes, smooth = _document(reading, derived=False)
-    logged, findings, cured = _cured(document, reading.base)
+    logged, findings, cured = _cured(document, reading)
     if any(f.name == "angular_frame" for f in findings):
         document, notes, smooth = _document(reading, derived=True)
         notes += ["angular velocities are in the world's frame: all velocities are derived"]
-        logged, findings, cured = _cured(document, reading.base)
+        logged, findings, cured = _cured(document, reading)
     return Draft(document, logged, findings, (*notes, *cured), smooth and _as_cured(smooth, document, reading.matching))
 
 
@@ -425,14 +425,19 @@ def _as_read(match: Match, held: Sequence[Place], factor: float) -> Match:
     )  # fmt: skip
 
 
-def _cured(document: dict[str, Any], base: Path) -> tuple[LoggedData, tuple[Finding, ...], list[str]]:
-    """Correct the keys, in place, by what the examination of the log surely finds; return what it finds then."""
+def _cured(document: dict[str, Any], reading: Reading) -> tuple[LoggedData, tuple[Finding, ...], list[str]]:
+    """Correct the keys, in place, by what the examination of the log surely finds; return what it finds then.
+
+    What is named by its unit is in no other one: a position that turns too far beside it is not in degrees.
+    """
+    named = {m.column.entry for m in reading.matching.of("velocity") if m.column.words.scale is not None}
     notes: list[str] = []
     done: set[tuple] = set()
     for _ in range(ROUNDS):
-        logged = read_log(make_config(document, base=base), uneven=True)
+        logged = read_log(make_config(document, base=reading.base), uneven=True)
         findings = logged.examined()
         new = [f for f in findings if f.sure and f.cure and f.name in CURED and (f.name, f.where) not in done]
+        new = [f for f in new if f.name != "degrees" or not named & f.cure["data"]["scale"].keys()]
         if not new:
             break
         for finding in new[:1]:

@@ -214,6 +214,8 @@ def units(record: Record, rules: Rules) -> list[Finding]:
     fits = [c for c in outside if _outside(record, c, DEGREE) < 0.05]
     columns = [i for c in angles for i in (c.position, c.velocity) if i is not None]
     as_is, degrees = skills(record, dict.fromkeys(columns, DEGREE))
+    if (found := _of_motors(record, rules, angles, degrees)) is not None:
+        return [found]
     targets = _targets(record, angles)
     _, both = skills(record, dict.fromkeys(columns, DEGREE), dict.fromkeys(targets, DEGREE)) if targets else (0.0, 0.0)
     if both - degrees > rules.skill:
@@ -236,6 +238,37 @@ def units(record: Record, rules: Rules) -> list[Finding]:
             cure={"data": {"scale": scale}},
         )]  # fmt: skip
     return []
+
+
+def _of_motors(record: Record, rules: Rules, angles: Sequence[Coordinate], degrees: float) -> Finding | None:
+    """Angles that are those of motors before gears, if the model explains more so than as they are, or in degrees.
+
+    A gear of 50 or 60 is as many as a radian has degrees: which of both is nearer decides.
+    """
+    ratios = [(c, _ratio(record, c)) for c in angles]
+    factors = {i: 1 / g for c, g in ratios if g > 1 for i in (c.position, c.velocity) if i is not None}
+    if not factors:
+        return None
+    as_is, divided = skills(record, factors)
+    if divided - as_is <= rules.skill or divided <= degrees:
+        return None
+    gears = ", ".join(f"{g:g} at {c.name}" for c, g in ratios if g > 1)
+    what = f"{record.named(list(factors))} are of the motors, before the gears ({gears})"
+    return Finding(
+        "motor_side", tuple(record.label(i) for i in factors), what, "sure",
+        evidence={"skill": as_is, "skill_divided": divided},
+        cure={"data": {"scale": {record.signal(i): factor for i, factor in factors.items()}}},
+    )  # fmt: skip
+
+
+def _ratio(record: Record, c: Coordinate) -> float:
+    """The gear ratio of the only actuator of a joint; 1 where there is none, or several."""
+    model = record.model
+    if model is None:
+        return 1.0
+    joint, through = int(model.dof_jntid[c.dof]), mujoco.mjtTrn.mjTRN_JOINT
+    own = [i for i in range(model.nu) if model.actuator_trntype[i] == through and model.actuator_trnid[i, 0] == joint]
+    return abs(float(model.actuator_gear[own[0], 0])) if len(own) == 1 else 1.0
 
 
 def _targets(record: Record, angles: Sequence[Coordinate]) -> list[int]:
