@@ -408,6 +408,23 @@ def test_a_step_that_only_named_effects_show_has_no_name() -> None:
     assert accept.is_done(ground, dataclasses.replace(state, current=without))
 
 
+@pytest.mark.parametrize(("name", "named"), [("integration", True), ("actuator_delay", False)])
+def test_a_finer_step_may_leave_something(name: str, named: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It removes most of what is left, a small part of the gap: it is no guess about the robot, and stands."""
+
+    def fitted(reduced: float, *names: str) -> SimpleNamespace:
+        placed = tuple(Placed(find_effect(n), None, (0.0,)) for n in names)
+        cost = Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis((), placed))
+
+    monkeypatch.setattr(accept, "is_of_step", lambda *_: False)
+    monkeypatch.setattr(accept, "step_shows", lambda *_: True)
+    ground, without = SimpleNamespace(rules=Rules()), fitted(20, "joint_friction")
+    assert accept.matters(ground, fitted(300_000), fitted(2.8, "joint_friction", name), without) == named
+    monkeypatch.setattr(accept, "step_shows", lambda *_: False)
+    assert not accept.matters(ground, fitted(300_000), fitted(2.8, "joint_friction", name), without)
+
+
 @pytest.mark.parametrize(("name", "needed"), [("integration", False), ("actuator_delay", True)])
 def test_an_effect_that_is_a_finer_step_needs_no_other_one(
     name: str, needed: bool, monkeypatch: pytest.MonkeyPatch

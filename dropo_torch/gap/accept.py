@@ -61,23 +61,30 @@ def matters(ground: Ground, base: Refit, whole: Refit, without: Refit) -> bool:
     """Return whether an effect removes enough of the first excess, or all that is left where that is a small part.
 
     What the model's own step leaves is no part of what is left, and an effect that removes no more than that is not
-    needed; of a large part, only where no step shows in the model as given: see :func:`step_shows`.
+    needed; of a large part, only where no step shows in the model as given: see :func:`step_shows`. Such a step itself
+    is needed where it removes most of what is left, whatever remains then.
     """
     rules = ground.rules
     if without.cost.excess - whole.cost.excess >= rules.least * base.cost.above(whole.cost):
         return not without.hypothesis.placed or step_shows(ground, base) or not _step_does(ground, whole, without)
     if not significant(without.cost, rules) or whole.cost.left_of(without.cost) > 1 - rules.most:
         return False
-    clear = not significant(whole.cost, rules) or is_of_step(ground, whole)
-    return clear and not _step_does(ground, whole, without)
+    if not significant(whole.cost, rules) or is_of_step(ground, whole):
+        return not _step_does(ground, whole, without)
+    return _adds_step(whole, without) and step_shows(ground, base)
 
 
 def _step_does(ground: Ground, whole: Refit, without: Refit) -> bool:
     """Whether a finer step leaves no more than noise without an effect; one that is such a step says so itself."""
-    own, rest = ({p.key for p in r.hypothesis.placed} for r in (whole, without))
-    if own - rest == {(STEP, None)}:
+    if _adds_step(whole, without):
         return not significant(whole.cost, ground.rules)
     return is_of_step(ground, without)
+
+
+def _adds_step(whole: Refit, without: Refit) -> bool:
+    """Whether a hypothesis differs from one without it by a finer step: no guess about the robot."""
+    own, rest = ({p.key for p in r.hypothesis.placed} for r in (whole, without))
+    return own - rest == {(STEP, None)}
 
 
 def step_shows(ground: Ground, base: Refit) -> bool:
