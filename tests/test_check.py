@@ -185,6 +185,29 @@ def test_a_spike_is_told_with_its_row_unless_the_velocity_shows_it(seen: bool) -
         assert "NaN" in finding.advice
 
 
+@pytest.mark.parametrize(("high", "told"), [(0.6, True), (0.8, True), (2.0, False)])
+def test_a_sensor_whose_range_ends_is_told(high: float, told: bool) -> None:
+    arrays = record(steps=400, noise=1e-4)
+    share = high * np.ptp(arrays["observations"][:, 1]) + arrays["observations"][:, 1].min()
+    for name in ("observations", "next_observations"):
+        arrays[name] = np.array(arrays[name])
+        arrays[name][:, 1] = np.minimum(arrays[name][:, 1], share)
+    found = {f.name for f in arm_findings(Trajectories(**arrays))}
+    assert bool(found & {"clipped", "frozen"}) == told  # frozen where it is so for long
+
+
+@pytest.mark.parametrize("quantum", [0.0, 2e-3])
+def test_what_comes_to_rest_at_the_end_of_its_motion_is_not_clipped(quantum: float) -> None:
+    """A joint that is moved up and down, and rests at both ends, by a sensor with or without noise of its own."""
+    model = mujoco.MjModel.from_xml_string(WAGON.format(spring=""))
+    phase = np.clip(np.abs((np.arange(401) / 60) % 2 - 1) * 1.6 - 0.3, 0, 1)
+    path = 0.5 - 0.5 * np.cos(np.pi * phase)
+    path = np.round(path / quantum) * quantum if quantum else path
+    states = np.stack([path, np.gradient(path, 0.01)], 1)
+    log = Trajectories(states[:-1], states[1:], np.zeros((400, 1)), np.arange(400) == 399)
+    assert "clipped" not in {f.name for f in examine(log, parse_observation(model, None, 2), model, 2)}
+
+
 # --- what only a robot can look like is never sure ---
 
 

@@ -13,7 +13,16 @@ from collections.abc import Callable, Sequence
 import mujoco
 import numpy as np
 
-from dropo_torch.data.examination.columns import commanded_range, quantised, ranges, silent, spikes, stuck, units
+from dropo_torch.data.examination.columns import (
+    clipped,
+    commanded_range,
+    quantised,
+    ranges,
+    silent,
+    spikes,
+    stuck,
+    units,
+)
 from dropo_torch.data.examination.commands import commands
 from dropo_torch.data.examination.continuity import continuous
 from dropo_torch.data.examination.finding import Finding
@@ -29,7 +38,17 @@ __all__ = ["CHECKS", "LATER_CHECKS", "Finding", "Rules", "examine"]
 
 Check = Callable[[Record, Rules], list[Finding]]
 
-CHECKS: tuple[Check, ...] = (stamps, quaternions, stuck, silent, spikes, velocities, quantised, commanded_range)
+CHECKS: tuple[Check, ...] = (
+    stamps,
+    quaternions,
+    stuck,
+    silent,
+    spikes,
+    clipped,
+    velocities,
+    quantised,
+    commanded_range,
+)
 LATER_CHECKS: tuple[Check, ...] = (units, ranges, commands)
 #: Findings by which a log is wrong although nobody knows in which of two ways: what is simulated from it tells nothing.
 UNDECIDED = ("order",)

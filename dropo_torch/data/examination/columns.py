@@ -160,6 +160,43 @@ def _repeated(record: Record, step: float, rules: Rules) -> list[Finding]:
     return found
 
 
+def clipped(record: Record, rules: Rules) -> list[Finding]:
+    """Return positions that stop dead at one end of their values: there the sensor's range ends."""
+    found = {
+        column: np.flatnonzero(rows)
+        for _, column in record.positions
+        if (rows := _clipped(record, column, rules)).any()
+    }
+    if not found:
+        return []
+    said = [f"{record.named([c])} at {record.before[rows[0], c]:.4g} in {len(rows)} rows" for c, rows in found.items()]
+    return [Finding(
+        "clipped", tuple(record.label(column) for column in found),
+        f"a position stops dead at the end of what its sensor shows: {', '.join(said)}", "doubtful",
+        rows=first_rows(np.unique(np.concatenate(list(found.values())))),
+        evidence={record.label(column): float(len(rows)) for column, rows in found.items()},
+        advice="leave these rows out, or set the values to NaN and let data: {pause: SECONDS} end an episode there",
+    )]  # fmt: skip
+
+
+def _clipped(record: Record, column: int, rules: Rules) -> np.ndarray:
+    """Rows in which a column stands at its largest or smallest value, if it comes and goes at speed, ``(T,)`` bool."""
+    values, size = record.before[:, column], np.abs(record.steps[:, column])
+    found = np.zeros(len(values), dtype=bool)
+    if len(size) < LEAST_STEPS or not size.any():
+        return found
+    usual = float(np.median(size[size > 0]))
+    for end in (values.max(), values.min()):
+        rows = np.flatnonzero(values == end)
+        stays = [s for s in np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(s) >= rules.clipped]
+        others = np.delete(size, np.concatenate([s[:-1] for s in stays])) if stays else size
+        edges = [size[i] for s in stays for i in (s[0] - 1, s[-1]) if 0 <= i < len(size)]
+        moves = (others == 0).mean() < rules.hold  # elsewhere; a sensor that counts stands still in between
+        if len(edges) > 1 and moves and np.median(edges) > rules.dead * usual:
+            found[np.concatenate(stays)] = True
+    return found
+
+
 def quantised(record: Record, rules: Rules) -> list[Finding]:
     """Return positions whose resolution is as coarse as their motion."""
     columns, quanta = [], []

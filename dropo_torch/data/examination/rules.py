@@ -43,6 +43,8 @@ class Rules:
         frozen: rows that a column stands still while it is said to move.
         frozen_travel: share of the column's range that it should have moved meanwhile.
         quantum: smallest difference of a column's values in its median steps, from which on it is told.
+        clipped: rows that a column stands at the end of its values, while it moves elsewhere.
+        dead: its last step before and its first one after that, in its median steps: what comes to rest is slower.
         jitter: relative deviation of stamps that is told.
         gap: stamps further apart than so many times the median leave samples out.
         norm: relative deviation of a quaternion's length that is told; rounding and noise stay below.
@@ -83,6 +85,8 @@ class Rules:
     frozen: int = 10
     frozen_travel: float = 0.05
     quantum: float = 0.5
+    clipped: int = 5
+    dead: float = 0.3
     jitter: float = 0.05
     gap: float = 1.75
     norm: float = 0.02
