@@ -28,7 +28,7 @@ from dropo_torch.proposal.columns import read_columns
 from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
 from dropo_torch.proposal.matching import match_columns, motion, unit_name
-from dropo_torch.proposal.places import known_names, places_of
+from dropo_torch.proposal.places import command_kind, known_names, places_of
 from dropo_torch.proposal.words import read_name
 
 DEG = 180 / math.pi
@@ -184,6 +184,35 @@ def test_actual_positions_beside_commands(tmp_path: Path) -> None:
     }  # fmt: skip
     only = {"j1_deg": shown["j1_act_deg"], "j2_deg": shown["j2_act_deg"], "j1_act_deg": sent["j1_cmd_deg"]}
     assert matched(tmp_path, {**only, "j2_act_deg": sent["j2_cmd_deg"]}, arm)["a2"] == "j2_act_deg"
+
+
+@pytest.mark.parametrize(
+    ("prm", "kind"),
+    [
+        ('gainprm="2" biasprm="0 0 -2"', "velocity"),
+        (f'gainprm="{2 * np.pi / 30}" biasprm="0 0 -2"', "velocity"),
+        ('gainprm="0.05" biasprm="0 0 -.35"', "effort"),  # a motor by its voltage, which its back-EMF brakes
+        ('gainprm="9" biasprm="0 -9 -1"', "position"),
+    ],
+)
+def test_what_an_actuator_takes(prm: str, kind: str) -> None:
+    xml = CART.replace('<motor name="pusher"', f'<general name="pusher" biastype="affine" {prm}')
+    assert command_kind(mujoco.MjModel.from_xml_string(xml), 0) == kind
+
+
+def test_tensions_are_what_winches_pull_with(tmp_path: Path) -> None:
+    """No name has a word in common, but there are as many forces as winches."""
+    xml = """<mujoco><worldbody><site name="a" pos="-1 0 1"/><site name="b" pos="1 0 1"/><body>
+      <joint name="px" type="slide" axis="1 0 0"/><joint name="tilt" axis="0 1 0"/><geom size=".1"/>
+      <site name="l" pos="-.1 0 0"/><site name="r" pos=".1 0 0"/></body></worldbody>
+      <tendon><spatial name="c1"><site site="a"/><site site="l"/></spatial><spatial name="c2"><site site="b"/>
+      <site site="r"/></spatial></tendon><actuator><motor name="winch1" tendon="c1" gear="-1"/>
+      <motor name="winch2" tendon="c2" gear="-1"/></actuator></mujoco>"""
+    t = 0.02 * np.arange(200)
+    (x, tilt), (v, rate) = swung(("a", "b")).values(), swung(("a", "b"), rates=True).values()
+    frame = {"time": t, "platform_x": x, "platform_tilt": tilt, "platform_vx": v, "tilt_rate": rate}
+    found = matched(tmp_path, frame | {f"tension_{i}": np.sin((5 + i) * t) for i in (1, 2)}, xml)
+    assert (found["winch1"], found["winch2"]) == ("tension_1", "tension_2")
 
 
 def test_actuators_called_as_poses_are(tmp_path: Path) -> None:

@@ -19,6 +19,9 @@ Kind = Literal["position", "velocity", "command", "marker"]
 #: and slides at once, both.
 Measure = Literal["angle", "length", "quaternion", "both"]
 
+#: Units of speeds, in SI: radians or meters, degrees, turns a minute, millimeters.
+SPEEDS = (1.0, np.pi / 180, np.pi / 30, 1e-3)
+
 
 @dataclass(frozen=True)
 class Place:
@@ -182,11 +185,15 @@ def _driven(model: mujoco.MjModel, actuator: str) -> Measure:
 
 
 def command_kind(model: mujoco.MjModel, a: int) -> Literal["position", "velocity", "effort"]:
-    """Return what an actuator takes as its command."""
+    """Return what an actuator takes as its command.
+
+    A velocity servo's command is a velocity in a usual unit; a motor whose back-EMF brakes it takes an effort.
+    """
     if int(model.actuator_biastype[a]) == mujoco.mjtBias.mjBIAS_AFFINE:
         gain = model.actuator_gainprm[a, 0]
         if model.actuator_biasprm[a, 1] != 0 and np.isclose(model.actuator_biasprm[a, 1], -gain):
             return "position"
-        if model.actuator_biasprm[a, 1] == 0 and model.actuator_biasprm[a, 2] != 0:
+        kv = -model.actuator_biasprm[a, 2]
+        if model.actuator_biasprm[a, 1] == 0 and kv > 0 and np.isclose(gain / kv, SPEEDS).any():
             return "velocity"
     return "effort"

@@ -25,7 +25,7 @@ _ROLES: dict[Role, frozenset[str]] = {
         "dq qd qdot qvel vel velo velocity velocities spd speed speeds omega dot rate v twist gyro angvel linvel"
     ),
     "acceleration": _set("ddq qdd qddot acc accel acceleration qacc"),
-    "effort": _set("tau torque torques effort efforts force forces moment current curr load frc"),
+    "effort": _set("tau torque torques effort efforts force forces tension tensions moment current curr load frc"),
     "command": _set(
         "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
         "target targets des desired ref reference setpoint setp goal sp pwm"
