@@ -27,7 +27,9 @@ from dropo_torch.proposal.clock import find_clock
 from dropo_torch.proposal.columns import read_columns
 from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
-from dropo_torch.proposal.matching import match_columns, motion, unit_name
+from dropo_torch.proposal.matches import unit_name
+from dropo_torch.proposal.matching import match_columns
+from dropo_torch.proposal.motions import motion
 from dropo_torch.proposal.places import command_kind, known_names, places_of
 from dropo_torch.proposal.words import read_name
 

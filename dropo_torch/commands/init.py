@@ -119,7 +119,7 @@ class Questions:
 
     def columns(self, columns: Columns, matching: Matching, places: Sequence[Place]) -> Matching:
         """Ask for the column, and the factor of its unit, of any number of the model."""
-        from dropo_torch.proposal.matching import Match
+        from dropo_torch.proposal.matches import Match
 
         while True:
             self._console.print(columns_table(matching))

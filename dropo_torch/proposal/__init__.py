@@ -2,7 +2,7 @@
 
 from dropo_torch.proposal.choice import Choice, Group, Told
 from dropo_torch.proposal.clock import Clock
-from dropo_torch.proposal.matching import Match, Matching
+from dropo_torch.proposal.matches import Match, Matching
 from dropo_torch.proposal.propose import Proposal, Review, propose_config
 
 __all__ = ["Choice", "Clock", "Group", "Match", "Matching", "Proposal", "Review", "Told", "propose_config"]

@@ -18,7 +18,7 @@ from dropo_torch.data.ticks import find_ticks
 from dropo_torch.logged import LoggedData, read_log
 from dropo_torch.proposal.clock import GAP, Clock
 from dropo_torch.proposal.columns import Columns
-from dropo_torch.proposal.matching import Match, Matching
+from dropo_torch.proposal.matches import Match, Matching
 from dropo_torch.proposal.places import Place
 
 #: Relative deviation up to which rows are a whole number of the model's steps apart.

@@ -16,7 +16,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.models.export import read_spec
 from dropo_torch.proposal.clock import Clock
 from dropo_torch.proposal.columns import Column, Columns
-from dropo_torch.proposal.matching import LENGTHS, Match, Matching
+from dropo_torch.proposal.matches import LENGTHS, Match, Matching
 from dropo_torch.proposal.places import Place
 from dropo_torch.proposal.words import object_words
 from dropo_torch.shooting.posing import posed_log

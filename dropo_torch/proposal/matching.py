@@ -5,17 +5,18 @@ from __future__ import annotations
 import difflib
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import replace
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns, last_part
+from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns
+from dropo_torch.proposal.drives import is_state, may_command, namesakes, numbered_drives
+from dropo_torch.proposal.matches import Match, Matching, Sureness, is_taken, orientation
+from dropo_torch.proposal.motions import LIKE, SAME, SPANS, motion, turning
 from dropo_torch.proposal.places import Place
-from dropo_torch.proposal.words import Words, called, split, unit_role
-
-Sureness = Literal["sure", "likely", "guess"]
+from dropo_torch.proposal.units import with_unit
+from dropo_torch.proposal.words import Words
 
 #: Score below which a column is not taken for a place, and above which its name leaves no doubt.
 LEAST, SURE = 0.3, 0.75
@@ -24,94 +25,11 @@ LEAST, SURE = 0.3, 0.75
 FOREIGN, STILL = 0.02, 0.02
 #: What a name is worth that is all of what a place is known as besides.
 ALIAS = 0.8
-#: Shares of motion that a velocity must explain to be its position's, and to be so whatever it is called.
-LIKE, SAME = 0.5, 0.9
 #: Share of motion below which a position speaks against a velocity, where it moves by so many times its noise.
 UNLIKE, SEEN = 0.1, 6.0
-#: Factors between a sensor's unit and the model's; the second kind are those of lengths.
-ANGLES = {1.0: "rad", math.pi / 180: "degrees", math.pi / 30: "rpm"}
-LENGTHS = {1.0: "m", 1e-3: "mm", 1e-2: "cm"}
-#: Rows over which motion is compared with velocities: noise of positions drowns it over one.
-SPANS = (1, 4, 16)
-#: Relative distance from a factor within which a unit is named.
-UNIT = 0.3
 _AXES = ("x", "y", "z")
 #: What the body is called by which all of a robot moves, whatever its name in the model.
 BASE = frozenset(("base", "root", "floating", "torso", "trunk", "pelvis", "chassis"))
-#: What columns of commands are called after where they say nothing else.
-DRIVES = frozenset(
-    (
-        *("motor", "motors", "servo", "servos", "actuator", "actuators", "drive", "drives", "rotor", "rotors", "prop"),
-        *("props", "propeller", "propellers", "thruster", "thrusters", "thrust", "esc", "muscle", "muscles"),
-    )
-)
-#: What LeRobot calls a gripper's position, which it has in hundredths of the range, and by how many these may pass it.
-GRIPPER, OF_RANGE, PAST = "gripper.pos", "% of the joint's range", 5.0
-
-
-@dataclass(frozen=True)
-class Match:
-    """A column that is a number of the model.
-
-    Attributes:
-        place: the number.
-        column: the column.
-        scale: by which its values are multiplied.
-        sureness: how sure that is.
-        why: by what it was found, in words.
-        offset: what is then added.
-        told_in: the unit of the values, where it is none of the usual.
-    """
-
-    place: Place
-    column: Column
-    scale: float
-    sureness: Sureness
-    why: str
-    offset: float = 0.0
-    told_in: str = ""
-
-    @property
-    def values(self) -> np.ndarray:
-        """The values in the model's unit, ``(N,)``."""
-        return self.scale * self.column.values + self.offset
-
-    @property
-    def entry(self) -> str | dict[str, Any]:
-        """The entry of a column map, which makes them so."""
-        return self.column.as_map(self.scale, self.offset)
-
-    @property
-    def unit(self) -> str:
-        """The unit of the column's values, for people."""
-        return self.told_in or unit_name(self.scale, self.place)
-
-
-@dataclass(frozen=True)
-class Matching:
-    """The columns that were found, and the places that have none.
-
-    Attributes:
-        matches: what was matched, in the model's order: positions, velocities, commands.
-        missing: places without a column.
-        unused: columns of numbers that move and are none of the model's.
-    """
-
-    matches: tuple[Match, ...]
-    missing: tuple[Place, ...]
-    unused: tuple[Column, ...]
-
-    def of(self, kind: str) -> tuple[Match, ...]:
-        """Return the matches of a kind, in the model's order."""
-        return tuple(m for m in self.matches if m.place.kind == kind)
-
-    def at(self, label: str) -> Match | None:
-        """Return the match of a place, or ``None``."""
-        return next((m for m in self.matches if m.place.label == label), None)
-
-    def lacks(self, kind: str) -> tuple[Place, ...]:
-        """Return the places of a kind that have no column."""
-        return tuple(p for p in self.missing if p.kind == kind)
 
 
 def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray, taken: Sequence[Column]) -> Matching:
@@ -128,7 +46,7 @@ def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray,
     free = [c for c in columns.numeric if c not in taken and not any(m.column is c for m in whole)]
     free = [c for c in free if not _counts(c, starts)]
     known = {m.place.label: m for m in whole}
-    own = {m.place.label: m for m in _namesakes(places, [c for c in free if _may_be(c, "command")], known)}
+    own = {m.place.label: m for m in namesakes(places, [c for c in free if _may_be(c, "command")], known)}
     found = _found(places, free, known | own, starts)
     driven = {m.place.partner for m in own.values()} & {p.label for p in places if not p.optional}
     if driven and not driven & found.keys():  # what is called after drives may be all that is measured of their joints
@@ -147,25 +65,21 @@ def _found(
     found = dict(known)
     for kind in ("position", "velocity", "command"):
         wanted = [p for p in places if p.kind == kind and p.label not in found]
-        fits = _assigned(wanted, [c for c in free if not _is_taken(c, found)], found, starts)
+        fits = _assigned(wanted, [c for c in free if not is_taken(c, found)], found, starts)
         found |= {m.place.label: m for m in fits}
         if kind == "command":
-            found |= {m.place.label: m for m in _namesakes(places, free, found)}
+            found |= {m.place.label: m for m in namesakes(places, free, found)}
         ordered = _by_family(places, kind, free, found)
         found |= {m.place.label: m for m in ordered if not _refuted(m.place, m.column, found, starts)}
     found |= {m.place.label: m for m in _in_order(places, free, found)}
     found |= {m.place.label: m for m in _gyroscope(places, free, found, starts)}
-    found |= {m.place.label: m for m in _numbered_drives(places, free, found)}
+    found |= {m.place.label: m for m in numbered_drives(places, free, found)}
     return found
 
 
 def _counts(column: Column, starts: np.ndarray) -> bool:
     """Whether a column numbers the rows, of the log or of each episode."""
     return len(starts) > 1 and bool((np.diff(column.values)[~starts[1:]] == 1).all())
-
-
-def _is_taken(column: Column, found: dict[str, Match]) -> bool:
-    return any(m.column is column for m in found.values())
 
 
 # --- arrays of a whole robot ---
@@ -309,7 +223,7 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
         rank: of the column among those that differ by their number, where there is one for each place.
         own: the place's.
     """
-    if place.kind == "command" and not _commands(words, place):
+    if place.kind == "command" and not may_command(words, place):
         return -2.0
     known, others = set(place.words), set(place.words) | set(place.aliases)
     said = set(words.objects) - (BASE if place.is_base else set())
@@ -358,15 +272,6 @@ def _likeness_of_words(said: set[str], known: set[str], aliases: set[str], axis:
     if axis and not said and axis in known | aliases | {w[-1] for w in known if len(w) > 2 and w[:-1] == "root"}:
         return 0.7
     return 0.0
-
-
-def _commands(words: Words, place: Place) -> bool:
-    """Whether a column may be what an actuator takes."""
-    if words.role == "effort":
-        return place.takes == "effort"
-    if words.role != "command":
-        return False
-    return words.commanded in ("", place.takes)
 
 
 def _with_axes(columns: Sequence[Column], wanted: Sequence[Place]) -> list[Words]:
@@ -444,7 +349,7 @@ def _ordered(wanted: Sequence[Place], family: Sequence[Column], found: dict[str,
     """
     known = [found.get(p.label) for p in wanted]
     lacking = [i for i, match in enumerate(known) if match is None]
-    left = [c for c in family if not _is_taken(c, found)]
+    left = [c for c in family if not is_taken(c, found)]
     if len(left) != len(lacking):
         return []
     if all(match is None or match.column is c for match, c in zip(known, family, strict=True)):
@@ -460,8 +365,8 @@ def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Colu
     groups: dict[tuple, list[Column]] = {}
     for c in (c for c in free if wanted and _may_be(c, wanted[0].kind)):
         w = c.words
-        is_bare = not w.role and not _is_state(c)
-        is_other = wanted[0].kind == "command" and not _commands(w, wanted[0])
+        is_bare = not w.role and not is_state(c)
+        is_other = wanted[0].kind == "command" and not may_command(w, wanted[0])
         if not (is_bare or is_other or w.axis or w.quaternion):
             groups.setdefault((c.array if c.index is not None else "", w.role, w.commanded, w.scale), []).append(c)
     return list(groups.values())
@@ -470,85 +375,10 @@ def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Colu
 def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
     """Places that nothing told apart, in the order of as many columns without a name."""
     wanted = [p for p in places if p.label not in found and p.kind == "position" and not p.optional]
-    nameless = [c for c in free if not _is_taken(c, found) and c.words.role in ("", "position") and c.moves]
+    nameless = [c for c in free if not is_taken(c, found) and c.words.role in ("", "position") and c.moves]
     if not wanted or len(wanted) != len(nameless):
         return []
     return [Match(p, c, 1.0, "guess", "the order of columns") for p, c in zip(wanted, nameless, strict=True)]
-
-
-def _namesakes(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
-    """Commands of actuators after which a column is called, and no joint is whose position is yet to be found.
-
-    Of several columns of a name, the one that is called a command is it.
-    """
-    joints = {p.label.rpartition(".")[0] for p in places if p.kind == "position" and p.label not in found}
-    wanted = [p for p in places if p.kind == "command"]
-    named: dict[str, Column] = {}
-    left = [c for c in free if not _is_state(c) and not _is_taken(c, found)]
-    for c in sorted(left, key=lambda c: c.words.role != "command"):
-        place = _namesake(c, wanted)
-        if place is not None and place.label not in joints:
-            named.setdefault(place.label, c)
-    return [
-        Match(p, named[p.label], 1.0, "sure", "the actuator's name")
-        for p in wanted if p.label in named and p.label not in found
-    ]  # fmt: skip
-
-
-def _namesake(column: Column, commands: Sequence[Place]) -> Place | None:
-    """The command of the actuator after which a column is called, in a unit of what it takes; ``None`` for none."""
-    name = column.label or column.entry
-    if (same := next((p for p in commands if p.label == name), None)) is not None:
-        return same
-    for said in called(name, column.words):
-        known = [p for p in commands if tuple(split(p.label)) == said]
-        if len(known) == 1:
-            return known[0] if list(said) == split(name) or _suits(column, known[0]) else None
-    return None
-
-
-def _suits(column: Column, place: Place) -> bool:
-    """Whether neither the unit of a column nor what it is a command of is another than an actuator takes."""
-    is_other = column.words.role == "command" and not _commands(column.words, place)
-    return not is_other and unit_role(column.label or column.entry) in ("", place.takes)
-
-
-def _is_state(column: Column) -> bool:
-    """Whether a column has a name in an array of what is measured."""
-    return bool(column.label) and last_part(column.array) in STATES
-
-
-def left_over(matching: Matching) -> list[Column]:
-    """Return unused columns that may be commands, in whose names there is that of an actuator that has none."""
-    positions = [p for p in (*matching.missing, *(m.place for m in matching.matches)) if p.kind == "position"]
-    joints = {p.label.rpartition(".")[0] for p in positions}
-    absent = [p for p in matching.lacks("command") if p.label not in joints]
-    free = [c for c in matching.unused if c.words.role in ("", "command") and not _is_state(c)]
-    return [c for c in free if any(_mentions(c, p) and _suits(c, p) for p in absent)]
-
-
-def _mentions(column: Column, place: Place) -> bool:
-    """Whether an actuator's name is part of a column's."""
-    every, own = split(column.label or column.entry), split(place.label)
-    return bool(own) and any(every[i : i + len(own)] == own for i in range(len(every) - len(own) + 1))
-
-
-def _numbered_drives(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
-    """Commands of actuators of which none has a column, by columns of drives that differ by their number only."""
-    wanted = [p for p in places if p.kind == "command"]
-    known = DRIVES | {word for p in wanted for word in p.words}
-    if not wanted or any(p.label in found or p.takes == "position" for p in wanted):
-        return []
-    groups: dict[tuple, dict[int, Column]] = {}
-    for c in (c for c in free if not _is_taken(c, found) and len(c.words.numbers) == 1):
-        own = {word for word in split(c.label or c.entry) if not word.isdigit()}
-        if c.words.role == "" and not c.words.axis and own <= known:
-            groups.setdefault(tuple(sorted(own)), {}).setdefault(c.words.numbers[0], c)
-    whole = [group for group in groups.values() if len(group) == len(wanted) > 1]
-    if len(whole) != 1:
-        return []
-    why = "the order of its number, one for each actuator"
-    return [Match(p, whole[0][n], 1.0, "likely", why) for p, n in zip(wanted, sorted(whole[0]), strict=True)]
 
 
 def _gyroscope(
@@ -558,10 +388,10 @@ def _gyroscope(
     wanted = [p for p in places if p.kind == "velocity" and p.angular and p.label not in found]
     for joint in {p.joint for p in wanted}:
         own = [p for p in wanted if p.joint == joint]
-        quaternion = _quaternion(joint, places, found)
+        quaternion = orientation(joint, places, found)
         groups: dict[tuple, dict[str, Column]] = {}
         for c in free:
-            if c.words.angular and c.words.role == "velocity" and c.words.axis and not _is_taken(c, found):
+            if c.words.angular and c.words.role == "velocity" and c.words.axis and not is_taken(c, found):
                 groups.setdefault((c.words.objects, c.words.numbers), {}).setdefault(c.words.axis, c)
         for group in groups.values():
             if len(own) == len(group) == 3 and quaternion is not None:
@@ -572,179 +402,4 @@ def _gyroscope(
     return []
 
 
-def _quaternion(joint: int, places: Sequence[Place], found: Mapping[str, Match]) -> np.ndarray | None:
-    """The orientation of a free body as columns show it, ``(N, 4)``; ``None`` without them."""
-    parts = [found.get(p.label) for p in places if p.joint == joint and p.measure == "quaternion"]
-    return np.stack([m.values for m in parts if m], axis=1) if len(parts) == 4 and all(parts) else None
-
-
 # --- motion and units ---
-
-
-def turning(quaternion: np.ndarray, rates: np.ndarray, starts: np.ndarray) -> tuple[float, float]:
-    """Do what :func:`motion` does, of orientations ``(N, 4)`` and angular velocities in the body's frame, ``(N, 3)``.
-
-    Return which share of the turns over some rows the velocities explain, and their factor.
-    """
-    best = (0.0, math.nan)
-    total = np.concatenate([np.zeros((1, 3)), np.cumsum(0.5 * (rates[1:] + rates[:-1]), axis=0)])
-    runs = np.cumsum(starts)
-    for span in SPANS:
-        if len(quaternion) < 4 * span + 8:
-            continue
-        start, end, told = quaternion[:-span], quaternion[span:], total[span:] - total[:-span]
-        w = np.sum(start * end, axis=1)
-        turned = start[:, :1] * end[:, 1:] - end[:, :1] * start[:, 1:] - np.cross(start[:, 1:], end[:, 1:])
-        turned *= 2 * np.where(w < 0, -1.0, 1.0)[:, None]
-        good = (runs[span:] == runs[:-span]) & np.isfinite(turned).all(1) & np.isfinite(told).all(1)
-        turned, told = turned[good].ravel(), told[good].ravel()
-        size = float(told @ told)
-        if size > 0 and (all_of := float(turned @ turned)) > 0:
-            slope = float(turned @ told) / size
-            share = 1 - float(((turned - slope * told) ** 2).sum()) / all_of
-            best = max(best, (share, slope), key=lambda x: x[0])
-    return best
-
-
-def motion(position: np.ndarray, velocity: np.ndarray, starts: np.ndarray) -> tuple[float, float]:
-    """Return which share of a position's changes a velocity explains, and its factor: seconds a row times its unit."""
-    best = (0.0, math.nan)
-    total = np.concatenate([[0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]))])
-    runs = np.cumsum(starts)
-    for span in SPANS:
-        if len(position) < 4 * span + 8:
-            continue
-        with np.errstate(all="ignore"):
-            change, told = position[span:] - position[:-span], total[span:] - total[:-span]
-            good = (runs[span:] == runs[:-span]) & np.isfinite(change) & np.isfinite(told)
-            change, told = change[good], told[good]
-            if len(change) < 8 or not told.any() or not change.any():
-                continue
-            kept = np.abs(change) <= np.quantile(np.abs(change), 0.995)  # without turns and joints of episodes
-            change, told = change[kept], told[kept]
-            size = float(told @ told)
-            if size == 0 or not change.any():
-                continue
-            slope = float(change @ told) / size
-            share = 1 - float(((change - slope * told) ** 2).sum()) / float(change @ change)
-        if share > best[0]:
-            best = (share, slope)
-    return best
-
-
-def with_unit(match: Match, found: dict[str, Match]) -> Match:
-    """Return a match with its unit, by its name, by its joint's range, or by the joint's own unit for a target."""
-    place, column = match.place, match.column
-    if place.measure == "quaternion":
-        return match
-    named = column.words.scale
-    if place.kind == "command" and place.takes != "position":
-        return match if named in (None, 1.0) or (place.takes == "effort" and named != 1e-3) else _scaled(match, named)
-    if named is not None:
-        return _scaled(match, named)
-    if (limits := _calibrated(match, found)) is not None:
-        return replace(match, scale=(limits[1] - limits[0]) / 100, offset=limits[0], told_in=OF_RANGE)
-    if place.kind == "position":
-        return _scaled(match, _by_range(place, column.values))
-    if place.kind == "command":
-        partner = found.get(place.partner)
-        if partner is not None:
-            own = with_unit(partner, found).scale
-            return _scaled(match, own if _alike(column.values, partner.column.values) else 1.0)
-    return match
-
-
-def _calibrated(match: Match, found: dict[str, Match]) -> tuple[float, float] | None:
-    """The range of which a gripper's position, or its target, is told in hundredths; ``None`` where it is not."""
-    place, values = match.place, match.column.values
-    of = found[place.partner].place if place.kind == "command" and place.partner in found else place
-    inside = np.isfinite(values) & (values > -PAST) & (values < 100 + PAST)
-    name = match.column.entry.rstrip("]").rpartition("[")[2]
-    return of.limits if place.kind != "velocity" and name.endswith(GRIPPER) and inside.mean() > 0.99 else None
-
-
-def _scaled(match: Match, scale: float | None) -> Match:
-    return match if scale is None else replace(match, scale=scale)
-
-
-def _alike(command: np.ndarray, position: np.ndarray) -> bool:
-    """Whether a target has the size of what was measured."""
-    sizes = [float(np.nanquantile(np.abs(x), 0.95)) for x in (command, position)]
-    return sizes[1] > 0 and 1 / 6 < sizes[0] / sizes[1] < 6
-
-
-def _by_range(place: Place, values: np.ndarray) -> float:
-    """The unit in which a position lies within its joint's range; 1 where nothing speaks for another."""
-    if place.limits is None:
-        return 1.0
-    low, high = place.limits
-    margin = 0.2 * (high - low)
-    finite = values[np.isfinite(values)]
-
-    def inside(scale: float) -> float:
-        return float(((scale * finite >= low - margin) & (scale * finite <= high + margin)).mean())
-
-    others = [s for s in (ANGLES if place.measure == "angle" else LENGTHS) if s != 1.0 and s != math.pi / 30]
-    if inside(1.0) > 0.8:
-        return 1.0
-    return next((s for s in others if inside(s) > 0.95), 1.0)
-
-
-def with_velocity_units(matching: Matching, starts: np.ndarray, dt: float) -> Matching:
-    """Return a matching in which velocities have the unit in which they are their positions' derivatives."""
-    found = []
-    for m in matching.matches:
-        if m.place.angular and m.column.words.scale is None and (unit := _unit_of_turns(matching, m, starts, dt)):
-            m = replace(m, scale=unit)
-        partner = matching.at(m.place.partner) if m.place.kind == "velocity" else None
-        if partner is not None and m.column.words.scale is None:
-            share, slope = motion(partner.values, m.column.values, starts)
-            if share > LIKE and (unit := nearest_unit(slope / dt, m.place)) is not None:
-                m = replace(m, scale=unit)
-        found.append(m)
-    return replace(matching, matches=tuple(found))
-
-
-def _unit_of_turns(matching: Matching, match: Match, starts: np.ndarray, dt: float) -> float | None:
-    """The unit of a free body's angular velocity, in which it is the derivative of the orientation."""
-    found = {m.place.label: m for m in matching.matches}
-    places = [m.place for m in matching.matches]
-    quaternion = _quaternion(match.place.joint, places, found)
-    rates = [m.column.values for m in matching.matches if m.place.joint == match.place.joint and m.place.angular]
-    if quaternion is None or len(rates) != 3:
-        return None
-    share, slope = turning(quaternion, np.stack(rates, axis=1), starts)
-    unit = nearest_unit(slope / dt, match.place) if share > LIKE else None
-    return unit if unit is not None and unit > 0 else None
-
-
-def nearest_unit(factor: float, place: Place) -> float | None:
-    """Return the unit's factor nearest to one that was measured, with its sign; ``None`` where none is near."""
-    known = ANGLES if place.measure == "angle" else LENGTHS
-    size = abs(factor)
-    near = min(known, key=lambda s: abs(math.log(max(size, 1e-300) / s)))
-    return math.copysign(near, factor) if abs(size / near - 1) < UNIT else None
-
-
-def rows_apart(matching: Matching, starts: np.ndarray) -> list[float]:
-    """Return the seconds between rows that each velocity makes of its position's changes, in the model's units."""
-    found = []
-    for m in matching.of("velocity"):
-        partner = matching.at(m.place.partner)
-        if partner is not None:
-            share, slope = motion(partner.values, m.values, starts)
-            if share > LIKE:
-                found.append(abs(slope))
-    return found
-
-
-def unit_name(scale: float, place: Place) -> str:
-    """Return the unit of a column's values, for people."""
-    known = ANGLES if place.measure == "angle" else LENGTHS
-    if place.measure == "quaternion":
-        return "–"
-    if place.kind == "command" and place.takes == "effort":
-        return {"angle": "N·m", "length": "N"}.get(place.measure, "SI") if scale == 1.0 else f"{scale:g} × SI"
-    near = next((name for factor, name in known.items() if math.isclose(abs(scale), factor)), f"{abs(scale):g} × SI")
-    per = "/s" if (place.kind == "velocity" or (place.takes == "velocity" and place.kind == "command")) else ""
-    return near + ("" if near == "rpm" else per) + (", reversed" if scale < 0 else "")

@@ -24,18 +24,14 @@ from dropo_torch.proposal.clock import FASTEST, SLOWEST, Clock, find_clock
 from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
 from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
+from dropo_torch.proposal.drives import left_over
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
-from dropo_torch.proposal.matching import (
-    Matching,
-    left_over,
-    match_columns,
-    nearest_unit,
-    rows_apart,
-    with_velocity_units,
-)
+from dropo_torch.proposal.matches import Matching
+from dropo_torch.proposal.matching import match_columns
 from dropo_torch.proposal.places import Place, known_names, places_of
 from dropo_torch.proposal.text import config_text
+from dropo_torch.proposal.units import nearest_unit, rows_apart, with_velocity_units
 from dropo_torch.shooting.posing import column_noise, posed
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
 from dropo_torch.support.report import Report

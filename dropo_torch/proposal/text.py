@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import yaml
 
 from dropo_torch.proposal.choice import Told
-from dropo_torch.proposal.matching import Match
+from dropo_torch.proposal.matches import Match
 
 if TYPE_CHECKING:
     from dropo_torch.proposal.propose import Proposal

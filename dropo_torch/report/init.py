@@ -9,7 +9,7 @@ import numpy as np
 
 from dropo_torch.proposal import Proposal, Told
 from dropo_torch.proposal.choice import TOLD
-from dropo_torch.proposal.matching import Match
+from dropo_torch.proposal.matches import Match
 from dropo_torch.report.figures import init as figures
 from dropo_torch.report.formatting import joined, plain, score
 from dropo_torch.report.page import Frame, write_page
