@@ -85,7 +85,7 @@ def _mentions(column: Column, place: Place) -> bool:
 
 
 def numbered_drives(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
-    """Return commands of actuators of which none has a column, by columns of drives that differ by their number only."""
+    """Return commands of actuators, none of which has a column, by columns of drives that differ by their number."""
     wanted = [p for p in places if p.kind == "command"]
     known = DRIVES | {word for p in wanted for word in p.words}
     if not wanted or any(p.label in found or p.takes == "position" for p in wanted):
