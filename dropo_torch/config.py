@@ -148,6 +148,12 @@ class Config(pydantic.BaseModel):
         return measured is None or (len(measured) == 0 and bool(options.get("derive")))
 
     @property
+    def keeps_noise(self) -> bool:
+        """Whether positions stay as they were measured, and only velocities are derived through a filter."""
+        options = self.data.get("preprocess") if isinstance(self.data, dict) else None
+        return isinstance(options, dict) and bool(options.get("derive"))
+
+    @property
     def moves_centres(self) -> bool:
         """Whether bodies' centers of mass or their axes may move: by effects, or as parameters."""
         from dropo_torch.models.load import CENTERS  # imports MuJoCo

@@ -1265,6 +1265,17 @@ def test_a_native_effect_survives_mjcf(effect: Effect, target: str | None, tmp_p
     np.testing.assert_allclose(*paths, rtol=0, atol=2e-5 * max(1.0, np.abs(paths[0]).max()))
 
 
+def test_an_activations_time_constant_is_written(tmp_path: Path) -> None:
+    source = tmp_path / "rig.xml"
+    source.write_text(MODELS["actuator_time_constant"])
+    assert (
+        write_model(source, [Placed(find_effect("actuator_time_constant"), "push", (0.12,))], tmp_path / "model.xml")
+        == []
+    )
+    written = mujoco.MjModel.from_xml_path(str(tmp_path / "model.xml"))
+    assert written.actuator("push").dynprm[0] == pytest.approx(0.12)
+
+
 def test_a_found_config_fits(tmp_path: Path) -> None:
     """The model and config that name a delay and a friction lead a fit to both."""
     base = record_arm(tmp_path, delay=3, friction=0.15)

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 import dropo_torch as dropo
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap import Hypothesis, find_gap, prepare, renew
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import FEWER, Ground, State
+from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.scene import _cut
 from dropo_torch.gap.search import NOTHING
+from dropo_torch.gap.smooth import WIDTHS, begun_smoothly, half_widths
 from dropo_torch.gap.starts import begun, merged, straightened, table_of
 from dropo_torch.gap.twin import Windows
 
@@ -131,3 +134,39 @@ def test_noise_beside_impacts_is_no_gap_and_hides_none(
     assert gap.reduced[1] < 1.2
     for effect in gap.effects:
         assert effect.parameters["damping"].value == pytest.approx(damping - 0.01, rel=0.1)
+
+
+def of_path(path: np.ndarray, episodes: int) -> tuple[np.ndarray, ...]:
+    """Transitions along a path ``(T + 1, n)`` without commands, in so many episodes."""
+    rows = len(path) - 1
+    before, after = np.tile(path[:-1], (episodes, 1)), np.tile(path[1:], (episodes, 1))
+    return before, after, np.zeros((len(before), 0)), np.arange(1, len(before) + 1) % rows == 0
+
+
+@pytest.mark.parametrize("impacts", [False, True])
+def test_starts_are_smoothed_as_far_as_the_log_follows_a_cubic(impacts: bool) -> None:
+    """Noise becomes a half or less; where a path has corners, the row alone says where it was."""
+    rng, t = np.random.default_rng(0), np.arange(400) / 100
+    true = np.stack([np.sin(3 * t), np.abs(np.sin(12 * t)) if impacts else np.cos(2 * t)], 1)
+    path = np.concatenate([true, np.zeros((400, 2))], 1) + 1e-3 * rng.standard_normal((400, 4))
+    model = mujoco.MjModel.from_xml_string(BALL)
+    observation, log = parse_observation(model, None, 4), dropo.Trajectories(*of_path(path, 3))
+    widths = half_widths(log, observation, [0, 1])
+    assert widths[0] == (WIDTHS[-1], pytest.approx(1e-3, rel=0.2))
+    windows = cut_windows(log, observation, 10)
+    smooth = begun_smoothly(windows, log, observation, widths)
+    off = smooth.begins - np.concatenate([true, np.zeros((400, 2))], 1)[windows.steps]
+    assert np.std(off[:, 0]) < 0.6e-3
+    assert np.std(off[:, 1]) < (0.9e-3 if impacts else 0.6e-3)
+    assert (smooth.begins[:, 2:] == windows.begins[:, 2:]).all()
+    assert begun_smoothly(windows, log, observation, {}) is windows
+
+
+def test_starts_that_are_found_stand_beside_smooth_ones(bouncing: Evidence) -> None:
+    windows = dataclasses.replace(bouncing.windows, smooth=bouncing.windows.measured[:, 0] + 0.01)
+    assert (windows.begins == windows.smooth).all()
+    found = dataclasses.replace(windows, starts=windows.begins + np.eye(len(windows), 4)[:, :1])
+    table = table_of(found)
+    assert len(table) == 1
+    assert (begun(windows, table) == found.starts).all()
+    assert (windows.select(np.array([2])).begins == windows.smooth[2]).all()

@@ -65,6 +65,7 @@ class Signals:
         angular_speed: root mean square angular velocity of each body, ``(nbody,)``.
         contacts: geoms that touch something somewhere in the log, ``(ngeom,)`` bool.
         ripples: angular frequencies over the position at which a joint lacks a force, by its position coordinate.
+        smoothed: rows on each side by which a column is smoothed where windows begin, and its noise, by its number.
     """
 
     timestep: float
@@ -78,6 +79,7 @@ class Signals:
     angular_speed: np.ndarray
     contacts: np.ndarray
     ripples: Mapping[int, tuple[float, ...]] = field(default_factory=dict)
+    smoothed: Mapping[int, tuple[int, float]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -29,6 +29,7 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.ripple import ripples
 from dropo_torch.gap.rules import Rules
 from dropo_torch.gap.screen import all_candidates
+from dropo_torch.gap.smooth import begun_smoothly, half_widths
 from dropo_torch.gap.twin import Twin, Windows
 from dropo_torch.gap.verify import hold_out
 from dropo_torch.problem import Problem
@@ -115,7 +116,8 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
         raise InputError(f"data: nothing moves in {train.source}: no observed column ever changes")
     begin, plain = Hypothesis(tuple(start_values(problem).tolist())), make_setting(problem, train)
     waves = ripples(_twin(problem, plain), train, begin.variant)
-    setting = replace(plain, signals=replace(plain.signals, ripples=waves))
+    smoothed = half_widths(train, plain.observation, _noisy_starts(problem, plain))
+    setting = replace(plain, signals=replace(plain.signals, ripples=waves, smoothed=smoothed))
     twin = _twin(problem, setting)
     given, since = problem.objective.noise, first_steps(twin, train, begin)
     if given is None:
@@ -127,6 +129,17 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     whole = Evidence(twin, shortest, noise, begin.variant, rough=True, rules=rules)
     evidence = _choose_windows(whole, train, begin, since)
     return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
+
+
+def _noisy_starts(problem: Problem, setting: Setting) -> list[int]:
+    """Columns of joints whose velocities are masked, where contacts or stops bend what begins at single rows."""
+    if not (problem.config.keeps_noise and setting.has_impacts):
+        return []
+    model, index = setting.model, np.asarray(setting.observation.index)
+    joints = {int(model.dof_jntid[index[c] - model.nq]) for c in setting.masked if index[c] >= model.nq}
+    ends = np.append(model.jnt_qposadr, model.nq)
+    positions = [(c, place) for c, place in enumerate(index) if 0 <= place < model.nq]
+    return [c for c, place in positions if np.searchsorted(ends, place, "right") - 1 in joints]
 
 
 def _twin(problem: Problem, setting: Setting) -> Twin:
@@ -199,7 +212,9 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
     """
     train, rules, twin = scene.train, evidence.rules, evidence.twin
     since = twin.settled(base.variant, train.commands)
-    windows = spread(cut_windows(train, twin.setting.observation, evidence.windows.length, since=since), ALL)
+    observation = twin.setting.observation
+    windows = spread(cut_windows(train, observation, evidence.windows.length, since=since), ALL)
+    windows = begun_smoothly(windows, train, observation, twin.setting.signals.smoothed)
     odds = []
     for rows in np.array_split(np.arange(len(windows)), max(1, -(-len(windows) // MOST))):
         part = evidence.on(windows.select(rows))
@@ -253,8 +268,10 @@ def _lengths(whole: Evidence, train: Trajectories) -> tuple[int, ...]:
 def _cut(
     evidence: Evidence, log: Trajectories, since: np.ndarray, length: int, most: int = MOST, *, rough: bool = True
 ) -> Evidence:
-    windows = cut_windows(log, evidence.twin.setting.observation, length, since=spared(log, length, since))
-    return replace(evidence.on(spread(windows, most)), rough=rough)
+    setting = evidence.twin.setting
+    windows = spread(cut_windows(log, setting.observation, length, since=spared(log, length, since)), most)
+    windows = begun_smoothly(windows, log, setting.observation, setting.signals.smoothed)
+    return replace(evidence.on(windows), rough=rough)
 
 
 def spared(log: Trajectories, length: int, since: np.ndarray) -> np.ndarray:

@@ -73,7 +73,7 @@ def table_of(windows: Windows) -> np.ndarray | None:
     """Return the starts of windows that do not begin as measured: episode, step and columns, ``(k, 2 + n)``."""
     if windows.starts is None:
         return None
-    rows = (windows.starts != windows.measured[:, 0]).any(-1)
+    rows = (windows.starts != windows.usual).any(-1)
     return np.column_stack([windows.episodes, windows.steps, windows.starts])[rows]
 
 
@@ -90,5 +90,5 @@ def begun(windows: Windows, table: np.ndarray | None) -> np.ndarray | None:
     if table is None:
         return None
     known = {(int(episode), int(step)): columns for episode, step, *columns in table}
-    own = zip(windows.episodes, windows.steps, windows.measured[:, 0], strict=True)
+    own = zip(windows.episodes, windows.steps, windows.usual, strict=True)
     return np.array([known.get((int(e), int(s)), columns) for e, s, columns in own])

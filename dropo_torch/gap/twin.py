@@ -40,7 +40,8 @@ class Windows:
         steps: logged step of each window's start within its episode, ``(W,)``.
         commands: commands of every episode at every logged step, the last one repeated, ``(E, N, nu)``.
         unseen: positions at the starts that no column has, dead-reckoned from their velocities, ``(W, k)``.
-        starts: observed columns from which they are simulated, ``(W, n)``; by default as they were measured.
+        starts: observed columns from which they are simulated, ``(W, n)``; by default :attr:`usual`.
+        smooth: these columns by the rows around, ``(W, n)``, where single rows are too noisy to begin at.
     """
 
     measured: np.ndarray
@@ -50,6 +51,7 @@ class Windows:
     commands: np.ndarray
     unseen: np.ndarray | None = None
     starts: np.ndarray | None = None
+    smooth: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of windows."""
@@ -58,7 +60,12 @@ class Windows:
     @property
     def begins(self) -> np.ndarray:
         """Observed columns from which they are simulated, ``(W, n)``."""
-        return self.measured[:, 0] if self.starts is None else self.starts
+        return self.usual if self.starts is None else self.starts
+
+    @property
+    def usual(self) -> np.ndarray:
+        """Observed columns from which they are simulated unless better ones are known, ``(W, n)``."""
+        return self.measured[:, 0] if self.smooth is None else self.smooth
 
     @property
     def length(self) -> int:
@@ -68,7 +75,9 @@ class Windows:
     def select(self, rows: np.ndarray | slice) -> Windows:
         """Return the given windows."""
         given = [
-            k for k in ("measured", "rates", "episodes", "steps", "unseen", "starts") if getattr(self, k) is not None
+            k
+            for k in ("measured", "rates", "episodes", "steps", "unseen", "starts", "smooth")
+            if getattr(self, k) is not None
         ]
         return replace(self, **{k: getattr(self, k)[rows] for k in given})
 
