@@ -460,7 +460,9 @@ def test_every_effect_has_words(name: str, target: str | None) -> None:
     number: Mapping[str, Strength] = {"size": Strength(0.5, 0.4, 0.6, "-")}
     gap = replace(single(), effects=(NamedEffect(name, target, number, 0.9),))
     sentence, items = gap_words.answer(gap)
-    assert sentence.endswith(": 0.50\u00a0(0.40\u00a0to\u00a00.60).")
+    of_model = name in ("actuator_gain", "actuator_stiffness", "inertia")
+    unit = " times the model's" if of_model else ""
+    assert sentence.replace("\u00a0", " ").endswith(f": 0.50{unit} (0.40 to 0.60).")
     assert sentence[0].isupper()
     assert not items
     assert "{" not in sentence

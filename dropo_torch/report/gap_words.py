@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -84,6 +85,8 @@ _CLAUSES = {
 #: Effects whose first number, if negative, says that the model has too much of them.
 _SIGNED = ("joint_damping", "joint_quadratic_damping", "joint_friction", "joint_stiffness", "armature",
            "actuator_damping")  # fmt: skip
+#: Effects whose number is a multiple of what the model has.
+_MULTIPLES = ("actuator_gain", "actuator_stiffness", "inertia")
 #: Members of the base family, in a list of a joint's.
 _SHORT = {
     "joint_friction": "dry friction",
@@ -399,7 +402,10 @@ def _mixed(effect: NamedEffect) -> bool:
 
 
 def _strengths(effect: NamedEffect) -> str:
-    return numbers(effect.parameters, str if effect.target == "*" else quantity)
+    own = effect.parameters
+    if effect.effect in _MULTIPLES:
+        own = {name: replace(given, unit="times the model's") for name, given in own.items()}
+    return numbers(own, str if effect.target == "*" else quantity)
 
 
 def _at(effect: str, target: str | None) -> str:
