@@ -196,6 +196,17 @@ def test_a_sensor_whose_range_ends_is_told(high: float, told: bool) -> None:
     assert bool(found & {"clipped", "frozen"}) == told  # frozen where it is so for long
 
 
+@pytest.mark.parametrize(("limit", "told"), [(0.7, False), (0.9, True)])
+def test_a_joint_at_its_stop_is_not_clipped(limit: float, told: bool) -> None:
+    rail = f'range="-1 {limit}" limited="true"'
+    model = mujoco.MjModel.from_xml_string(WAGON.format(spring=rail).replace("{spring}", ""))
+    path = np.minimum(np.sin(0.1 * np.arange(401)), 0.7)
+    states = np.stack([path, np.zeros(401)], 1) + 1e-9
+    log = Trajectories(states[:-1], states[1:], np.zeros((400, 1)), np.arange(400) == 399)
+    found = {f.name for f in examine(log, parse_observation(model, None, 2), model, 2)}
+    assert ("clipped" in found) == told
+
+
 @pytest.mark.parametrize("quantum", [0.0, 2e-3])
 def test_what_comes_to_rest_at_the_end_of_its_motion_is_not_clipped(quantum: float) -> None:
     """A joint that is moved up and down, and rests at both ends, by a sensor with or without noise of its own."""

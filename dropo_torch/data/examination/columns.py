@@ -164,8 +164,8 @@ def clipped(record: Record, rules: Rules) -> list[Finding]:
     """Return positions that stop dead at one end of their values: there the sensor's range ends."""
     found = {
         column: np.flatnonzero(rows)
-        for _, column in record.positions
-        if (rows := _clipped(record, column, rules)).any()
+        for c, column in record.positions
+        if (rows := _clipped(record, c, column, rules)).any()
     }
     if not found:
         return []
@@ -179,8 +179,11 @@ def clipped(record: Record, rules: Rules) -> list[Finding]:
     )]  # fmt: skip
 
 
-def _clipped(record: Record, column: int, rules: Rules) -> np.ndarray:
-    """Rows in which a column stands at its largest or smallest value, if it comes and goes at speed, ``(T,)`` bool."""
+def _clipped(record: Record, c: Coordinate, column: int, rules: Rules) -> np.ndarray:
+    """Rows in which a column stands at its largest or smallest value, if it comes and goes at speed, ``(T,)`` bool.
+
+    Not where the joint has a stop.
+    """
     values, size = record.before[:, column], np.abs(record.steps[:, column])
     found = np.zeros(len(values), dtype=bool)
     if len(size) < LEAST_STEPS or not size.any():
@@ -192,7 +195,8 @@ def _clipped(record: Record, column: int, rules: Rules) -> np.ndarray:
         others = np.delete(size, np.concatenate([s[:-1] for s in stays])) if stays else size
         edges = [size[i] for s in stays for i in (s[0] - 1, s[-1]) if 0 <= i < len(size)]
         moves = (others == 0).mean() < rules.hold  # elsewhere; a sensor that counts stands still in between
-        if len(edges) > 1 and moves and np.median(edges) > rules.dead * usual:
+        stops = c.limits is not None and np.abs(end - np.array(c.limits)).min() < rules.stop * _width(c)
+        if len(edges) > 1 and moves and not stops and np.median(edges) > rules.dead * usual:
             found[np.concatenate(stays)] = True
     return found
 

@@ -45,6 +45,7 @@ class Rules:
         quantum: smallest difference of a column's values in its median steps, from which on it is told.
         clipped: rows that a column stands at the end of its values, while it moves elsewhere.
         dead: its last step before and its first one after that, in its median steps: what comes to rest is slower.
+        stop: distance from a joint's limit, in its range, within which it may stand at the stop.
         jitter: relative deviation of stamps that is told.
         gap: stamps further apart than so many times the median leave samples out.
         norm: relative deviation of a quaternion's length that is told; rounding and noise stay below.
@@ -87,6 +88,7 @@ class Rules:
     quantum: float = 0.5
     clipped: int = 5
     dead: float = 0.3
+    stop: float = 0.03
     jitter: float = 0.05
     gap: float = 1.75
     norm: float = 0.02
