@@ -69,7 +69,7 @@ from dropo_torch.gap.refit import (
 )
 from dropo_torch.gap.renew import noise_beside, noise_left
 from dropo_torch.gap.result import NamedEffect, Score, Strength
-from dropo_torch.gap.rules import Rules, Sound, Tried, accounts, allowance, clears, most_left, significant
+from dropo_torch.gap.rules import Rules, Sound, Tried, accounts, allowance, beyond_free, clears, most_left, significant
 from dropo_torch.gap.scene import outstanding, searched, short_windows
 from dropo_torch.gap.screen import Candidate, Focus, all_candidates, promised, screen
 from dropo_torch.gap.search import Ended, Naming, believed, instead_of_one, leaves_wrong, start
@@ -276,6 +276,13 @@ def placed(name: str, *values: float, target: str = "rail") -> Placed:
     return Placed(find_effect(name), target, values)
 
 
+def test_a_finer_step_is_no_number_that_imitates() -> None:
+    cogging = placed("joint_cogging", 0.1, 3.0, 0.0)
+    free = Hypothesis((), (cogging, placed("joint_stiffness", 1.0, 0.0)))
+    with_step = dataclasses.replace(free, placed=(*free.placed, Placed(find_effect("integration"), None, (0.001,))))
+    assert beyond_free(with_step, Rules()) == beyond_free(free, Rules()) > 0
+
+
 def test_many_numbers_may_leave_less_of_the_gap() -> None:
     rules = Rules(accounted=0.97, free=3)
     friction, spring = placed("joint_friction", 0.3), placed("joint_stiffness", 0.2, 0.0)
@@ -406,6 +413,35 @@ def test_a_step_that_only_named_effects_show_has_no_name() -> None:
     assert not accept.matters(ground, state.base, whole, without)
     assert accept.matters(ground, state.base, without, state.base)
     assert accept.is_done(ground, dataclasses.replace(state, current=without))
+
+
+@pytest.mark.parametrize(
+    ("best", "finer", "taken"),
+    [("actuator_delay", 200.0, True), ("actuator_delay", 1.0, False), ("integration", 200.0, False)],
+)
+def test_a_family_takes_no_place_of_what_a_finer_step_makes_as_good(
+    best: str, finer: float, taken: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Late sensors, one for each column, may do what a model's step leaves beside a late command."""
+
+    def fitted(reduced: float, *names: str) -> SimpleNamespace:
+        placed = tuple(Placed(find_effect(n), None, (0.0,)) for n in names)
+        cost = Cost(np.array([4e3 * reduced]), np.zeros(1), 4e3)
+        return SimpleNamespace(cost=cost, hypothesis=Hypothesis((), placed))
+
+    single, family, late = fitted(300, best), fitted(4, *["sensor_delay"] * 4), find_effect("sensor_delay")
+    monkeypatch.setattr(late, "targets", lambda setting: list("abcd"))
+    monkeypatch.setattr(accept, "sound", lambda ground, found: found)
+    monkeypatch.setattr(accept, "promising_families", lambda *_: [tuple(Placed(late, c, (0.0,)) for c in "abcd")])
+    fine = {id(single): finer, id(family): 1.0}
+    ground = SimpleNamespace(
+        rules=Rules(), setting=None, focus=lambda current: None,
+        refits=lambda state, current, groups, stage: ([family] if groups else [], state),
+        resolved=lambda r: SimpleNamespace(fit=fitted(fine[id(r)])),
+    )  # fmt: skip
+    state = SimpleNamespace(current=fitted(12_000))
+    found, _ = accept._among_several(ground, state, [], single, pairs=False)
+    assert found is (family if taken else single)
 
 
 @pytest.mark.parametrize(("name", "named"), [("integration", True), ("actuator_delay", False)])
