@@ -276,7 +276,7 @@ def _sloped(evidence: Evidence, here: Refit, limits: Limits, residuals: np.ndarr
     slope, columns = np.zeros_like(here.slope), np.flatnonzero(limits.free)
     if columns.size:
         slope[columns] = _differences(evidence, here, limits, residuals, columns, STEP)
-    if columns.size and evidence.rough:
+    if columns.size and (evidence.rough or evidence.twin.setting.signals.contacts.any()):
         longer = _differences(evidence, here, limits, residuals, columns, LONG_STEP)
         jumps = np.linalg.norm(slope[columns], axis=-1) > JUMPS * np.linalg.norm(longer, axis=-1)
         slope[columns] = np.where(jumps[..., None], longer, slope[columns])
