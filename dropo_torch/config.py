@@ -141,8 +141,8 @@ class Config(pydantic.BaseModel):
     @property
     def derives_velocities(self) -> bool:
         """Whether all velocities of the log are derived from its positions, by ``data: preprocess``."""
-        options = self.data.get("preprocess") if isinstance(self.data, dict) else None
-        if not isinstance(options, dict):
+        options = self._preprocessing
+        if options is None:
             return False
         measured = options.get("velocities")
         return measured is None or (len(measured) == 0 and bool(options.get("derive")))
@@ -150,8 +150,13 @@ class Config(pydantic.BaseModel):
     @property
     def keeps_noise(self) -> bool:
         """Whether positions stay as they were measured, and only velocities are derived through a filter."""
+        return bool((self._preprocessing or {}).get("derive"))
+
+    @property
+    def _preprocessing(self) -> dict[str, Any] | None:
+        """What ``data: preprocess`` says, ``None`` without one."""
         options = self.data.get("preprocess") if isinstance(self.data, dict) else None
-        return isinstance(options, dict) and bool(options.get("derive"))
+        return options if isinstance(options, dict) else None
 
     @property
     def moves_centres(self) -> bool:

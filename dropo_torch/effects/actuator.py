@@ -55,7 +55,7 @@ def is_servo(model: mujoco.MjModel, actuator: int) -> bool:
     """Return whether an actuator pulls toward a target: its force is of the error between command and length."""
     fixed = model.actuator_gaintype[actuator] == mujoco.mjtGain.mjGAIN_FIXED
     affine, kp = model.actuator_biastype[actuator] == _AFFINE, model.actuator_gainprm[actuator, 0]
-    return bool(fixed and affine and kp != 0 and model.actuator_biasprm[actuator, 1] == -kp)
+    return bool(fixed and affine and kp != 0 and np.isclose(model.actuator_biasprm[actuator, 1], -kp))
 
 
 def unit_of(setting: Setting, target: str | None, turning: str, sliding: str) -> str:

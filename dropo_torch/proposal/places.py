@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from dropo_torch.data.observation import joint_name
-from dropo_torch.effects.actuator import unit_of
+from dropo_torch.effects.actuator import is_servo, unit_of
 from dropo_torch.effects.base import Setting, object_number
 from dropo_torch.parameters import object_names
 from dropo_torch.proposal.words import object_words, says_kind
@@ -189,10 +189,10 @@ def command_kind(model: mujoco.MjModel, a: int) -> Literal["position", "velocity
 
     A velocity servo's command is a velocity in a usual unit; a motor whose back-EMF brakes it takes an effort.
     """
+    if is_servo(model, a):
+        return "position"
     if int(model.actuator_biastype[a]) == mujoco.mjtBias.mjBIAS_AFFINE:
         gain = model.actuator_gainprm[a, 0]
-        if model.actuator_biasprm[a, 1] != 0 and np.isclose(model.actuator_biasprm[a, 1], -gain):
-            return "position"
         kv = -model.actuator_biasprm[a, 2]
         if model.actuator_biasprm[a, 1] == 0 and kv > 0 and np.isclose(gain / kv, SPEEDS).any():
             return "velocity"
