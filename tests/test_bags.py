@@ -130,7 +130,7 @@ def test_a_pause_ends_an_episode(tmp_path: Path) -> None:
     kept = [one for one in joint_states() if not 0.8 < one[2] - START < 1.2]
     path = write(tmp_path / "run", [*kept, *commands()])
     with pytest.raises(
-        InputError, match=r"has no sample for 0\.\d+ s from 0\.79\d* s on.*or begin an episode there with pause"
+        InputError, match=r"has no sample for 0\.\d+ s from 0\.79\d* s on.*or begin an episode there with data: pause"
     ):
         read_trajectories(path, **ASKED)
     log = read_trajectories(path, **ASKED, pause=0.1)
