@@ -15,7 +15,7 @@ import numpy as np
 
 from dropo_torch.config import PLANNING_KEYS, TRAINING_KEYS, Config
 from dropo_torch.data.observation import Observation, generic_observation, parse_observation
-from dropo_torch.data.trajectory import Trajectories, make_transitions, reckoned
+from dropo_torch.data.trajectory import Trajectories, make_transitions, with_unseen
 from dropo_torch.effects import find_effect, load_effects
 from dropo_torch.effects.placing import EffectSet, lowest, place_effects, plain_setting
 from dropo_torch.effects.simulator import effect_simulator, first_known
@@ -128,7 +128,7 @@ def make_problem(config: Config, *, log: Trajectories | None = None, general: bo
         since = known if since is None else np.maximum(since, known)
     _check_log(trajectories, simulator, frame_skip)
     observation = _observation(config, space.model, simulator.num_states, width)
-    trajectories = reckoned(trajectories, observation, simulator.timestep, _ahead(space.model, frame_skip))
+    trajectories = with_unseen(trajectories, observation, simulator.timestep, _ahead(space.model, frame_skip))
     lag = 1 if sensed else config.lag
     transitions = make_transitions(trajectories, observation, lag=lag, history=simulator.history, since=since)
     likelihood = {key: getattr(config, key) for key in ("epsilon", "noise", "mask", "scaling", "orientation")}

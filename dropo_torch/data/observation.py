@@ -15,20 +15,23 @@ any order, some of which may be missing or of no interest, and of sensors' value
 ``skip``, ``skip[3]``          one column, three columns of the log which are no state
 =============================  ==================================================================
 
-A sensor that is a joint's encoder (``jointpos``, ``jointvel``, ``ballquat``, ``ballangvel``) stands for the columns of
-the state that it shows. With sensors, a state of which not every column is observed is estimated from the log.
+Joints without a column that the model's equality constraints determine, in closed loops or by coupling, are where these
+are met. A sensor that is a joint's encoder (``jointpos``, ``jointvel``, ``ballquat``, ``ballangvel``) stands for the
+columns of the state that it shows. With sensors, a state of which not every column is observed is estimated from the
+log.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import mujoco
 import numpy as np
 
+from dropo_torch.data.loops import Loops, find_loops
 from dropo_torch.data.sensors import Sensor, sensors_of
 from dropo_torch.errors import InputError, choices
 
@@ -90,7 +93,8 @@ class Observation:
         reckoned: positions that are not observed, with their velocities, which are. Such a position is where its
             velocity has led since the episode's start, where it had its default.
         is_sensed: whether states are not what the log shows: they are to be estimated from it. Then states are
-            extended by ``sensordata``, at rest and reckoned are none.
+            extended by ``sensordata``, at rest, reckoned and loops are none.
+        loops: joints that are not observed and that the model's equality constraints determine; ``None`` for none.
     """
 
     columns: tuple[int, ...]
@@ -103,6 +107,7 @@ class Observation:
     at_rest: tuple[str, ...] = ()
     reckoned: tuple[Reckoned, ...] = ()
     is_sensed: bool = False
+    loops: Loops | None = field(default=None, compare=False)
 
     @property
     def size(self) -> int:
@@ -119,7 +124,7 @@ class Observation:
 
         Args:
             observations: rows of the log.
-            unseen: positions that :attr:`reckoned` lists, ``(T, k)``; their defaults if not given.
+            unseen: the positions of :attr:`unseen`, ``(T, k)``; if not given, reckoned ones have their defaults.
         """
         self.check_quaternions(np.asarray(observations, dtype=np.float64), "observations")
         states = self.full(self.observed(observations), unseen)
@@ -146,13 +151,20 @@ class Observation:
     def full(self, columns: np.ndarray, unseen: np.ndarray | None = None) -> np.ndarray:
         """Return full states ``(T, nq + nv)`` of observed columns ``(T, n)``; what is not observed has its default.
 
-        Positions that :attr:`reckoned` lists have those of ``unseen``, ``(T, k)``, where it is given.
+        Positions that :attr:`unseen` lists have those of ``unseen``, ``(T, k)``, where it is given; from there
+        :attr:`loops` are closed.
         """
         states = np.tile(np.asarray(self.default_state), (len(columns), 1))
         states[:, self.index] = columns
         if unseen is not None:
-            states[:, [r.position for r in self.reckoned]] = unseen
-        return states
+            states[:, list(self.unseen)] = unseen
+        return states if self.loops is None else self.loops.closed(states, near=unseen is not None)
+
+    @cached_property
+    def unseen(self) -> tuple[int, ...]:
+        """Columns of positions in the state that no column shows and that still follow from the log, ``k`` of them."""
+        held = () if self.loops is None else self.loops.positions.tolist()
+        return (*(r.position for r in self.reckoned), *held)
 
     def reckon(
         self, before: np.ndarray, after: np.ndarray, terminals: np.ndarray, timestep: float, ahead: float = 0.0
@@ -230,6 +242,7 @@ def parse_observation(
         at_rest=() if is_sensed else tuple(joint.name for joint in joints if _is_at_rest(joint, set(columns))),
         reckoned=() if is_sensed else _reckoned(model, joints, columns),
         is_sensed=is_sensed,
+        loops=None if is_sensed else find_loops(model, columns),
     )
 
 

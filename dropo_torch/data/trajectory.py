@@ -58,8 +58,8 @@ class Trajectories(ByValue):
         dt: duration of a transition in seconds, or ``None`` where the log does not say.
         source: where the log came from, for messages.
         origin: what the file calls its columns and rows, where it was read from one.
-        unseen: positions before each transition that no column has, dead-reckoned from their velocities, ``(T, k)``;
-            see :func:`reckoned`. ``None`` where they are not needed.
+        unseen: positions before each transition that no column has and that follow from the others, ``(T, k)``; see
+            :func:`with_unseen`. ``None`` where there are none.
 
     Raises:
         InputError: shapes that do not fit, a value that is not finite, no transition.
@@ -159,23 +159,35 @@ class Trajectories(ByValue):
         return self.select(np.isin(self.episodes, wanted))
 
 
-def reckoned(
+def with_unseen(
     trajectories: Trajectories, observation: Observation, timestep: float | None, ahead: float = 0.0
 ) -> Trajectories:
-    """Return a log with the positions that only their velocities show, as :meth:`Observation.reckon` has them.
+    """Return a log with the positions that follow from its columns: :attr:`Observation.unseen`.
 
     Args:
         trajectories: the log.
         observation: its columns.
-        timestep: seconds of a transition where the log does not say; without either, nothing is reckoned.
+        timestep: seconds of a transition where the log does not say; without either, no position is reckoned from its
+            velocity.
         ahead: of :meth:`Observation.reckon`.
+
+    Raises:
+        InputError: loops that the logged positions do not close.
     """
-    step = trajectories.dt or timestep
-    if not observation.reckoned or step is None:
-        return trajectories
-    log = trajectories
-    unseen = observation.reckon(log.observations, log.next_observations, log.terminals, step, ahead)
-    return replace(log, unseen=unseen)
+    log, loops, step = trajectories, observation.loops, trajectories.dt or timestep
+    reckons = bool(observation.reckoned) and step is not None
+    if not reckons and loops is None:
+        return log
+    states = np.tile(np.asarray(observation.default_state), (len(log), 1))
+    states[:, observation.index] = observation.observed(log.observations)
+    if reckons:
+        assert step is not None
+        at = [r.position for r in observation.reckoned]
+        states[:, at] = observation.reckon(log.observations, log.next_observations, log.terminals, step, ahead)
+    if loops is not None:
+        states = loops.closed(states, near=False)
+        loops.check(states, log.source)
+    return replace(log, unseen=states[:, list(observation.unseen)])
 
 
 def concatenate(logs: Sequence[Trajectories]) -> Trajectories:

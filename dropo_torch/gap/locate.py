@@ -88,7 +88,7 @@ def regressors(setting: Setting, windows: Windows, dof: int) -> list[Regressor]:
     if model.jnt_type[joint] >= int(mujoco.mjtJoint.mjJNT_SLIDE):
         at = position[:, model.jnt_qposadr[joint]]
         plainly(f"with the position of {name}", at, f"position of {name}", "rad" if angular else "m")
-    begin, end = (setting.observation.full(windows.measured[:, i])[:, model.nq + dof] for i in (0, -1))
+    begin, end = (setting.observation.full(windows.measured[:, i], windows.unseen)[:, model.nq + dof] for i in (0, -1))
     plainly(f"with the acceleration of {name}", end - begin, f"change of {speed[0]}", speed[1])
     earlier = windows.commands[windows.episodes, np.maximum(windows.steps + windows.length // 2 - 3, 0)]
     for i in range(model.nu):

@@ -113,7 +113,10 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
     nq, nv, physics, step = model.nq, model.nv, float(model.opt.timestep), problem.simulator.timestep
     step = problem.simulator.frame_skip * physics if step is None else step
     frame_skip = round(step / physics)  # steps of the given model, whatever the simulator makes of them
-    states, after = observation.states(log.observations, log.unseen), observation.states(log.next_observations)
+    states, after = (
+        observation.states(log.observations, log.unseen),
+        observation.states(log.next_observations, log.unseen),
+    )
     rows = evenly(len(states), SAMPLES)
     inertia, force, touches = np.zeros(nv), np.zeros(nv), np.zeros(model.ngeom, bool)
     squares = np.zeros((model.nbody, 2))  # of angular and linear velocity
@@ -131,7 +134,7 @@ def make_setting(problem: Problem, log: Trajectories) -> Setting:
             squares[b] += (velocity**2).reshape(2, 3).sum(1)
         for contact in data.contact[: data.ncon]:
             touches[contact.geom[contact.geom >= 0]] = True
-    known = [*observation.columns, *(r.position for r in observation.reckoned if log.unseen is not None)]
+    known = [*observation.columns, *(observation.unseen if log.unseen is not None else ())]
     seen, speeds = np.isin(np.arange(nq), known), np.sqrt(squares / len(rows))
     signals = Signals(
         timestep=step,

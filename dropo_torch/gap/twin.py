@@ -27,6 +27,8 @@ from dropo_torch.simulators.hidden import filters_known
 
 #: Bytes of filtered commands that are kept; of the last candidate, in any case.
 KEPT = 2**27
+#: Sets of initial states that are kept where loops have to be closed.
+CLOSED = 16
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Windows:
         episodes: episode of each window, ``(W,)``.
         steps: logged step of each window's start within its episode, ``(W,)``.
         commands: commands of every episode at every logged step, the last one repeated, ``(E, N, nu)``.
-        unseen: positions at the starts that no column has, dead-reckoned from their velocities, ``(W, k)``.
+        unseen: positions at the starts that no column has and that follow from the log, ``(W, k)``.
         starts: observed columns from which they are simulated, ``(W, n)``; by default :attr:`usual`.
         smooth: these columns by the rows around, ``(W, n)``, where single rows are too noisy to begin at.
     """
@@ -110,6 +112,7 @@ class Twin:
         self.rates = np.array(observed_rates(setting))
         self._commands: np.ndarray | None = None
         self._filtered: dict[tuple, np.ndarray] = {}
+        self._closed: dict[bytes, np.ndarray] = {}
         self.simulated_transitions, self._finer, self._coarser = 0, dict[float, Twin](), coarser
 
     def finer(self, step: float) -> Twin:
@@ -247,11 +250,22 @@ class Twin:
                 steps = late / self.setting.signals.timestep
                 rates[:, f.column] = secants(windows.measured[:, :, f.column], steps) / late
         true = self._true(torch.tensor(shown), torch.from_numpy(rates), sensors).numpy()
-        states = observation.full(true, windows.unseen)
+        states = self._full(true, windows.unseen)
         for q in observation.quaternions:
             at = observation.index[list(q)]
             states[:, at] /= np.linalg.norm(states[:, at], axis=1, keepdims=True)
         return states
+
+    def _full(self, columns: np.ndarray, unseen: np.ndarray | None) -> np.ndarray:
+        """:meth:`Observation.full`; where loops are closed, which takes longer, the last ones are kept."""
+        if self.setting.observation.loops is None or unseen is None:
+            return self.setting.observation.full(columns, unseen)
+        key = columns.tobytes() + unseen.tobytes()
+        if key not in self._closed:
+            if len(self._closed) >= CLOSED:
+                self._closed.pop(next(iter(self._closed)))
+            self._closed[key] = self.setting.observation.full(columns, unseen)
+        return self._closed[key].copy()
 
     def _true(self, shown: torch.Tensor, rates: torch.Tensor, sensors: Sequence[Filter]) -> torch.Tensor:
         """Return the true columns ``(W, n)`` of which sensors show ``shown``, and whose time derivatives are ``rates``.

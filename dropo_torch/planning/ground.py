@@ -12,7 +12,7 @@ import numpy as np
 
 from dropo_torch.config import Config, load_config
 from dropo_torch.data.observation import joint_name, parse_observation
-from dropo_torch.data.trajectory import Trajectories, make_transitions, reckoned
+from dropo_torch.data.trajectory import Trajectories, make_transitions, with_unseen
 from dropo_torch.distribution import Distribution, to_coordinates
 from dropo_torch.errors import InputError
 from dropo_torch.logged import completed
@@ -119,7 +119,7 @@ class Ground:
         )  # fmt: skip
         skip = self.problem.simulator.frame_skip
         explicit = self.model.opt.integrator == mujoco.mjtIntegrator.mjINT_RK4
-        return reckoned(log, observation, self.timestep, 0.0 if explicit else 1 / skip)
+        return with_unseen(log, observation, self.timestep, 0.0 if explicit else 1 / skip)
 
     def told(self, states: np.ndarray, commands: np.ndarray) -> list[Information]:
         """Return what motions ``(P, N + 1, nq + nv)`` tell, from some of their windows."""

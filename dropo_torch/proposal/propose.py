@@ -14,6 +14,7 @@ import numpy as np
 
 from dropo_torch.config import Config, make_config
 from dropo_torch.data.examination import Finding
+from dropo_torch.data.loops import Loops, find_loops
 from dropo_torch.data.observation import joint_name
 from dropo_torch.errors import InputError, choices
 from dropo_torch.models.load import load_model
@@ -208,9 +209,11 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
     """Which column is which number of the model and when rows were taken, with the model of which they are rows."""
     places = places_of(robot.model)
     matching, clock = _matched(columns, places, find_clock(columns, robot.step, dt), robot.step)
+    matching = _without_dependent(matching, robot.model)
     matching, path = _marked(robot, columns, matching, clock)
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
+        matching = _without_dependent(matching, robot.model)
     _check(matching, columns, robot.model, clock)
     path, step = _with_whole_steps(robot, path, columns, matching, clock)
     if not robot.commanded:
@@ -221,9 +224,27 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
     return Reading(_relative(path, base), _relative(columns.path, base), columns, matching, places, clock, step, base)
 
 
+def _loops(matching: Matching, model: mujoco.MjModel) -> Loops | None:
+    """The joints without columns that equality constraints determine from those that have some."""
+    return find_loops(model, [m.place.number for m in (*matching.of("position"), *matching.of("velocity"))])
+
+
+def _without_dependent(matching: Matching, model: mujoco.MjModel) -> Matching:
+    """The matching without those places among the missing that closed loops and couplings determine."""
+    loops = _loops(matching, model)
+    if loops is None:
+        return matching
+    held = {("position", int(c)) for c in loops.positions} | {("velocity", int(c)) for c in loops.velocities}
+    return replace(matching, missing=tuple(p for p in matching.missing if (p.kind, p.number) not in held))
+
+
 def _drafted(reading: Reading, robot: _Robot) -> Draft:
-    """The config's keys but noise and parameters, with a note where the model is one with finer steps."""
+    """The config's keys but noise and parameters, with notes of what it does that the log does not say by itself."""
     draft = make_draft(reading)
+    if (loops := _loops(reading.matching, robot.model)) is not None:
+        draft = draft.noted(
+            f"{', '.join(loops.names)}: no column shows them; they are where the model's equality constraints are met"
+        )
     if reading.timestep == robot.step:
         return draft
     return draft.noted(

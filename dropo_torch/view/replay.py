@@ -222,8 +222,11 @@ def logged_states(problem: Problem, stretch: Stretch) -> np.ndarray:
     if log.unseen is None:
         return observation.states(observations)
     ends = np.stack([observations[-2], observations[-1]])
-    moved = np.diff(observation.reckon(ends, ends[[1, 1]], np.array([False, True]), stretch.timestep), axis=0)
-    return observation.states(observations, np.concatenate([log.unseen[rows], log.unseen[last : last + 1] + moved]))
+    after = log.unseen[last : last + 1].copy()
+    after[:, : len(observation.reckoned)] += np.diff(
+        observation.reckon(ends, ends[[1, 1]], np.array([False, True]), stretch.timestep), axis=0
+    )
+    return observation.states(observations, np.concatenate([log.unseen[rows], after]))
 
 
 def noise_unit(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarray:
@@ -245,9 +248,9 @@ def noise_unit(problem: Problem, noise: Mapping[str, float] | None) -> np.ndarra
 
 
 def _unseen(problem: Problem) -> tuple[int, ...]:
-    """Position columns of the state that are neither observed nor reckoned from velocities."""
+    """Position columns of the state that are neither observed nor follow from what is."""
     model, observation = problem.space.model, problem.observation
     if model is None:
         return ()
-    known = {*observation.columns, *(r.position for r in observation.reckoned)}
+    known = {*observation.columns, *observation.unseen}
     return tuple(c for c in range(model.nq) if c not in known)
