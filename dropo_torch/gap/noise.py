@@ -33,6 +33,9 @@ QUIET, CALM = 0.25, 0.98
 ENOUGH = 5
 #: By how much a uniform distribution is wider than its standard deviation.
 UNIFORM = 12**0.5
+#: Share of fourth differences that are no larger than noise makes beside contacts; of them that must not be zero; by how
+#: much noise that is nearly white may show less in them.
+LOUD, SHOWN, MARGIN = 0.9, 0.5, 1.5
 #: Least degrees of freedom that a feature is taken to have in a window; and in all of them, to tell its noise.
 LEAST_DEGREES, TELLING = 0.3, 5.0
 
@@ -63,6 +66,9 @@ class Diverges(InputError):
 def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarray | None = None) -> FreeForces:
     """Estimate the noise and the forces that are missing.
 
+    Beside contacts, a model that is wrong about the ground begins windows within it, and no free force explains how they
+    go on: what then is left counts as noise no further than the log's own fourth differences allow.
+
     Masked columns are not compared, but the windows start where they say; their noise is told as if they were. Of a
     sensor that counts, slow motion shows less than its resolution leaves open, which is the least that its noise is.
 
@@ -80,7 +86,7 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     found = _free_forces(evidence, sizes, known=noise is not None)
     if noise is not None:
         return found
-    found = replace(found, noise=np.maximum(found.noise, _rounding(evidence)))
+    found = replace(found, noise=np.maximum(np.minimum(found.noise, _most(evidence)), _rounding(evidence)))
     if not twin.setting.masked:
         return found
     whole = _free_forces(replace(evidence, whole=True), sizes, known=False)
@@ -97,6 +103,20 @@ def _rounding(evidence: Evidence) -> np.ndarray:
     found = np.zeros(chart.size)
     found[: len(chart.plain)] = [resolution(measured[..., c].ravel()) / UNIFORM for c in chart.plain]
     return found / chart.scale
+
+
+def _most(evidence: Evidence) -> np.ndarray:
+    """The most that each feature's noise may be, ``(m,)``: fourth differences of it have 70 times its variance.
+
+    Motion only adds to them. Infinite where nothing touches, and where a sensor is too coarse to show any.
+    """
+    chart, measured = evidence.chart, evidence.windows.measured
+    if not evidence.twin.setting.signals.contacts.any() or measured.shape[1] < 5:
+        return np.full(chart.size, np.inf)
+    away = chart.difference(measured, np.broadcast_to(measured[:, :1], measured.shape))
+    fourth = np.abs(np.diff(away, 4, axis=1)).reshape(-1, chart.size)
+    size = np.quantile(fourth, LOUD, axis=0) / (stats.norm.ppf(0.5 + 0.5 * LOUD) * 70**0.5)
+    return np.where((fourth > 0).mean(0) > SHOWN, MARGIN * size, np.inf)
 
 
 def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeForces:
