@@ -117,7 +117,8 @@ IDLE: dict[str, tuple[str, ...]] = {
     "center_of_mass": ("cart",), "inertia": ("cart",),
     "sensor_bias": ("root.position[x]", "root.position[y]", "rail.position"),
     **dict.fromkeys(
-        ("contact_friction", "contact_stiffness", "contact_margin", "contact_sole"), ("upper", "lower", "cart")
+        ("contact_friction", "contact_rolling", "contact_stiffness", "contact_margin", "contact_sole"),
+        ("upper", "lower", "cart"),
     ),
 }  # fmt: skip
 #: Numbers at which an effect acts on the rig, where those from which a search begins are too small for it.

@@ -161,7 +161,7 @@ def soft_ground(spec: mujoco.MjSpec) -> None:
 
 
 ROLLBOT = Robot(
-    summary="outside the vocabulary: robot in a rolling shell, with a rolling resistance of 6 mm",
+    summary="robot in a rolling shell: its rolling resistance has a lever arm of 6 mm",
     file="rollbot.xml",
     start=rollbot_start,
     log=Log(
@@ -171,7 +171,13 @@ ROLLBOT = Robot(
         noise=((4e-4, 4e-4, 1e-4, 8e-4, 8e-4, 8e-4, 3e-4), (4e-3, 4e-3, 2e-3, 8e-3, 8e-3, 8e-3, 0.01)),
         decimals=(2, 4),
     ),
-    hidden=(Hidden(edit=soft_ground),),
+    hidden=(
+        Hidden(
+            (("contact_rolling", "shell"), ("contact_rolling", "floor")),
+            values={"rolling": 0.006, "torsional": 0.005},
+            edit=soft_ground,
+        ),
+    ),
     integrator=IMPLICIT,
     seconds=20.0,
     warm=0.5,

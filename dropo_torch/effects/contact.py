@@ -13,6 +13,12 @@ from dropo_torch.models.contacts import condim, mixing, never_touch
 
 #: Sliding friction of slippery things, from which a search begins where the model has less, or none.
 LEAST = 0.1
+#: Dimensions of contacts from which on they resist turning about their normal, and rolling.
+_TURNS, _ROLLS = 4, 6
+#: Geoms that roll.
+_ROLLING = tuple(
+    int(getattr(mujoco.mjtGeom, f"mjGEOM_{name}")) for name in ("SPHERE", "CAPSULE", "ELLIPSOID", "CYLINDER")
+)
 
 
 class ContactEffect(Effect):
@@ -143,6 +149,48 @@ class ContactFriction(ContactEffect):
             model.geom_friction[deciding.geom, 0] = values[0]
         else:
             deciding.scale(model.geom_friction[:, 0], values[0] / deciding.friction)
+
+
+class ContactRolling(ContactEffect):
+    """Resistance of a geom's contacts to rolling, and to turning on the spot."""
+
+    name = "contact_rolling"
+    sentence = "{target} resists rolling otherwise than in the model"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return geoms that touch something, where any of these is round."""
+        touching = setting.model.geom_type[setting.signals.contacts]
+        return super().targets(setting) if np.isin(touching, _ROLLING).any() else []
+
+    def own(self, model: mujoco.MjModel, target: str | None) -> np.ndarray:
+        """Return the rolling and torsional friction that the model's contacts of this geom have, ``(2,)``."""
+        kind = Deciding.of(model, object_number(model, "geom", target)).kinds[0]
+        return np.where([kind.condim >= _ROLLS, kind.condim >= _TURNS], kind.friction[[2, 1]], 0.0)
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        geom = object_number(setting.model, "geom", target)
+        size = float(setting.model.geom_rbound[geom]) or 0.1
+        names, owns = ("rolling", "torsional"), self.own(setting.model, target)
+        return tuple(
+            Quantity(name, "m", float(own), 0.0, float(max(size, 5 * own)), 0.02 * size)
+            for name, own in zip(names, owns, strict=True)
+        )
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        """Begin where rolling costs something: contacts of more dimensions are stiffer along their normal, too."""
+        size = np.array([q.scale for q in self.quantities(setting, target)])
+        own = self.own(setting.model, target)
+        return [own + share * size for share in (0.5, 2.0)]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        if np.array_equal(values, self.own(model, target)):
+            return
+        deciding = Deciding.of(model, object_number(model, "geom", target))
+        if not deciding.take_over(model):  # the larger friction of two geoms counts
+            plain = [g for g in deciding.equals if model.geom_condim[g] < _TURNS]
+            model.geom_friction[plain, 1:] = 0.0
+        model.geom_condim[deciding.geom] = _ROLLS
+        model.geom_friction[deciding.geom, 1:] = values[1], values[0]
 
 
 class ContactStiffness(ContactEffect):

@@ -33,8 +33,8 @@ QUIET, CALM = 0.25, 0.98
 ENOUGH = 5
 #: By how much a uniform distribution is wider than its standard deviation.
 UNIFORM = 12**0.5
-#: Share of fourth differences that are no larger than noise makes beside contacts; of them that must not be zero; by how
-#: much noise that is nearly white may show less in them.
+#: Share of fourth differences that are no larger than noise makes beside contacts; of them that must not be zero; by
+#: how much noise that is nearly white may show less in them.
 LOUD, SHOWN, MARGIN = 0.9, 0.5, 1.5
 #: Least degrees of freedom that a feature is taken to have in a window; and in all of them, to tell its noise.
 LEAST_DEGREES, TELLING = 0.3, 5.0
@@ -66,8 +66,8 @@ class Diverges(InputError):
 def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarray | None = None) -> FreeForces:
     """Estimate the noise and the forces that are missing.
 
-    Beside contacts, a model that is wrong about the ground begins windows within it, and no free force explains how they
-    go on: what then is left counts as noise no further than the log's own fourth differences allow.
+    Beside contacts, a model that is wrong about the ground begins windows within it, and no free force explains how
+    they go on: what then is left counts as noise no further than the log's own fourth differences allow.
 
     Masked columns are not compared, but the windows start where they say; their noise is told as if they were. Of a
     sensor that counts, slow motion shows less than its resolution leaves open, which is the least that its noise is.

@@ -46,6 +46,8 @@ ALL, RARE, BESIDE = 600, 20, 60
 LEAD, LEAD_SHARE = 20, 0.1
 #: Windows of an episode from which on one of them is not missed.
 MANY = 6
+#: Times its noise by which a feature's standard deviation shows that it moves.
+MOVING = 5.0
 
 
 @dataclass(frozen=True)
@@ -286,8 +288,13 @@ def spared(log: Trajectories, length: int, since: np.ndarray) -> np.ndarray:
 
 
 def _end_error(evidence: Evidence, begin: Hypothesis) -> float:
-    """Typical error at the windows' ends, relative to the motion's own standard deviation; the median over features."""
+    """Typical error at the windows' ends, relative to the motion's own standard deviation; the median over features.
+
+    Features that hardly move, of which the error is noise whatever the simulation does, count for nothing.
+    """
     found, _ = evidence.residuals([begin.variant])
     end = found[0, :, -evidence.chart.size :] * evidence.noise
     size = feature_sizes(evidence.twin.setting, evidence.windows.measured[:, 0])
-    return float(np.median(np.nanmedian(np.abs(end), axis=0) / np.maximum(size, 1e-12)))
+    moving = size > MOVING * evidence.noise
+    relative = np.nanmedian(np.abs(end), axis=0) / np.maximum(size, 1e-12)
+    return float(np.median(relative[moving] if moving.any() else relative))
