@@ -19,8 +19,9 @@ Kind = Literal["mass", "damping", "friction", "armature", "stiffness", "gain", "
 
 #: A joint's friction, damping and rotor inertia that count, as a share of its typical force, force by speed, inertia.
 TYPICAL = 0.1
-#: The largest of them, in the same units, and as multiples of the model's own.
-MOST, MULTIPLE = 1.0, 3.0
+#: The largest of them, in the same units, and as multiples of the model's own. Through a gear of n, a rotor's inertia
+#: counts n² times, and may be many times that of what it moves.
+MOST, ROTOR, MULTIPLE = 1.0, 10.0, 3.0
 #: How far a center of mass may lie from the model's, in radii of gyration.
 AWAY = 0.5
 #: Share of the largest joint speed of its kind below which a joint stands still.
@@ -165,11 +166,12 @@ def _joints(setting: Setting) -> list[Candidate]:
         ):  # fmt: skip
             if what == "armature" and kind == mujoco.mjtJoint.mjJNT_BALL:
                 continue
-            most = rounded(max(MOST * typical, MULTIPLE * float(own)), 2)
+            largest = ROTOR if what == "armature" else MOST
+            most = rounded(max(largest * typical, MULTIPLE * float(own)), 2)
             spec = {"field": field, "name": name, "bounds": [0.0, most], "unit": unit}
             found.append(Candidate(
                 f"{word}_{what}", what, spec, float(own), max(float(own), TYPICAL * typical),  # type: ignore[arg-type]
-                f"0 up to the size of the log's {why}",
+                f"0 up to {'ten times ' if what == 'armature' else ''}the size of the log's {why}",
             ))  # fmt: skip
         if model.jnt_stiffness[j] > 0:
             own = float(model.jnt_stiffness[j])
