@@ -131,3 +131,39 @@ def test_friction_in_a_closed_loop_is_found_by_the_motors_encoders_alone(tmp_pat
     (number,) = gap.effects[0].parameters.values()
     assert number.low <= 0.06 * 1.002
     assert number.high >= 0.06 * 0.998
+
+
+#: A gripper as ROS has it: the second finger mimics the first one, and has no motor of its own.
+MIMIC = """
+<robot name="gripper"><link name="base"/>
+  <link name="left"><inertial><mass value="0.2"/><origin xyz="0 0.03 0.01"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="right"><inertial><mass value="0.2"/><origin xyz="0 0.03 0.01"/>
+    <inertia ixx="1e-4" iyy="1e-4" izz="1e-4" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="finger" type="revolute"><parent link="base"/><child link="left"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="5" velocity="9"/></joint>
+  <joint name="follower" type="revolute"><parent link="base"/><child link="right"/><axis xyz="1 0 0"/>
+    <limit lower="-1" upper="1" effort="5" velocity="9"/><mimic joint="finger" multiplier="-1"/></joint>
+</robot>"""
+
+
+def test_a_mimicking_joint_needs_neither_columns_nor_a_motor(tmp_path: Path) -> None:
+    spec = mujoco.MjSpec.from_string(MIMIC)
+    spec.add_actuator(name="finger", target="finger", trntype=mujoco.mjtTrn.mjTRN_JOINT)
+    model, rows = spec.compile(), []
+    data = mujoco.MjData(model)
+    for row in range(600):
+        data.ctrl[:] = 0.5 * np.sin(row / 30) + 0.3 * np.sin(row / 11) - 3 * data.qpos[0] - 0.1 * data.qvel[0]
+        rows.append([row / 100, data.qpos[0], data.qvel[0], data.ctrl[0]])
+        mujoco.mj_step(model, data, 5)
+    table = pd.DataFrame(rows, columns=["t", "finger_pos", "finger_vel", "finger_effort"])
+    table.to_csv(tmp_path / "log.csv", index=False)
+    (tmp_path / "robot.urdf").write_text(MIMIC)
+    found = propose_config(tmp_path / "robot.urdf", tmp_path / "log.csv", out=tmp_path / "robot.yaml")
+    assert [m.place.label for m in found.matching.of("command")] == ["finger"]
+    problem = dropo.make_problem(found.config)
+    assert problem.space.model is not None
+    assert problem.space.model.nu == 1
+    log = problem.trajectories
+    states = problem.observation.states(log.observations, log.unseen)
+    np.testing.assert_allclose(states[:, 1], -states[:, 0], atol=1e-9)

@@ -96,7 +96,7 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
     rows = (
         ("one-step mean squared error", "mse", "{:.3g}"),
         ("log-likelihood", "log_likelihood", "{:.1f}"),
-        (f"open-loop error over {gap.rollout_seconds:g} s", "rollout_rmse", "{:.3g}"),
+        (f"open-loop error over {gap.rollout_seconds:.3g} s", "rollout_rmse", "{:.3g}"),
     )
     for words, key, form in rows:
         table.add_row(words, *(form.format(getattr(s, key)) for s in (gap.before, gap.after, gap.noise_floor)))

@@ -214,6 +214,8 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
         matching = _without_dependent(matching, robot.model)
+    if not robot.commanded:
+        matching = _without_motors(matching)
     _check(matching, columns, robot.model, clock)
     path, step = _with_whole_steps(robot, path, columns, matching, clock)
     if not robot.commanded:
@@ -236,6 +238,14 @@ def _without_dependent(matching: Matching, model: mujoco.MjModel) -> Matching:
         return matching
     held = {("position", int(c)) for c in loops.positions} | {("velocity", int(c)) for c in loops.velocities}
     return replace(matching, missing=tuple(p for p in matching.missing if (p.kind, p.number) not in held))
+
+
+def _without_motors(matching: Matching) -> Matching:
+    """The matching without made-up motors whose joints no force is logged of, where all forces of the log are used."""
+    spare = any(c.words.role in ("effort", "command") for c in matching.unused)
+    if spare or left_over(matching) or not matching.of("command"):
+        return matching
+    return replace(matching, missing=tuple(p for p in matching.missing if p.kind != "command"))
 
 
 def _drafted(reading: Reading, robot: _Robot) -> Draft:
