@@ -53,7 +53,9 @@ class Screening:
     def rivals(self, placed: Sequence[Placed], index: int, rules: Alike) -> set[tuple[str, str | None]] | None:
         """Return which candidates may explain what one effect does beside others, by first order; ``None`` for any.
 
-        This screening says so only where it predicts, for the effects themselves, what they turned out to explain.
+        This screening says so only where it predicts, for the effects themselves, what they turned out to explain. Of a
+        finer step it never does, since that is found among a few by simulation; nor is it a name that others may stand
+        for.
 
         Args:
             placed: effects that were found since.
@@ -66,7 +68,8 @@ class Screening:
         others = [alive[p.key] for i, p in enumerate(placed) if i != index]
         before = max(left_by(self, others) - self.degrees, 1e-12)
         share = {key: (left_by(self, [*others, c]) - self.degrees) / before for key, c in alive.items()}
-        if share[placed[index].key] > rules.straight:
+        own = placed[index]
+        if own.effect.name != "integration" and share[own.key] > rules.straight:
             return None
         return {key for key, left in share.items() if left < rules.likely}
 
