@@ -356,6 +356,19 @@ class Filter:
         return math.sqrt(power * ((2 * math.pi * self.cutoff) ** 2 / 3 if of_rate else 1.0))
 
 
+def _continuous(match: Match, positions: Sequence[Match]) -> np.ndarray:
+    """The values of a position ``(N,)`` as reading makes them continuous: angles that wrap, quaternions that flip."""
+    values, joint = match.values.copy(), match.place.joint
+    if match.place.measure == "quaternion":
+        parts = [m.values for m in positions if m.place.joint == joint and m.place.measure == "quaternion"]
+        along = np.nansum([part[1:] * part[:-1] for part in parts], axis=0)
+        values[1:] *= np.cumprod(np.where(along < 0, -1.0, 1.0))
+    elif match.place.measure == "angle":
+        known = np.isfinite(values)
+        values[known] = np.unwrap(values[known])
+    return values
+
+
 def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequence[int]) -> Filter | None:
     """Return the filter above whose frequency positions show noise alone; ``None`` where noise does not matter."""
     from scipy import signal
@@ -366,7 +379,7 @@ def make_filter(positions: Sequence[Match], clock: Clock, rows: int, parts: Sequ
     assert dt is not None
     is_noisy, density = False, {}
     for m in positions:
-        values = m.values[part]
+        values = _continuous(m, positions)[part]
         values = values[np.isfinite(values)]
         if len(values) < 64 or not np.ptp(values):
             continue
