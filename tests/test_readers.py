@@ -484,6 +484,16 @@ def test_time_that_starts_again_needs_an_episode_column(tmp_path):
     fails(r"time goes from 0\.15 s to 0 s at row 4 .*tells episodes apart", path, **{**columns, "episode": None})
 
 
+def test_decimal_commas_are_read_where_no_comma_separates(tmp_path):
+    lines = ["t;q;u"] + [f"0,{i:03d};{1.5 * i:.4f};{i}".replace(".", ",") for i in range(20)]
+    (tmp_path / "log.csv").write_text("\n".join(lines))
+    log = read_trajectories(tmp_path / "log.csv", separator=";", time="t", observations="q", actions="u")
+    np.testing.assert_allclose(log.observations[:, 0], 1.5 * np.arange(19))
+    assert log.dt == pytest.approx(0.001)
+    (tmp_path / "log.csv").write_text("\n".join(["t;q;u"] + [f"{i};{i},000;1,234" for i in range(1, 20)]))
+    fails("q is '1,000' at row 0", tmp_path / "log.csv", separator=";", dt=1.0, observations="q", actions="u")
+
+
 def test_wrong_separator_is_suggested(tmp_path):
     frame().to_csv(tmp_path / "log.csv", index=False, sep=";")
     fails(r"separator: ';' may be what is meant", tmp_path / "log.csv", **COLUMNS)

@@ -44,6 +44,10 @@ from dropo_torch.support.given import check_size, reading
 if TYPE_CHECKING:
     import pandas as pd
 
+#: Numbers with a comma before their decimals, and whole ones with one before every thousand, which look alike.
+_DECIMAL_COMMA = r"[-+]?\d*(,\d*)?([eE][-+]?\d+)?"
+_THOUSANDS = r"[-+]?(0|[1-9]\d{0,2}(,\d{3})*)"
+
 _HDF5_SIGNATURE = b"\x89HDF\r\n\x1a\n"
 
 
@@ -95,6 +99,8 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
         )
         head = read(header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
         frame = read()
+        if separator != "," and _has_decimal_commas(frame):
+            frame = read(decimal=",")
         frame.columns = pd.Index([name.strip() or f"Unnamed: {i}" for i, name in enumerate(head)])
     twice = frame.columns[frame.columns.duplicated()]
     if len(twice):
@@ -110,6 +116,14 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
     if len(frame.columns) == 1 and other is not None:
         raise InputError(f"{path}: its one column is {only!r}; separator: {other!r} may be what is meant")
     return [frame_table(str(path), frame)]
+
+
+def _has_decimal_commas(frame: pd.DataFrame) -> bool:
+    """Whether columns of text are numbers with a comma before their decimals, and not one before every thousand."""
+    kinds = [kind.kind not in "biuf" for kind in frame.dtypes]
+    texts = [frame.iloc[:, i].dropna().astype(str).str.strip() for i in np.flatnonzero(kinds)]
+    numbers = [t for t in texts if len(t) and t.str.fullmatch(_DECIMAL_COMMA).all()]
+    return any(not t.str.fullmatch(_THOUSANDS).all() for t in numbers)
 
 
 def open_parquet(path: Path, _: str | None) -> list[Table]:
