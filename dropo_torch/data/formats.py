@@ -121,7 +121,7 @@ def open_text(path: Path, separator: str | None) -> list[Table]:
 def _has_decimal_commas(frame: pd.DataFrame) -> bool:
     """Whether columns of text are numbers with a comma before their decimals, and not one before every thousand."""
     kinds = [kind.kind not in "biuf" for kind in frame.dtypes]
-    texts = [frame.iloc[:, i].dropna().astype(str).str.strip() for i in np.flatnonzero(kinds)]
+    texts = [frame[name].dropna().astype(str).str.strip() for name in frame.columns[kinds]]
     numbers = [t for t in texts if len(t) and t.str.fullmatch(_DECIMAL_COMMA).all()]
     return any(not t.str.fullmatch(_THOUSANDS).all() for t in numbers)
 
