@@ -26,6 +26,9 @@ REACH = 2
 TERMS = 8
 #: Rows below which commands are not examined: they would be as few as what may explain them.
 LEAST_ROWS = 100
+#: Rows that a command stays the same from which on a row says little of when it acts: velocities that were smoothed
+#: change before it does.
+HELD = 3.0
 #: Blocks over which readings are compared.
 BLOCKS = 20
 DEGREE = float(np.pi / 180)
@@ -396,6 +399,13 @@ def is_servo(record: Record, actuator: int) -> bool:
     return bool(joint and model.actuator_biasprm[actuator, 1] != 0)
 
 
+def _held(record: Record) -> float:
+    """For how many rows a command stays the same, on average."""
+    actions = record.log.actions
+    changes = (np.abs(np.diff(actions, axis=0)) > 1e-9 * actions.std(axis=0)).any(axis=1).mean()
+    return float(1 / max(changes, 1e-9))
+
+
 def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> list[Finding]:
     """Commands that act in other rows than theirs."""
     own = tuple(range(effects.controls))
@@ -420,7 +430,7 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
             f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands "
             "than those that act, or the observations come late"
         )
-        sure = better > rules.sure_significance and left < rules.earlier
+        sure = better > rules.sure_significance and left < rules.earlier and _held(record) <= HELD
         return [Finding("action_shift", names, what, confidence(sure), evidence=evidence, cure=cure)]
     what = (
         f"the accelerations of a row follow from the commands logged {rows} before: rows carry later commands than "
