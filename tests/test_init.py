@@ -1188,3 +1188,51 @@ def test_columns_of_decimal_commas_are_told_as_text(tmp_path: Path, capfd: pytes
     frame = {"time": np.arange(50) * 0.01, "slide_pos": [f"0,{i:03d}" for i in range(50)], "push_cmd": np.ones(50)}
     assert main(["init", *written(tmp_path, frame, CLOCKED), "--out", str(tmp_path / "robot.yaml")]) == 2
     assert "these hold text, and no numbers: slide_pos such as '0,000'" in capfd.readouterr().err
+
+
+def test_beside_what_was_measured_a_lone_d_is_desired(tmp_path: Path) -> None:
+    """``tau_d`` beside ``tau`` is the command; ``hinge_d`` beside ``hinge`` is its derivative."""
+    model = mujoco.MjModel.from_xml_string(CARTPOLE)
+    t, q, v, u = recorded(model, 6, 4, lambda s: [3 * math.sin(4 * s) + math.sin(9 * s)])
+    noise = 0.3 * np.random.default_rng(0).standard_normal(len(t))
+    frame = {"t": t, "slider": q[:, 0], "hinge": q[:, 1], "slider_d": v[:, 0], "hinge_d": v[:, 1]}
+    frame |= {"tau_J": u[:, 0] + noise, "tau_J_d": u[:, 0]}
+    found = dropo.propose_config(*written(tmp_path, frame, CARTPOLE), out=tmp_path / "robot.yaml")
+    assert [m.column.entry for m in found.matching.of("command")] == ["tau_J_d"]
+    assert [m.column.entry for m in found.matching.of("velocity")] == ["slider_d", "hinge_d"]
+
+
+def test_what_an_encoder_counts_is_in_no_unit(tmp_path: Path) -> None:
+    model = mujoco.MjModel.from_xml_string(CARTPOLE)
+    t, q, _, u = recorded(model, 6, 4, lambda s: [3 * math.sin(4 * s)])
+    frame = {"t": t, "slider": q[:, 0], "hinge_ticks": np.round(q[:, 1] * 4096 / (2 * np.pi)), "force": u[:, 0]}
+    with pytest.raises(dropo.InputError, match=r"hinge_ticks .hinge.position. is what an encoder counts.*in rad"):
+        dropo.propose_config(*written(tmp_path, frame, CARTPOLE), out=tmp_path / "robot.yaml")
+
+
+def test_an_angle_that_wraps_has_the_noise_of_one_that_does_not(tmp_path: Path) -> None:
+    xml = CLOCKED.replace('type="slide" axis="1 0 0"', 'axis="0 0 1" damping="0.5"')
+    t, q, _, u = recorded(mujoco.MjModel.from_xml_string(xml), 5, 20, lambda s: [2 + math.sin(2 * s) + math.sin(5 * s)])
+    angle = q[:, 0] + 2e-3 * np.random.default_rng(0).standard_normal(len(t))
+    known = []
+    for name, values in (("whole", angle), ("wrapped", np.mod(angle + np.pi, 2 * np.pi) - np.pi)):
+        (tmp_path / name).mkdir()
+        frame = {"t": t, "slide_rad": values, "push_cmd": u[:, 0]}
+        found = dropo.propose_config(*written(tmp_path / name, frame, xml), out=tmp_path / name / "robot.yaml")
+        known.append((found.document["data"]["preprocess"], found.document["noise"]))
+    (whole, noise), (wrapped, other) = known
+    assert np.ptp(angle) > 4 * np.pi
+    assert wrapped["derive"] == whole["derive"] == ["slide_rad"]
+    np.testing.assert_allclose(other, noise, rtol=0.05)
+
+
+def test_odometry_is_of_what_all_of_a_robot_moves_by(tmp_path: Path) -> None:
+    xml = """<mujoco><worldbody><body name="car"><joint name="base_x" type="slide" axis="1 0 0" damping="2"/>
+      <joint name="base_y" type="slide" axis="0 1 0" damping="2"/><joint name="base_yaw" axis="0 0 1" damping=".3"/>
+      <geom size=".1" mass="2"/></body></worldbody><actuator><motor name="push" joint="base_x"/>
+      <motor name="turn" joint="base_yaw"/></actuator></mujoco>"""
+    t, q, _, u = recorded(mujoco.MjModel.from_xml_string(xml), 5, 5, lambda s: [math.sin(3 * s), 0.1 * math.sin(2 * s)])
+    frame = {"time": t, "odom_x": q[:, 0], "odom_y": q[:, 1], "odom_yaw_deg": np.degrees(q[:, 2])}
+    frame |= {"push_cmd": u[:, 0], "turn_cmd": u[:, 1]}
+    found = dropo.propose_config(*written(tmp_path, frame, xml), out=tmp_path / "robot.yaml")
+    assert [m.column.entry for m in found.matching.of("position")] == ["odom_x", "odom_y", "odom_yaw_deg"]

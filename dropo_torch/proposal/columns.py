@@ -17,11 +17,13 @@ from dropo_torch.data.formats import open_tables
 from dropo_torch.data.streams import TIME
 from dropo_torch.data.tables import Choice, Table, missing, numbers
 from dropo_torch.errors import InputError
-from dropo_torch.proposal.words import Words, actual, read_name
+from dropo_torch.proposal.words import Words, actual, desired, read_name
 from dropo_torch.support.given import MOST_TEXT
 
 #: Columns of a matrix beyond which it is a picture or a cloud of points, and no state.
 WIDEST = 200
+#: Correlation from which on a column called after another one is what was commanded of it, and no derivative.
+ALIKE = 0.5
 #: Arrays that hold what is observed, and commanded, of a whole robot.
 STATES = ("observations", "observation", "obs", "state", "states")
 ACTIONS = ("actions", "action", "ctrl", "control", "controls", "u", "commands")
@@ -146,6 +148,15 @@ def read_columns(path: str | Path, known: Sequence[str] = ()) -> Columns:
 def _understood(columns: Sequence[Column], known: Sequence[str]) -> list[Column]:
     """The columns with what their names say."""
     names = [f"{c.array} {c.label}" if c.label else c.entry for c in columns]
+
+    def alike(i: int, j: int) -> bool:
+        one, other = columns[i].values, columns[j].values
+        known = np.isfinite(one) & np.isfinite(other) if len(one) == len(other) else np.zeros(0, dtype=bool)
+        if known.sum() < 3 or not np.ptp(one[known]) or not np.ptp(other[known]):
+            return False
+        return bool(np.corrcoef(one[known], other[known])[0, 1] > ALIKE)
+
+    names = desired(names, alike)
     names = actual(names, [read_name(name, known) for name in names])
     return [replace(c, words=read_name(name, known)) for c, name in zip(columns, names, strict=True)]
 

@@ -28,8 +28,10 @@ ALIAS = 0.8
 #: Share of motion below which a position speaks against a velocity, where it moves by so many times its noise.
 UNLIKE, SEEN = 0.1, 6.0
 _AXES = ("x", "y", "z")
-#: What the body is called by which all of a robot moves, whatever its name in the model.
-BASE = frozenset(("base", "root", "floating", "torso", "trunk", "pelvis", "chassis"))
+#: What the body is called by which all of a robot moves, whatever its name in the model, or what measures where it is.
+BASE = frozenset((
+    "base", "root", "floating", "torso", "trunk", "pelvis", "chassis", "odom", "odometry", "mocap", "vicon", "optitrack"
+))  # fmt: skip
 
 
 def match_columns(columns: Columns, places: Sequence[Place], starts: np.ndarray, taken: Sequence[Column]) -> Matching:
@@ -361,7 +363,10 @@ def _ordered(wanted: Sequence[Place], family: Sequence[Column], found: dict[str,
 
 
 def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Column]]:
-    """Columns that may be of a kind of places and belong together: by array, kind, unit and what is commanded."""
+    """Columns that may be of a kind of places and belong together: by array, kind, unit and what is commanded.
+
+    What is called a command comes before efforts that may have been measured.
+    """
     groups: dict[tuple, list[Column]] = {}
     for c in (c for c in free if wanted and _may_be(c, wanted[0].kind)):
         w = c.words
@@ -369,7 +374,7 @@ def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Colu
         is_other = wanted[0].kind == "command" and not may_command(w, wanted[0])
         if not (is_bare or is_other or w.axis or w.quaternion):
             groups.setdefault((c.array if c.index is not None else "", w.role, w.commanded, w.scale), []).append(c)
-    return list(groups.values())
+    return sorted(groups.values(), key=lambda group: wanted[0].kind == "command" and group[0].words.role != "command")
 
 
 def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:

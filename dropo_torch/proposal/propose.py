@@ -33,6 +33,7 @@ from dropo_torch.proposal.matching import match_columns
 from dropo_torch.proposal.places import Place, known_names, places_of
 from dropo_torch.proposal.text import config_text
 from dropo_torch.proposal.units import nearest_unit, rows_apart, with_velocity_units
+from dropo_torch.proposal.words import COUNTS, split
 from dropo_torch.shooting.posing import column_noise, posed
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
 from dropo_torch.support.report import Report
@@ -363,6 +364,14 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
     ]  # fmt: skip
     if lacking:
         raise InputError(f"{columns.source}: {_lacking(lacking, model, free)}{_texts(columns)}")
+    for m in (*matching.of("position"), *matching.of("velocity")):
+        if COUNTS & set(split(m.column.label or m.column.entry)) and m.scale == 1.0:
+            unit = "rad or degrees" if m.place.measure == "angle" else "m or mm"
+            raise InputError(
+                f"{columns.source}: {m.column.entry} ({m.place.label}) is what an encoder counts, and nothing says how "
+                f"many make a {'turn' if m.place.measure == 'angle' else 'meter'}; log it in {unit}, with the unit in "
+                "its name, such as " + ("theta_rad" if m.place.measure == "angle" else "x_m")
+            )
     absent = matching.lacks("command")
     told, named = matching.of("command"), [c.entry for c in left_over(matching)]
     if absent and (told or named or any(p.takes != "position" for p in absent)):

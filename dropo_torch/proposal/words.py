@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -25,7 +25,9 @@ _ROLES: dict[Role, frozenset[str]] = {
         "dq qd qdot qvel vel velo velocity velocities spd speed speeds omega dot rate v twist gyro angvel linvel"
     ),
     "acceleration": _set("ddq qdd qddot acc accel acceleration qacc"),
-    "effort": _set("tau torque torques effort efforts force forces tension tensions moment current curr load frc"),
+    "effort": _set(
+        "tau torque torques effort efforts force forces thrust tension tensions moment current curr load frc"
+    ),
     "command": _set(
         "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
         "target targets des desired ref reference setpoint setp goal sp pwm"
@@ -61,6 +63,8 @@ TIME_UNITS = {
     "milliseconds": 1e-3, "us": 1e-6, "usec": 1e-6, "micros": 1e-6, "microseconds": 1e-6, "ns": 1e-9, "nsec": 1e-9,
     "nanos": 1e-9, "nanoseconds": 1e-9, "nanosec": 1e-9,
 }  # fmt: skip
+#: Words of what an encoder counts: how many make a turn or a meter, no name tells.
+COUNTS = _set("tick ticks counts cnts pulses lsb")
 #: Words of angles.
 _TURNS = _set("angle angles theta th phi psi alpha beta thetadot phidot dtheta dphi")
 #: Words that tell nothing.
@@ -202,6 +206,25 @@ def _misleads(name: str) -> bool:
 def says_kind(name: str) -> bool:
     """Return whether a name has a word of a kind of columns, such as ``position``."""
     return any(_role(word) in ("position", "velocity", "effort", "command") for word in split(name))
+
+
+def desired(names: Sequence[str], alike: Callable[[int, int], bool]) -> list[str]:
+    """Return names with ``des`` for a lone ``d`` where another column is called alike but for that.
+
+    Beside ``tau_J``, ``tau_J_d`` is what was commanded; beside ``theta``, ``theta_d`` may be its derivative.
+
+    Args:
+        names: of columns.
+        alike: whether the values of two of them are, which a derivative's are not.
+    """
+    every = {tuple(split(name)): i for i, name in enumerate(names)}
+    found = list(names)
+    for i, name in enumerate(names):
+        words = split(name)
+        bare = tuple(word for word in words if word != "d")
+        if words.count("d") == 1 and bare in every and alike(i, every[bare]):
+            found[i] = " ".join("des" if word == "d" else word for word in words)
+    return found
 
 
 def actual(names: Sequence[str], words: Sequence[Words]) -> list[str]:
