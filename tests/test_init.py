@@ -1236,3 +1236,17 @@ def test_odometry_is_of_what_all_of_a_robot_moves_by(tmp_path: Path) -> None:
     frame |= {"push_cmd": u[:, 0], "turn_cmd": u[:, 1]}
     found = dropo.propose_config(*written(tmp_path, frame, xml), out=tmp_path / "robot.yaml")
     assert [m.column.entry for m in found.matching.of("position")] == ["odom_x", "odom_y", "odom_yaw_deg"]
+
+
+def test_seconds_and_nanoseconds_of_a_header_are_one_clock(tmp_path: Path) -> None:
+    t, q, v, u = recorded(mujoco.MjModel.from_xml_string(CARTPOLE), 6, 4, lambda s: [3 * math.sin(4 * s)])
+    stamps = np.round((t + 0.37) * 1e9).astype(np.int64)
+    frame = {"header.stamp.sec": 1700000000 + stamps // 10**9, "header.stamp.nanosec": stamps % 10**9}
+    frame |= {"slider": q[:, 0], "hinge": q[:, 1], "slider_vel": v[:, 0], "hinge_vel": v[:, 1], "force": u[:, 0]}
+    found = dropo.propose_config(*written(tmp_path, frame, CARTPOLE), out=tmp_path / "robot.yaml")
+    data = found.document["data"]
+    assert data["time"] == ["header.stamp.sec", {"signal": "header.stamp.nanosec", "scale": 1e-9}]
+    assert "breaks" not in data
+    log = dropo.make_problem(found.config).trajectories
+    assert (log.num_episodes, len(log)) == (1, len(t) - 1)
+    assert log.dt == pytest.approx(t[1] - t[0], rel=1e-4)

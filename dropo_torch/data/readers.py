@@ -113,7 +113,8 @@ def read_trajectories(
             ``next_observations`` where there is one and ``observations`` is not given; otherwise the next
             row of the same episode.
         actions: the columns commanded, by default the array ``actions``; ``[]`` for a passive system.
-        time: the column of time stamps in seconds, as dates, or in any unit with ``{signal: stamp_ns, scale: 1e-9}``.
+        time: the column of time stamps in seconds, as dates, or in any unit with ``{signal: stamp_ns, scale: 1e-9}``;
+            two columns are added, such as a header's seconds and nanoseconds.
         episode: a column whose value differs from one episode to the next.
         terminals: columns of flags that are true at an episode's last row, any of them; by default the
             arrays ``terminals`` and ``timeouts``, one of which must be there unless ``observations`` is given;
@@ -372,9 +373,13 @@ def _time(table: Table, options: ReadOptions, episodes: np.ndarray) -> np.ndarra
         if are_dates(stamps):
             return dates_in_seconds(stamps, f"{table.source}: {signals[0].signal}")
     values, names = table.matrix(column, "time", len(episodes))
-    if len(names) != 1:
-        raise InputError(f"{table.source}: time has {len(names)} columns; expected one")
-    return values[:, 0]
+    if len(names) == 1:
+        return values[:, 0]
+    if len(names) != 2 or (values[:, 0] != np.round(values[:, 0])).any():
+        raise InputError(
+            f"{table.source}: time has {len(names)} columns; expected one, or whole seconds and their parts"
+        )
+    return np.asarray((values - values[:1]).sum(axis=1))
 
 
 def dates_in_seconds(stamps: np.ndarray, where: str) -> np.ndarray:

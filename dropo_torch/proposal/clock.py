@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from dropo_torch.data.readers import are_dates, dates_in_seconds
 from dropo_torch.proposal.columns import Column, Columns
-from dropo_torch.proposal.words import time_unit
+from dropo_torch.proposal.words import TIME_UNITS, split, time_unit
 
 #: Units of time stamps, the likeliest first, and seconds between rows that a robot's log may have.
 UNITS = (1.0, 1e-3, 1e-9, 1e-6)
@@ -17,6 +18,8 @@ FASTEST, SLOWEST = 1.5e-4, 0.6
 #: Steps between stamps beyond which another episode begins: what was commanded there is unknown. Fewer, if most rows
 #: (which share) are then in pieces that are long enough to compare (of how many rows).
 GAP, SHORT_GAP, MOST, PIECE = 12.0, 3.5, 0.7, 40
+#: Seconds of a nanosecond.
+NANO = 1e-9
 #: Relative deviation of a spacing up to which stamps count as even.
 EVEN = 0.05
 
@@ -35,6 +38,8 @@ class Clock:
         terminals: columns of flags that end episodes.
         breaks: rows at which stamps begin anew or leave a gap, where no column says so.
         why: how unit and episodes were found, in words.
+        summed: the two columns, of whole seconds and of their nanoseconds, of which ``column`` is the sum; empty for
+            one of its own.
     """
 
     column: Column | None
@@ -46,6 +51,19 @@ class Clock:
     terminals: tuple[Column, ...]
     breaks: tuple[int, ...]
     why: tuple[str, ...]
+    summed: tuple[Column, ...] = ()
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """The columns of the log that tell the time."""
+        return self.summed or ((self.column,) if self.column is not None else ())
+
+    @property
+    def entry(self) -> str | dict[str, Any] | list[str | dict[str, Any]]:
+        """The entry ``time`` of a config, in seconds."""
+        *whole, last = self.columns
+        fine = last.entry if self.unit == 1.0 else {"signal": last.entry, "scale": self.unit}
+        return [*(c.entry for c in whole), fine] if whole else fine
 
     def starts(self, rows: int, parts: Sequence[int]) -> np.ndarray:
         """Return at which rows an episode begins, ``(N,)`` bool."""
@@ -78,6 +96,8 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     if column is None:
         said = f"rows are {dt:g} s apart, as given" if given else "the log has no time stamps"
         return Clock(None, 1.0, dt, True, 0.0, episode, empty.terminals, (), (said,))
+    summed = _with_seconds(columns, column)
+    column = column if summed is None else _sum(*summed)
     stamps = _stamps(column)
     spacing = np.diff(stamps)
     usual = spacing[(spacing > 0) & ~known[1:]]
@@ -93,7 +113,7 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     jitter = float(np.std(within[within < 2])) if within.size else 0.0
     return Clock(
         column, unit, float(within.mean()) * median * unit if even else median * unit, even, jitter, episode,
-        empty.terminals, breaks, tuple(why),
+        empty.terminals, breaks, tuple(why), summed or (),
     )  # fmt: skip
 
 
@@ -121,6 +141,29 @@ def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
         return max(named, key=lambda c: _steps(_stamps(c)))
     rising = [c for c in columns.numeric if not c.words.role and _rises(c, known) and _evenly(c.values, known)]
     return rising[0] if len(rising) == 1 else None
+
+
+def _with_seconds(columns: Columns, fine: Column) -> tuple[Column, Column] | None:
+    """A column of whole seconds and the one of their nanoseconds, as a message's header has them; ``None`` without."""
+    if (
+        time_unit(fine.entry) != NANO
+        or not fine.values.size
+        or not (fine.values.min() >= 0 and np.ptp(fine.values) < 1e9)
+    ):
+        return None
+    own = [word for word in split(fine.entry) if word not in TIME_UNITS]
+    for c in columns.numeric:
+        words = split(c.entry)
+        whole = words != own and [w for w in words if w not in TIME_UNITS] == own and c is not fine
+        if whole and time_unit(c.entry) in (1.0, None) and np.isin(np.diff(c.values), (0, 1)).mean() > 0.9:
+            return c, fine
+    return None
+
+
+def _sum(seconds: Column, fine: Column) -> Column:
+    """A column of nanoseconds since the first whole second."""
+    values = (seconds.values - seconds.values[0]) / NANO + fine.values
+    return replace(fine, values=values, labels=values)
 
 
 def _rises(column: Column, known: np.ndarray) -> bool:

@@ -170,8 +170,7 @@ def _source(reading: Reading) -> dict[str, Any]:
     elif clock.column is None:
         source["dt"] = float(f"{clock.dt:.6g}")
     else:
-        unit = clock.unit
-        source["time"] = clock.column.entry if unit == 1.0 else {"signal": clock.column.entry, "scale": unit}
+        source["time"] = clock.entry
     if clock.episode is not None:
         source["episode"] = clock.episode.entry
     elif clock.terminals:

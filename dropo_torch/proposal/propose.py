@@ -320,7 +320,7 @@ def _whole_step(path: Path, columns: Columns, clock: Clock, step: float) -> floa
 def _matched(columns: Columns, places: Sequence[Place], clock: Clock, timestep: float) -> tuple[Matching, Clock]:
     """Columns and their units, with the clock's unit as velocities show it."""
     starts = clock.starts(len(columns), columns.parts)
-    taken = [c for c in (clock.column, clock.episode, *clock.terminals) if c is not None]
+    taken = [c for c in (*clock.columns, clock.episode, *clock.terminals) if c is not None]
     matching = match_columns(columns, places, starts, taken)
     clock = _checked_clock(clock, matching, starts, timestep)
     if clock.dt is not None:
@@ -391,7 +391,7 @@ def _check(matching: Matching, columns: Columns, model: mujoco.MjModel, clock: C
 
 def _free(matching: Matching, columns: Columns, clock: Clock) -> list[str]:
     """The columns of numbers that are nothing yet, first those that move."""
-    taken = [*(m.column for m in matching.matches), clock.column, clock.episode, *clock.terminals]
+    taken = [*(m.column for m in matching.matches), *clock.columns, clock.episode, *clock.terminals]
     used = {c.entry for c in taken if c is not None}
     return [c.entry for c in sorted(columns.numeric, key=lambda c: not c.moves) if c.entry not in used]
 
