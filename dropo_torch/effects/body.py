@@ -34,27 +34,14 @@ class BodyEffect(Effect):
 
     @staticmethod
     def extent(setting: Setting, body: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the corners of the box around a body's geoms and where others hang on it, in its frame, ``(3,)`` each.
-
-        Without geoms, as in many a URDF, the body is taken for the even box that has its moments of inertia.
-        """
+        """Return the corners of the box around a body's geoms, in its frame, ``(3,)`` each."""
         m = setting.model
-        size = np.full(3, 0.02) if m.body_geomnum[body] else np.maximum(_inertia_box(m, body), 0.02)
-        points = np.array([m.body_ipos[body], *m.body_pos[np.flatnonzero(m.body_parentid == body)]])
-        low = np.minimum(m.body_ipos[body] - size, points.min(0))
-        high = np.maximum(m.body_ipos[body] + size, points.max(0))
+        low, high = m.body_ipos[body] - 0.02, m.body_ipos[body] + 0.02
         for g in range(m.body_geomadr[body], m.body_geomadr[body] + m.body_geomnum[body]):
             turn = _rotation(m.geom_quat[g])
             reach, center = np.abs(turn) @ m.geom_aabb[g, 3:], m.geom_pos[g] + turn @ m.geom_aabb[g, :3]
             low, high = np.minimum(low, center - reach), np.maximum(high, center + reach)
         return low, high
-
-
-def _inertia_box(model: mujoco.MjModel, body: int) -> np.ndarray:
-    """Half the sides of the box along a body's axes that holds an even box of the same moments of inertia, ``(3,)``."""
-    about = model.body_inertia[body]
-    squares = 1.5 * (about.sum() - 2 * about) / max(float(model.body_mass[body]), 1e-12)
-    return np.abs(_rotation(model.body_iquat[body])) @ np.sqrt(np.maximum(squares, 0.0))
 
 
 def _rotation(quaternion: np.ndarray) -> np.ndarray:
