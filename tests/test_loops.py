@@ -161,6 +161,7 @@ def test_a_mimicking_joint_needs_neither_columns_nor_a_motor(tmp_path: Path) -> 
     (tmp_path / "robot.urdf").write_text(MIMIC)
     found = propose_config(tmp_path / "robot.urdf", tmp_path / "log.csv", out=tmp_path / "robot.yaml")
     assert [m.place.label for m in found.matching.of("command")] == ["finger"]
+    assert "follower: no column is a force there; no motor was added" in found.draft.notes
     problem = dropo.make_problem(found.config)
     assert problem.space.model is not None
     assert problem.space.model.nu == 1

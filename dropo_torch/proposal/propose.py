@@ -256,6 +256,9 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
         draft = draft.noted(
             f"{', '.join(loops.names)}: no column shows them; they are where the model's equality constraints are met"
         )
+    driven = robot.driven(reading.matching)
+    if driven and (idle := [name for name in drivable(robot.model) if name not in driven]):
+        draft = draft.noted(f"{', '.join(idle)}: no column is a force there; no motor was added")
     if reading.timestep == robot.step:
         return draft
     return draft.noted(
