@@ -96,7 +96,7 @@ def _unwrapped(
     bounds = np.flatnonzero(np.diff(recording.episodes)) + 1
     for part in np.split(np.arange(len(values)), bounds):
         for column in columns:
-            values[part, column] = _continuous(values[part, column])
+            values[part, column] = continuous(values[part, column])
     if following is not None:
         following = np.array(following)
         turns = np.round((values[:, columns] - following[:, columns]) / TURN)
@@ -104,7 +104,7 @@ def _unwrapped(
     return replace(recording, observations=values), following
 
 
-def _continuous(angle: np.ndarray) -> np.ndarray:
+def continuous(angle: np.ndarray) -> np.ndarray:
     """An angle ``(N,)`` without jumps by a turn, the first within half a turn of 0; NaN, which is no sample, stays."""
     angle, present = np.array(angle), ~np.isnan(angle)
     unwrapped = np.unwrap(angle[present])

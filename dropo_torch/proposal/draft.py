@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.config import make_config
+from dropo_torch.data.corrections import continuous
 from dropo_torch.data.examination import Finding
 from dropo_torch.data.ticks import find_ticks
 from dropo_torch.logged import LoggedData, read_log
@@ -363,8 +364,7 @@ def _continuous(match: Match, positions: Sequence[Match]) -> np.ndarray:
         along = np.nansum([part[1:] * part[:-1] for part in parts], axis=0)
         values[1:] *= np.cumprod(np.where(along < 0, -1.0, 1.0))
     elif match.place.measure == "angle":
-        known = np.isfinite(values)
-        values[known] = np.unwrap(values[known])
+        values = continuous(values)
     return values
 
 
