@@ -1611,9 +1611,10 @@ def test_differences_are_taken_with_a_step_that_costs_less(monkeypatch: pytest.M
 def test_so_are_those_of_a_log_that_is_compared_with_a_finer_step(finer: int, monkeypatch: pytest.MonkeyPatch) -> None:
     scene, hypothesis = scene_of("joint_friction"), true(hidden("joint_friction"))
     step = scene.setting.model.opt.timestep
-    evidence = dataclasses.replace(scene.evidence, twin=scene.twin.finer(step / finer))
-    assert evidence.twin.eased is scene.twin.finer(step / 2)
-    assert scene.twin.finer(step / 2).eased is scene.twin.finer(step / 2)
+    fine, half = (scene.twin.finer(Placed(find_effect("integration"), None, (step / n,))) for n in (finer, 2))
+    evidence = dataclasses.replace(scene.evidence, twin=fine)
+    assert fine.eased is half
+    assert half.eased is half
     assert scene.twin.eased is scene.twin
     easy = refit(evidence, hypothesis, iterations=0)
     monkeypatch.setattr(type(evidence.twin), "eased", property(lambda self: self))
@@ -1773,7 +1774,8 @@ def test_a_step_that_noise_hides_widens_intervals(seed: int) -> None:
     own = refit(hidden, true(case))
     last = resolved(hidden, own)
     assert last.fit is own
-    finer = refit(dataclasses.replace(hidden, twin=hidden.twin.finer(step / 8)), true(case))
+    fine = hidden.twin.finer(Placed(find_effect("integration"), None, (step / 8,)))
+    finer = refit(dataclasses.replace(hidden, twin=fine), true(case))
     np.testing.assert_allclose(last.error, np.abs(finer.hypothesis.vector - own.hypothesis.vector), rtol=0.5)
 
 

@@ -333,6 +333,11 @@ class Placed:
         """Effect and target, without the values."""
         return self.effect.name, self.target
 
+    @property
+    def called(self) -> tuple[str, str | None]:
+        """Effect and target as answers call them: kinds of the same effect have one name, and exclude each other."""
+        return self.effect.known_as or self.effect.name, self.target
+
     def at(self, values: Sequence[float] | np.ndarray) -> Placed:
         """Return the same effect with other values."""
         return Placed(self.effect, self.target, tuple(float(v) for v in values))

@@ -387,7 +387,7 @@ def finer_steps(model: mujoco.MjModel, changed: mujoco.MjModel, native: EffectSe
     """
     ratio = whole_ratio(model.opt.timestep, changed.opt.timestep)
     if ratio is None:
-        entry = next((e for e in native.entries if e.effect.name == "integration"), native.entries[0])
+        entry = next((e for e in native.entries if e.effect.steps), native.entries[0])
         raise InputError(
             f"effects: {entry.place} makes steps of {changed.opt.timestep:g} s, of which no whole number is the "
             f"model's {model.opt.timestep:g} s"

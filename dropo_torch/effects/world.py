@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
+
 import mujoco
 import numpy as np
 
-from dropo_torch.effects.base import Effect, Quantity, Setting
+from dropo_torch.effects.base import Effect, Placed, Quantity, Setting
 
 
 def _turn(roll: float, pitch: float) -> np.ndarray:
@@ -94,6 +96,34 @@ class Integration(WorldEffect):
         model.opt.timestep = values[0]
         if not _has_stiff_damping(model):
             model.opt.integrator = mujoco.mjtIntegrator.mjINT_RK4
+
+
+class OwnIntegration(Integration):
+    """A log that was simulated by the model's own integrator with a finer step, and so has an error of its own."""
+
+    name = "integration_own"
+    known_as = Integration.name
+    sentence = "the simulator's own integration step is coarser than the one that the log was made with"
+
+    #: How many times finer the step may become, and with which ones a search begins.
+    FINER = 16
+    RATIOS = (2, 3, 4, 5, 8, 10)
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return the world, unless :class:`Integration` keeps the model's integrator, too."""
+        step, finer = setting.model.opt.timestep, copy.copy(setting.model)
+        Integration().apply(finer, None, np.array([step / Integration.FINER]))
+        return [None] if finer.opt.integrator != setting.model.opt.integrator else []
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        return [np.array([float(setting.model.opt.timestep) / ratio]) for ratio in self.RATIOS]
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        there = simpler.effect.name == Integration.name and self.targets(setting)
+        return self.starts(setting, None) if there else []
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.opt.timestep = values[0]
 
 
 def _has_stiff_damping(model: mujoco.MjModel) -> bool:

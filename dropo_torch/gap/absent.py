@@ -22,7 +22,7 @@ Allowed = tuple[Placed, np.ndarray]
 def absent(ground: Ground, hypothesis: Hypothesis) -> list[Placed]:
     """Return what a family could have besides its members, with neutral values: slopes only of friction that it has."""
     setting = ground.setting
-    taken = {(p.effect.known_as or p.effect.name, p.target) for p in hypothesis.placed}
+    taken = {p.called for p in hypothesis.placed}
     others, slope = base_family(setting, ground.effects), find_effect(SLOPE)
     if slope in ground.effects:
         rubbing = {p.target for p in hypothesis.placed if p.effect.name in (FRICTION, SOFT)}

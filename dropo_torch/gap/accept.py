@@ -30,8 +30,6 @@ from dropo_torch.gap.sound import absurd
 MANY = 3
 #: Dry friction as MuJoCo has it by default.
 SOFT = "joint_soft_friction"
-#: A finer step as an effect.
-STEP = "integration"
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
@@ -83,8 +81,9 @@ def _step_does(ground: Ground, whole: Refit, without: Refit) -> bool:
 
 def _adds_step(whole: Refit, without: Refit) -> bool:
     """Whether a hypothesis differs from one without it by a finer step: no guess about the robot."""
-    own, rest = ({p.key for p in r.hypothesis.placed} for r in (whole, without))
-    return own - rest == {(STEP, None)}
+    rest = {p.key for p in without.hypothesis.placed}
+    added = [p for p in whole.hypothesis.placed if p.key not in rest]
+    return len(added) == 1 and added[0].effect.steps
 
 
 def step_shows(ground: Ground, base: Refit) -> bool:

@@ -69,7 +69,7 @@ class Screening:
         before = max(left_by(self, others) - self.degrees, 1e-12)
         share = {key: (left_by(self, [*others, c]) - self.degrees) / before for key, c in alive.items()}
         own = placed[index]
-        if own.effect.name != "integration" and share[own.key] > rules.straight:
+        if not own.effect.steps and share[own.key] > rules.straight:
             return None
         return {key for key, left in share.items() if left < rules.likely}
 

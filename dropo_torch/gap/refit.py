@@ -391,7 +391,7 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
     vector, finest = fitted.hypothesis.vector, finest_step(evidence, fitted.hypothesis)
     if finest is None:
         return Resolved(fitted, evidence, np.zeros(len(vector)))
-    finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, 2 * finest))
+    finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, finest.at((2 * finest.values[0],))))
     anew = anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules)
     if anew := anew and step_may_explain(evidence, fitted):
         finer = _anew(finer)
@@ -399,6 +399,9 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
             coarser.evidence, finer.fit, finer.fit.hypothesis, limits_of(fitted.hypothesis, evidence.twin)
         )
     fine = finer.fit
+    made, between = _as_made(evidence, fitted, finer)
+    if made is not None:
+        return made
     if fine.loss >= fitted.loss:
         untold = fine.loss < fitted.loss + UNTOLD
         return Resolved(fitted, evidence, np.abs(fine.hypothesis.vector - vector) * untold)
@@ -408,15 +411,46 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
     limits = limits_of(fitted.hypothesis, evidence.twin)
     ahead = fine.hypothesis.vector if anew else fine.hypothesis.vector + change
     there = fine.hypothesis.at(np.clip(ahead, limits.low, limits.high))
-    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change))
+    return Resolved(replace(fine, hypothesis=there), finer.evidence, np.abs(change) + between)
 
 
-def finest_step(evidence: Evidence, hypothesis: Hypothesis) -> float | None:
+def _as_made(evidence: Evidence, fitted: Refit, finest: Resolved) -> tuple[Resolved | None, np.ndarray]:
+    """A fit under the step of the model's own integrator with which a log was made, if it shows that it was.
+
+    A simulated log has the error of the simulator that made it. That of a model's integrator is of first order in the
+    step, so a fit under its own step and one under the finest tell by their residuals which step between them it is.
+
+    Returns:
+        The fit, and what remains uncertain of the numbers ``(q,)`` where there is none.
+    """
+    own, setting = find_effect("integration_own"), evidence.twin.setting
+    vector, fine = fitted.hypothesis.vector, finest.fit
+    nothing = np.zeros(len(vector))
+    if not own.targets(setting):
+        return None, nothing
+    caps = np.reshape(evidence.caps, (-1, 1))
+    rest, change = caps * fine.residual, caps * (fitted.residual - fine.residual)
+    size = float(np.linalg.norm(change))
+    share = -float((rest * change).sum()) / max(size**2, 1e-300)
+    if not 0 < share < 1:
+        return None, nothing
+    moved = np.abs(vector - fine.hypothesis.vector)
+    if (min(share, 1 - share) * size) ** 2 < UNTOLD:
+        return None, share * moved
+    (quantity,) = own.quantities(setting, None)
+    ratio = round(np.clip(1 / share, 2, quantity.high / quantity.low))
+    made = _stepped(evidence, fitted, Placed(own, None, (quantity.high / ratio,)))
+    if made.fit.loss > min(fine.loss, fitted.loss) - UNTOLD:
+        return None, nothing
+    return replace(made, error=max(Z90 / size, abs(share - 1 / ratio)) * moved), nothing
+
+
+def finest_step(evidence: Evidence, hypothesis: Hypothesis) -> Placed | None:
     """Return the finest step with which a hypothesis is compared, ``None`` where it says itself what the step is."""
-    effect = find_effect("integration")
-    if STEP_FIELD in evidence.twin.space.fields or any(p.effect is effect for p in hypothesis.placed):
+    if STEP_FIELD in evidence.twin.space.fields or any(p.effect.steps for p in hypothesis.placed):
         return None
-    return effect.quantities(evidence.twin.setting, None)[0].low
+    effect = find_effect("integration")
+    return Placed(effect, None, (effect.quantities(evidence.twin.setting, None)[0].low,))
 
 
 def change_of_step(evidence: Evidence, fitted: Refit) -> np.ndarray | None:
@@ -452,10 +486,9 @@ def half_widths(last: Resolved) -> np.ndarray:
 
 def _of_named_step(evidence: Evidence, fitted: Refit) -> np.ndarray:
     """By how much numbers ``(q,)`` change with twice the step that a hypothesis names: as much as without any."""
-    names = [p.effect.name for p in fitted.hypothesis.placed]
-    if "integration" not in names:
+    index = next((i for i, p in enumerate(fitted.hypothesis.placed) if p.effect.steps), None)
+    if index is None:
         return np.zeros(len(fitted.scale))
-    index = names.index("integration")
     own = fitted.hypothesis.placed[index]
     twice = fitted.hypothesis.instead(index, own.at(2 * np.array(own.values)))
     limits = limits_of(twice, evidence.twin)
@@ -469,7 +502,7 @@ def _anew(last: Resolved) -> Resolved:
     return replace(last, fit=there) if there.loss < last.fit.loss else last
 
 
-def _stepped(evidence: Evidence, fitted: Refit, step: float) -> Resolved:
+def _stepped(evidence: Evidence, fitted: Refit, step: Placed) -> Resolved:
     """A fit moved to where it is best under another step, by the derivatives that it has."""
     finer = replace(evidence, twin=evidence.twin.finer(step))
     return _nearest(finer, fitted, fitted.hypothesis, limits_of(fitted.hypothesis, evidence.twin))

@@ -72,7 +72,7 @@ class NamedEffect:
     ) -> NamedEffect:
         """Return a named effect as it was found, with its numbers, its share of the gap, and what ties with it."""
         kind, sentence = placed.effect, placed.effect.sentence.format(target=placed.target)
-        keys = tuple((p.effect.known_as or p.effect.name, p.target) for p in tied)
+        keys = tuple(dict.fromkeys(p.called for p in tied if p.called != placed.called))
         name, variant = (kind.known_as, kind.name) if kind.known_as else (kind.name, "")
         return cls(name, placed.target, parameters, share, keys, sentence, variant)
 

@@ -142,8 +142,8 @@ def screen(
         tried: thresholds.
         on_progress: called with the share of candidates that is done.
     """
-    taken = {p.key for p in focus.fitted.hypothesis.placed}
-    waiting, found = [c for c in candidates if c.key not in taken], list[Candidate]()
+    taken = {p.called for p in focus.fitted.hypothesis.placed}
+    waiting, found = [c for c in candidates if c.called not in taken], list[Candidate]()
     for rows in parts(len(waiting), BATCH):
         found += _predict(focus, waiting[rows], tried.dead)
         on_progress(rows.stop / len(candidates))
@@ -341,7 +341,8 @@ def promising_families(focus: Focus, candidates: Sequence[Candidate], tried: Tri
 
 def promising_pairs(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:
     """Return the pairs of candidates that together predict the least χ², the best first."""
-    pairs = combinations([c for c in candidates if not c.dead], 2)
+    alive = combinations([c for c in candidates if not c.dead], 2)
+    pairs = (pair for pair in alive if len({c.placed.called for c in pair}) == 2)
     return [[c.placed for c in pair] for _, pair in _best(focus, pairs)[: tried.pairs]]
 
 

@@ -112,7 +112,7 @@ def promising(focus: Focus, ranked: Sequence[Candidate], own: Placed, rules: Ali
     before = max(float(focus.residual @ focus.residual) - degrees, 1e-12)
     share = {c.key: (left_by(focus, [c]) - degrees) / before for c in ranked if not c.dead}
     most = max(rules.promising, 2 * share.get(own.key, 0.0))
-    found = [c for c in ranked if not c.dead and c.key != own.key and share[c.key] < most]
+    found = [c for c in ranked if not c.dead and c.placed.called != own.called and share[c.key] < most]
     found = [c for c in found if not (own.effect.name in c.placed.effect.contains and c.placed.target == own.target)]
     return sorted(found, key=lambda c: share[c.key])[: rules.roughly]
 

@@ -113,13 +113,13 @@ class Twin:
         self._commands: np.ndarray | None = None
         self._filtered: dict[tuple, np.ndarray] = {}
         self._closed: dict[bytes, np.ndarray] = {}
-        self.simulated_transitions, self._finer, self._coarser = 0, dict[float, Twin](), coarser
+        self.simulated_transitions, self._finer, self._coarser = 0, dict[Placed, Twin](), coarser
 
-    def finer(self, step: float) -> Twin:
-        """Return the same with another physics step, as ``integration`` has it: of filters and effects, too."""
+    def finer(self, step: Placed) -> Twin:
+        """Return the same with the physics step that an effect sets: of filters and effects, too."""
         if step not in self._finer:
-            model = applied(self.setting.model, [Placed(find_effect("integration"), None, (step,))])
-            ratio = round(self.setting.model.opt.timestep / step)
+            model = applied(self.setting.model, [step])
+            ratio = round(self.setting.model.opt.timestep / model.opt.timestep)
             setting = replace(self.setting, model=model, frame_skip=self.setting.frame_skip * ratio)
             self._finer[step] = Twin(
                 setting, self.space, num_threads=self.num_threads, chunk_size=self._chunk, warp=self._warp,
@@ -136,8 +136,10 @@ class Twin:
         if self._coarser is None:
             return self
         setting, effect = self._coarser.setting, find_effect("integration")
-        (step,) = effect.eased(setting, (effect.quantities(setting, None)[0].low,))
-        return self if step <= self.setting.model.opt.timestep else self._coarser.finer(step)
+        step = effect.eased(setting, (effect.quantities(setting, None)[0].low,))
+        if step[0] <= self.setting.model.opt.timestep:
+            return self
+        return self._coarser.finer(Placed(effect, None, step))
 
     def effects(self, variant: Variant) -> tuple[Placed, ...]:
         """Return all effects of a variant, those that every variant has among them."""
@@ -193,12 +195,12 @@ class Twin:
     def _filtering(self, variant: Variant) -> Twin | None:
         """The twin with the finer step under which a variant's filters act; ``None`` where that is this one."""
         placed = self.effects(variant)
-        step = next((p.values[0] for p in placed if p.effect.name == "integration"), None)
-        if step is None or step == self.setting.model.opt.timestep:
+        step = next((p for p in placed if p.effect.steps), None)
+        if step is None or step.values[0] == self.setting.model.opt.timestep:
             return None
         if not any(p.effect.has("command") or p.effect.has("sense") for p in placed):
             return None  # physics alone is stepped finer by the engine, with other variants
-        return self.finer(step) if whole_ratio(self.setting.model.opt.timestep, step) else None
+        return self.finer(step) if whole_ratio(self.setting.model.opt.timestep, step.values[0]) else None
 
     def _predict_apart(
         self, twins: Sequence[Twin | None], variants: Sequence[Variant], windows: Windows, starts: np.ndarray | None,
