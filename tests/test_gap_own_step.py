@@ -61,7 +61,7 @@ def test_a_finer_step_of_the_own_integrator_is_told(tmp_path: Path, ratio: int) 
     assert "simulated with a finer step" in answer(gap)[0]
 
 
-@pytest.mark.parametrize("ratio", [3, 8])
+@pytest.mark.parametrize("ratio", [3, 6, 8])
 def test_numbers_are_those_of_the_log_s_own_step(tmp_path: Path, ratio: int) -> None:
     """Also of a step that is none of those that a search begins with."""
     gap = find_gap(problem(tmp_path, STEP / ratio, damping=0.13))

@@ -105,7 +105,7 @@ class OwnIntegration(Integration):
     known_as = Integration.name
     sentence = "the simulator's own integration step is coarser than the one that the log was made with"
 
-    #: How many times finer the step may become, and with which ones a search begins.
+    #: How many times finer the step may become, and with which numbers a search begins.
     FINER = 16
     RATIOS = (2, 3, 4, 5, 8, 10)
 

@@ -274,9 +274,9 @@ def swap(ground: Ground, state: State) -> State:
             here = refit(focus.evidence, state.current.hypothesis, iterations=0, slopes=False).cost.chi2
             likely = state.first.rivals(state.current.hypothesis.placed, index, ground.rules.alike)
             alive = [c for c in ground.screened(without, likely) if not c.dead]
-            rivals = [
-                (c.placed,) for c in alive[: tried.rivals] if c.chi2 < tried.promises * here
-            ]  # that promise to explain more
+            # Far from where it begins, a prediction promises too little of any effect, of the accepted one as well.
+            least = max(here, next((c.chi2 for c in alive if c.key == own), 0.0))
+            rivals = [(c.placed,) for c in alive[: tried.rivals] if c.key != own and c.chi2 < tried.promises * least]
             found, _ = ground.refits(state, without, rivals, "swapping")
             better = [r for r in sound(ground, found[:1]) if r.cost.excess < state.current.cost.excess]
             if better and beats(ground, better[0], state.current):

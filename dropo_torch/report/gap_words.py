@@ -385,9 +385,10 @@ def _clause(effect: NamedEffect) -> str:
         return f"Your model has too much {missing.removeprefix('a ')}"
     if _mixed(effect):
         return f"Your model has too little or too much {missing.removeprefix('a ')}"
-    if effect.effect not in _CLAUSES:
+    kind = next((name for name in (effect.variant, effect.effect) if name in _CLAUSES), None)
+    if kind is None:
         return f"Your model lacks {missing}"
-    text = _CLAUSES[effect.effect].format(_at(effect.effect, effect.target))
+    text = _CLAUSES[kind].format(_at(effect.effect, effect.target))
     return text[0].upper() + text[1:] if text.startswith(("actuator ", "all ", "the world ")) else text
 
 
