@@ -20,6 +20,7 @@ from arm import XML, Folder, record
 from conftest import BOX_XML
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.signal import savgol_filter
 
 from benchmarks.measured_logs import measured_logs
 from benchmarks.wrong_logs import FAULTS, THROWN, Fault, Log, examined, good
@@ -162,6 +163,31 @@ def test_a_command_against_its_sign_may_be_the_joints(spring: str, negated: str,
     if not found.sure:
         assert "{actions: -1}" in found.advice
         assert "{observations[0]: -1, observations[1]: -1}" in found.advice
+
+
+FINGER = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>
+  <body><joint name="knuckle" type="hinge" axis="0 1 0" stiffness=".1" damping="{damping}" armature="2e-5"/>
+    <geom type="capsule" size=".009" fromto="0 0 0 .05 0 0" mass=".03"/></body></worldbody>
+  <actuator><motor name="pull" joint="knuckle"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize("missing", [0.01, 0.03, 0.1])
+def test_missing_damping_is_no_earlier_command(missing: float) -> None:
+    """Where inertia is next to nothing, what a motion leaves of damping that the model lacks leads the commands."""
+    model, true = (mujoco.MjModel.from_xml_string(FINGER.format(damping=d)) for d in (0.004, 0.004 + missing))
+    data, path, rng = mujoco.MjData(true), [], np.random.default_rng(0)
+    time, waves = 0.005 * np.arange(1204), rng.uniform(2, 16, 6)
+    actions = 0.05 * np.sin(time[:, None] * waves + rng.uniform(0, 6, 6)).sum(1, keepdims=True)
+    for action in actions:
+        path.append(data.qpos[0])
+        data.ctrl[:] = action
+        mujoco.mj_step(true, data, 5)
+    measured = np.array(path) + 1e-3 * rng.standard_normal(len(path))
+    smooth = savgol_filter(measured, 25, 3)
+    states = np.column_stack([smooth, np.gradient(smooth, 0.005)])[2:1203]
+    log = Trajectories(states[:-1], states[1:], actions[2:1202], np.arange(1200) == 1199)
+    found = examine(log, parse_observation(model, None, 2), model, 5)
+    assert not [f.name for f in found if f.sure]
 
 
 @pytest.mark.parametrize("seen", [False, True])

@@ -27,7 +27,7 @@ from dropo_torch.proposal.clock import find_clock
 from dropo_torch.proposal.columns import read_columns
 from dropo_torch.proposal.draft import Filter
 from dropo_torch.proposal.information import nominal_point
-from dropo_torch.proposal.matches import unit_name
+from dropo_torch.proposal.matches import Match, unit_name
 from dropo_torch.proposal.matching import match_columns
 from dropo_torch.proposal.motions import motion
 from dropo_torch.proposal.places import command_kind, known_names, places_of
@@ -299,15 +299,20 @@ ARM = """<mujoco><worldbody><body name="turntable"><joint name="base_yaw" axis="
     <position name="servo_3" joint="elbow" kp="9"/></actuator></mujoco>"""
 
 
-def matched(folder: Path, frame: dict[str, np.ndarray], xml: str = ARM) -> dict[str, str]:
-    """The column of each number of a model, by its label."""
+def matches_of(folder: Path, frame: dict[str, np.ndarray], xml: str = ARM) -> dict[str, Match]:
+    """What each number of a model is matched with, by its label."""
     model = mujoco.MjModel.from_xml_string(xml)
     pd.DataFrame(frame).to_csv(folder / "log.csv", index=False)
     columns = read_columns(folder / "log.csv", known_names(model))
     clock = find_clock(columns, model.opt.timestep)
     starts = clock.starts(len(columns), columns.parts)
     taken = [c for c in (clock.column, clock.episode) if c is not None]
-    return {m.place.label: m.column.entry for m in match_columns(columns, places_of(model), starts, taken).matches}
+    return {m.place.label: m for m in match_columns(columns, places_of(model), starts, taken).matches}
+
+
+def matched(folder: Path, frame: dict[str, np.ndarray], xml: str = ARM) -> dict[str, str]:
+    """The column of each number of a model, by its label."""
+    return {label: m.column.entry for label, m in matches_of(folder, frame, xml).items()}
 
 
 def swung(names: Sequence[str], *, of: str = "{}", rates: bool = False) -> dict[str, np.ndarray]:
@@ -396,6 +401,36 @@ def test_a_grippers_position_is_told_in_hundredths_of_its_range(tmp_path: Path) 
     assert [told[f"{n}.position"].unit for n in names] == ["degrees", "% of the joint's range"]
     entry = {"signal": told["gripper"].column.entry, "scale": pytest.approx(0.02), "offset": -0.2}
     assert told["gripper"].entry == entry
+
+
+EXCAVATOR = """<mujoco><compiler angle="radian"/><worldbody><body><joint name="boom" axis="0 1 0"/><geom size=".1"/>
+  <body pos="0 0 .3"><joint name="stick" axis="0 1 0" range="-1 2"/><geom size=".05"/></body></body></worldbody>
+  <actuator><motor name="boom_cyl" joint="boom" gear="100" ctrlrange="{boom}"/>
+  <position name="stick_cyl" joint="stick" ctrlrange="-1 1"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(
+    ("boom", "lowest", "told"), [("-2 2", -80.0, 0.02), ("0 4", 0.0, 0.04), ("-2 2", 0.0, 0.02), ("", -80.0, 1.0)]
+)
+def test_percent_are_of_what_an_actuator_takes(boom: str, lowest: float, told: float, tmp_path: Path) -> None:
+    """Forces from zero on, targets from the lower end; of an actuator without a range, nobody knows."""
+    xml = EXCAVATOR.format(boom=boom).replace(' ctrlrange=""', "")
+    wave = np.sin(5 * TIME)
+    frame = {"boom_angle": 0.3 * np.sin(TIME), "stick_angle": 0.5 + np.cos(3 * TIME)}
+    frame |= {"boom_valve_pct": lowest + (80 - lowest) * (0.5 + 0.5 * wave), "stick_valve_pct": 50 + 40 * wave}
+    found = matches_of(tmp_path, frame | {"time": TIME}, xml)
+    np.testing.assert_allclose(found["boom_cyl"].values, told * frame["boom_valve_pct"])
+    np.testing.assert_allclose(found["stick_cyl"].values, 0.8 * wave, atol=1e-9)
+    assert found["stick_cyl"].unit == "% of the command's range"
+
+
+@pytest.mark.parametrize(("name", "role"), [("throttle_1_pct", "command"), ("battery_pct", ""), ("grip_percent", "")])
+def test_percent_are_no_part_of_a_name(name: str, role: str) -> None:
+    words = read_name(name)
+    assert words.percent
+    assert words.scale is None
+    assert words.role in (role, "other")
+    assert not {"pct", "percent"} & set(words.objects)
 
 
 def test_a_joints_number_is_not_its_fingers(tmp_path: Path) -> None:

@@ -249,7 +249,8 @@ def _name(words: Words, place: Place, rank: int | None, own: int | None) -> floa
     if numbered is False:
         return -2.0
     score = _likeness_of_words(said, known, set(place.aliases), words.axis)
-    if not words.role and score < SURE and (said or not words.axis):  # a bare name must be the joint's
+    bare = not words.role and not (words.percent and place.kind == "command")
+    if bare and score < SURE and (said or not words.axis):  # a bare name must be the joint's
         return 0.0
     if not said and not numbered and score == 0.0 and not words.axis:
         return 0.4 if words.turns and place.measure == "angle" else 0.0 if words.turns else LEAST

@@ -14,7 +14,9 @@ from dropo_torch.proposal.places import Place
 #: Relative distance from a factor within which a unit is named.
 UNIT = 0.3
 #: What LeRobot calls a gripper's position, which it has in hundredths of the range, and by how many these may pass it.
-GRIPPER, OF_RANGE, PAST = "gripper.pos", "% of the joint's range", 5.0
+GRIPPER, PAST = "gripper.pos", 5.0
+#: What hundredths are told to be of, and the largest number that is a share of one, and no hundredths.
+OF_RANGE, OF_COMMAND, SHARE = "% of the joint's range", "% of the command's range", 1.05
 
 
 def with_unit(match: Match, found: dict[str, Match]) -> Match:
@@ -23,6 +25,8 @@ def with_unit(match: Match, found: dict[str, Match]) -> Match:
     if place.measure == "quaternion":
         return match
     named = column.words.scale
+    if (limits := _hundredths_of(match, found)) is not None:
+        return _of_range(match, limits)
     if place.kind == "command" and place.takes != "position":
         return match if named in (None, 1.0) or (place.takes == "effort" and named != 1e-3) else _scaled(match, named)
     if named is not None:
@@ -46,6 +50,25 @@ def _calibrated(match: Match, found: dict[str, Match]) -> tuple[float, float] | 
     inside = np.isfinite(values) & (values > -PAST) & (values < 100 + PAST)
     name = match.column.entry.rstrip("]").rpartition("[")[2]
     return of.limits if place.kind != "velocity" and name.endswith(GRIPPER) and inside.mean() > 0.99 else None
+
+
+def _hundredths_of(match: Match, found: dict[str, Match]) -> tuple[float, float] | None:
+    """The range of which a column is told in percent, by its name: an actuator's, or a joint's; ``None`` of none."""
+    place, values = match.place, match.column.values[np.isfinite(match.column.values)]
+    if not match.column.words.percent or place.kind == "velocity" or not values.size:
+        return None
+    partner = found.get(place.partner)
+    limits = place.limits or (partner.place.limits if partner is not None and place.takes == "position" else None)
+    return limits if SHARE < np.abs(values).max() < 100 + PAST else None
+
+
+def _of_range(match: Match, limits: tuple[float, float]) -> Match:
+    """A match in hundredths of a range: positions from its lower end, forces and speeds from zero where it has that."""
+    low, high = limits
+    if match.place.kind == "command" and match.place.takes != "position" and low <= 0 <= high:
+        return replace(match, scale=max(-low, high) / 100, told_in=OF_COMMAND)
+    told_in = OF_COMMAND if match.place.kind == "command" else OF_RANGE
+    return replace(match, scale=(high - low) / 100, offset=low, told_in=told_in)
 
 
 def _scaled(match: Match, scale: float | None) -> Match:

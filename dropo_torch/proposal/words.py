@@ -30,7 +30,7 @@ _ROLES: dict[Role, frozenset[str]] = {
     ),
     "command": _set(
         "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
-        "target targets des desired ref reference setpoint setp goal sp pwm"
+        "target targets des desired ref reference setpoint setp goal sp pwm throttle duty"
     ),
     "time": _set("t time times timestamp timestamps stamp clock sec secs seconds"),
     "episode": _set(
@@ -51,6 +51,8 @@ UNITS: dict[str, float] = {
     "dps": math.pi / 180, "rpm": math.pi / 30, "rad": 1.0, "rads": 1.0, "radian": 1.0, "radians": 1.0, "mm": 1e-3,
     "mmps": 1e-3, "cm": 1e-2, "meter": 1.0, "meters": 1.0, "nm": 1.0, "newton": 1.0, "mnm": 1e-3,
 }  # fmt: skip
+#: Words of hundredths of a range, and of what is so commanded.
+_PERCENT, _OPENS = _set("pct percent perc"), _set("valve spool pump")
 #: Of commands the actuator's, of measurements that they are actual ones.
 _ACT = "act"
 #: Units that count only as a name's last word: they are letters with other meanings, too.
@@ -93,6 +95,7 @@ class Words:
         angular: whether it is an angular velocity about an axis.
         commanded: of a command, the role of what it commands: ``position``, ``velocity``, ``effort``, or empty.
         turns: whether it is called an angle.
+        percent: whether it is told in hundredths of a range.
     """
 
     role: Role = ""
@@ -104,6 +107,7 @@ class Words:
     angular: bool = False
     commanded: Role = ""
     turns: bool = False
+    percent: bool = False
 
 
 def split(name: str) -> list[str]:
@@ -159,6 +163,7 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
             return replace(rest, objects=objects + rest.objects, numbers=number + rest.numbers)
     words, numbers = [w for w in every if not w.isdigit()], tuple(int(w) for w in every if w.isdigit())
     words = [part for w in words for part in _parts(w)]
+    percent, words = bool(set(words) & _PERCENT), [word for word in words if word not in _PERCENT]
     words, scale = _unit(words)
     axis, quaternion, angular = "", False, False
     roles: list[Role] = []
@@ -175,7 +180,7 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
             angular |= kind == "angular"
             roles.append("velocity" if kind in ("velocity", "angular") else "position")
             continue
-        role = _role(word)
+        role = "command" if percent and word in _OPENS else _role(word)
         if role:
             roles.append(role)
             commanded = "position" if word in _TARGETS and not commanded else commanded
@@ -194,7 +199,9 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
     if quaternion and role in ("", "other"):
         role = "position"
     turns = bool(set(words) & _TURNS)
-    return Words(role, scale, tuple(said), numbers, axis, quaternion and not angular, angular, commanded, turns)
+    return Words(
+        role, scale, tuple(said), numbers, axis, quaternion and not angular, angular, commanded, turns, percent
+    )
 
 
 def _misleads(name: str) -> bool:

@@ -29,6 +29,9 @@ LEAST_ROWS = 100
 #: Rows that a command stays the same from which on a row says little of when it acts: velocities that were smoothed
 #: change before it does.
 HELD = 3.0
+#: Share of its effect in its own row that a command has in the right one, at least: what is a row off looks weaker, and
+#: what explains less and less of it the later it is stands for something else, such as damping that the model lacks.
+WEAKENED = 0.9
 #: Blocks over which readings are compared.
 BLOCKS = 20
 DEGREE = float(np.pi / 180)
@@ -430,7 +433,8 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
             f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands "
             "than those that act, or the observations come late"
         )
-        sure = better > rules.sure_significance and left < rules.earlier and _held(record) <= HELD
+        grows = (best.gains > WEAKENED * plain.gains)[acting].all()
+        sure = better > rules.sure_significance and left < rules.earlier and grows and _held(record) <= HELD
         return [Finding("action_shift", names, what, confidence(sure), evidence=evidence, cure=cure)]
     what = (
         f"the accelerations of a row follow from the commands logged {rows} before: rows carry later commands than "
