@@ -217,6 +217,22 @@ def test_linear_drag_slows_a_free_body_in_proportion_to_its_speed() -> None:
     assert find_effect("linear_drag").targets(setting_of(general(xml))) == ["drone"]
 
 
+def test_quadratic_drag_is_alike_in_all_directions() -> None:
+    """A free body that nothing else moves slows down as 1/(1 + c·v₀·t/m), in a straight line."""
+    xml = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>
+      <body name="drone"><freejoint/><geom type="box" size=".1 .2 .3" mass="2"/></body>
+      <body name="link" pos="9 0 0"><joint/><geom size=".1" pos=".3 0 0"/></body></worldbody></mujoco>"""
+    model, effect = general(xml), find_effect("quadratic_drag")
+    setting, data = setting_of(model), mujoco.MjData(model)
+    data.qvel[:3] = begin = np.array([1.0, -2.0, 0.5])
+    for _ in range(1000):
+        force = effect.force(setting, "drone", np.array([[0.4]]), data.qpos[None], data.qvel[None])
+        data.qfrc_applied[:] = force[0]
+        mujoco.mj_step(model, data)
+    np.testing.assert_allclose(data.qvel[:3], begin / (1 + 0.4 * np.linalg.norm(begin) / 2), rtol=1e-3)
+    assert effect.targets(setting) == ["drone"]
+
+
 def holding(name: str, target: str, values: np.ndarray) -> np.ndarray:
     """Generalized forces at rest, away from the model's rest position, ``(nv,)``."""
     plain = general()

@@ -660,6 +660,31 @@ def test_a_proposed_config_is_checked_and_fitted_as_it_is(
     assert main(["init", *files, "--out", str(path)]) == 2  # nothing of the user's is replaced
 
 
+HELD_DOWN = """<mujoco><option timestep="0.005"/><worldbody><body pos="0 0 1">
+  <joint name="lift" axis="0 1 0" damping=".2"/>
+  <geom type="capsule" size=".03" fromto="0 0 0 .4 0 0" mass="1"/></body></worldbody>
+  <actuator><motor name="lift_motor" joint="lift"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("flipped", "names"), [((-1, 1), ("lift_pos", "lift_vel")), ((1, -1), ("lift_tau",))])
+def test_signs_that_are_surely_wrong_are_put_right(
+    flipped: tuple[int, int], names: tuple[str, ...], tmp_path: Path
+) -> None:
+    """By its weight, a joint that counts the other way is told from a motor that is wired so."""
+    model = mujoco.MjModel.from_xml_string(HELD_DOWN)
+    t, q, v, u = recorded(model, 20, 4, lambda t: [-1.5 + 1.2 * math.sin(3 * t) + math.sin(7.1 * t)])
+    frame = {
+        "t": t,
+        "lift_pos": flipped[0] * q[:, 0],
+        "lift_vel": flipped[0] * v[:, 0],
+        "lift_tau": flipped[1] * u[:, 0],
+    }
+    files = written(tmp_path, frame, HELD_DOWN)
+    found = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    assert found.document["data"]["scale"] == dict.fromkeys(names, -1.0)
+    assert not [f for f in found.findings if f.sure]
+
+
 def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
     tmp_path: Path, log: tuple[np.ndarray, ...]
 ) -> None:

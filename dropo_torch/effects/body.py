@@ -224,21 +224,26 @@ class FluidDrag(BodyEffect):
         model.geom_fluid[geom, 1] = values[0] / (area * self.DENSITY)
 
 
-class LinearDrag(BodyEffect):
-    """Drag of air or water on a free body, in proportion to its speed: of what is slow, small, or driven by rotors.
+class FreeBodyEffect(BodyEffect):
+    """An effect of what moves freely."""
 
-    It is damping of the three degrees of freedom in which the body's frame moves.
-    """
-
-    name = "linear_drag"
     turning = False
-    sentence = "drag of air or water on {target}, in proportion to its speed"
 
     def targets(self, setting: Setting) -> list[str | None]:
         free = [j for j in range(setting.model.njnt) if setting.model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE]
         names, bodies = setting.names("body"), setting.model.jnt_bodyid[free]
         floating = {names[b] for b in bodies}
         return [t for t in super().targets(setting) if t in floating]
+
+
+class LinearDrag(FreeBodyEffect):
+    """Drag of air or water on a free body, in proportion to its speed: of what is slow, small, or driven by rotors.
+
+    It is damping of the three degrees of freedom in which the body's frame moves.
+    """
+
+    name = "linear_drag"
+    sentence = "drag of air or water on {target}, in proportion to its speed"
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m, body = setting.model, body_number(setting.model, target)
@@ -260,6 +265,25 @@ class LinearDrag(BodyEffect):
     def in_mjcf(self) -> bool:
         """No: there, a free joint has one damping, which slows its turning, too."""
         return False
+
+
+class QuadraticDrag(FreeBodyEffect):
+    """Drag on a free body with the square of its speed, alike in all directions: −coefficient·|v|·v on its frame."""
+
+    name = "quadratic_drag"
+    known_as = FluidDrag.name
+    sentence = "drag of air or water on {target}, with the square of its speed, alike in all directions"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return FluidDrag().quantities(setting, target)
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        first = int(setting.model.body_dofadr[body_number(setting.model, target)])
+        moving, out = velocity[:, first : first + 3], np.zeros_like(velocity)
+        out[:, first : first + 3] = -values[..., :1] * np.linalg.norm(moving, axis=1, keepdims=True) * moving
+        return out
 
 
 def _largest_section(model: mujoco.MjModel, geom: int) -> float:

@@ -50,6 +50,7 @@ MOTIONS = {
     "ground_slope": "slides and presses on the ground",
     "fluid_drag": "moves these bodies fast",
     "linear_drag": "moves these bodies fast",
+    "quadratic_drag": "moves these bodies fast",
 }
 
 

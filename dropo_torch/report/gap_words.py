@@ -42,6 +42,7 @@ _NOUNS = {
     "external_force": "a constant external force on {0}",
     "fluid_drag": "fluid drag on {0}",
     "linear_drag": "linear drag on {0}",
+    "quadratic_drag": "quadratic drag on {0}",
     "gravity_tilt": "a tilt of the base relative to gravity",
     "ground_slope": "a slope of the ground",
     "integration": "a finer integration step",
