@@ -515,12 +515,14 @@ def test_ties_are_told_in_the_terminal(tmp_path: Path) -> None:
     ) in " ".join(text.split())
 
 
-def test_the_terminal_has_all_numbers_of_which_the_sentence_gives_the_first(tmp_path: Path) -> None:
+@pytest.mark.parametrize(("effect", "target"), [("payload", "hand"), ("actuator_lag", "*")])
+def test_the_terminal_has_all_numbers_of_which_the_sentence_gives_the_first(
+    effect: str, target: str, tmp_path: Path
+) -> None:
     console = Console(record=True, width=200, file=io.StringIO())
     numbers = {"mass": Strength(0.9, 0.89, 0.91, "kg")} | {a: Strength(v, v - 0.01, v + 0.01, "m") for a, v in
                                                            {"x": 0.01, "y": -0.02, "z": 0.12}.items()}  # fmt: skip
-    payload = NamedEffect("payload", "hand", numbers, 1.0)
-    _show(replace(single(), effects=(payload,)), tmp_path, console)
+    _show(replace(single(), effects=(NamedEffect(effect, target, numbers, 1.0),)), tmp_path, console)
     text = console.export_text().replace("\u00a0", " ")
     assert "more in the table" in text
     assert all(value in text for value in ("0.900 kg (0.890 to 0.910)", "0.120 m (0.110 to 0.130)"))

@@ -68,3 +68,4 @@ def test_resistance_to_rolling_is_found(tmp_path: Path) -> None:
     assert [(e.effect, e.target) for e in named] in ([("contact_rolling", "shell")], [("contact_rolling", "floor")])
     assert named[0].parameters["rolling"].value == pytest.approx(0.003, rel=0.03)
     assert gap.verdict == "explained"
+    assert "they may be the same thing" in str(gap.next_experiment)  # of two that touch nothing else

@@ -538,7 +538,10 @@ def test_targets_are_not_made_up_beside_columns_called_after_servos(
 # --- rates and episodes ---
 
 
-@pytest.mark.parametrize(("name", "unit"), [("t", 1.0), ("time", 1e-3), ("stamp", 1e-9), ("t_us", 1e-6)])
+@pytest.mark.parametrize(
+    ("name", "unit"),
+    [("t", 1.0), ("time", 1e-3), ("stamp", 1e-9), ("t_us", 1e-6), ("epoch_ms", 1e-3), ("host_us", 1e-6)],
+)
 def test_the_unit_of_time_stamps_is_found(name: str, unit: float, tmp_path: Path) -> None:
     stamps = 0.02 * np.arange(50)
     pd.DataFrame({name: stamps / unit, "q": np.sin(stamps)}).to_csv(tmp_path / "log.csv", index=False)

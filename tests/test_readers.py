@@ -479,6 +479,21 @@ def test_bad_cell_is_named(tmp_path, column, row, value, message):
     fails(message, tmp_path / "log.csv", **COLUMNS)
 
 
+def test_a_row_that_is_told_again_counts_once(tmp_path):
+    """All of it, its stamp too; one that differs in anything is refused as a stamp that does not rise."""
+    table = frame()
+    told = pd.concat([table.iloc[:3], table.iloc[2:3], table.iloc[2:]])
+    told.to_csv(tmp_path / "log.csv", index=False)
+    table.to_csv(tmp_path / "once.csv", index=False)
+    log, once = (read_trajectories(tmp_path / name, **COLUMNS) for name in ("log.csv", "once.csv"))
+    np.testing.assert_array_equal(log.observations, once.observations)
+    np.testing.assert_array_equal(log.terminals, once.terminals)
+    assert log.dt == once.dt
+    told.iloc[3, list(told.columns).index("q")] += 1e-6
+    told.to_csv(tmp_path / "log.csv", index=False)
+    fails(r"time goes from 0\.1 s to 0\.1 s at row 3", tmp_path / "log.csv", **COLUMNS)
+
+
 def test_time_that_starts_again_needs_an_episode_column(tmp_path):
     path, columns = write_csv(tmp_path)
     fails(r"time goes from 0\.15 s to 0 s at row 4 .*tells episodes apart", path, **{**columns, "episode": None})

@@ -85,7 +85,7 @@ def _show(gap: Gap, out: Path, console: Console) -> None:
     for line in (headline, *(f"  - {item}" for item in items)):
         console.print(line)
     if rows_of_numbers := tabled(gap):
-        numbers = Table("what is missing", "number", "value (90 % interval)")
+        numbers = Table("what is missing", "number or place", "value (90 % interval)")
         for row in rows_of_numbers:
             numbers.add_row(*row)
         console.print(numbers)

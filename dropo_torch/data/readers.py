@@ -260,11 +260,21 @@ def _recording(table: Table, options: ReadOptions) -> Recording:
     time = _time(table, options, episodes)
     if options.pause is not None:
         episodes = _paused(episodes, time, ~np.isnan(observations).all(axis=1), options.pause, table.source)
+    kept = np.arange(len(episodes))
+    if time is not None and options.next_observations is None and not table.sparse:
+        kept = _told_once(observations, actions, time, episodes)
     return Recording(
-        observations, actions, time, episodes, names, action_names, source=table.source, sparse=table.sparse,
-        quaternions=tuple(table.orientations(wanted, "observations")),
-        cut=options.pause is not None or bool(options.breaks),
+        observations[kept], actions[kept], None if time is None else time[kept], episodes[kept], names, action_names,
+        source=table.source, sparse=table.sparse, quaternions=tuple(table.orientations(wanted, "observations")),
+        cut=options.pause is not None or bool(options.breaks), rows=kept,
     )  # fmt: skip
+
+
+def _told_once(observations: np.ndarray, actions: np.ndarray, time: np.ndarray, episodes: np.ndarray) -> np.ndarray:
+    """Numbers of the rows ``(k,)`` that are not all of the row before them again, stamp and episode, too."""
+    every = np.column_stack([observations, actions, time, episodes])
+    again = ((every[1:] == every[:-1]) | (np.isnan(every[1:]) & np.isnan(every[:-1]))).all(axis=1)
+    return np.flatnonzero(np.append(True, ~again))
 
 
 def _chosen(table: Table, observations: ColumnMap, actions: ColumnMap, options: ReadOptions) -> Table:

@@ -82,7 +82,9 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     """
     names = f"{_called(one)} from {_called(other)}"
     log = evidence.on(spread(evidence.windows, LOGGED))
-    rival, own = refit(log, second, iterations=ADAPTED), refit(log, first, iterations=0, slopes=False).cost
+    own = refit(log, first, iterations=0, slopes=False).cost
+    begins = [second, second.at(first.vector)] if one.effect is other.effect else [second]  # it may be the same thing
+    rival = min((refit(log, start, iterations=ADAPTED) for start in begins), key=lambda fitted: fitted.loss)
     share = len(evidence.windows) / max(len(log.windows), 1)
     found = []
     for words, windows in motions(evidence, first):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -93,6 +93,8 @@ def read_ties(folder: Path) -> Ties:
     ties = []
     for index, effect, target in tied[:MOST]:
         starts = _starts(scene.setting, effect, target)
+        if effect == placed[index].effect.name:  # at another place it may be the same thing
+            starts.append(replace(placed[index], target=target))
         fits = [refit(log, true.instead(index, start), iterations=ADAPTED) for start in starts]
         if fits:
             rival = min(fits, key=lambda f: f.loss)

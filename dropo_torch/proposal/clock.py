@@ -137,10 +137,16 @@ def _stamps(column: Column) -> np.ndarray:
 def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
     """The column of time stamps: by its name, or as the only one that rises evenly."""
     named = [c for c in columns.columns if c.words.role == "time" and _rises(c, known)]
+    named = named or [c for c in columns.numeric if not c.words.role and _by_unit(c) and _rises(c, known)]
     if named:
         return max(named, key=lambda c: _steps(_stamps(c)))
     rising = [c for c in columns.numeric if not c.words.role and _rises(c, known) and _evenly(c.values, known)]
     return rising[0] if len(rising) == 1 else None
+
+
+def _by_unit(column: Column) -> bool:
+    """Whether a name tells a unit of time, and one that is nothing else: ``log_ms``, but not ``x_s``."""
+    return (time_unit(column.entry) or 1.0) < 1.0
 
 
 def _with_seconds(columns: Columns, fine: Column) -> tuple[Column, Column] | None:

@@ -32,7 +32,10 @@ _ROLES: dict[Role, frozenset[str]] = {
         "cmd cmds command commands commanded u ctrl control controls action actions act input inputs "
         "target targets des desired ref reference setpoint setp goal sp pwm throttle duty"
     ),
-    "time": _set("t time times timestamp timestamps stamp clock sec secs seconds"),
+    "time": _set(
+        "t time times timestamp timestamps stamp clock sec secs seconds epoch unix utc elapsed uptime millis micros "
+        "nanos msec usec nsec"
+    ),
     "episode": _set(
         "episode episodes ep run trial traj trajectory demo rollout segment take experiment"
     ),

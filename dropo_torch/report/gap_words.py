@@ -197,8 +197,14 @@ def numbers(parameters: Mapping[str, Strength], named: Callable[[str], str] = qu
 
 def tabled(gap: Gap) -> list[tuple[str, str, str]]:
     """Return all numbers of the effects of which sentences give the first of many: effect, number, value."""
-    many = [e for e in gap.effects if len(e.parameters) > MOST_NUMBERS and e.target != FAMILY]
-    return [(noun(e.effect, e.target), quantity(n), with_interval(s)) for e in many for n, s in e.parameters.items()]
+    if gap.forces or gap.joints:  # there each place has a sentence of its own
+        return []
+    many = [e for e in gap.effects if len(e.parameters) > MOST_NUMBERS]
+    return [
+        (noun(e.effect, e.target), n if e.target == FAMILY else quantity(n), with_interval(s))
+        for e in many
+        for n, s in e.parameters.items()
+    ]
 
 
 def ambiguous(effect: NamedEffect) -> str:

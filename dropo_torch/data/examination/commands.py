@@ -433,7 +433,7 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
             f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands "
             "than those that act, or the observations come late"
         )
-        grows = (best.gains > WEAKENED * plain.gains)[acting].all()
+        grows = bool((best.gains > WEAKENED * plain.gains)[acting].all())
         sure = better > rules.sure_significance and left < rules.earlier and grows and _held(record) <= HELD
         return [Finding("action_shift", names, what, confidence(sure), evidence=evidence, cure=cure)]
     what = (
