@@ -217,6 +217,35 @@ def test_linear_drag_slows_a_free_body_in_proportion_to_its_speed() -> None:
     assert find_effect("linear_drag").targets(setting_of(general(xml))) == ["drone"]
 
 
+TENDONS = """<mujoco><worldbody><site name="anchor" pos="0 .1 .5"/>
+  <body><joint name="knuckle" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".4"/>
+    <body pos=".3 0 0"><joint name="tip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".2"/>
+      <site name="end" pos=".2 0 0"/></body></body></worldbody>
+  <tendon><fixed name="flexor"><joint joint="knuckle" coef=".1"/><joint joint="tip" coef="-.06"/></fixed>
+    <spatial name="cable"><site site="anchor"/><site site="end"/></spatial></tendon>
+  <actuator><motor name="flex" tendon="flexor" gear="3"/><motor name="pull" tendon="cable"/></actuator></mujoco>"""
+
+
+@pytest.mark.parametrize(("actuator", "tendon", "gear"), [("flex", "flexor", 3.0), ("pull", "cable", 1.0)])
+def test_damping_of_an_actuator_is_that_of_the_tendon_it_pulls(actuator: str, tendon: str, gear: float) -> None:
+    model, effect = mujoco.MjModel.from_xml_string(TENDONS), find_effect("actuator_damping")
+    setting = plain_setting(model, parse_observation(model, None), 4, 0.3)
+    assert actuator in effect.targets(setting)
+    (quantity,) = effect.quantities(setting, actuator)
+    assert 0 < quantity.scale < 1e3
+    damped, braked = (mujoco.MjModel.from_xml_string(TENDONS) for _ in range(2))
+    damped.tendon_damping.reshape(damped.ntendon, -1)[damped.tendon(tendon).id, 0] = 2.0 * gear**2
+    effect.apply(braked, actuator, np.array([2.0]))
+    forces = []
+    for own in (damped, braked):
+        data = mujoco.MjData(own)
+        data.qpos[:], data.qvel[:] = (0.4, -0.7), (1.5, -2.0)
+        mujoco.mj_forward(own, data)
+        forces.append(data.qfrc_passive + data.qfrc_actuator)
+    assert np.abs(forces[0]).max() > 1e-3
+    np.testing.assert_allclose(forces[0], forces[1], rtol=1e-12, atol=1e-14)
+
+
 def test_quadratic_drag_is_alike_in_all_directions() -> None:
     """A free body that nothing else moves slows down as 1/(1 + c·v₀·t/m), in a straight line."""
     xml = """<mujoco><option timestep="0.001" gravity="0 0 0"/><worldbody>

@@ -154,15 +154,35 @@ class ActuatorDamping(ActuatorEffect):
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         m, i = setting.model, object_number(setting.model, "actuator", target)
-        speed = gear(m, i) * float(setting.signals.speed[m.jnt_dofadr[driven_joint(m, i)]])
-        scale = self.force_scale(setting, target) / max(speed, 1e-12)
+        scale = self.force_scale(setting, target) / max(self.speed_scale(setting, target), 1e-12)
         own = max(-float(m.actuator_biasprm[i, 2]), 0.0)
         unit = unit_of(setting, target, "N·m·s/rad", "N·s/m")
         return (Quantity("damping", unit, 0.0, -own, 30 * scale, scale),)
 
     def targets(self, setting: Setting) -> list[str | None]:
+        """Return the actuators that drive a joint, or pull a tendon that moves in the log."""
         m = setting.model
-        return [t for t in super().targets(setting) if driven_joint(m, object_number(m, "actuator", t)) is not None]
+        return [
+            t for t in super().targets(setting)
+            if driven_joint(m, i := object_number(m, "actuator", t)) is not None
+            or (m.actuator_trntype[i] == mujoco.mjtTrn.mjTRN_TENDON and self.speed_scale(setting, t) > 0)
+        ]  # fmt: skip
+
+    @staticmethod
+    def speed_scale(setting: Setting, target: str | None) -> float:
+        """Return the typical speed of an actuator, times its gear; of a tendon's, by its lever arms at ``qpos0``."""
+        m, i = setting.model, object_number(setting.model, "actuator", target)
+        if (joint := driven_joint(m, i)) is not None:
+            return gear(m, i) * float(setting.signals.speed[m.jnt_dofadr[joint]])
+        data, moment = mujoco.MjData(m), np.zeros((m.nu, m.nv))
+        mujoco.mj_kinematics(m, data)
+        mujoco.mj_comPos(m, data)
+        mujoco.mj_tendon(m, data)
+        mujoco.mj_transmission(m, data)
+        mujoco.mju_sparse2dense(
+            moment, data.actuator_moment, data.moment_rownnz, data.moment_rowadr, data.moment_colind
+        )
+        return float(np.linalg.norm(moment[i] * setting.signals.speed))
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
         i = object_number(model, "actuator", target)
