@@ -13,6 +13,7 @@ import numpy as np
 from scipy import stats
 
 from dropo_torch.data.resolution import resolution
+from dropo_torch.effects.base import Placed, find_effect
 from dropo_torch.effects.engine import Variant
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
@@ -36,6 +37,9 @@ UNIFORM = 12**0.5
 #: Share of fourth differences that are no larger than noise makes beside contacts; of them that must not be zero; by
 #: how much noise that is nearly white may show less in them.
 LOUD, SHOWN, MARGIN = 0.9, 0.5, 1.5
+#: Rows by which commands are tried late, where they bend by this share of what white noise of their size would; and how
+#: much lower noise must then be.
+LATE, JUMPS, QUIETER = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0), 0.05, 0.8
 #: Least degrees of freedom that a feature is taken to have in a window; and in all of them, to tell its noise.
 LEAST_DEGREES, TELLING = 0.3, 5.0
 
@@ -86,7 +90,8 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     found = _free_forces(evidence, sizes, known=noise is not None)
     if noise is not None:
         return found
-    found = replace(found, noise=np.maximum(np.minimum(found.noise, _most(evidence)), _rounding(evidence)))
+    quieter = _beside_late_commands(evidence, sizes, found.noise)
+    found = replace(found, noise=np.maximum(np.minimum(quieter, _most(evidence)), _rounding(evidence)))
     if not twin.setting.masked:
         return found
     whole = _free_forces(replace(evidence, whole=True), sizes, known=False)
@@ -95,6 +100,33 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     for column, error in twin.setting.derived:  # errors that follow on each other do not show in short windows
         noise[evidence.chart.plain.index(column)] = error
     return replace(found, noise=noise, unsure=np.where(told, found.unsure, whole.unsure))
+
+
+def _beside_late_commands(evidence: Evidence, sizes: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """The noise of each feature ``(m,)``, where it is clearly lower if commands act late.
+
+    What a jump of a command does in another row than the model says is no smooth force, and passes for noise.
+    """
+    twin, variant, step = evidence.twin, evidence.begin, evidence.twin.setting.signals.timestep
+    delay, known = find_effect("actuator_delay"), {p.key for p in twin.effects(variant)}
+    jumping = [t for t in delay.targets(twin.setting) if (delay.name, t) not in known and _jumps(evidence, t)]
+    for rows in LATE if jumping else ():
+        late = tuple(Placed(delay, target, (rows * step,)) for target in jumping)
+        try:
+            there = _free_forces(
+                evidence, sizes, known=False, variant=replace(variant, placed=(*variant.placed, *late))
+            )
+        except Diverges:
+            continue
+        noise = np.where(np.isfinite(there.unsure) & (there.noise < QUIETER * noise), there.noise, noise)
+    return noise
+
+
+def _jumps(evidence: Evidence, actuator: str | None) -> bool:
+    """Whether a command bends from row to row by a share of its size that counts."""
+    commands = evidence.windows.commands[..., evidence.twin.setting.command_column(actuator)]
+    bends = np.diff(commands, 2, axis=1)
+    return float(np.sqrt((bends**2).mean())) > JUMPS * 6**0.5 * float(commands.std())
 
 
 def _rounding(evidence: Evidence) -> np.ndarray:
@@ -119,9 +151,9 @@ def _most(evidence: Evidence) -> np.ndarray:
     return np.where((fourth > 0).mean(0) > SHOWN, MARGIN * size, np.inf)
 
 
-def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool) -> FreeForces:
+def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool, variant: Variant | None = None) -> FreeForces:
     """The forces, and the noise of features of given sizes ``(m,)`` unless that of the evidence is known."""
-    twin, windows, variant = evidence.twin, evidence.windows, evidence.begin
+    twin, windows, variant = evidence.twin, evidence.windows, variant or evidence.begin
     m, nv, length = len(sizes), twin.setting.model.nv, windows.length
     scale = TRIAL * twin.setting.signals.force
     time = (np.arange(length) + 0.5) / length - 0.5

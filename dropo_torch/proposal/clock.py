@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from dropo_torch.data.readers import are_dates, dates_in_seconds
+from dropo_torch.errors import InputError
 from dropo_torch.proposal.columns import Column, Columns
 from dropo_torch.proposal.words import TIME_UNITS, split, time_unit
 
@@ -84,6 +85,9 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
         columns: the log.
         timestep: the model's, seconds.
         dt: seconds between rows, where they are given.
+
+    Raises:
+        InputError: time stamps that fall from row to row.
     """
     episode, flags = _episode(columns), _flags(columns)
     if columns.apart is not None:
@@ -136,7 +140,13 @@ def _stamps(column: Column) -> np.ndarray:
 
 def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
     """The column of time stamps: by its name, or as the only one that rises evenly."""
-    named = [c for c in columns.columns if c.words.role == "time" and _rises(c, known)]
+    called = [c for c in columns.columns if c.words.role == "time"]
+    named = [c for c in called if _rises(c, known)]
+    for c in () if named else called:
+        if c.values.size and _rises(replace(c, values=-c.values), known):
+            raise InputError(
+                f"{columns.source}: {c.entry} falls from row to row; sort the rows by it, or name another column of time"
+            )
     named = named or [c for c in columns.numeric if not c.words.role and _by_unit(c) and _rises(c, known)]
     if named:
         return max(named, key=lambda c: _steps(_stamps(c)))

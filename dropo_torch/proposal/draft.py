@@ -329,7 +329,7 @@ def _longest_hole(match: Match, starts: np.ndarray) -> int:
 
 @dataclass(frozen=True)
 class Filter:
-    """A low-pass filter that takes the noise off positions, and what it leaves.
+    """A low-pass filter through which velocities are derived from noisy positions, and what it leaves.
 
     Attributes:
         cutoff: its frequency, Hz.
@@ -339,9 +339,9 @@ class Filter:
     cutoff: float
     density: dict[str, float]
 
-    def noise(self, label: str, *, of_rate: bool) -> float:
-        """Return the standard deviation that the filter leaves of a position's noise, or of its derivative's."""
-        return self._left(self.density.get(label, 0.0), of_rate=of_rate)
+    def rate_noise(self, label: str) -> float:
+        """Return the standard deviation that the filter leaves of the noise of a position's derivative."""
+        return self._left(self.density.get(label, 0.0))
 
     def turning_noise(self, joint: str) -> float:
         """Return that of an angular velocity, rad/s, from the noise of an orientation.
@@ -349,11 +349,10 @@ class Filter:
         A small rotation about an axis changes a unit quaternion by half as much, about each of three at right angles.
         """
         parts = (v for label, v in self.density.items() if label.startswith(f"{joint}.position[q"))
-        return self._left(4 / 3 * sum(parts), of_rate=True)
+        return self._left(4 / 3 * sum(parts))
 
-    def _left(self, density: float, *, of_rate: bool) -> float:
-        power = density * self.cutoff
-        return math.sqrt(power * ((2 * math.pi * self.cutoff) ** 2 / 3 if of_rate else 1.0))
+    def _left(self, density: float) -> float:
+        return math.sqrt(density * self.cutoff * (2 * math.pi * self.cutoff) ** 2 / 3)
 
 
 def _continuous(match: Match, positions: Sequence[Match]) -> np.ndarray:

@@ -78,7 +78,7 @@ class Information:
 def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
     """Return the noise of a log, by short windows in which forces are free: what no missing effect explains.
 
-    Of filtered positions, short windows show next to nothing: what the filter leaves counts.
+    Of velocities that were derived through a filter, they show next to nothing: what that leaves counts.
 
     Raises:
         InputError: a log too short for that.
@@ -91,16 +91,17 @@ def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
     spread = problem.observation.observed(log.observations).std(0)
     columns = Features.of(problem.observation).column_noise(found.noise)
     if smooth is not None:
-        columns = np.maximum(columns, [_left(smooth, label) for label in problem.observation.labels])
+        columns = np.maximum(columns, [_left_of_rate(smooth, label) for label in problem.observation.labels])
     return Noise(np.maximum(columns, FLOOR * np.where(spread > 0, spread, 1.0)), setting, problem.config)
 
 
-def _left(smooth: Filter, label: str) -> float:
-    """The noise that a filter leaves of an observed column."""
-    of_rate, joint = ".velocity" in label, label.split(".")[0]
-    if of_rate and "[w" in label:
-        return smooth.turning_noise(joint)
-    return smooth.noise(label.replace(".velocity[v", ".position[").replace(".velocity", ".position"), of_rate=of_rate)
+def _left_of_rate(smooth: Filter, label: str) -> float:
+    """The noise that a filter leaves of a derived velocity; none of a position, which stays as it was measured."""
+    if ".velocity" not in label:
+        return 0.0
+    if "[w" in label:
+        return smooth.turning_noise(label.split(".")[0])
+    return smooth.rate_noise(label.replace(".velocity[v", ".position[").replace(".velocity", ".position"))
 
 
 def noise_keys(problem: Problem, noise: np.ndarray) -> dict[str, Any]:
