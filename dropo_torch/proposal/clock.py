@@ -145,7 +145,7 @@ def _time_column(columns: Columns, known: np.ndarray) -> Column | None:
     for c in () if named else called:
         if c.values.size and _rises(replace(c, values=-c.values), known):
             raise InputError(
-                f"{columns.source}: {c.entry} falls from row to row; sort the rows by it, or name another column of time"
+                f"{columns.source}: {c.entry} falls from row to row; sort the rows by it, or name another column"
             )
     named = named or [c for c in columns.numeric if not c.words.role and _by_unit(c) and _rises(c, known)]
     if named:
