@@ -122,7 +122,7 @@ IDLE: dict[str, tuple[str, ...]] = {
     ),
 }  # fmt: skip
 #: Numbers at which an effect acts on the rig, where those from which a search begins are too small for it.
-NUMBERS = {"joint_limit": {"lower": 0.8, "upper": -0.8}}
+NUMBERS = {"joint_limit": {"lower": 0.8, "upper": -0.8}, "joint_stop": {"lower": 0.0, "upper": 0.0}}
 
 
 @pytest.mark.parametrize("unseen", [(), ("shoulder",), ("rail", "elbow")])

@@ -45,7 +45,8 @@ NOISE = (2e-5, 5e-4)
 FINER = Placed(find_effect("integration"), None, (STEP / 8,))
 #: Numbers at which an effect acts on the rig, beside those from which a search begins.
 NUMBERS = {
-    "joint_limit": {"lower": 0.4, "upper": -0.4}, "actuator_saturation": {"limit": 0.3},
+    "joint_limit": {"lower": 0.4, "upper": -0.4}, "joint_stop": {"lower": 0.0, "upper": 0.1},
+    "actuator_saturation": {"limit": 0.3},
     "actuator_delay": {"delay": 2.375 * STEP}, "sensor_delay": {"delay": 1.375 * STEP},
 }  # fmt: skip
 PENDULUM = """

@@ -66,6 +66,7 @@ class Signals:
         contacts: geoms that touch something somewhere in the log, ``(ngeom,)`` bool.
         ripples: angular frequencies over the position at which a joint lacks a force, by its position coordinate.
         smoothed: rows on each side by which a column is smoothed where windows begin, and its noise, by its number.
+        late: rows by which commands may act late, beside which noise is told, too.
     """
 
     timestep: float
@@ -80,6 +81,7 @@ class Signals:
     contacts: np.ndarray
     ripples: Mapping[int, tuple[float, ...]] = field(default_factory=dict)
     smoothed: Mapping[int, tuple[int, float]] = field(default_factory=dict)
+    late: tuple[float, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -72,6 +72,9 @@ def _copy_rest(spec: mujoco.MjSpec, model: mujoco.MjModel) -> None:
         geom.fluid_ellipsoid = float(model.geom_fluid[geom.id, 0])
         if geom.fluid_ellipsoid:
             geom.fluid_coefs = model.geom_fluid[geom.id, 1:6]
+    for joint in spec.joints:
+        if joint.type in (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE):
+            joint.limited = int(model.jnt_limited[joint.id])
     for actuator in spec.actuators:
         actuator.biastype = mujoco.mjtBias(int(model.actuator_biastype[actuator.id]))
 

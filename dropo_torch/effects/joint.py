@@ -357,6 +357,42 @@ class JointLimit(JointEffect):
         model.jnt_range[object_number(model, "jnt", target)] += values
 
 
+class JointStop(JointEffect):
+    """Stops of a joint that the model lets turn or slide without end, as soft as the model's stops are."""
+
+    name = "joint_stop"
+    known_as = JointLimit.name
+    positional = True
+    sentence = "{target} has stops, where the model lets it move without end"
+
+    #: Shares of the measured range by which stops lie beyond it where they are absent, and at most.
+    ABSENT, FARTHEST = 0.5, 2.0
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        m, seen = setting.model, setting.signals.position
+        free = [t for t in super().targets(setting) if not m.jnt_limited[setting.joint(str(t))]]
+        return [t for t in free if np.ptp(seen[setting.coordinate(t)]) > 0]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        low, high = (float(end) for end in setting.signals.position[setting.coordinate(target)])
+        width, middle, kind = high - low, 0.5 * (low + high), unit(setting, target, "rad", "m")
+        out, most = self.ABSENT * width, self.FARTHEST * width
+        return (
+            Quantity("lower", kind, low - out, low - most, middle, 0.1 * width),
+            Quantity("upper", kind, high + out, middle, high + most, 0.1 * width),
+        )
+
+    def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
+        """Begin at the ends of the measured motion."""
+        none = tuple(q.neutral for q in self.quantities(setting, target))
+        low, high = setting.signals.position[setting.coordinate(target)]
+        return [np.array(s) for s in ((low, none[1]), (none[0], high), (low, high))]
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        joint = object_number(model, "jnt", target)
+        model.jnt_limited[joint], model.jnt_range[joint] = 1, values
+
+
 class JointCoupling(JointEffect):
     """A spring between a joint and the one before it in the chain, as of a tendon or a belt."""
 

@@ -7,6 +7,7 @@ What even this cannot explain is noise; the forces that it needed tell where the
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from dropo_torch.effects.base import Placed, find_effect
 from dropo_torch.effects.engine import Variant
 from dropo_torch.errors import InputError
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.log import feature_sizes
+from dropo_torch.gap.log import feature_sizes, spread
 from dropo_torch.gap.twin import Twin, Windows
 
 #: Logged steps of a window, and coefficients of a force in it.
@@ -40,6 +41,8 @@ LOUD, SHOWN, MARGIN = 0.9, 0.5, 1.5
 #: Rows by which commands are tried late, where they bend by this share of what white noise of their size would; and how
 #: much lower noise must then be.
 LATE, JUMPS, QUIETER = (0.5, 1.0, 1.5, 2.0, 2.5, 3.0), 0.05, 0.8
+#: Windows that tell whether they are late, at most, and the effect by which they are.
+FEW, DELAY = 40, "actuator_delay"
 #: Least degrees of freedom that a feature is taken to have in a window; and in all of them, to tell its noise.
 LEAST_DEGREES, TELLING = 0.3, 5.0
 
@@ -90,7 +93,7 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     found = _free_forces(evidence, sizes, known=noise is not None)
     if noise is not None:
         return found
-    quieter = _beside_late_commands(evidence, sizes, found.noise)
+    quieter = _quieter(evidence, sizes, found.noise, twin.setting.signals.late)
     found = replace(found, noise=np.maximum(np.minimum(quieter, _most(evidence)), _rounding(evidence)))
     if not twin.setting.masked:
         return found
@@ -102,24 +105,45 @@ def free_forces(twin: Twin, windows: Windows, variant: Variant, noise: np.ndarra
     return replace(found, noise=noise, unsure=np.where(told, found.unsure, whole.unsure))
 
 
-def _beside_late_commands(evidence: Evidence, sizes: np.ndarray, noise: np.ndarray) -> np.ndarray:
-    """The noise of each feature ``(m,)``, where it is clearly lower if commands act late.
+def late_rows(twin: Twin, windows: Windows, variant: Variant) -> tuple[float, ...]:
+    """Return by how many rows commands may act late: those with which the noise of a column is clearly lower.
 
-    What a jump of a command does in another row than the model says is no smooth force, and passes for noise.
+    What a jump of a command does in another row than the model says is no smooth force, and passes for noise. Commands
+    that hardly bend from row to row leave that to smooth forces.
+
+    Args:
+        twin: simulates windows.
+        windows: short windows, spread over the log.
+        variant: the hypothesis beside which the forces are free.
     """
-    twin, variant, step = evidence.twin, evidence.begin, evidence.twin.setting.signals.timestep
-    delay, known = find_effect("actuator_delay"), {p.key for p in twin.effects(variant)}
-    jumping = [t for t in delay.targets(twin.setting) if (delay.name, t) not in known and _jumps(evidence, t)]
-    for rows in LATE if jumping else ():
-        late = tuple(Placed(delay, target, (rows * step,)) for target in jumping)
+    windows = spread(windows, FEW)
+    sizes = np.maximum(feature_sizes(twin.setting, windows.measured), 1e-12)
+    evidence = Evidence(twin, windows, GUESS * sizes, variant, rough=False)
+    if not _jumping(evidence):
+        return ()
+    own = _free_forces(evidence, sizes, known=False).noise
+    return tuple(rows for rows in LATE if (_quieter(evidence, sizes, own, (rows,)) < own).any())
+
+
+def _quieter(evidence: Evidence, sizes: np.ndarray, noise: np.ndarray, late: Iterable[float]) -> np.ndarray:
+    """The noise of each feature ``(m,)``, where it is clearly lower if all commands that jump act some rows late."""
+    twin, variant, jumping = evidence.twin, evidence.begin, _jumping(evidence)
+    for rows in late if jumping else ():
+        seconds = (rows * twin.setting.signals.timestep,)
+        placed = (*variant.placed, *(Placed(find_effect(DELAY), target, seconds) for target in jumping))
         try:
-            there = _free_forces(
-                evidence, sizes, known=False, variant=replace(variant, placed=(*variant.placed, *late))
-            )
+            there = _free_forces(evidence, sizes, known=False, variant=replace(variant, placed=placed))
         except Diverges:
             continue
         noise = np.where(np.isfinite(there.unsure) & (there.noise < QUIETER * noise), there.noise, noise)
     return noise
+
+
+def _jumping(evidence: Evidence) -> list[str | None]:
+    """Actuators whose commands bend from row to row by a share of their size, and that have no delay so far."""
+    twin, variant = evidence.twin, evidence.begin
+    known = {p.target for p in twin.effects(variant) if p.effect.name == DELAY}
+    return [t for t in find_effect(DELAY).targets(twin.setting) if t not in known and _jumps(evidence, t)]
 
 
 def _jumps(evidence: Evidence, actuator: str | None) -> bool:

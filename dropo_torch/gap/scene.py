@@ -24,7 +24,7 @@ from dropo_torch.gap.log import (
     spread,
     start_values,
 )
-from dropo_torch.gap.noise import LENGTH, free_forces
+from dropo_torch.gap.noise import LENGTH, free_forces, late_rows
 from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.ripple import ripples
 from dropo_torch.gap.rules import Rules
@@ -123,7 +123,10 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     twin = _twin(problem, setting)
     given, since = problem.objective.noise, first_steps(twin, train, begin)
     if given is None:
-        noise = free_forces(twin, short_windows(setting, train, since), begin.variant).noise
+        short = short_windows(setting, train, since)
+        setting = replace(setting, signals=replace(setting.signals, late=late_rows(twin, short, begin.variant)))
+        twin = _twin(problem, setting)
+        noise = free_forces(twin, short, begin.variant).noise
     else:
         noise = Features.of(problem.observation).feature_noise(given.numpy())
     rules = rules or Rules()

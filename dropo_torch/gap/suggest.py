@@ -41,6 +41,7 @@ STARTS: Mapping[str, float] = {
 #: What a motion must do to show an effect, by its name or else by its kind; a body or the world just has to move more.
 MOTIONS = {
     "joint_limit": "reaches the stops",
+    "joint_stop": "",  # nothing says that there are any
     "armature": "accelerates these joints",
     "joint": "moves these joints further, faster and to and fro",
     "actuator_saturation": "asks for larger forces",
@@ -144,6 +145,7 @@ def separation(motion: Evidence, true: Hypothesis, rival: Refit, share: float = 
 def excite(silent: Sequence[Placed]) -> str | None:
     """Return what a log would have to show so that candidates that it cannot judge can be judged."""
     silent = [p for p in silent if not p.effect.steps]  # whatever moves, the model's step is the same
+    silent = [p for p in silent if MOTIONS.get(p.effect.name) != ""]
     if not silent:
         return None
     wanted: dict[str, list[str]] = {}

@@ -16,7 +16,7 @@ from dropo_torch.distribution import to_coordinates
 from dropo_torch.effects.base import Setting
 from dropo_torch.effects.engine import Variant
 from dropo_torch.gap.log import make_setting, start_values
-from dropo_torch.gap.noise import free_forces
+from dropo_torch.gap.noise import free_forces, late_rows
 from dropo_torch.gap.scene import short_windows
 from dropo_torch.gap.twin import Twin
 from dropo_torch.initial_noise import NOISE_DRAWS
@@ -86,8 +86,9 @@ def measure_noise(problem: Problem, smooth: Filter | None = None) -> Noise:
     log = replace(problem.trajectories, dt=problem.trajectories.dt or problem.simulator.timestep)
     setting = make_setting(problem, log)
     twin = Twin(setting, problem.space, num_threads=problem.config.threads)
-    own = Variant(tuple(start_values(problem).tolist()))
-    found = free_forces(twin, short_windows(setting, log), own)
+    own, short = Variant(tuple(start_values(problem).tolist())), short_windows(setting, log)
+    setting = replace(setting, signals=replace(setting.signals, late=late_rows(twin, short, own)))
+    found = free_forces(Twin(setting, problem.space, num_threads=problem.config.threads), short, own)
     spread = problem.observation.observed(log.observations).std(0)
     columns = Features.of(problem.observation).column_noise(found.noise)
     if smooth is not None:

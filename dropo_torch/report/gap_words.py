@@ -35,6 +35,7 @@ _NOUNS = {
     "joint_cogging": "a force at {0} that is periodic in its position (cogging)",
     "armature": "rotor or gear inertia (armature) at {0}",
     "joint_limit": "different stops of {0}",
+    "joint_stop": "stops of {0}",
     "joint_coupling": "a spring between {0} and its parent joint",
     "payload": "a mass on {0}",
     "center_of_mass": "a different center of mass of {0}",
@@ -66,9 +67,12 @@ _NOUNS = {
     "contact_margin": "contacts of {0} that act at a distance (margin)",
     "contact_sole": "a sole or coating on {0}",
 }
+#: What the numbers of an effect are, where their names alone do not say it.
+_QUANTITIES = {"joint_limit": "{} stop moved by", "joint_stop": "{} stop at"}
 #: Whole clauses where "Your model lacks" does not fit.
 _CLAUSES = {
     "joint_limit": "The stops of {0} are not where your model has them",
+    "joint_stop": "{0} has stops that your model lacks",
     "center_of_mass": "The center of mass of {0} is not where your model has it",
     "inertia": "The moments of inertia of {0} are not those of your model",
     "gravity_tilt": "The base is tilted, unlike in your model",
@@ -417,7 +421,10 @@ def _strengths(effect: NamedEffect) -> str:
     own = effect.parameters
     if effect.effect in _MULTIPLES:
         own = {name: replace(given, unit="times the model's") for name, given in own.items()}
-    return numbers(own, str if effect.target == "*" else quantity)
+    if effect.target == "*":
+        return numbers(own, str)
+    said = _QUANTITIES.get(effect.variant or effect.effect, "{}")
+    return numbers(own, lambda name: said.format(quantity(name)))
 
 
 def _at(effect: str, target: str | None) -> str:
