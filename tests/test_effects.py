@@ -217,6 +217,19 @@ def test_linear_drag_slows_a_free_body_in_proportion_to_its_speed() -> None:
     assert find_effect("linear_drag").targets(setting_of(general(xml))) == ["drone"]
 
 
+def test_axis_drag_is_along_the_axes_of_the_body() -> None:
+    xml = """<mujoco><option gravity="0 0 0"/><worldbody><body name="hull"><freejoint/>
+      <geom type="box" size=".1 .2 .3" mass="2"/></body></worldbody></mujoco>"""
+    model, effect = general(xml), find_effect("axis_drag")
+    turned = np.array([[0, 0, 0, np.cos(0.4), 0, 0, np.sin(0.4)]])  # about z, by 0.8 rad
+    speed = 1.5 * np.array([[np.cos(0.8), np.sin(0.8), 0, 0, 0, 0]])  # ahead
+    force = effect.force(setting_of(model), "hull", np.array([[2.0, 9.0, 5.0]]), turned, speed)
+    np.testing.assert_allclose(force, -2.0 * 1.5 * speed, atol=1e-12)
+    sideways = np.array([[-np.sin(0.8), np.cos(0.8), 0, 0, 0, 0]])
+    force = effect.force(setting_of(model), "hull", np.array([[2.0, 9.0, 5.0]]), turned, sideways)
+    np.testing.assert_allclose(force, -9.0 * sideways, atol=1e-12)
+
+
 TENDONS = """<mujoco><worldbody><site name="anchor" pos="0 .1 .5"/>
   <body><joint name="knuckle" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .3 0 0" size=".02" mass=".4"/>
     <body pos=".3 0 0"><joint name="tip" axis="0 1 0"/><geom type="capsule" fromto="0 0 0 .2 0 0" size=".02" mass=".2"/>
@@ -678,7 +691,8 @@ def test_only_a_first_number_is_absent_at_a_bound() -> None:
         if q.neutral in (q.low, q.high)
     ]
     # friction at rest, as at speed; what rolls with resistance and turns on the spot without
-    assert {*shapes} <= {("joint_stribeck", "static"), ("contact_rolling", "torsional")}
+    drag = {("axis_drag", axis) for axis in "yz"}  # of a body that only moves ahead
+    assert {*shapes} <= drag | {("joint_stribeck", "static"), ("contact_rolling", "torsional")}
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "warp"])

@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, by_product, object_number
 
@@ -283,6 +284,31 @@ class QuadraticDrag(FreeBodyEffect):
         first = int(setting.model.body_dofadr[body_number(setting.model, target)])
         moving, out = velocity[:, first : first + 3], np.zeros_like(velocity)
         out[:, first : first + 3] = -values[..., :1] * np.linalg.norm(moving, axis=1, keepdims=True) * moving
+        return out
+
+
+class AxisDrag(FreeBodyEffect):
+    """Drag on a free body with the square of its speed along each axis of its frame, as a hull or a wing has it.
+
+    Along each axis it is −coefficient·|v|·v of the velocity along that axis (Fossen 2011, eq. 6.72, its diagonal).
+    """
+
+    name = "axis_drag"
+    known_as = FluidDrag.name
+    sentence = "drag of air or water on {target}, with the square of its speed along each of its axes"
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        (one,) = FluidDrag().quantities(setting, target)
+        return tuple(Quantity(axis, one.unit, one.neutral, one.low, one.high, one.scale) for axis in "xyz")
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        m, body = setting.model, body_number(setting.model, target)
+        first, place = int(m.body_dofadr[body]), int(m.jnt_qposadr[m.body_jntadr[body]]) + 3
+        turn, out = Rotation.from_quat(position[:, place : place + 4], scalar_first=True), np.zeros_like(velocity)
+        along = turn.apply(velocity[:, first : first + 3], inverse=True)
+        out[:, first : first + 3] = turn.apply(-values * np.abs(along) * along)
         return out
 
 

@@ -52,6 +52,7 @@ MOTIONS = {
     "fluid_drag": "moves these bodies fast",
     "linear_drag": "moves these bodies fast",
     "quadratic_drag": "moves these bodies fast",
+    "axis_drag": "moves these bodies fast along all of their axes",
 }
 
 

@@ -27,7 +27,7 @@ WHOLE = 1e-3
 #: Findings of an examination whose cures are taken; others are told.
 CURED = (
     "degrees", "motor_side", "units", "sign", "order", "wraps", "quaternion_order", "joined", "frame_skip", "delay",
-    "dropouts", "jitter", "next_observations", "joint_sign", "action_sign",
+    "dropouts", "jitter", "next_observations", "joint_sign", "action_sign", "action_order",
 )  # fmt: skip
 #: Examinations at most: each may find what the one before hid.
 ROUNDS = 8

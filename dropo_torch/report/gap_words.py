@@ -44,6 +44,7 @@ _NOUNS = {
     "fluid_drag": "fluid drag on {0}",
     "linear_drag": "linear drag on {0}",
     "quadratic_drag": "quadratic drag on {0}",
+    "axis_drag": "quadratic drag on {0} along its axes",
     "gravity_tilt": "a tilt of the base relative to gravity",
     "ground_slope": "a slope of the ground",
     "integration": "a finer integration step",
@@ -72,7 +73,7 @@ _QUANTITIES = {"joint_limit": "{} stop moved by", "joint_stop": "{} stop at"}
 #: Whole clauses where "Your model lacks" does not fit.
 _CLAUSES = {
     "joint_limit": "The stops of {0} are not where your model has them",
-    "joint_stop": "{0} has stops that your model lacks",
+    "joint_stop": "The motion of {0} has stops that your model lacks",
     "center_of_mass": "The center of mass of {0} is not where your model has it",
     "inertia": "The moments of inertia of {0} are not those of your model",
     "gravity_tilt": "The base is tilted, unlike in your model",

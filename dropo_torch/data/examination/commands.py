@@ -31,7 +31,7 @@ LEAST_ROWS = 100
 HELD = 3.0
 #: Share of its effect in its own row that a command has in the right one, at least: what is a row off looks weaker, and
 #: what explains less and less of it the later it is stands for something else, such as damping that the model lacks.
-WEAKENED = 0.9
+WEAKENED = 0.7
 #: Blocks over which readings are compared.
 BLOCKS = 20
 DEGREE = float(np.pi / 180)
@@ -422,7 +422,8 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
     left = (1 - best.share) / max(1 - plain.share, 1e-12)
     acting = best.shares > 0.02
     in_range = np.abs(np.log(np.maximum(best.gains[acting], 1e-9))) < np.log(rules.gain)
-    if better < rules.significance or left > 0.9 or not acting.any() or not in_range.all():
+    grows = bool((best.gains > WEAKENED * plain.gains)[acting].all())
+    if better < rules.significance or left > 0.9 or not acting.any() or not (grows and in_range.all()):
         return []
     rows = f"{abs(shift)} {'row' if abs(shift) == 1 else 'rows'}"
     evidence = {"rows": float(shift), "standard_errors": better, "left": left, "share": best.share}
@@ -433,8 +434,7 @@ def _late(record: Record, effects: _Effects, plain: Explained, rules: Rules) -> 
             f"the accelerations of a row follow from the commands logged {rows} later: rows carry earlier commands "
             "than those that act, or the observations come late"
         )
-        grows = bool((best.gains > WEAKENED * plain.gains)[acting].all())
-        sure = better > rules.sure_significance and left < rules.earlier and grows and _held(record) <= HELD
+        sure = better > rules.sure_significance and left < rules.earlier and _held(record) <= HELD
         return [Finding("action_shift", names, what, confidence(sure), evidence=evidence, cure=cure)]
     what = (
         f"the accelerations of a row follow from the commands logged {rows} before: rows carry later commands than "
