@@ -195,6 +195,7 @@ class ActuatorDelay(ActuatorEffect):
 
     name = "actuator_delay"
     sentence = "commands reach actuator {target} late"
+    everywhere_like = ("sensor_delay",)
     shares = (0.4, 2.0, 5.0)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:

@@ -62,6 +62,7 @@ class SensorDelay(SensorEffect):
     name = "sensor_delay"
     sentence = "the measurement of {target} comes late"
     shares = (0.4, 1.5)
+    everywhere_like = ("actuator_delay",)
     differentiates = True
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:

@@ -323,7 +323,8 @@ def promising_families(focus: Focus, candidates: Sequence[Candidate], tried: Tri
     """Return the effects of one number that, at several of their targets together, predict the least χ².
 
     Friction or damping is seldom missing in one joint only: it is at all of them, or at the same joint of each limb. A
-    family is offered where it promises much less than what its best single member leaves.
+    family is offered where it promises much less than what its best single member leaves, and with it the one that does
+    the same.
     """
     families: dict[str, list[Candidate]] = {}
     for c in candidates:
@@ -336,7 +337,9 @@ def promising_families(focus: Focus, candidates: Sequence[Candidate], tried: Tri
         best = _best(focus, [members for members in groups if len(members) > 1])
         clear = (members for left, members in best if left < tried.clearer * min(c.chi2 for c in members))
         found += [[c.placed for c in members] for members in clear][: tried.families]
-    return found
+    known = {group[0].effect.name for group in found}
+    alike = dict.fromkeys(name for group in found for name in group[0].effect.everywhere_like if name not in known)
+    return found + [[c.placed for c in families[name]] for name in alike if len(families.get(name, ())) > 1]
 
 
 def promising_pairs(focus: Focus, candidates: Sequence[Candidate], tried: Tried) -> list[list[Placed]]:
