@@ -277,6 +277,8 @@ def test_a_column_called_after_a_joint_is_its_position(tmp_path: Path) -> None:
         ("0 0 3 0 0 2", 'site="rotor1"', "SI"),
         ("1", 'joint="fan"', "N·m"),
         ("1", 'tendon="rope"', "N"),
+        ("1", 'tendon="flexor"', "N"),
+        ("1", 'tendon="pair"', "N·m"),
     ],
 )
 def test_the_unit_of_a_command_is_that_of_what_it_makes(gear: str, transmission: str, unit: str) -> None:
@@ -284,7 +286,9 @@ def test_the_unit_of_a_command_is_that_of_what_it_makes(gear: str, transmission:
     fan = '<body><joint name="fan"/><geom size=".1"/><site name="end"/></body></body>'
     xml = xml.replace("</body>", fan, 1).replace(
         "<actuator>",
-        '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial></tendon><actuator>',
+        '<tendon><spatial name="rope"><site site="rotor1"/><site site="end"/></spatial>'
+        '<fixed name="flexor"><joint joint="fan" coef=".011"/></fixed>'
+        '<fixed name="pair"><joint joint="fan" coef="-1"/></fixed></tendon><actuator>',
     )
     (place,) = (p for p in places_of(mujoco.MjModel.from_xml_string(xml)) if p.kind == "command")
     assert unit_name(1.0, place) == unit

@@ -61,7 +61,7 @@ def is_servo(model: mujoco.MjModel, actuator: int) -> bool:
 def unit_of(setting: Setting, target: str | None, turning: str, sliding: str) -> str:
     """Of two units that of an actuator, by whether its force turns or slides what it acts on; none where it does both.
 
-    Of a tendon over joints and of a site, by these joints and by which components the gear has.
+    Of a tendon over joints and of a site, by these joints, or its lever arms, and by which components the gear has.
     """
     model = setting.model
     i = object_number(model, "actuator", target)
@@ -70,8 +70,9 @@ def unit_of(setting: Setting, target: str | None, turning: str, sliding: str) ->
         slides = {_slides(model, through, i)}
     elif kind == kinds.mjTRN_TENDON:
         wraps = range(model.tendon_adr[through], model.tendon_adr[through] + model.tendon_num[through])
-        over = [int(model.wrap_objid[w]) for w in wraps if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT]
-        slides = {_slides(model, joint, i) for joint in over} or {True}  # one in space pulls along its length
+        over = [w for w in wraps if model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT]
+        arms = any(abs(model.wrap_prm[w]) != 1 for w in over)  # lever arms: what turns with one pulls along its length
+        slides = {arms or _slides(model, int(model.wrap_objid[w]), i) for w in over} or {True}  # so does one in space
     elif kind == kinds.mjTRN_SITE:
         slides = {half == 0 for half in (0, 1) if model.actuator_gear[i, 3 * half : 3 * half + 3].any()}
     else:
