@@ -1077,6 +1077,7 @@ def test_fixed_native_effects_become_part_of_the_model_and_keep_gradients(tmp_pa
     [
         ("payload", "lower", (0.2, 0.05, 0.0, -0.3)), ("payload", "ball", (0.2, 0.05, 0.0, 0.0)),
         ("gravity_tilt", None, (0.1, 0.2)), ("ground_slope", None, (0.1, -0.05)), ("integration", None, (STEP / 8,)),
+        ("integration_own", None, (STEP / 4,)), ("fluid_medium", None, (300.0,)), ("joint_stop", "elbow", (-0.3, 0.4)),
         ("contact_friction", "floor", (0.3,)), ("joint_limit", "shoulder", (0.8, -0.8)),
         ("actuator_saturation", "bend", (0.5,)),
     ],

@@ -69,6 +69,28 @@ def _planes(model: mujoco.MjModel) -> list[int]:
     return [int(g) for g in np.flatnonzero(planes)]
 
 
+class FluidMedium(WorldEffect):
+    """Water or another medium around the robot, as MuJoCo simulates it: lift and drag of all bodies by its density."""
+
+    name = "fluid_medium"
+    sentence = "the robot moves in a medium, such as water, that the model lacks"
+    #: Of air, of what is thin, and of water.
+    shares = (0.0012, 0.1, 1.0)
+
+    #: Density of water, kg/m³, and the largest as a multiple of it.
+    WATER, DENSEST = 1000.0, 20.0
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        return [None] if (setting.signals.linear_speed + setting.signals.angular_speed).max(initial=0.0) > 0 else []
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        own = float(setting.model.opt.density)
+        return (Quantity("density", "kg/m³", 0.0, -own, self.DENSEST * self.WATER, self.WATER),)
+
+    def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        model.opt.density += values[0]
+
+
 class Integration(WorldEffect):
     """The simulator's own step is too coarse: a finer one, with a better integrator, gives other motion."""
 
