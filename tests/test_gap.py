@@ -52,7 +52,7 @@ from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, i
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearization, cost_of, robust_factors
 from dropo_torch.gap.ground import Ground, Screening
-from dropo_torch.gap.locate import guilty, middles, regime, slopes
+from dropo_torch.gap.locate import guilty, middles, part_of_log, regime, slopes
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import Diverges, FreeForces, _relative_noise, free_forces
 from dropo_torch.gap.outcome import _notes
@@ -1888,6 +1888,26 @@ def test_regime_is_told(name: str, dof: int, words: str) -> None:
     free = free_forces(scene.twin, short_windows(scene.setting, scene.train), base.variant, scene.noise)
     assert guilty(free) == dof
     assert regime(scene.setting, free, dof).words == words
+
+
+@pytest.mark.parametrize(
+    ("begins", "single", "words"),
+    [
+        (True, True, "from 0.48 s on"), (False, True, "until 0.46 s"), (True, False, "from episode 2 on"),
+        (False, False, "up to episode 1"),
+    ],
+)  # fmt: skip
+def test_a_force_that_is_missing_in_a_part_of_the_log_is_told_so(begins: bool, single: bool, words: str) -> None:
+    """As of a load that is picked up or put down: by time where the log is one episode, else by the episode."""
+    scene = scene_of()
+    windows = cut_windows(scene.train, scene.setting.observation, 6, stride=2)
+    windows = windows.select(windows.episodes == 0) if single else windows
+    late = windows.steps >= 48 if single else windows.episodes >= 1
+    wave = 30 * np.sin(np.arange(len(windows)))
+    forces = wave * (late if begins else ~late) + np.random.default_rng(0).standard_normal(len(windows))
+    free = FreeForces(scene.noise, scene.noise, np.stack([forces, wave], 1), np.ones((len(windows), 2)), windows)
+    assert part_of_log(scene.setting, free, 0) == words
+    assert not part_of_log(scene.setting, free, 1)
 
 
 def test_the_slope_of_a_line_is_the_same_over_however_many_windows() -> None:

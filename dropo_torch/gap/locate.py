@@ -18,6 +18,8 @@ from dropo_torch.gap.result import Place, Residuals
 from dropo_torch.gap.rules import Shown
 from dropo_torch.gap.twin import Windows
 
+#: Windows on each side of a change, at least.
+LEAST = 10
 #: Thresholds of what is told of where and when.
 SHOWN = Shown()
 
@@ -125,6 +127,41 @@ def regime(setting: Setting, free: FreeForces, dof: int, rules: Shown = SHOWN) -
     return best if most > rules.correlation else replace(found[1], words="")
 
 
+def told_when(setting: Setting, free: FreeForces, dof: int, rules: Shown = SHOWN) -> str:
+    """Return when the force on a degree of freedom is missing, in words: in a part of the log, or in a regime."""
+    return part_of_log(setting, free, dof, rules) or regime(setting, free, dof, rules).words
+
+
+def part_of_log(setting: Setting, free: FreeForces, dof: int, rules: Shown = SHOWN) -> str:
+    """Return in which part of the log a force is missing, if it is in one alone: before or after something changed.
+
+    The windows are in the order of the log. Where they are best parted in two, the typical square of the force, by its
+    error, is many times larger on one side. Forces that come and go with the motion do not differ by as much.
+    """
+    windows = free.windows
+    size = (free.forces[:, dof] / free.errors[:, dof]) ** 2
+    order = np.lexsort((windows.steps, windows.episodes))
+    order = order[np.isfinite(size[order])]
+    size, least = size[order], max(LEAST, len(order) // 10)
+    ends = np.arange(least, len(order) - least)
+    if not ends.size:
+        return ""
+    before = np.cumsum(size)[ends - 1]
+    after = size.sum() - before
+    spread = ends * np.log(before / ends + 1) + (len(order) - ends) * np.log(after / (len(order) - ends) + 1)
+    end = int(ends[spread.argmin()])  # the likeliest, if each part has a variance of its own
+    first, second = (float(np.median(part)) + 1 for part in np.split(size, [end]))
+    if max(first, second) < rules.changes * min(first, second):
+        return ""
+    from_there = second > first
+    row = order[end if from_there else end - 1]
+    if windows.episodes.max() > 0:
+        episode = windows.episodes[row] + 1
+        return f"from episode {episode} on" if from_there else f"up to episode {episode}"
+    time = f"{windows.steps[row] * setting.signals.timestep:.3g} s"
+    return f"from {time} on" if from_there else f"until {time}"
+
+
 def _p_value(values: np.ndarray, force: np.ndarray, episodes: np.ndarray) -> float:
     """p-value that the slope has no sign, over trajectories (or tenths of a single one)."""
     found = slopes(values, force, blocks_of(episodes, 4))
@@ -161,7 +198,7 @@ def places(setting: Setting, free: FreeForces, screening: Screening, rules: Show
     for (kind, name), share in sorted(shares.items(), key=lambda item: -item[1])[: rules.places]:
         if share >= rules.place:
             dof = _dof_of(setting, kind, name)
-            when = "" if dof is None else regime(setting, free, dof, rules).words
+            when = "" if dof is None else told_when(setting, free, dof, rules)
             found.append(Place("contact" if kind == "geom" else kind, name, share, when))
     return tuple(found)
 

@@ -14,7 +14,7 @@ from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
-from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, regime, residual_pictures
+from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, residual_pictures, told_when
 from dropo_torch.gap.noise import FreeForces, free_forces
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
 from dropo_torch.gap.renew import moved, noise_beside
@@ -355,7 +355,7 @@ def _remaining(
     dof = guilty(after)
     share = float(np.clip(cost.left_of(base) * base.degrees / cost.degrees, 0, 1))
     off = float(np.mean(typical > rules.sound.rest))
-    when = regime(setting, after, dof, rules.shown).words
+    when = told_when(setting, after, dof, rules.shown)
     return Remaining(cost.reduced, share, off, dof_names(setting.model)[dof], when, astray)
 
 
@@ -388,7 +388,7 @@ def _unnamed(setting: Setting, free: FreeForces) -> NamedEffect:
     """What has no name, where its force stands out most."""
     dof = guilty(free)
     force = float(np.sqrt(np.nanmean(free.forces[:, dof] ** 2)))
-    words, name = regime(setting, free, dof).words, dof_names(setting.model)[dof]
+    words, name = told_when(setting, free, dof), dof_names(setting.model)[dof]
     strength = Strength(force, float("nan"), float("nan"), force_unit(setting.model, dof))
     text = f"something without a name, at {name}" + (f", {words}" if words else "")
     return NamedEffect("unnamed", name, {"force": strength}, 1.0, (), text)

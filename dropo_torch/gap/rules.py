@@ -226,6 +226,7 @@ class Shown:
         better: by how much a less plain one must exceed a plainer one's, absolute and relative.
         constant: share of the force's mean square in its mean, and
         sure: standard errors of the mean, from which on the force is always the same.
+        changes: how many times larger the missing force's typical square is in one part of the log, to be told so.
         term: share of an unnamed force's root mean square below which its formula has no such term.
         formula: share of its mean square below which no formula is offered, and
         terms: the most terms that one may have.
@@ -239,6 +240,7 @@ class Shown:
     better: tuple[float, float] = (0.02, 1.05)
     constant: float = 0.5
     sure: float = 5.0
+    changes: float = 30.0
     term: float = 0.15
     formula: float = 0.5
     terms: int = 5
