@@ -70,7 +70,7 @@ def _planes(model: mujoco.MjModel) -> list[int]:
 
 
 class FluidMedium(WorldEffect):
-    """Water or another medium around the robot, as MuJoCo simulates it: lift and drag of all bodies by its density."""
+    """Water or another medium around what swims or flies, as MuJoCo simulates it: lift and drag by its density."""
 
     name = "fluid_medium"
     sentence = "the robot moves in a medium, such as water, that the model lacks"
@@ -78,10 +78,12 @@ class FluidMedium(WorldEffect):
     shares = (0.0012, 0.1, 1.0)
 
     #: Density of water, kg/m³, and the largest as a multiple of it.
-    WATER, DENSEST = 1000.0, 20.0
+    WATER, DENSEST = 1000.0, 1.5
 
     def targets(self, setting: Setting) -> list[str | None]:
-        return [None] if (setting.signals.linear_speed + setting.signals.angular_speed).max(initial=0.0) > 0 else []
+        free = setting.model.jnt_type == mujoco.mjtJoint.mjJNT_FREE
+        moves = setting.signals.linear_speed[setting.model.jnt_bodyid[free]] > 0
+        return [None] if moves.any() else []
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         own = float(setting.model.opt.density)
