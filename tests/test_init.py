@@ -728,6 +728,21 @@ def test_signs_that_are_surely_wrong_are_put_right(
     assert not [f for f in found.findings if f.sure]
 
 
+def test_commands_that_are_surely_exchanged_are_put_right(tmp_path: Path) -> None:
+    xml = HELD_DOWN.replace("</body>", """<body pos=".4 0 0"><joint name="bend" axis="0 1 0" damping=".1"/>
+      <geom type="capsule" size=".02" fromto="0 0 0 .2 0 0" mass=".4"/></body></body>""").replace(
+        "</actuator>", '<motor name="bend_motor" joint="bend"/></actuator>'
+    )  # fmt: skip
+    model, rng = mujoco.MjModel.from_xml_string(xml), np.random.default_rng(0)
+    t, q, v, u = recorded(model, 20, 4, lambda t: rng.standard_normal(2) * (1, 0.3))
+    columns = (t, q[:, 0], q[:, 1], v[:, 0], v[:, 1], u[:, 1], u[:, 0])
+    names = ("t", "lift_pos", "bend_pos", "lift_vel", "bend_vel", "lift_tau", "bend_tau")
+    files = written(tmp_path, dict(zip(names, columns, strict=True)), xml)
+    found = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    assert found.document["data"]["actions"] == ["bend_tau", "lift_tau"]
+    assert not [f for f in found.findings if f.sure]
+
+
 def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
     tmp_path: Path, log: tuple[np.ndarray, ...]
 ) -> None:
