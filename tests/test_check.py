@@ -486,6 +486,15 @@ def test_a_good_log_exits_0_and_writes_nothing(folder: Folder, capsys: pytest.Ca
     assert sorted(folder.path.iterdir()) == sorted([*before, config])
 
 
+def test_a_parameter_of_nothing_in_the_model_exits_2(folder: Folder, capsys: pytest.CaptureFixture[str]) -> None:
+    misspelt = {"friction": {"field": "dof_damping", "name": "elbw", "bounds": [0.0, 1.0]}}
+    assert main(["check", str(folder.config(parameters=misspelt))]) == 2
+    output, error = capsys.readouterr()
+    assert "Nothing is wrong with the log" in output
+    assert "did you mean 'elbow'" in error
+    assert error.count("\n") == 1
+
+
 def test_a_wrong_log_exits_2_with_the_name_of_what_is_wrong(
     folder: Folder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

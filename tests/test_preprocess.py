@@ -72,6 +72,38 @@ def test_samples_on_the_grid_come_back_exactly():
     np.testing.assert_allclose(out.observations[:, 0], values[:-1:4], atol=1e-9)
 
 
+@pytest.mark.parametrize("noise", [0.3, 1e-3, 1e-5])
+@pytest.mark.parametrize("drift", [0.0, 1e-3, 0.4])
+def test_what_lies_between_samples_has_the_noise_that_is_told(noise, drift):
+    time = 0.01 * (1 + drift / 4) * np.arange(4000)
+    time = time + drift * 0.004 * np.random.default_rng(1).uniform(-1, 1, 4000)
+    motion = np.sin(2 * np.pi * time)
+    known = preprocess(recording(time, {"q": motion, "dq": motion}), Preprocess(dt=0.01, velocities=["dq"]))
+    draws = noise * np.random.default_rng(2).standard_normal((2, 4000))
+    log = preprocess(
+        recording(time, {"q": motion + draws[0], "dq": motion + draws[1]}), Preprocess(dt=0.01, velocities=["dq"])
+    )
+    if drift == 0:
+        assert log.gains is None
+        return
+    error = (log.observations - known.observations) / noise
+    gains = log.gains[:, 0]
+    np.testing.assert_array_equal(log.gains[1:, 0], log.gains[:-1, 1])
+    for part in np.array_split(np.argsort(gains[:, 0]), 4):
+        np.testing.assert_allclose(error[part].std(), gains[part].mean(), rtol=0.07)
+    assert gains.min() < 0.95
+
+
+def test_a_filtered_or_derived_column_has_the_noise_of_its_own():
+    time = np.cumsum(0.01 + 0.002 * np.random.default_rng(0).uniform(-1, 1, 500))
+    noisy = np.sin(time) + 1e-3 * np.random.default_rng(1).standard_normal(500)
+    log = preprocess(recording(time, {"q": noisy}), Preprocess(dt=0.01, velocities=[], derive=["q"], cutoff=8.0))
+    assert log.gains[:, :, 0].min() < 0.9
+    np.testing.assert_array_equal(log.gains[:, :, 1], 1.0)
+    assert preprocess(recording(time, {"q": noisy}), Preprocess(dt=0.01, cutoff=8.0)).gains is None
+    assert log.select(np.arange(10, 20)).gains.shape == (10, 2, 2)
+
+
 @pytest.mark.parametrize("cutoff", [None, 40.0])
 def test_derivative_of_a_sine(cutoff):
     out = preprocess(sine_recording(), Preprocess(dt=0.01, cutoff=cutoff))

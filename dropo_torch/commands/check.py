@@ -39,10 +39,12 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     """Run ``dropo check``, which writes ``check.json`` and ``report.html`` where a folder is given.
 
     Raises:
-        InputError: something is surely wrong with the log; the files are written all the same.
+        InputError: something is surely wrong with the log, or the parameters are none of the model's; the files are
+            written all the same.
     """
     from dropo_torch.data.examination.finding import verdict
     from dropo_torch.logged import read_log
+    from dropo_torch.parameters import ParameterSpace
 
     config = load_config(given.config, overrides)
     logged = read_log(config, uneven=True)
@@ -61,6 +63,8 @@ def run(given: argparse.Namespace, overrides: Mapping[str, Any], console: Consol
     if given.out is not None:
         console.print(f"report: {given.out / 'report.html'}", soft_wrap=True, markup=False)
     refuse(findings)
+    if config.parameters and logged.model is not None:
+        ParameterSpace(logged.model, config.parameters)  # raises where one is none of the model's
 
 
 def check_first(logged: LoggedData, console: Console, *, force: bool) -> None:

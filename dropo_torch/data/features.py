@@ -112,6 +112,12 @@ class Features:
         parts += [np.repeat(valid[..., list(q)].all(-1, keepdims=True), 3, -1) for q in self.quaternions]
         return np.concatenate(parts, -1)
 
+    def gains(self, columns: np.ndarray) -> np.ndarray:
+        """Return of features ``(..., m)`` what relates the noise of each to its usual one, from that of columns."""
+        parts = [columns[..., list(self.plain)]]
+        parts += [np.repeat(columns[..., list(q)].mean(-1, keepdims=True), 3, -1) for q in self.quaternions]
+        return np.concatenate(parts, -1)
+
     def feature_noise(self, columns: np.ndarray) -> np.ndarray:
         """Return σ of the features ``(m,)`` from those of columns ``(n,)``; a quaternion's ν turns by 2ν."""
         turned = [np.repeat(2 * columns[list(q)].mean(), 3) for q in self.quaternions]

@@ -33,6 +33,8 @@ Actions = Literal["hold", "mean", "position", "velocity"]
 
 _EDGE = 1e-3  # fraction of a step by which a stamp may lie behind the grid and still count for it
 _MISSING = 1.7  # usual sampling intervals between two samples from among which one is missing
+_BENT, _TELLING = 8, 1000  # samples of which a spline's noise is known, at least, and those that tell it, at most
+_DRAWS, _SEED = 8, 3  # of noise
 _GAP = 2.5  # steps, or sampling intervals, over which a signal is interpolated unless max_gap says otherwise
 _LEAST_CORRELATION = 0.5
 
@@ -164,12 +166,50 @@ class _Samples:
 
     time: np.ndarray
     values: np.ndarray
+    filtered: bool = False
 
     @property
     def spline(self) -> Akima1DInterpolator:
         from scipy.interpolate import Akima1DInterpolator  # heavy, and most logs need none
 
         return Akima1DInterpolator(self.time, self.values)
+
+    def gain(self, times: np.ndarray) -> np.ndarray:
+        """Return the noise of the spline at some times relative to that of a sample, ``(N,)``; 1 where filtered.
+
+        Midway between two samples it is least. How low, depends on whether the signal or its noise bends the spline
+        more, which draws of noise show.
+        """
+        if self.filtered or len(self.time) < _BENT:
+            return np.ones(len(times))
+        after = np.clip(np.searchsorted(self.time, times, side="right"), 1, len(self.time) - 1)
+        begin, end = self.time[after - 1], self.time[after]
+        share = np.clip((times - begin) / (end - begin), 0.0, 1.0)
+        return np.sqrt(1 - (1 - self._middle_gain**2) * (4 * share * (1 - share)) ** 2)
+
+    @cached_property
+    def _middle_gain(self) -> float:
+        """The noise of the spline midway between samples, relative to that of these."""
+        few = _Samples(self.time[:_TELLING], self.values[:_TELLING])
+        noise = few._noise
+        if not noise > 0:
+            return 1.0
+        middle = 0.5 * (few.time[1:] + few.time[:-1])[1:-1]
+        draws = noise * np.random.default_rng(_SEED).standard_normal((_DRAWS, len(few.time)))
+        moved = [_Samples(few.time, few.values + draw).spline(middle) for draw in draws]
+        return min(float(np.std(np.array(moved) - few.spline(middle)) / noise), 1.0)
+
+    @property
+    def _noise(self) -> float:
+        """The noise of the samples, by how far each lies from the cubic through the four about it."""
+        around = np.delete(np.lib.stride_tricks.sliding_window_view(np.arange(len(self.time)), 5), 2, axis=1)
+        times = self.time[around] - self.time[2:-2, None]
+        weights = np.stack(
+            [np.prod([times[:, k] / (times[:, k] - times[:, j]) for k in range(4) if k != j], 0) for j in range(4)],
+            axis=1,
+        )
+        away = self.values[2:-2] - (weights * self.values[around]).sum(1)
+        return float(np.sqrt(np.mean(away**2 / (1 + (weights**2).sum(1)))))
 
     @property
     def filled(self) -> _Samples:
@@ -358,7 +398,15 @@ class _Episode:
         observations = np.stack([*position.values(), *velocity.values()], axis=1)
         commands = np.stack(list(actions.values()), axis=1) if actions else np.empty((len(grid) - 1, 0))
         log = Trajectories.of_samples(observations, commands, dt=self.options.dt, source=self.part.source)
-        return replace(log, origin=Origin((*position, *velocity), tuple(actions)))
+        sampled = [signals[name] for name in position] + [signals[n] if n in velocities else None for n in velocity]
+        origin = Origin((*position, *velocity), tuple(actions))
+        return replace(log, origin=origin, gains=self._gains(sampled, grid))
+
+    def _gains(self, interpolated: Sequence[_Samples | None], grid: np.ndarray) -> np.ndarray | None:
+        """Noise of columns before and after each transition, relative to a sample's ``(T, 2, n)``, if it is another."""
+        ones = np.ones(len(grid))
+        gain = np.stack([ones if samples is None else samples.gain(grid) for samples in interpolated], axis=1)
+        return None if np.allclose(gain, 1.0, atol=_EDGE) else np.stack([gain[:-1], gain[1:]], axis=1)
 
     def _resolve(self, key: str, wanted: Sequence[str], names: Sequence[str]) -> list[str]:
         return resolve_names(wanted, names, f"{self.part.source}: preprocess: {key}")
@@ -410,7 +458,7 @@ class _Episode:
         time = np.linspace(first, last, count)
         sections = butter(self.options.order, cutoff, fs=rate, output="sos")
         values = sosfiltfilt(sections, samples.spline(time), padlen=min(pad, count - 1))
-        return _Samples(time=time, values=values)
+        return _Samples(time, values, filtered=True)
 
     def _grid(self, signals: Sequence[_Samples]) -> np.ndarray:
         """The result's times: where every signal has samples, within start and stop."""
@@ -488,7 +536,6 @@ def _velocities(
 
 def _names(value: object, what: str) -> tuple[str, ...] | None:
     if value is None:
-        return None
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"preprocess: {what} is {value!r}; expected a list of signals")
     return tuple(str(name) for name in value)

@@ -60,6 +60,8 @@ class Trajectories(ByValue):
         origin: what the file calls its columns and rows, where it was read from one.
         unseen: positions before each transition that no column has and that follow from the others, ``(T, k)``; see
             :func:`with_unseen`. ``None`` where there are none.
+        gains: noise of each column before and after each transition, relative to that of a sample, ``(T, 2, n)``: what
+            lies between two samples has less. ``None`` where rows are samples.
 
     Raises:
         InputError: shapes that do not fit, a value that is not finite, no transition.
@@ -73,6 +75,7 @@ class Trajectories(ByValue):
     source: str = "log"
     origin: Origin | None = None
     unseen: np.ndarray | None = None
+    gains: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         for name in ("observations", "next_observations", "actions"):
@@ -144,8 +147,9 @@ class Trajectories(ByValue):
         gap = np.append(np.diff(index) != 1, True)
         rest = {name: getattr(self, name)[index] for name in ("observations", "next_observations", "actions")}
         origin = None if self.origin is None else self.origin.select(index)
-        unseen = None if self.unseen is None else self.unseen[index]
-        return replace(self, **rest, terminals=self.terminals[index] | gap, origin=origin, unseen=unseen)
+        more = {name: getattr(self, name) for name in ("unseen", "gains")}
+        rest |= {name: array[index] for name, array in more.items() if array is not None}
+        return replace(self, **rest, terminals=self.terminals[index] | gap, origin=origin)
 
     def select_episodes(self, which: Sequence[int]) -> Trajectories:
         """Return the given episodes, counted from 0."""
@@ -207,11 +211,13 @@ def concatenate(logs: Sequence[Trajectories]) -> Trajectories:
         if log.dt is not None and timed.dt is not None and not np.isclose(log.dt, timed.dt, rtol=1e-3):
             raise InputError(f"{log.source}: sampled every {log.dt:g} s, but {timed.source} every {timed.dt:g} s")
     names = ("observations", "next_observations", "actions", "terminals")
+    gains = [np.ones((len(log), 2, log.observations.shape[1])) if log.gains is None else log.gains for log in logs]
     return Trajectories(
         **{name: np.concatenate([getattr(log, name) for log in logs]) for name in names},
         dt=timed.dt,
         source=first.source if len(logs) == 1 else f"{first.source} and {len(logs) - 1} more",
         origin=Origin.joined([log.origin for log in logs]),
+        gains=None if all(log.gains is None for log in logs) else np.concatenate(gains),
     )
 
 
@@ -393,9 +399,11 @@ def check_values(values: np.ndarray, names: Sequence[str], source: str, *, missi
     if bad.size:
         row, column = (int(i) for i in bad[0])
         more = f" and {len(bad) - 1} more" if len(bad) > 1 else ""
+        sample = np.isnan(values[row, column]) and names[column] != "time"
+        bridged = "; preprocess: {max_gap: SECONDS} leaves such samples out" if sample else ""
         raise InputError(
             f"{source}: {names[column]} is {values[row, column]} at row {row} (counted from 0){more}; "
-            "every value must be finite"
+            f"every value must be finite{bridged}"
         )
 
 

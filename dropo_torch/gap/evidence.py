@@ -109,6 +109,12 @@ class Evidence:
         setting = self.twin.setting
         return Features.of(setting.observation, frozenset() if self.whole else setting.masked)
 
+    @cached_property
+    def noises(self) -> np.ndarray:
+        """Noise of each feature at each instant of the windows, ``(W, L + 1, m)``, or of all windows, ``(1, 1, m)``."""
+        gains = self.windows.gains
+        return self.noise[None, None] if gains is None else self.noise * self.chart.gains(gains)
+
     @property
     def num_rows(self) -> int:
         """Residuals of a window."""
@@ -142,11 +148,11 @@ class Evidence:
         measured, shape = self.windows.measured, (len(variants), len(self.windows))
         initial = None
         if moved is not None:
-            change = np.broadcast_to(moved * self.noise, (*shape, self.chart.size))
+            change = np.broadcast_to(moved * self.noises[:, 0], (*shape, self.chart.size))
             initial = self.chart.move(self.windows.begins, change)
         columns, valid = self.twin.predict(variants, self.windows, initial, pushes)
         with np.errstate(invalid="ignore"):
-            residual = self.chart.difference(measured, columns) / self.noise
+            residual = self.chart.difference(measured, columns) / self.noises
         known = self.chart.known(valid).reshape(*shape, self.num_rows)
         return np.where(known, residual.reshape(known.shape) / self.model_error, 0.0), known
 

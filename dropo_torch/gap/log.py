@@ -57,8 +57,16 @@ def cut_windows(
         np.reshape(measured, (-1, length + 1, observation.size)),
         np.reshape(rates, (-1, observation.size)) / (log.dt or 1.0),
         np.array(episodes, dtype=int), np.array(steps, dtype=int), commands,
-        None if log.unseen is None else log.unseen[rows],
+        None if log.unseen is None else log.unseen[rows], gains=_gains(log, observation, rows, length),
     )  # fmt: skip
+
+
+def _gains(log: Trajectories, observation: Observation, rows: np.ndarray, length: int) -> np.ndarray | None:
+    """Noise of each column in windows that begin at some rows, relative to that of a sample, ``(W, L + 1, n)``."""
+    if log.gains is None:
+        return None
+    gains = log.gains[:, :, list(observation.log_columns)]
+    return np.concatenate([gains[rows, :1], gains[rows[:, None] + np.arange(length), 1]], axis=1)
 
 
 def longest_episode(log: Trajectories) -> int:

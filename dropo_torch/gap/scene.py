@@ -296,7 +296,7 @@ def _end_error(evidence: Evidence, begin: Hypothesis) -> float:
     Features that hardly move, of which the error is noise whatever the simulation does, count for nothing.
     """
     found, _ = evidence.residuals([begin.variant])
-    end = found[0, :, -evidence.chart.size :] * evidence.noise
+    end = found[0, :, -evidence.chart.size :] * evidence.noises[:, -1]
     size = feature_sizes(evidence.twin.setting, evidence.windows.measured[:, 0])
     moving = size > MOVING * evidence.noise
     relative = np.nanmedian(np.abs(end), axis=0) / np.maximum(size, 1e-12)

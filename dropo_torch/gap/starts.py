@@ -66,7 +66,7 @@ def _step(part: Evidence, variant: Variant, *, bent: bool) -> tuple[np.ndarray, 
     bends = np.maximum(left[0], promised) > BENDS * np.minimum(left[0], promised)
     better = usable & (bends | bent) & (left.min(0) < (1 - GAINS) * (here**2).sum(-1))
     best = trials[left.argmin(0), np.arange(len(step))]
-    return part.chart.move(part.windows.begins, best * part.noise), better
+    return part.chart.move(part.windows.begins, best * part.noises[:, 0]), better
 
 
 def table_of(windows: Windows) -> np.ndarray | None:

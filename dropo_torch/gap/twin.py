@@ -44,6 +44,7 @@ class Windows:
         unseen: positions at the starts that no column has and that follow from the log, ``(W, k)``.
         starts: observed columns from which they are simulated, ``(W, n)``; by default :attr:`usual`.
         smooth: these columns by the rows around, ``(W, n)``, where single rows are too noisy to begin at.
+        gains: noise of each column at each instant relative to that of a sample, ``(W, L + 1, n)``; 1 by default.
     """
 
     measured: np.ndarray
@@ -54,6 +55,7 @@ class Windows:
     unseen: np.ndarray | None = None
     starts: np.ndarray | None = None
     smooth: np.ndarray | None = None
+    gains: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of windows."""
@@ -76,12 +78,9 @@ class Windows:
 
     def select(self, rows: np.ndarray | slice) -> Windows:
         """Return the given windows."""
-        given = [
-            k
-            for k in ("measured", "rates", "episodes", "steps", "unseen", "starts", "smooth")
-            if getattr(self, k) is not None
-        ]
-        return replace(self, **{k: getattr(self, k)[rows] for k in given})
+        names = ("measured", "rates", "episodes", "steps", "unseen", "starts", "smooth", "gains")
+        given = {name: getattr(self, name) for name in names}
+        return replace(self, **{name: array[rows] for name, array in given.items() if array is not None})
 
 
 class Twin:

@@ -227,7 +227,7 @@ def below(noise: np.ndarray) -> float:
 def _rollout(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     """Root mean square open-loop error of each feature ``(m,)``; infinite where it diverged, NaN where it is masked."""
     found, known = (_after(x, evidence) for x in evidence.residuals([hypothesis.variant]))
-    error = found * evidence.noise
+    error = found * evidence.noises[:, 1:]
     error = np.where(np.isfinite(error), error, np.inf)
     error = np.sqrt((error**2 * known).sum((0, 1, 2)) / np.maximum(known.sum((0, 1, 2)), 1))
     return np.where(_compared(evidence), error, np.nan)
@@ -296,9 +296,11 @@ def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     draws = np.random.default_rng(SEED).standard_normal((count, num_windows, m))
     moved = np.concatenate([np.zeros((1, num_windows, m)), draws])
     found, _ = evidence.residuals([hypothesis.variant] * len(moved), moved)
-    change = found[1:] - found[:1]
-    finite = np.isfinite(change).all(-1)
+    change = _after(found[1:] - found[:1], evidence)
+    finite = np.isfinite(change).all((-2, -1))
     if not finite.any():
         return np.full(m, np.inf)
-    change = change[finite].reshape(-1, evidence.windows.length + 1, m)[:, 1:]
-    return np.where(_compared(evidence), np.sqrt((change**2).mean((0, 1)) + 1) * evidence.noise, np.nan)
+    noises = np.broadcast_to(evidence.noises[:, 1:], change.shape[1:])
+    square = (change * noises)[finite] ** 2
+    noise = np.broadcast_to(noises, change.shape)[finite]
+    return np.where(_compared(evidence), np.sqrt((square + noise**2).mean((0, 1))), np.nan)
