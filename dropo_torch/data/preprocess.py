@@ -536,6 +536,7 @@ def _velocities(
 
 def _names(value: object, what: str) -> tuple[str, ...] | None:
     if value is None:
+        return None
     if isinstance(value, str) or not isinstance(value, Sequence):
         raise InputError(f"preprocess: {what} is {value!r}; expected a list of signals")
     return tuple(str(name) for name in value)
