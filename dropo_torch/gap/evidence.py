@@ -111,9 +111,9 @@ class Evidence:
 
     @cached_property
     def noises(self) -> np.ndarray:
-        """Noise of each feature at each instant of the windows, ``(W, L + 1, m)``, or of all windows, ``(1, 1, m)``."""
-        gains = self.windows.gains
-        return self.noise[None, None] if gains is None else self.noise * self.chart.gains(gains)
+        """Noise of each feature at each instant of the windows, ``(W, L + 1, m)``."""
+        gains = 1.0 if self.windows.gains is None else self.chart.gains(self.windows.gains)
+        return np.broadcast_to(self.noise * gains, (len(self.windows), self.windows.length + 1, self.chart.size))
 
     @property
     def num_rows(self) -> int:

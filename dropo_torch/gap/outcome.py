@@ -73,6 +73,7 @@ class _Fitted:
         rest: the fit as noise alone weighs the residuals.
         alone: the declared parameters alone, weighed alike.
         own_step: χ² per degree of freedom with the model's own step and a finer one, where that is all that remains.
+        halves: half-widths of the 90 % intervals of all numbers, ``(q,)``; empty where nothing is named.
     """
 
     evidence: Evidence
@@ -81,6 +82,14 @@ class _Fitted:
     rest: Refit
     alone: Refit
     own_step: tuple[float, float] | None
+    halves: np.ndarray
+
+    @property
+    def of_names(self) -> list[np.ndarray]:
+        """Half-widths of the numbers of each name, ``(p,)`` each."""
+        hypothesis = self.final.hypothesis
+        sizes = [len(hypothesis.declared), *(len(p.values) for p in hypothesis.placed)]
+        return np.split(self.halves, np.cumsum(sizes)[:-1])[1:]
 
 
 @dataclass(frozen=True)
@@ -117,6 +126,8 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         report: called with a stage and its share done.
     """
     fitted = _fitted_on_all(scene, naming, report)
+    if fitted.last is not None and (fewer := _without_unsure(scene.setting, naming, fitted, scene.rules)) is not None:
+        return make_result(scene, fewer, started, report)
     checked = _checked(scene, naming, fitted, report)
     if not naming.gap and checked.astray > scene.rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(checked.astray))
@@ -129,13 +140,14 @@ def _fitted_on_all(scene: Scene, naming: Naming, report: Report) -> _Fitted:
     """The last fit, and the declared parameters alone."""
     evidence, alone = naming.evidence, naming.base
     if not naming.named:
-        return _Fitted(evidence, naming.final, None, naming.final, alone, None)
+        return _Fitted(evidence, naming.final, None, naming.final, alone, None, np.zeros(0))
     report("fitting on all windows", 0.0)
     last, rest, own = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
     if not np.array_equal(last.evidence.noise, evidence.noise):
         evidence = replace(evidence, noise=last.evidence.noise)
         alone = refit(evidence, alone.hypothesis, iterations=0, slopes=False)
-    return _Fitted(evidence, last.fit, last, rest, alone, _own_step(own, rest.cost, scene.rules))
+    step = _own_step(own, rest.cost, scene.rules)
+    return _Fitted(evidence, last.fit, last, rest, alone, step, half_widths(last))
 
 
 def _checked(scene: Scene, naming: Naming, fitted: _Fitted, report: Report) -> _Checked:
@@ -176,7 +188,7 @@ def _put_together(
     after = free_forces(twin, scene.short, best.variant, noise) if naming.named else before
     shown: tuple[NamedEffect, ...] = ()
     if naming.gap:
-        shown = (_unnamed(setting, before),) if fitted.last is None else _named(setting, naming, fitted.last)
+        shown = (_unnamed(setting, before),) if fitted.last is None else _named(setting, naming, fitted)
     remaining = None
     if naming.named and (fitted.own_step is None or naming.partial):
         remaining = _remaining(setting, naming, fitted.alone.cost, fitted.rest, after, checked.astray, rules)
@@ -190,7 +202,7 @@ def _put_together(
         next_experiment=_next_experiment(naming, fitted.final, report),
         found=naming.gap,
         declared=dict(zip(problem.space.names, declared, strict=True)),
-        fitted=_fitted(problem.space, evidence, best, fitted.last),
+        fitted=_fitted(problem.space, evidence, best, fitted),
         noise=tuple(noise.tolist()),
         labels=evidence.chart.labels,
         units=evidence.chart.units,
@@ -329,13 +341,39 @@ def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Nami
 def _spared(naming: Naming, absurd: Sequence[tuple[Placed, str]]) -> Naming:
     """What was found without what is at a bound of physics: a family without these members, other names not at all."""
     out = {placed.key for placed, _ in absurd}
-    placed = naming.final.hypothesis.placed
-    kept = [k for k, p in enumerate(placed) if p.key not in out]
-    if not naming.family or not kept:
-        return _nameless(naming, absurd[0][1])
-    rest = replace(naming.final.hypothesis, placed=tuple(placed[k] for k in kept))
+    kept = [k for k, p in enumerate(naming.final.hypothesis.placed) if p.key not in out]
+    return _keeping(naming, kept) if naming.family and kept else _nameless(naming, absurd[0][1])
+
+
+def _keeping(naming: Naming, kept: Sequence[int]) -> Naming:
+    """What was found, with some of its names only."""
+    hypothesis = naming.final.hypothesis
+    rest = replace(hypothesis, placed=tuple(hypothesis.placed[k] for k in kept))
     ties, shares = tuple(naming.ties[k] for k in kept), tuple(naming.shares[k] for k in kept)
     return replace(naming, final=refit(naming.evidence, rest, iterations=6), ties=ties, shares=shares)
+
+
+def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Rules) -> Naming | None:
+    """What was found without names that may as well be absent: the less sure half of a family's, or one; else ``None``.
+
+    What remains that noise does not make is alike from row to row. It widens intervals, by which an effect of one
+    number may be nothing that misfit alone takes for needed.
+    """
+    assert fitted.last is not None
+    placed, family = fitted.last.fit.hypothesis.placed, naming.family
+    halves, sure = fitted.of_names, dict[int, float]()
+    for index, (p, half) in enumerate(zip(placed, halves, strict=True)):
+        (quantity, *more), (value, *_) = p.effect.quantities(setting, p.target), p.values
+        if not (more or quantity.discrete or p.effect.steps):
+            sure[index] = abs(value - quantity.neutral) / max(half[0], 1e-300)
+    least = rules.family.sure if family else 1.0
+    unsure = sorted((index for index in sure if sure[index] < least), key=sure.__getitem__)
+    idle = unsure[: (len(unsure) + 1) // 2 if family else 1]
+    if not idle or len(idle) == len(placed):
+        return None
+    found = _keeping(naming, [k for k in range(len(placed)) if k not in idle])
+    allowed = [(placed[k], halves[k]) for k in idle if family]
+    return replace(found, left_out=(*found.left_out, *allowed))
 
 
 def _nameless(naming: Naming, reason: str) -> Naming:
@@ -394,26 +432,27 @@ def _unnamed(setting: Setting, free: FreeForces) -> NamedEffect:
     return NamedEffect("unnamed", name, {"force": strength}, 1.0, (), text)
 
 
-def _named(setting: Setting, naming: Naming, last: Resolved) -> tuple[NamedEffect, ...]:
+def _named(setting: Setting, naming: Naming, fitted: _Fitted) -> tuple[NamedEffect, ...]:
     """The named effects, the strongest first."""
-    final, halves = last.fit, half_widths(last)
-    own, found = iter(halves[len(final.hypothesis.declared) :]), []
-    for placed, tied, excess in zip(final.hypothesis.placed, naming.ties, naming.shares, strict=True):
-        numbers = _strengths(setting, placed, [next(own) for _ in placed.values])
+    placed_all, found = fitted.final.hypothesis.placed, []
+    for placed, halves, tied, excess in zip(placed_all, fitted.of_names, naming.ties, naming.shares, strict=True):
+        numbers = _strengths(setting, placed, halves)
         share = float(np.clip(excess / naming.base.cost.above(naming.final.cost), 0, 1))
         found.append(NamedEffect.of(placed, numbers, share, tied))
     return merge_families(tuple(sorted(found, key=lambda e: -e.share_of_gap)), setting)
 
 
 def _fitted(
-    space: ParameterSpace, evidence: Evidence, hypothesis: Hypothesis, last: Resolved | None
+    space: ParameterSpace, evidence: Evidence, hypothesis: Hypothesis, fitted: _Fitted
 ) -> Mapping[str, Strength]:
     """The declared parameters beside what was named, with their intervals."""
     if not len(space):
         return {}
-    if last is None:
-        last = Resolved(refit(evidence, hypothesis, iterations=0), evidence, np.zeros(len(hypothesis.vector)))
-    bounds = zip(space.parameters, hypothesis.declared, half_widths(last), space.low, space.high, strict=False)
+    halves = fitted.halves
+    if fitted.last is None:
+        nothing = Resolved(refit(evidence, hypothesis, iterations=0), evidence, np.zeros(len(hypothesis.vector)))
+        halves = half_widths(nothing)
+    bounds = zip(space.parameters, hypothesis.declared, halves, space.low, space.high, strict=False)
     return {
         p.name: Strength(value, max(value - half, float(low)), min(value + half, float(high)), p.unit)
         for p, value, half, low, high in bounds

@@ -113,6 +113,7 @@ class Family:
         members: of it, so many must be needed at half of the joints.
         spare: share of the excess that it leaves by which dropping the members least needed may raise it.
         sloped: share of the excess that it must leave at most where dry friction changes along the joints' ranges.
+        sure: half-widths of its 90 % interval by which a member must in the end differ from none.
         iterations, rounds: of its fit, and how often those not needed are dropped, at most.
     """
 
@@ -125,6 +126,7 @@ class Family:
     members: int = 2
     spare: float = 0.03
     sloped: float = 0.7
+    sure: float = 1.8
     iterations: int = 24
     rounds: int = 8
 

@@ -300,7 +300,5 @@ def rollout_floor(evidence: Evidence, hypothesis: Hypothesis) -> np.ndarray:
     finite = np.isfinite(change).all((-2, -1))
     if not finite.any():
         return np.full(m, np.inf)
-    noises = np.broadcast_to(evidence.noises[:, 1:], change.shape[1:])
-    square = (change * noises)[finite] ** 2
-    noise = np.broadcast_to(noises, change.shape)[finite]
-    return np.where(_compared(evidence), np.sqrt((square + noise**2).mean((0, 1))), np.nan)
+    noises = np.broadcast_to(evidence.noises[:, 1:], change.shape)[finite]
+    return np.where(_compared(evidence), np.sqrt(((change[finite] ** 2 + 1) * noises**2).mean((0, 1))), np.nan)

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
 from dropo_torch.proposal.columns import STATES, Column, last_part
 from dropo_torch.proposal.matches import Match, Matching, is_taken
+from dropo_torch.proposal.motions import LIKE
 from dropo_torch.proposal.places import Place
 from dropo_torch.proposal.words import Words, called, split, unit_role
 
@@ -16,6 +20,9 @@ DRIVES = frozenset(
         *("props", "propeller", "propellers", "thruster", "thrusters", "thrust", "esc", "muscle", "muscles"),
     )
 )
+
+#: By which factor an effort may differ from its command.
+ALIKE = 1.5
 
 
 def namesakes(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
@@ -53,6 +60,40 @@ def _suits(column: Column, place: Place) -> bool:
     """Whether neither the unit of a column nor what it is a command of is another than an actuator takes."""
     is_other = column.words.role == "command" and not may_command(column.words, place)
     return not is_other and unit_role(column.label or column.entry) in ("", place.takes)
+
+
+def behind_efforts(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
+    """Return the commands that efforts answered, where the efforts were measured beside them, one for each.
+
+    A controller's list of commands need not be in the order of the model or of what is measured; which is whose, the
+    efforts say.
+    """
+    told = [found[p.label] for p in places if p.kind == "command" and p.label in found]
+    told = [match for match in told if match.column.words.role == "effort"]
+    groups: dict[tuple, list[Column]] = {}
+    for c in (c for c in free if c.words.role == "command" and not is_taken(c, found)):
+        if all(may_command(c.words, match.place) for match in told):
+            groups.setdefault((c.array, c.words.commanded, c.words.scale), []).append(c)
+    for group in (group for group in groups.values() if 1 < len(group) == len(told)):
+        shares = np.array([[_share(match.values, c.values) for c in group] for match in told])
+        rows, columns = linear_sum_assignment(shares, maximize=True)
+        if shares[rows, columns].min() > LIKE:
+            pairs = zip(told, columns, shares[rows, columns], strict=True)
+            why = "the effort that was measured (r² {:.2f})"
+            return [Match(match.place, group[j], 1.0, "likely", why.format(share)) for match, j, share in pairs]
+    return []
+
+
+def _share(effort: np.ndarray, command: np.ndarray) -> float:
+    """How much of an effort a command explains that is about as large; 0 of another one."""
+    good = np.isfinite(effort) & np.isfinite(command)
+    effort, command = (values[good] - values[good].mean() for values in (effort, command))
+    size = float(command @ command)
+    if not (good.any() and size > 0 and effort.any()):
+        return 0.0
+    slope = float(effort @ command) / size
+    share = 1 - float(((effort - slope * command) ** 2).sum()) / float(effort @ effort)
+    return share if 1 / ALIKE < slope < ALIKE else 0.0
 
 
 def may_command(words: Words, place: Place) -> bool:

@@ -11,7 +11,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from dropo_torch.proposal.columns import ACTIONS, STATES, Column, Columns
-from dropo_torch.proposal.drives import is_state, may_command, namesakes, numbered_drives
+from dropo_torch.proposal.drives import behind_efforts, is_state, may_command, namesakes, numbered_drives
 from dropo_torch.proposal.matches import Match, Matching, Sureness, is_taken, orientation
 from dropo_torch.proposal.motions import LIKE, SAME, SPANS, motion, turning
 from dropo_torch.proposal.places import Place
@@ -76,6 +76,7 @@ def _found(
     found |= {m.place.label: m for m in _in_order(places, free, found)}
     found |= {m.place.label: m for m in _gyroscope(places, free, found, starts)}
     found |= {m.place.label: m for m in numbered_drives(places, free, found)}
+    found |= {m.place.label: m for m in behind_efforts(places, free, found)}
     return found
 
 
