@@ -1389,7 +1389,7 @@ def test_names_that_leave_nothing_are_believed_before_others(
     waiting, sure = iter(ready), ended(scene, 1.0)
     monkeypatch.setattr("dropo_torch.gap.run.search", lambda *_, **__: next(waiting))
     monkeypatch.setattr("dropo_torch.gap.run.searched", lambda scene: ((str(n), scene.evidence) for n in range(2)))
-    monkeypatch.setattr("dropo_torch.gap.run.with_ties", lambda end: end.naming)
+    monkeypatch.setattr("dropo_torch.gap.run.with_ties", lambda ended, end: ended.naming)
     monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: None)
     assert gap_package.name(scene).final is ready[chosen].naming.final
     assert len(list(waiting)) == len(ready) - asked

@@ -24,13 +24,14 @@ from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap import family as members
 from dropo_torch.gap.evidence import Cost, Linearization
-from dropo_torch.gap.family import base_family, not_needed, pushing, shares_of, without_steps
+from dropo_torch.gap.family import base_family, not_needed, pushing, without_steps
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.limbs import alike, by_limbs, joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.rules import Rules, family_accounts
 from dropo_torch.gap.scene import prepare
 from dropo_torch.gap.search import Naming, leaves_wrong, resort, start
+from dropo_torch.gap.shares import shares_of
 from dropo_torch.report.gap_words import answer, by_joint
 
 Triple = tuple[float, ...]
@@ -306,6 +307,7 @@ def test_members_are_not_judged_where_all_of_them_leave_too_much(
     monkeypatch.setattr(members, "one_kind", lambda _: False)
     monkeypatch.setattr(members, "extend", lambda _, found: found)
     monkeypatch.setattr(members, "is_of_step", lambda *_: False)
+    monkeypatch.setattr(members, "with_one_more", lambda *_: [])
     monkeypatch.setattr(members, "leaves_too_much", lambda *_: False)
     monkeypatch.setattr(members, "fitted_family", lambda *_: whole)
     monkeypatch.setattr(members, "whole_family", lambda _, fit: judged.append(fit))
@@ -340,6 +342,31 @@ def test_the_family_is_none_where_one_effect_more_leaves_less(
     base = SimpleNamespace(cost=None, hypothesis=None)
     first: Any = Ended(current=fit(1000.0, left), base=base)
     assert members.with_family(ground, SimpleNamespace(base=base), first).family == is_family  # type: ignore[arg-type]
+
+
+def test_no_family_is_fitted_where_one_effect_more_leaves_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Delays at all joints and one weak motor: as many members as joints would take most of the time."""
+
+    def fit(excess: float) -> Any:
+        return SimpleNamespace(
+            cost=SimpleNamespace(excess=excess, left_of=lambda other: excess / other.excess), hypothesis=hypothesis
+        )
+
+    hypothesis: Any = SimpleNamespace(placed=(object(),))
+    base, tried = fit(10_000.0), [fit(1.0)]
+    for name, made in {"has_family": True, "one_kind": True, "is_of_step": False, "nearer": None}.items():
+        monkeypatch.setattr(members, name, lambda *_, made=made: made)
+    monkeypatch.setattr(members, "significant", lambda cost, rules: cost.excess > 2)
+    monkeypatch.setattr(members, "sound", lambda *_: tried)
+    monkeypatch.setattr(members, "beats", lambda *_: True)
+    monkeypatch.setattr(members, "leaves_too_much", lambda *_: pytest.fail("a family was fitted"))
+    ground: Any = SimpleNamespace(
+        rules=Rules(), screened=lambda _: [], focus=lambda _: None, refits=lambda *_: (tried, None)
+    )
+    first: Any = Ended(current=fit(100.0), base=base)
+    found = members.with_family(ground, SimpleNamespace(base=base), first)  # type: ignore[arg-type]
+    assert found.current is tried[0]
+    assert not found.family
 
 
 def test_what_is_of_the_models_own_step_asks_for_no_family(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -465,7 +465,7 @@ def test_names_without_skill_are_no_rivals_of_the_forces(tmp_path: Path, monkeyp
         return Ended(ground, state, found)
 
     monkeypatch.setattr(run, "search", astray)
-    monkeypatch.setattr(run, "with_ties", lambda ended: ended.naming)
+    monkeypatch.setattr(run, "with_ties", lambda ended, end: ended.naming)
     problem = problem_of(tmp_path, 5, friction=(0.5, 0.8, 0.3), seconds=20)
     gap = find_gap(problem, effects=[find_effect(e) for e in ("joint_friction", "actuator_delay")])
     assert [e.effect for e in gap.effects] == ["joint_friction"]

@@ -9,7 +9,7 @@ from dataclasses import replace
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.ground import FEWER, Ground, State
+from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.refit import ANEW, Refit, change_of_step, least_beside, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import (
@@ -24,10 +24,9 @@ from dropo_torch.gap.rules import (
     simplest,
 )
 from dropo_torch.gap.screen import Candidate, nearer, promising_families, promising_pairs, screen
+from dropo_torch.gap.shares import MANY, families, shares_of
 from dropo_torch.gap.sound import absurd
 
-#: Places from which on an effect is a family, whose members stand together.
-MANY = 3
 #: Dry friction as MuJoCo has it by default.
 SOFT = "joint_soft_friction"
 
@@ -46,7 +45,7 @@ def is_needed(ground: Ground, state: State, whole: Refit, without: Refit) -> boo
     if not matters(ground, state.base, whole, without):
         return False
     chance, error = ground.rules.chance, ground.chance(whole, without) * ground.comparisons
-    if error <= chance.error or error > chance.open or len(ground.evidence.windows) <= ground.few:
+    if error <= chance.error or error > chance.open or len(ground.evidence.windows) <= ground.most:
         return error <= chance.error
     ground.report("judging on all windows", 0.5)
     every, base = with_base(replace(ground, few=len(ground.evidence.windows), caps=1.0), state.base.hypothesis)
@@ -245,7 +244,7 @@ def paired(ground: Ground, state: State, alive: Sequence[Candidate]) -> tuple[li
         alive: candidates, the best first.
     """
     tried, current = ground.rules.tried, state.current
-    focus = ground.focus(current, 2 * FEWER)  # on more windows, and from where the candidates promise the most
+    focus = ground.focus(current, 2)  # on more windows, and from where the candidates promise the most
     known, excluded = {p.key for p in current.hypothesis.placed}, set[tuple[str, str | None]]()
     for _ in range(tried.anew):
         rest = [c.placed for c in alive if c.key not in excluded][: tried.paired]
@@ -363,17 +362,29 @@ def everywhere(ground: Ground, state: State) -> State:
 
 
 def prune(ground: Ground, state: State) -> State:
-    """Drop effects that are not needed, the least needed first; then two that only undo each other."""
+    """Drop effects that are not needed, the least needed first; then two that only undo each other.
+
+    Of one effect at many places, the place is asked about at which it explains least.
+    """
     current = state.current
     while current.hypothesis.placed:
         count = len(current.hypothesis.placed)
-        without = [ground.refit(current.hypothesis.without(i)) if count > 1 else state.base for i in range(count)]
+        asked = _least(ground, current)
+        without = [ground.refit(current.hypothesis.without(i)) if count > 1 else state.base for i in asked]
         idle = [r for r in without if not is_needed(ground, state, current, r)]
         idle = idle or undone(ground, state, current)
         if not idle:
             break
         current = min(idle, key=lambda r: r.cost.excess)
     return replace(state, current=current)
+
+
+def _least(ground: Ground, current: Refit) -> list[int]:
+    """The effects of a hypothesis, of each family only the member that explains least by the derivatives."""
+    groups = families(current.hypothesis.placed)
+    shares = shares_of(ground, current) if groups else ()
+    spared = {i for group in groups for i in group if i != min(group, key=shares.__getitem__)}
+    return [i for i in range(len(current.hypothesis.placed)) if i not in spared]
 
 
 def undone(ground: Ground, state: State, current: Refit) -> list[Refit]:

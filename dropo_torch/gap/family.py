@@ -15,21 +15,22 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
-from dropo_torch.gap.accept import SOFT, extend, is_of_step, sound, with_soft_friction
+from dropo_torch.gap.accept import SOFT, beats, extend, is_of_step, sound, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.ground import Ground, State
+from dropo_torch.gap.ground import Ground, State, scarcity
 from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
 from dropo_torch.gap.screen import nearer
+from dropo_torch.gap.shares import offsets
 from dropo_torch.gap.sound import absurd
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
 #: One more of them, where what these leave is more than noise; and those on top of which it is.
 SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
-#: Windows of the first fit.
-ROUGHLY = 12
+#: Windows of the first fit, and where each has many residuals.
+ROUGHLY, LEAST = 12, 6
 
 #: What is reported.
 STAGE = "fitting friction, inertia, offset and delay of all joints"
@@ -53,8 +54,9 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     At several joints several members must be needed: what sits at one joint, or is of one kind, the search names
     one by one. What a coarse step does to stiff servos is no member, although inertia, friction and delay of every
     joint together make up for it. Where the first effects are not one effect at several joints already, it must
-    leave next to nothing of what they leave. What ends at a bound of physics is no member. Where it leaves more
-    than noise, and one effect more beside the first ones leaves less, the search goes on with these.
+    leave next to nothing of what they leave. What ends at a bound of physics is no member. Where one effect more
+    beside the first ones leaves no more than noise, or less than the family that leaves more, the search goes on with
+    these.
 
     Args:
         ground: what the search stands on.
@@ -71,6 +73,9 @@ def with_family(ground: Ground, state: State, found: State) -> State:
         return found
     if is_of_step(ground, best.current):
         return found
+    beside = with_one_more(ground, best)
+    if beside and (not significant(beside[0].cost, ground.rules) or is_of_step(ground, beside[0])):
+        return replace(best, current=beside[0])
     most = rules.hopeless * rules.clearer[int(kind)]
     if leaves_too_much(ground, state.base.hypothesis, best.current.hypothesis, most):
         return found
@@ -78,27 +83,30 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     if fitted.cost.left_of(cost) > most:
         return found
     whole = whole_family(ground, fitted)
-    if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)] or is_surpassed(ground, best, whole):
+    if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)] or is_surpassed(ground, beside, whole):
         return found
     return replace(found, current=whole, family=True, done=True, refused="")
 
 
-def is_surpassed(ground: Ground, found: State, whole: Refit) -> bool:
-    """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more.
+def with_one_more(ground: Ground, found: State) -> list[Refit]:
+    """Return the first effects with one more beside them, the best first, where these explain most of the gap.
 
-    What several joints lack, such as a delay, may hide what one body lacks, of which every member would take a part.
-    That is looked for where the first ones explain most of the gap.
+    What several joints lack, such as a delay, may hide what one body lacks, of which every member of a base family
+    would take a part.
     """
     current = found.current
-    if found.done or not current.hypothesis.placed or not significant(whole.cost, ground.rules):
-        return False
-    if current.cost.left_of(found.base.cost) > 1 - ground.rules.most:
-        return False
+    if found.done or not current.hypothesis.placed or current.cost.left_of(found.base.cost) > 1 - ground.rules.most:
+        return []
     alive = [c for c in ground.screened(current) if not c.dead][: ground.rules.tried.refits]
     focus = ground.focus(current)
     groups = [(nearer(focus, current.hypothesis, c),) for c in alive]
     singles, _ = ground.refits(found, current, groups, STAGE)
-    return any(r.cost.excess < whole.cost.excess for r in sound(ground, singles))
+    return [r for r in sound(ground, singles) if beats(ground, r, current)]
+
+
+def is_surpassed(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
+    """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more."""
+    return significant(whole.cost, ground.rules) and any(r.cost.excess < whole.cost.excess for r in beside)
 
 
 def has_family(ground: Ground) -> bool:
@@ -121,7 +129,8 @@ def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
 def leaves_too_much(ground: Ground, begin: Hypothesis, rival: Hypothesis, most: float) -> bool:
     """Return whether the base family leaves more than a share of what a fitted rival leaves, on few windows."""
     ground.report(STAGE, 0.0)
-    few, iterations = ground.part.few(ROUGHLY), ground.rules.family.iterations
+    few = ground.part.few(max(LEAST, round(ROUGHLY * scarcity(ground.evidence))))
+    iterations = ground.rules.family.iterations
     rough = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
     return rough.cost.left_of(refit(few, rival, iterations=0, slopes=False).cost) > most
 
@@ -273,20 +282,6 @@ def _cost_without(normal: np.ndarray, off: np.ndarray, rows: np.ndarray) -> floa
     across = normal[np.ix_(rows, gone)]
     schur = normal[np.ix_(gone, gone)] - across.T @ inverse @ across
     return float(off[gone] @ schur @ off[gone])
-
-
-def offsets(setting: Setting, whole: Refit) -> np.ndarray:
-    """Return by how many scales each number differs from its neutral value ``(q,)``; declared parameters do not."""
-    neutral = [p.effect.quantities(setting, p.target)[0].neutral for p in whole.hypothesis.placed]
-    absent = np.concatenate([whole.hypothesis.declared, neutral])
-    return np.asarray((whole.hypothesis.vector - absent) / whole.scale)
-
-
-def shares_of(ground: Ground, whole: Refit) -> tuple[float, ...]:
-    """Return the χ² that would come back without each effect, by the derivatives at the fit."""
-    (slope, _), first = whole.weighted(ground.part.caps), len(whole.hypothesis.declared)
-    variance = np.diag(np.linalg.pinv(slope @ slope.T, rcond=1e-12, hermitian=True))
-    return tuple((offsets(ground.setting, whole) ** 2 / np.maximum(variance, 1e-300))[first:].tolist())
 
 
 def spread_out(setting: Setting, hypothesis: Hypothesis, members: int) -> bool:

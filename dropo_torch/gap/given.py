@@ -14,7 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from dropo_torch.effects import Effect
-from dropo_torch.gap.ground import FEW
+from dropo_torch.gap.ground import FEW, scarcity
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import Gap
@@ -151,8 +151,8 @@ def _as_good(problem: Problem, free: Sequence[str], gap: Gap) -> Problem | None:
 
 def _seconds(scene: Scene, first: Gap) -> float:
     """Seconds that a search with the declared parameters takes at the least, by what simulations took so far."""
-    windows = scene.evidence.windows
-    simulated = FITS * (1 + len(scene.begin.declared)) * min(len(windows), FEW) * windows.length
+    windows, most = scene.evidence.windows, round(FEW * scarcity(scene.evidence))
+    simulated = FITS * (1 + len(scene.begin.declared)) * min(len(windows), most) * windows.length
     return simulated * first.seconds / max(first.simulated_transitions, 1)
 
 

@@ -22,6 +22,8 @@ from dropo_torch.support.report import Report
 
 #: Windows that refits use, and that the screening uses; all if there are fewer.
 FEW, FEWER = 40, 10
+#: Residuals of a window from which on fewer windows do, which tell as much; the share of them that there are at least.
+RICH, SCARCE = 400, 0.5
 
 
 @dataclass(frozen=True)
@@ -111,6 +113,11 @@ class State:
     starts: np.ndarray | None = None
 
 
+def scarcity(evidence: Evidence) -> float:
+    """Return which share of the usual windows tells enough, as each has many residuals."""
+    return float(np.clip(RICH / max(evidence.num_rows, 1), SCARCE, 1.0))
+
+
 @dataclass(frozen=True)
 class Ground:
     """What a search stands on, the same for all of its steps.
@@ -121,7 +128,7 @@ class Ground:
         report: called with a stage and its share done.
         caps: factors of the refitted windows' residuals, ``(W,)``, or 1.
         short: short windows from which the noise is estimated; ``None`` where it is given.
-        few: windows that refits use, at most.
+        few: windows that refits use, at most; by default as many as tell enough.
     """
 
     evidence: Evidence
@@ -129,7 +136,7 @@ class Ground:
     report: Report = lambda stage, share: None
     caps: np.ndarray | float = 1.0
     short: Windows | None = None
-    few: int = FEW
+    few: int | None = None
 
     def at(self, state: State) -> Ground:
         """Return the ground with the noise, the windows with their starts, and the caps that a state has found."""
@@ -155,10 +162,15 @@ class Ground:
         """The model and its columns."""
         return self.evidence.twin.setting
 
+    @property
+    def most(self) -> int:
+        """Windows that refits use, at most."""
+        return round(FEW * scarcity(self.evidence)) if self.few is None else self.few
+
     @cached_property
     def part(self) -> Evidence:
         """The evidence on the windows that refits use."""
-        return replace(self.evidence.on(spread(self.evidence.windows, self.few)), caps=self.caps)
+        return replace(self.evidence.on(spread(self.evidence.windows, self.most)), caps=self.caps)
 
     @cached_property
     def candidates(self) -> list[Placed]:
@@ -191,8 +203,14 @@ class Ground:
         """Return whether effects are right although something else remains in some windows; only if these may part."""
         return self.evidence.robust and clears(base, current, self.rules)
 
-    def focus(self, fitted: Refit, count: int = FEWER) -> Focus:
-        """Return a fitted hypothesis on the windows that it fits worst and on a spread of the others."""
+    def focus(self, fitted: Refit, times: int = 1) -> Focus:
+        """Return a fitted hypothesis on the windows that it fits worst and on a spread of the others.
+
+        Args:
+            fitted: the hypothesis.
+            times: of the windows that the screening uses.
+        """
+        count = round(times * FEWER * scarcity(self.evidence))
         order = np.argsort(-fitted.cost.windows)
         half = count // 2
         others = np.linspace(0, len(order) - 1, count - half).astype(int)
@@ -250,7 +268,7 @@ class Ground:
         """
         if not groups:
             return [], state
-        focus = self.focus(beside, 2 * FEWER)
+        focus = self.focus(beside, 2)
         before, first = focus.cost, len(beside.hypothesis.placed)
 
         def rough(hypothesis: Hypothesis, most: int) -> Refit:

@@ -23,6 +23,16 @@ def joint_of(setting: Setting, placed: Placed) -> int | None:
     return None
 
 
+def joint_of_column(setting: Setting, label: str | None) -> int | None:
+    """Return the hinge or slide joint of which an observed column has the position or velocity; ``None`` for none."""
+    model, place = setting.model, int(setting.observation.index[setting.column(label)])
+    if place < 0:
+        return None
+    of = model.jnt_dofadr == place - model.nq if place >= model.nq else model.jnt_qposadr == place
+    found = np.flatnonzero(of & np.isin(model.jnt_type, (mujoco.mjtJoint.mjJNT_HINGE, mujoco.mjtJoint.mjJNT_SLIDE)))
+    return int(found[0]) if found.size else None
+
+
 def alike(model: mujoco.MjModel) -> list[list[int]]:
     """Return groups of two or more joints that are the same joint of several limbs.
 

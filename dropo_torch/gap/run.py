@@ -263,7 +263,7 @@ class _Searches:
         if rare is None:
             return nothing
         effects = tuple(e for e in self.ground.effects if not e.has("command"))
-        return with_ties(self.over("-rare", replace(self.ground, evidence=rare, effects=effects), self.end))
+        return with_ties(self.over("-rare", replace(self.ground, evidence=rare, effects=effects), self.end), self.end)
 
     def doubts(self, naming: Naming) -> bool:
         """Whether names leave a rest where there are contacts."""
@@ -276,8 +276,8 @@ class _Searches:
             ended = instead_of_one(ended)
         if self.has_time and leaves_wrong(ended.naming, self.ground):
             naming = resort(ended.ground, ended.naming)
-            return naming if naming.family else with_ties(ended)
-        return with_ties(ended)
+            return naming if naming.family else with_ties(ended, self.end)
+        return with_ties(ended, self.end)
 
     def sure_of(self, ended: Ended, others: Sequence[Evidence]) -> Naming | None:
         """Return what a search named, if it leaves nothing in one of the other choices of windows."""
@@ -286,7 +286,8 @@ class _Searches:
                 break
             sure = believed(replace(self.ground, evidence=other), self.scene.begin, ended)
             if sure is not None:
-                return replace(with_ties(sure), unfinished=ended.naming.unfinished)
+                naming = with_ties(sure, self.end)
+                return replace(naming, unfinished=ended.naming.unfinished or naming.unfinished)
         return None
 
     def best(self, found: Sequence[Ended], waiting: int) -> Naming:
@@ -299,7 +300,8 @@ class _Searches:
         if waiting:
             late = late or f"{waiting} more searches over shorter windows were waiting"
         refused = best.naming.refused or next((e.naming.refused for e in found if e.naming.refused), "")
-        return replace(with_ties(best), refused="" if best.naming.named else refused, unfinished=late)
+        naming = with_ties(best, self.end)
+        return replace(naming, refused="" if naming.named else refused, unfinished=late or naming.unfinished)
 
 
 def _ruled(scene: Scene, rules: Rules | None) -> Scene:

@@ -26,13 +26,14 @@ from dropo_torch.gap.accept import (
     swap,
 )
 from dropo_torch.gap.evidence import Evidence
-from dropo_torch.gap.family import fitted_family, has_family, shares_of, whole_family, with_family
+from dropo_torch.gap.family import fitted_family, has_family, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
 from dropo_torch.gap.renew import noise_beside, renewed, restarted, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, family_accounts, may_leave, remains, significant
+from dropo_torch.gap.shares import shares_of
 from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
 from dropo_torch.support.checkpoint import Checkpoint
 
@@ -178,7 +179,7 @@ def believed(ground: Ground, begin: Hypothesis, known: Ended) -> Ended | None:
 def start_anywhere(ground: Ground, begin: Hypothesis) -> State:
     """Return :func:`start`, on all windows where those that refits use show nothing: a gap may show in a few only."""
     state, count = start(ground, begin), len(ground.evidence.windows)
-    if not state.done or count <= ground.few:
+    if not state.done or count <= ground.most:
         return state
     every = start(replace(ground, few=count), begin)
     return state if every.done else every
@@ -197,7 +198,7 @@ def start(ground: Ground, begin: Hypothesis, first: Screening | None = None) -> 
     base = ground.refit(begin)
     noise = noise_beside(ground.evidence, ground.short, base)
     ground, base = with_base(ground.on(noise, since), base.hypothesis)
-    bare = State(noise, since, ground.caps, base, NOTHING, base, few=ground.few)
+    bare = State(noise, since, ground.caps, base, NOTHING, base, few=ground.most)
     ground, state = restarted(ground, bare)
     base, missing = state.base, significant(state.base.cost, ground.rules)
     if not missing:
@@ -219,6 +220,7 @@ def step(ground: Ground, state: State, on_found: Callable[[State], None] = lambd
     """
     found = add(ground, state)
     if not found.done:
+        on_found(replace(found, number=state.number + 1))
         rest = significant(found.current.cost, ground.rules)
         ground.report("part of it is explained" if rest else "all but noise is explained", 1.0)
     if state.number == 0:
@@ -287,14 +289,24 @@ def judged(ground: Ground, state: State, found: Refit, unnamed: Naming) -> Namin
     return replace(unnamed, refused="", final=state.current, named=True, partial=partial)
 
 
-def with_ties(ended: Ended) -> Naming:
-    """Return what was found, and what ties with it; first what surpasses it, where the search did not come by that."""
+def with_ties(ended: Ended, end: float = math.inf) -> Naming:
+    """Return what was found, and what ties with it; first what surpasses it, where the search did not come by that.
+
+    Args:
+        ended: what was found.
+        end: when no more ties are looked for, by ``time.monotonic``.
+    """
     naming, ground = ended.naming, ended.ground
     if not naming.named or naming.family:
         return naming
-    tied, shares, state = rivals_of_all(ground, ended.state)
+    try:
+        tied, shares, state = rivals_of_all(replace(ground, report=until(ground.report, end)), ended.state)
+    except OutOfTime as error:
+        nothing, shares = ((),) * len(naming.final.hypothesis.placed), list(shares_of(ground, naming.final))
+        unfinished = naming.unfinished or f"{error}, with all that was found named"
+        return replace(naming, ties=nothing, shares=tuple(shares), unfinished=unfinished)
     if surpasses(ground, state.current, ended.state.current):
-        return with_ties(continued(ground, state, naming.unfinished))
+        return with_ties(continued(ground, state, naming.unfinished), end)
     state, told = canonical(ground, state, tied)
     return replace(naming, final=state.current, ties=told, shares=tuple(shares), attempts=state.attempts)
 
@@ -344,7 +356,7 @@ def resort(ground: Ground, naming: Naming) -> Naming:
     if whole is None or (naming.named and not leaves_far_less(here, whole, naming.final.hypothesis)):
         return naming
     since = np.zeros(len(evidence.windows.commands), dtype=int)
-    state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.few)
+    state = State(evidence.noise, since, here.caps, base, naming.first, whole, done=True, family=True, few=here.most)
     state = renewed(here, replace(state, attempts=naming.attempts))
     found = conclude_family(here.at(state), state, replace(naming, evidence=here.at(state).evidence, base=state.base))
     return found if found.named else naming

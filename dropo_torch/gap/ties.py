@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import permutations
 
-from dropo_torch.effects.base import Placed
+from dropo_torch.effects.base import Effect, Placed, Setting, find_effect
 from dropo_torch.gap.accept import nonsense
 from dropo_torch.gap.ground import Ground, State
+from dropo_torch.gap.limbs import joint_of, joint_of_column
 from dropo_torch.gap.refit import Refit, step_may_explain
 from dropo_torch.gap.rules import Alike, remains, significant
 from dropo_torch.gap.screen import Candidate, Focus, left_by, nearer
+from dropo_torch.gap.shares import families, shares_of
 
 #: Iterations of their fits on few windows: a tie with more numbers than needed settles slowly.
 ITERATIONS = (6, 12)
@@ -58,18 +60,88 @@ def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]
     A search that takes one effect at a time may have explained by two, each a part of it, what one explains alone.
     Where a rival surpasses one of them, it is no tie: the state has it in its place, and the others are not looked at.
     """
+    state, everywhere = _alike_everywhere(ground, state)
     while True:
         tied, shares = list[tuple[Refit, ...]](), list[float]()
+        known = families(state.current.hypothesis.placed)
+        members, own = {i for group in known for i in group}, shares_of(ground, state.current) if known else ()
         for index in range(len(state.current.hypothesis.placed)):
             before = state.current
+            if index in members:  # what is at many places is asked about at all of them
+                tied.append(())
+                shares.append(own[index])
+                continue
             rivals, share, state = ties(ground, state, index)
             if state.current is not before:
-                return [told(t) for t in tied], shares, state
+                return _with_those(everywhere, state, tied), shares, state
             tied.append(rivals)
             shares.append(share)
         if (fewer := _one_for_two(ground, state, tied)) is None:
-            return [told(t) for t in tied], shares, state
+            return _with_those(everywhere, state, tied), shares, state
         state = replace(state, current=fewer)
+
+
+#: What may stand in the place of an effect that is everywhere, by its effect and target.
+Everywhere = Mapping[tuple[str, str | None], Placed]
+
+
+def _with_those(everywhere: Everywhere, state: State, tied: Sequence[tuple[Refit, ...]]) -> list[tuple[Placed, ...]]:
+    """What ties with each named effect, also of what is everywhere."""
+    own = state.current.hypothesis.placed[: len(tied)]
+    return [told(t) or tuple(filter(None, [everywhere.get(p.key)])) for p, t in zip(own, tied, strict=True)]
+
+
+def _alike_everywhere(ground: Ground, state: State) -> tuple[State, Everywhere]:
+    """The state, and what does the same at all joints as an effect at many places of it: what is late both ways.
+
+    Of these, the one that the vocabulary lists first is named.
+    """
+    order = {effect.name: i for i, effect in enumerate(ground.effects)}
+    for group in families(state.current.hypothesis.placed):
+        placed = state.current.hypothesis.placed
+        members = [placed[i] for i in group]
+        for name in (n for n in members[0].effect.everywhere_like if n in order):
+            others = _in_the_place_of(ground.setting, members, find_effect(name), placed)
+            if not others:
+                continue
+            ground.report("looking for ties", 0.1)
+            rest = tuple(p for i, p in enumerate(placed) if i not in group)
+            fitted = ground.refit(replace(state.current.hypothesis, placed=(*rest, *others)))
+            if not as_good(ground, state, fitted) or nonsense(ground, fitted):
+                continue
+            others = list(fitted.hypothesis.placed[len(rest) :])
+            if order[name] < order[members[0].effect.name]:
+                return replace(state, current=fitted), _by_joints(ground.setting, others, members)
+            return state, _by_joints(ground.setting, members, others)
+    return state, {}
+
+
+def _by_joints(setting: Setting, named: Sequence[Placed], others: Sequence[Placed]) -> Everywhere:
+    """What stands at the same joint as each of several effects."""
+    there = {_joint(setting, p): p for p in reversed(others)}
+    return {p.key: there[joint] for p in named if (joint := _joint(setting, p)) in there}
+
+
+def _in_the_place_of(
+    setting: Setting, members: Sequence[Placed], effect: Effect, placed: Sequence[Placed]
+) -> list[Placed]:
+    """An effect at all joints at which another one is, where it is not already; none if it cannot be at one of them."""
+    places: dict[int | None, list[str | None]] = {}
+    for target in effect.targets(setting):
+        places.setdefault(_joint(setting, Placed(effect, target)), []).append(target)
+    size = {_joint(setting, p): p.values for p in members}
+    if None in size or not size.keys() <= places.keys():
+        return []
+    taken = {p.key for p in placed}
+    wanted = [Placed(effect, target).at(values) for joint, values in size.items() for target in places[joint]]
+    return [p for p in wanted if p.key not in taken]
+
+
+def _joint(setting: Setting, placed: Placed) -> int | None:
+    """The joint at which an effect of a sensor or an actuator sits."""
+    if placed.effect.kind == "sensor":
+        return joint_of_column(setting, placed.target)
+    return joint_of(setting, placed)
 
 
 def told(tied: Sequence[Refit]) -> tuple[Placed, ...]:

@@ -297,16 +297,16 @@ def _with_axes(columns: Sequence[Column], wanted: Sequence[Place]) -> list[Words
 
 
 def _of_the_body(words: Sequence[Words], wanted: Sequence[Place]) -> list[Words]:
-    """The words of columns, without those of what measures it where there is a single pose, of a single free body.
+    """The words of columns, without those of what measures it where one orientation is told, of a single free body.
 
-    Such a pose is the body's, whether it is called after the body, a state estimator or a motion capture system.
+    It is the body's, whether it is called after the body, an IMU, a state estimator or a motion capture system.
     """
     bodies = {p.joint: {*p.words, *p.aliases} for p in wanted if p.axis}
     poses: dict[tuple, set[tuple]] = {}
     for w in words:
         if w.axis and not w.angular and w.role in ("position", ""):
             poses.setdefault((w.objects, w.numbers), set()).add((w.quaternion, w.axis))
-    whole = {*((False, axis) for axis in "xyz"), *((True, axis) for axis in "wxyz")}
+    whole = {(True, axis) for axis in "wxyz"}
     found = [called for called, parts in poses.items() if whole <= parts]
     if len(bodies) != 1 or len(found) != 1 or not found[0][0] or {*found[0][0]} & next(iter(bodies.values())):
         return list(words)

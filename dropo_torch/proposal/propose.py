@@ -416,7 +416,11 @@ def _lacking(lacking: Sequence[Place], model: mujoco.MjModel, free: Sequence[str
         j for j in dict.fromkeys(p.joint for p in lacking)
         if sum(p.joint == j and p.measure == "quaternion" for p in lacking) == 4
     ]  # fmt: skip
-    rest = [p for p in lacking if not (p.measure == "quaternion" and p.joint in turned)]
+    nowhere = [
+        j for j in dict.fromkeys(p.joint for p in lacking)
+        if int(model.jnt_type[j]) == mujoco.mjtJoint.mjJNT_FREE and j not in turned
+    ]  # fmt: skip
+    rest = [p for p in lacking if not (p.measure == "quaternion" and p.joint in turned) and p.joint not in nowhere]
     said = []
     for j in turned:
         name = _body(model, j)
@@ -424,6 +428,13 @@ def _lacking(lacking: Sequence[Place], model: mujoco.MjModel, free: Sequence[str
         slides = ", or give the model three slides along x, y and z instead of the free joint" if free_joint else ""
         columns = ", ".join(f"{name}_q{axis}" for axis in "wxyz")
         said.append(f"the orientation of {name} is not in the log; log it as {columns}{slides}")
+    for j in nowhere:
+        name = _body(model, j)
+        said.append(
+            f"where {name} is, is not in the log; log it as {name}_px, {name}_py, {name}_pz, such as by motion "
+            "capture, or write a config whose observation names the model's sensors, [sensor[gyro], ...]: dropo fit "
+            "then estimates it"
+        )
     if rest:
         names = ", ".join(_called(p, model) for p in rest[:6]) + (", ..." if len(rest) > 6 else "")
         known = _choices(_called(rest[0], model).partition(".")[0], free)

@@ -41,9 +41,14 @@ _ROLES: dict[Role, frozenset[str]] = {
     ),
     "flag": _set("done dones terminal terminals terminated truncated timeout timeouts reset"),
     "other": _set(
-        "temp temperature voltage volt volts error err status mode battery seq frame id std var cov reward rewards next"
+        "temp temperature error err status mode battery seq frame id std var cov reward rewards next"
     ),
 }  # fmt: skip
+#: What drives a motor, unless it is that of a supply; and its unit at the end of a name that says so.
+_VOLTAGE, _SUPPLY, _IN_VOLTS = (
+    _set("voltage voltages volt volts"), _set("battery batt bat vbat bus supply pack rail logic vcc vdd cell"),
+    re.compile(r"[\s_(\[]V[)\]]?$"),
+)  # fmt: skip
 #: A current, unless it stands beside a kind of motion: the one at present.
 _CURRENT = _set("current curr")
 #: Words of commands that are positions to be reached.
@@ -167,6 +172,9 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
     words, numbers = [w for w in every if not w.isdigit()], tuple(int(w) for w in every if w.isdigit())
     words = [part for w in words for part in _parts(w)]
     percent, words = bool(set(words) & _PERCENT), [word for word in words if word not in _PERCENT]
+    driven = {word for word in words if word in _VOLTAGE and not _SUPPLY & set(words)}
+    if _IN_VOLTS.search(name) and (driven or any(_role(word) == "command" for word in words)):
+        words = words[:-1]
     words, scale = _unit(words)
     axis, quaternion, angular = "", False, False
     roles: list[Role] = []
@@ -183,7 +191,8 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
             angular |= kind == "angular"
             roles.append("velocity" if kind in ("velocity", "angular") else "position")
             continue
-        role = "command" if percent and word in _OPENS else _role(word)
+        role = "command" if word in driven or (percent and word in _OPENS) else _role(word)
+        role = "other" if word in _VOLTAGE - driven else role
         if role:
             roles.append(role)
             commanded = "position" if word in _TARGETS and not commanded else commanded
