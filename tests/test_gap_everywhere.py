@@ -14,6 +14,7 @@ from dropo_torch.gap import find_gap, prepare
 from dropo_torch.gap.limbs import joint_of_column
 from dropo_torch.gap.ties import _in_the_place_of
 from dropo_torch.problem import Problem
+from dropo_torch.report.gap_words import rivals
 
 SERVOS = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbody>
   <body pos="0 0 1"><joint name="pan" axis="0 0 1" damping=".3" armature=".02"/>
@@ -65,6 +66,7 @@ def test_servos_that_are_all_late_are_told_so_and_not_their_sensors(tmp_path: Pa
     for number in late.parameters.values():
         assert number.value == pytest.approx(LATE, abs=0.002)
     assert {effect for effect, _ in late.indistinguishable_from} == {"sensor_delay"}
+    assert rivals(late) == ["a delay of the measurement of all sensors"]
     if gain < 1:
         assert told["actuator_gain"].target == "m_lift"
         assert next(iter(told["actuator_gain"].parameters.values())).value == pytest.approx(gain, rel=0.02)

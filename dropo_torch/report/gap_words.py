@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 
@@ -135,8 +136,11 @@ def group(places: Sequence[tuple[str, str | None]]) -> str:
 
 
 def rivals(effect: NamedEffect) -> list[str]:
-    """Return the effects that explain the log as well, each as a noun phrase."""
-    return [noun(*rival) for rival in effect.indistinguishable_from]
+    """Return the effects that explain the log as well, each as a noun phrase; as one where both are everywhere."""
+    counts = Counter(name for name, _ in effect.indistinguishable_from)
+    whole = {name for name, count in counts.items() if effect.target == FAMILY and count == len(effect.parameters)}
+    places = [(name, FAMILY if name in whole else target) for name, target in effect.indistinguishable_from]
+    return [noun(*place) for place in dict.fromkeys(places)]
 
 
 def title(effect: str) -> str:
