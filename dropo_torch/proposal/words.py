@@ -140,6 +140,7 @@ def called(name: str, words: Words) -> tuple[tuple[str, ...], ...]:
     """
     every = split(name)
     found = [every, _unit(every)[0] if words.scale is not None else every]
+    found += [[word for word in every if word not in _PERCENT]] if words.percent else []
     if words.role == "command":
         bare = [w for w in (part for word in found[-1] for part in _parts(word)) if w not in _ROLES["command"]]
         found += [bare, [w for w in bare if _role(w) not in ("position", "velocity", "effort")]]
