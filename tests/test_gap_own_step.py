@@ -27,11 +27,11 @@ NOISE = np.repeat([1e-4, 1e-3], 2)
 
 
 def problem(
-    folder: Path, step: float, *, damping: float = 0.1, integrator: str = "Euler", exact: bool = False
+    folder: Path, step: float, *, damping: float = 0.1, integrator: str = "Euler", exact: bool = False, arm: str = ARM
 ) -> Problem:
     """The log of an arm by an elbow's damping that the model has as 0.1, simulated with a step of its own."""
     rng, rows = np.random.default_rng(4), []
-    model = mujoco.MjModel.from_xml_string(ARM.format(damping=damping, integrator="RK4" if exact else integrator))
+    model = mujoco.MjModel.from_xml_string(arm.format(damping=damping, integrator="RK4" if exact else integrator))
     model.opt.timestep = step
     for episode in range(4):
         data, turns = mujoco.MjData(model), rng.uniform(0.5, 3.0, (2, 2))
@@ -43,13 +43,28 @@ def problem(
             mujoco.mj_step(model, data, round(SKIP * STEP / step))
     header = "episode,t,q0,q1,v0,v1,u0,u1"
     np.savetxt(folder / "log.csv", rows, delimiter=",", header=header, comments="", fmt="%.12g")
-    (folder / "arm.xml").write_text(ARM.format(damping=0.1, integrator=integrator))
+    (folder / "arm.xml").write_text(arm.format(damping=0.1, integrator=integrator))
     config = folder / "arm.yaml"
     config.write_text(
         "model: arm.xml\ndata: {path: log.csv, time: t, episode: episode, observations: [q0, q1, v0, v1], "
         f"actions: [u0, u1]}}\nframe_skip: {SKIP}\nobservation: [qpos, qvel]\nnoise: {NOISE.tolist()}\nthreads: 1\n"
     )
     return dropo.make_problem(dropo.load_config(config), general=True)
+
+
+@pytest.mark.parametrize("ratio", [2, 3, 5])
+def test_the_step_is_told_where_the_integrator_stays(tmp_path: Path, ratio: int) -> None:
+    """A servo's damping asks for the implicit integrator, which is then no nearer to the exact motion by itself."""
+    servo = '<position name="bend" joint="elbow" kp="30" kv="2"/>'
+    gap = find_gap(
+        problem(
+            tmp_path, STEP / ratio, integrator="implicitfast",
+            arm=ARM.replace('<motor name="bend" joint="elbow"/>', servo),
+        )
+    )  # fmt: skip
+    assert [e.effect for e in gap.effects] == ["integration"]
+    assert gap.effects[0].parameters["timestep"].value == pytest.approx(STEP / ratio)
+    assert gap.remaining is None
 
 
 @pytest.mark.parametrize("ratio", [2, 4])

@@ -105,6 +105,21 @@ class Integration(WorldEffect):
     EASED = 2
     shares = (1 / FINER, 0.25, 0.5)
     steps = True
+    #: How many times finer the step may be where the integrator stays, whose error a log then has by its own step.
+    RATIOS: tuple[int, ...] = (2, 3, 4, 5, 8)
+
+    def keeps_integrator(self, setting: Setting) -> bool:
+        """Return whether the integrator stays the model's."""
+        finer = copy.copy(setting.model)
+        Integration().apply(finer, None, np.array([setting.model.opt.timestep / self.FINER]))
+        return bool(finer.opt.integrator == setting.model.opt.integrator)
+
+    def extends(self, setting: Setting, simpler: Placed) -> list[np.ndarray]:
+        """Return other steps of an integrator that stays."""
+        if simpler.effect.name != self.name or not self.keeps_integrator(setting):
+            return []
+        own, step = simpler.values[0], float(setting.model.opt.timestep)
+        return [np.array([step / ratio]) for ratio in self.RATIOS if not np.isclose(step / ratio, own)]
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         step = float(setting.model.opt.timestep)
@@ -135,9 +150,7 @@ class OwnIntegration(Integration):
 
     def targets(self, setting: Setting) -> list[str | None]:
         """Return the world, unless :class:`Integration` keeps the model's integrator, too."""
-        step, finer = setting.model.opt.timestep, copy.copy(setting.model)
-        Integration().apply(finer, None, np.array([step / Integration.FINER]))
-        return [None] if finer.opt.integrator != setting.model.opt.integrator else []
+        return [] if self.keeps_integrator(setting) else [None]
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
         return [np.array([float(setting.model.opt.timestep) / ratio]) for ratio in self.RATIOS]
