@@ -10,7 +10,7 @@ from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import ANEW, Refit, change_of_step, least_beside, refit, resolved
+from dropo_torch.gap.refit import ANEW, Hypothesis, Refit, change_of_step, least_beside, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import (
     accounts,
@@ -215,12 +215,12 @@ def _among_several(
     and must leave next to nothing of what it leaves.
     """
     rules, current = ground.rules, state.current
-    two, state = paired(ground, state, alive) if pairs else ([], state)
+    two, state = paired(ground, state, alive, best.hypothesis) if pairs else ([], state)
     families = promising_families(ground.focus(current), alive, rules.tried)
     if not pairs:
         by_step = best.hypothesis.placed[-1].effect.steps  # a family, such as of late sensors, may do what a step does
         families = [f for f in families if len(f[0].effect.targets(ground.setting)) >= MANY and not by_step]
-    found, state = ground.refits(state, current, families, "refitting families")
+    found, state = ground.refits(state, current, families, "refitting families", known=best.hypothesis)
     several = sound(ground, found)
     for tried in (simplest(r, rules) for r in (two, several) if r):
         clearer = tried.cost.left_of(best.cost) < (rules.tried.clearer if pairs else rules.family.clearer[0])
@@ -232,7 +232,9 @@ def _among_several(
     return best, state
 
 
-def paired(ground: Ground, state: State, alive: Sequence[Candidate]) -> tuple[list[Refit], State]:
+def paired(
+    ground: Ground, state: State, alive: Sequence[Candidate], known: Hypothesis | None = None
+) -> tuple[list[Refit], State]:
     """Return the best pairs of candidates beside what was accepted, and the state with these attempts.
 
     A candidate that makes the best pair nonsense stands for another one, such as an inertia that vanishes for a motor
@@ -242,15 +244,16 @@ def paired(ground: Ground, state: State, alive: Sequence[Candidate]) -> tuple[li
         ground: what the search stands on.
         state: where it stands.
         alive: candidates, the best first.
+        known: a fitted hypothesis that they must come near.
     """
     tried, current = ground.rules.tried, state.current
     focus = ground.focus(current, 2)  # on more windows, and from where the candidates promise the most
-    known, excluded = {p.key for p in current.hypothesis.placed}, set[tuple[str, str | None]]()
+    before, excluded = {p.key for p in current.hypothesis.placed}, set[tuple[str, str | None]]()
     for _ in range(tried.anew):
         rest = [c.placed for c in alive if c.key not in excluded][: tried.paired]
         pairs = promising_pairs(focus, screen(focus, rest, tried), tried)
-        found, state = ground.refits(state, current, pairs, "refitting pairs")
-        bad = {p.key for r in found[:1] for p, _ in absurd(ground.part, r, ground.rules.sound)} - known
+        found, state = ground.refits(state, current, pairs, "refitting pairs", known=known)
+        bad = {p.key for r in found[:1] for p, _ in absurd(ground.part, r, ground.rules.sound)} - before
         excluded |= bad
         if not bad:
             break
@@ -326,9 +329,11 @@ def refines(ground: Ground, state: State, better: Refit) -> bool:
     """Return whether an effect that contains an accepted one explains enough more to stand in its place.
 
     Where the model's own step may be part of what both leave, a finer one tells: it may even be that the own step makes
-    the wrong one of two the better.
+    the wrong one of two the better. Of the same effects with another whole number, the one that leaves less is right.
     """
     rules, own, here = ground.rules, state.current, better
+    if {p.key for p in own.hypothesis.placed} == {p.key for p in better.hypothesis.placed}:
+        return better.cost.excess < own.cost.excess
     larger = len(better.hypothesis.vector) > len(own.hypothesis.vector)
     gained, least = own.cost.excess - here.cost.excess, rules.least * state.base.cost.above(here.cost)
     more = here.cost.left_of(own.cost) <= (rules.most if larger else 1 - rules.most)

@@ -40,6 +40,8 @@ from dropo_torch.support.threads import single_thread
 
 #: Windows of the last fit, at most, those that try a length, and short ones for the noise.
 MOST, FEW, SHORT = 120, 24, 160
+#: Residuals of a short window from which on fewer of them tell as much, and the share that there are at least.
+RICH, SCARCE = 120, 0.4
 #: Windows among which those that stand out are looked for, at most; of these that are searched, and with others beside.
 ALL, RARE, BESIDE = 600, 20, 60
 #: Logged steps, and share of an episode, that are left out at its beginning for what candidates remember, at most.
@@ -181,7 +183,8 @@ def short_windows(setting: Setting, log: Trajectories, since: np.ndarray | None 
     Raises:
         InputError: a log with too few of them.
     """
-    windows = spread(cut_windows(log, setting.observation, LENGTH, since=since), SHORT)
+    share = np.clip(RICH / ((LENGTH + 1) * setting.observation.size), SCARCE, 1.0)
+    windows = spread(cut_windows(log, setting.observation, LENGTH, since=since), round(SHORT * share))
     if len(windows) < 5:
         raise InputError(
             f"data: {log.source} has {len(windows)} stretches of {LENGTH} steps; expected at least 5, "
