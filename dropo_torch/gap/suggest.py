@@ -100,7 +100,7 @@ def suggest(evidence: Evidence, first: Hypothesis, second: Hypothesis, one: Plac
     if most < needed:
         why = "on this robot they may be the same thing"
         if most > evidence.rules.shown.apart:
-            why = f"beside what neither explains, it takes {needed:.0f} σ"
+            why = f"with errors as large as this log has beside both, it would take {needed:.0f} σ"
         return Advice(
             f"None of {len(found)} motions that were tried would tell {names} (at best {most:.1f} σ): {why}.",
             tells=False,
