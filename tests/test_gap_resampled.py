@@ -61,6 +61,7 @@ def test_resampled_logs_are_explained(tmp_path: Path, damping: float) -> None:
     gap = find_gap(swinging(tmp_path, drift=0.002, jitter=3.0, damping=damping))
     assert [(e.effect, e.target) for e in gap.effects] == ([("joint_damping", "lower")] if damping > 0.02 else [])
     assert gap.remaining is None
+    assert gap.noise_floor.mse < 2 * np.mean(NOISE**2)  # of samples
     for entry in gap.effects:
         (number,) = entry.parameters.values()
         assert number.low < damping - 0.02 < number.high or number.low < damping < number.high

@@ -214,6 +214,9 @@ def one_step_objective(evidence: Evidence, held: Held, hypothesis: Hypothesis) -
         simulator = make(setting.model, setting.frame_skip, space)
     transitions = make_transitions(held.log, setting.observation, history=simulator.history).select(held.rows)
     noise = Features.of(setting.observation).column_noise(evidence.noise)
+    if held.log.gains is not None:  # of rows between samples, on average
+        gains = held.log.gains[held.rows][..., list(setting.observation.log_columns)]
+        noise = noise * np.sqrt((gains**2).mean((0, 1)))
     mask = [setting.observation.labels[c] for c in sorted(setting.masked)]
     given = {"epsilon": below(noise), "noise": noise.tolist(), "mask": mask}
     return Objective(simulator, transitions, setting.observation, **given)
