@@ -117,6 +117,11 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("taucmd_2", "command", None, (), (2,)),
         ("address", "", None, ("address",), ()),
         ("subtarget", "", None, ("subtarget",), ()),
+        ("motor_voltage [V]", "command", None, (), ()),
+        ("arm_volts", "command", None, ("arm",), ()),
+        ("u_V", "command", None, (), ()),
+        ("battery_voltage", "other", None, (), ()),
+        ("v", "velocity", None, (), ()),
     ],
 )
 def test_names_say_what_people_mean(
@@ -435,6 +440,38 @@ def test_percent_are_no_part_of_a_name(name: str, role: str) -> None:
     assert words.scale is None
     assert words.role in (role, "other")
     assert not {"pct", "percent"} & set(words.objects)
+
+
+DRIVES = """<mujoco><worldbody><body><joint name="base_x" type="slide" axis="1 0 0"/><geom size=".1"/>
+  <body><joint name="base_y" type="slide" axis="0 1 0"/><geom size=".1"/></body></body></worldbody>
+  <actuator><motor name="drive_fx" joint="base_x" ctrlrange="-40 40"/>
+  <motor name="drive_fy" joint="base_y" ctrlrange="-40 40"/></actuator></mujoco>"""
+
+
+def test_percent_columns_are_called_after_their_actuators(tmp_path: Path) -> None:
+    frame = {"time": TIME, "base_x_pos": np.sin(TIME), "base_y_pos": np.cos(3 * TIME)}
+    frame |= {"drive_fx_pct": 50 * np.sin(5 * TIME), "drive_fy_pct": 30 * np.cos(7 * TIME)}
+    found = matches_of(tmp_path, frame, DRIVES)
+    np.testing.assert_allclose(found["drive_fx"].values, 0.4 * frame["drive_fx_pct"])
+    np.testing.assert_allclose(found["drive_fy"].values, 0.4 * frame["drive_fy_pct"])
+
+
+@pytest.mark.parametrize("factor", [1.0, 8.0])
+def test_efforts_tell_which_command_of_a_list_was_whose(factor: float, tmp_path: Path) -> None:
+    """A controller's list is in an order of its own; what is eight times as large is in another unit."""
+    waves = {name: np.sin((5 + 2 * i) * TIME) for i, name in enumerate(("a", "b", "c"))}
+    noise = np.random.default_rng(0).standard_normal((3, len(TIME)))
+    frame = {"time": TIME} | {f"{name}_pos": np.sin((1 + i) * TIME) for i, name in enumerate(waves)}
+    frame |= {f"{name}_effort": wave + 0.05 * e for (name, wave), e in zip(waves.items(), noise, strict=True)}
+    frame |= {f"commands[{i}]": factor * waves[name] for i, name in enumerate(("c", "a", "b"))}
+    joints = "".join(
+        f'<body><joint name="{name}" axis="0 1 0"/><geom size=".1" pos="0 0 .2"/></body>' for name in waves
+    )
+    motors = "".join(f'<motor name="m_{name}" joint="{name}"/>' for name in waves)
+    xml = f"<mujoco><worldbody>{joints}</worldbody><actuator>{motors}</actuator></mujoco>"
+    found = matches_of(tmp_path, frame, xml)
+    for name, wave in waves.items():
+        assert (np.abs(found[f"m_{name}"].values - wave).max() < 1e-6) == (factor == 1), name
 
 
 def test_a_joints_number_is_not_its_fingers(tmp_path: Path) -> None:
@@ -1132,6 +1169,20 @@ def test_a_body_without_an_orientation_in_the_log_is_named_with_what_to_do(
     del frame["ball_z"]
     assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
     assert "no column is ball.position[z]" in capfd.readouterr().err
+
+
+def test_a_robot_with_an_imu_and_without_a_position_is_told_of_sensors(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    xml = '<mujoco><worldbody><body name="trunk"><freejoint/><geom size=".1"/></body></worldbody></mujoco>'
+    half = 0.2 * np.sin(TIME)
+    frame = {"time": TIME, "imu_qw": np.cos(half), "imu_qx": np.sin(half), "imu_qy": 0 * half, "imu_qz": 0 * half}
+    frame |= {f"gyro_{axis}": np.gradient(2 * half, TIME) * (axis == "x") for axis in "xyz"}
+    assert main(["init", *written(tmp_path, frame, xml), "--out", str(tmp_path / "robot.yaml")]) == 2
+    error = capfd.readouterr().err
+    assert "where trunk is, is not in the log; log it as trunk_px, trunk_py, trunk_pz" in error
+    assert "sensor[gyro]" in error
+    assert "orientation" not in error
 
 
 def test_what_a_column_was_found_by_is_said_once(tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:

@@ -73,7 +73,8 @@ def behind_efforts(places: Sequence[Place], free: Sequence[Column], found: dict[
     groups: dict[tuple, list[Column]] = {}
     for c in (c for c in free if c.words.role == "command" and not is_taken(c, found)):
         if all(may_command(c.words, match.place) for match in told):
-            groups.setdefault((c.array, c.words.commanded, c.words.scale), []).append(c)
+            array = c.array if c.index is not None else ""
+            groups.setdefault((array, c.words.commanded, c.words.scale), []).append(c)
     for group in (group for group in groups.values() if 1 < len(group) == len(told)):
         shares = np.array([[_share(match.values, c.values) for c in group] for match in told])
         rows, columns = linear_sum_assignment(shares, maximize=True)
