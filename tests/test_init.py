@@ -963,9 +963,12 @@ def test_what_is_not_used_is_said(tmp_path: Path, log: tuple[np.ndarray, ...]) -
     theta = q[:, 1].copy()
     theta[40] = np.nan
     frame = {"t": t, "x": q[:, 0], "theta": theta, "x_dot": v[:, 0], "theta_dot": v[:, 1], "u": u[:, 0]}
-    frame["pressure"] = np.random.default_rng(1).standard_normal(len(t))
+    for name in ("pressure", "acc_y", "motor_current"):
+        frame[name] = np.random.default_rng(1).standard_normal(len(t))
     found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
     assert "not used, for nothing of the model is called so: pressure" in found.draft.notes
+    assert "not used, for the motion tells accelerations: acc_y" in found.draft.notes
+    assert "not used, for commands are known: motor_current" in found.draft.notes
     assert any(note.endswith("short gaps are bridged: 1 of theta") for note in found.draft.notes)
 
 

@@ -202,13 +202,22 @@ def _of_markers(reading: Reading) -> tuple[dict[str, Any], list[str]]:
 
 def _lost(matching: Matching) -> list[str]:
     """What of the log is not used: columns that are nothing of the model's, and values that are no numbers."""
-    free = [c.entry for c in matching.unused]
-    notes = [f"not used, for nothing of the model is called so: {', '.join(free[:6])}" + ", ..." * (len(free) > 6)]
+    told = {
+        "the motion tells accelerations": [c for c in matching.unused if c.words.role == "acceleration"],
+        "commands are known": [c for c in matching.unused if c.words.role == "effort" and matching.of("command")],
+    }
+    told["nothing of the model is called so"] = [
+        c for c in matching.unused if not any(c is other for group in told.values() for other in group)
+    ]
+    notes = [
+        f"not used, for {why}: {', '.join(c.entry for c in group[:6])}" + ", ..." * (len(group) > 6)
+        for why, group in told.items() if group
+    ]  # fmt: skip
     lost = {m.column.entry: int(np.isnan(m.column.values).sum()) for m in matching.matches}
     holes = [f"{count} of {name}" for name, count in lost.items() if count]
     worded = {m.column.entry: m.column.text for m in matching.matches}
     texts = [f"{name} is {text[1]!r} at row {text[0]} (counted from 0)" for name, text in worded.items() if text]
-    return (notes if free else []) + (
+    return notes + (
         [
             f"values that are {'NaN, blank or text' if texts else 'NaN or blank'} count as not measured; short gaps "
             f"are bridged: {'; '.join([', '.join(holes), *texts])}"
