@@ -796,6 +796,10 @@ class Judged:
     def evidence(self) -> Judged:
         return self
 
+    @property
+    def most(self) -> int:
+        return self.few
+
     def chance(self, _whole: SimpleNamespace, _without: SimpleNamespace) -> float:
         return self.chances[self.few]
 

@@ -365,8 +365,8 @@ def test_what_shows_in_a_few_stretches_only_is_missing() -> None:
     scene = scene_of(RAIL, lambda model: None, pushes, shape=(8, 700))
     windows = scene.evidence.windows
     ground = Ground(scene.evidence, (VOCABULARY["joint_damping"], VOCABULARY["joint_stiffness"]))
-    assert len(windows) > 2 * ground.few
-    (hidden,) = np.flatnonzero(~np.isin(windows.measured, spread(windows, ground.few).measured).any((1, 2)))[:1]
+    assert len(windows) > 2 * ground.most
+    (hidden,) = np.flatnonzero(~np.isin(windows.measured, spread(windows, ground.most).measured).any((1, 2)))[:1]
     other = Hypothesis((), (Placed(VOCABULARY["joint_damping"], "rail", (3.0,)),))
     path = scene.evidence.twin.predict([other.variant], windows.select([hidden]))[0][0, 0]
     measured = windows.measured.copy()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import SimpleNamespace
@@ -795,6 +796,20 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
     assert found.document["observation"] == ["slider.position", "hinge.position", "slider.velocity", "hinge.velocity"]
     assert not [f for f in found.findings if f.sure]
     assert dropo.make_problem(found.config).trajectories.observations.shape[1] == 4
+    assert any(re.fullmatch(r"time stamps jitter by \d+% of 0.0\d+ s: resampled", n) for n in found.draft.notes)
+
+
+@pytest.mark.parametrize(("jitter", "words"), [(0.0, ""), (2e-3, r"time stamps jitter by \d+% of 0.0\d+ s and ")])
+def test_rows_that_are_missing_are_told_as_such(
+    jitter: float, words: str, tmp_path: Path, log: tuple[np.ndarray, ...]
+) -> None:
+    t, q, _, u = log
+    late = t + jitter * np.random.default_rng(3).uniform(-1, 1, len(t))
+    kept = np.setdiff1d(np.arange(len(t)), [50, 120, 121, 200])
+    frame = {"time": late, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]}
+    files = written(tmp_path, {name: values[kept] for name, values in frame.items()})
+    notes = dropo.propose_config(*files, out=tmp_path / "robot.yaml").draft.notes
+    assert any(re.fullmatch(f"{words}4 rows are missing: resampled", note) for note in notes)
 
 
 HOVER = """

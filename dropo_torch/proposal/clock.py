@@ -21,8 +21,8 @@ FASTEST, SLOWEST = 1.5e-4, 0.6
 GAP, SHORT_GAP, MOST, PIECE = 12.0, 3.5, 0.7, 40
 #: Seconds of a nanosecond.
 NANO = 1e-9
-#: Relative deviation of a spacing up to which stamps count as even.
-EVEN = 0.05
+#: Relative deviation of a spacing up to which stamps count as even; and spacing from which on a row is missing.
+EVEN, MISSING = 0.05, 1.5
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ class Clock:
         why: how unit and episodes were found, in words.
         summed: the two columns, of whole seconds and of their nanoseconds, of which ``column`` is the sum; empty for
             one of its own.
+        missing: rows that are missing between others, episodes aside.
     """
 
     column: Column | None
@@ -53,6 +54,7 @@ class Clock:
     breaks: tuple[int, ...]
     why: tuple[str, ...]
     summed: tuple[Column, ...] = ()
+    missing: int = 0
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -114,10 +116,11 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
     why = [f"time stamps of {column.entry} {told}"]
     if breaks:
         why.append(f"they begin anew, or leave a gap, at {len(breaks)} rows: an episode begins there")
-    jitter = float(np.std(within[within < 2])) if within.size else 0.0
+    near = within < MISSING
+    jitter = float(np.std(within[near])) if near.any() else 0.0
     return Clock(
         column, unit, float(within.mean()) * median * unit if even else median * unit, even, jitter, episode,
-        empty.terminals, breaks, tuple(why), summed or (),
+        empty.terminals, breaks, tuple(why), summed or (), int((np.round(within[~near]) - 1).sum()),
     )  # fmt: skip
 
 

@@ -145,11 +145,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         )  # fmt: skip
         notes += more
         notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
-        notes += (
-            []
-            if clock.even or columns.apart
-            else [f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s: resampled"]
-        )
+        notes += [] if clock.even or columns.apart else [_unevenness(clock, dt)]
     rates = _rates(some, reading.places)
     entries = [m.place.entry for m in positions] + rates + [m.place.entry for m in velocities]
     document = {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}
@@ -198,6 +194,13 @@ def _of_markers(reading: Reading) -> tuple[dict[str, Any], list[str]]:
     entries = [m.place.entry for m in shown]
     notes.append("states are estimated from the markers' places; velocities are not measured")
     return {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}, notes
+
+
+def _unevenness(clock: Clock, dt: float) -> str:
+    """Why a log is resampled whose rows are not evenly spaced."""
+    jitter = f"time stamps jitter by {clock.jitter:.0%} of {dt:.4g} s" if clock.jitter >= 0.005 else ""
+    missing = f"{clock.missing:,} row{'s are' if clock.missing > 1 else ' is'} missing" if clock.missing else ""
+    return f"{' and '.join(filter(None, (jitter, missing))) or 'time stamps are uneven'}: resampled"
 
 
 def _lost(matching: Matching) -> list[str]:
