@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.refit import ANEW, Hypothesis, Refit, change_of_step, least_beside, refit, resolved
+from dropo_torch.gap.refit import ANEW, Refit, change_of_step, least_beside, refit, resolved
 from dropo_torch.gap.renew import with_base
 from dropo_torch.gap.rules import (
     accounts,
@@ -215,7 +215,7 @@ def _among_several(
     and must leave next to nothing of what it leaves.
     """
     rules, current = ground.rules, state.current
-    two, state = paired(ground, state, alive, best.hypothesis) if pairs else ([], state)
+    two, state = paired(ground, state, alive, best) if pairs else ([], state)
     families = promising_families(ground.focus(current), alive, rules.tried)
     if not pairs:
         by_step = best.hypothesis.placed[-1].effect.steps  # a family, such as of late sensors, may do what a step does
@@ -233,7 +233,7 @@ def _among_several(
 
 
 def paired(
-    ground: Ground, state: State, alive: Sequence[Candidate], known: Hypothesis | None = None
+    ground: Ground, state: State, alive: Sequence[Candidate], single: Refit | None = None
 ) -> tuple[list[Refit], State]:
     """Return the best pairs of candidates beside what was accepted, and the state with these attempts.
 
@@ -244,7 +244,7 @@ def paired(
         ground: what the search stands on.
         state: where it stands.
         alive: candidates, the best first.
-        known: a fitted hypothesis that they must come near.
+        single: the best single one, fitted: what promises most beside it makes pairs, too, and they must come near it.
     """
     tried, current = ground.rules.tried, state.current
     focus = ground.focus(current, 2)  # on more windows, and from where the candidates promise the most
@@ -252,12 +252,24 @@ def paired(
     for _ in range(tried.anew):
         rest = [c.placed for c in alive if c.key not in excluded][: tried.paired]
         pairs = promising_pairs(focus, screen(focus, rest, tried), tried)
+        pairs += [] if single is None else _partnered(ground, single, excluded)
+        known = None if single is None else single.hypothesis
         found, state = ground.refits(state, current, pairs, "refitting pairs", known=known)
         bad = {p.key for r in found[:1] for p, _ in absurd(ground.part, r, ground.rules.sound)} - before
         excluded |= bad
         if not bad:
             break
     return sound(ground, found), state
+
+
+def _partnered(ground: Ground, single: Refit, excluded: Collection[tuple[str, str | None]]) -> list[list[Placed]]:
+    """The best single candidate, fitted, with each of those that promise most beside it.
+
+    Where a gap is large, predictions from where candidates begin pair those that bend the least.
+    """
+    own, focus = single.hypothesis.placed[-1], ground.focus(single)
+    alive = [c for c in ground.screened(single) if not (c.dead or c.key in excluded)]
+    return [[own, nearer(focus, single.hypothesis, c)] for c in alive[: ground.rules.tried.partners]]
 
 
 def swap(ground: Ground, state: State) -> State:

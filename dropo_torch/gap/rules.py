@@ -72,6 +72,7 @@ class Tried:
         refits: candidates that are refitted in a round.
         paired: candidates of which pairs are tried, where no single one removes most.
         pairs, families: of these, how many are refitted; as many families at all places, and at one joint of each limb.
+        partners: how many are refitted as a pair with the best single candidate, as they promise the most beside it.
         anew: times that pairs are chosen, each without candidates that make the best of the ones before nonsense.
         clearer: share of what the best single one leaves below which a pair or a family takes its place.
         promises: share of the misfit that a rival for an accepted effect promises to leave, to be refitted;
@@ -85,6 +86,7 @@ class Tried:
     refits: int = 7
     paired: int = 16
     pairs: int = 5
+    partners: int = 3
     anew: int = 3
     families: int = 2
     clearer: float = 0.5
