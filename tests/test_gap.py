@@ -436,7 +436,7 @@ def test_a_family_takes_no_place_of_what_a_finer_step_makes_as_good(
     fine = {id(single): finer, id(family): 1.0}
     ground = SimpleNamespace(
         rules=Rules(), setting=None, focus=lambda current: None,
-        refits=lambda state, current, groups, stage: ([family] if groups else [], state),
+        refits=lambda state, current, groups, stage, known: ([family] if groups else [], state),
         resolved=lambda r: SimpleNamespace(fit=fitted(fine[id(r)])),
     )  # fmt: skip
     state = SimpleNamespace(current=fitted(12_000))
