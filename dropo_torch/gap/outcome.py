@@ -364,7 +364,7 @@ def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Ru
     halves, sure = fitted.of_names, dict[int, float]()
     for index, (p, half) in enumerate(zip(placed, halves, strict=True)):
         (quantity, *more), (value, *_) = p.effect.quantities(setting, p.target), p.values
-        if not (more or quantity.discrete or p.effect.steps):
+        if np.isfinite(half[0]) and not (more or quantity.discrete or p.effect.steps):
             sure[index] = abs(value - quantity.neutral) / max(half[0], 1e-300)
     least = rules.family.sure if family else 1.0
     unsure = sorted((index for index in sure if sure[index] < least), key=sure.__getitem__)
