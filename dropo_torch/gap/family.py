@@ -83,7 +83,9 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     if fitted.cost.left_of(cost) > most:
         return found
     whole = whole_family(ground, fitted)
-    if whole is None or whole.cost.left_of(cost) > rules.clearer[int(kind)] or is_surpassed(ground, beside, whole):
+    if whole is None or is_surpassed(ground, beside, whole):
+        return found
+    if whole.cost.left_of(cost) > rules.clearer[int(kind)] and not is_plainer(ground, beside, whole):
         return found
     return replace(found, current=whole, family=True, done=True, refused="")
 
@@ -107,6 +109,18 @@ def with_one_more(ground: Ground, found: State) -> list[Refit]:
 def is_surpassed(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
     """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more."""
     return significant(whole.cost, ground.rules) and any(r.cost.excess < whole.cost.excess for r in beside)
+
+
+def is_plainer(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
+    """Return whether the base family leaves far less than effects with one more beside them that have about as many
+    numbers.
+
+    One effect that has several numbers, such as a payload, may take in so much that the family does not leave next to
+    nothing of the rest.
+    """
+    numbers = len(whole.hypothesis.vector)
+    alike = [r for r in beside[:1] if numbers <= len(r.hypothesis.vector) + 1]
+    return any(whole.cost.left_of(r.cost) <= ground.rules.family.clearer[1] for r in alike)
 
 
 def has_family(ground: Ground) -> bool:

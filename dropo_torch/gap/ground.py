@@ -253,7 +253,8 @@ class Ground:
     ) -> tuple[list[Refit], State]:  # fmt: skip
         """Refit a hypothesis with each group of effects more; the best first, and the state with these attempts.
 
-        All are fitted a little, on few windows; those that come near the best of them are then fitted in full.
+        All are fitted a little, on few windows; those that come near the best of them are then fitted in full. Of the
+        same effects from several starts, the best goes on.
 
         Args:
             state: where the search stands.
@@ -288,7 +289,7 @@ class Ground:
         near = best.excess + (tried.worse - 1) * max(best.misfit, 0.0)
         near += self.rules.least * before.above(best) + tried.sigmas * best.sigma
         full = []
-        chosen = [r for r in found[:most] if r.cost.excess <= near]
+        chosen = [r for r in _best_starts(found[: most + 1])[:most] if r.cost.excess <= near]
         chosen[1:] = [r for r in chosen[1:] if r.cost.left_of(before) <= hopeless]
         for number, fitted in enumerate(chosen):
             self.report(stage, (len(groups) + number / (most + 1)) / (len(groups) + 2))
@@ -301,3 +302,11 @@ class Ground:
         for p in placed:
             together = tuple(other.key for other in placed if other is not p)
             yield Ranked(*p.key, p.summary(self.setting), left, state.number, together)
+
+
+def _best_starts(found: Sequence[Refit]) -> list[Refit]:
+    """Of fits with the same effects at the same places, the first."""
+    first: dict[tuple, Refit] = {}
+    for fitted in found:
+        first.setdefault(tuple(p.key for p in fitted.hypothesis.placed), fitted)
+    return list(first.values())
