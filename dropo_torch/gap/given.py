@@ -132,7 +132,8 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
         return None
     parameters = problem.config.parameters or {}
     masses = {n: p.get("name") for n, p in parameters.items() if p.get("field") == "body_mass"}
-    own, every = [n for n, body in masses.items() if body in bodies], list(masses)
+    own = [n for n, at in masses.items() if bodies.intersection(at if isinstance(at, list) else [at])]
+    every = list(masses)
     named = sum(len(e.parameters) for e in gap.effects)
     for free in (own, every if len(own) < len(every) <= named else []):
         if free and (plain := _as_good(problem, free, gap)) is not None:
