@@ -291,7 +291,7 @@ def swap(ground: Ground, state: State) -> State:
             # Far from where it begins, a prediction promises too little of any effect, of the accepted one as well.
             least = max(here, next((c.chi2 for c in alive if c.key == own), 0.0))
             rivals = [(c.placed,) for c in alive[: tried.rivals] if c.key != own and c.chi2 < tried.promises * least]
-            found, _ = ground.refits(state, without, rivals, "swapping")
+            found, _ = ground.refits(state, without, rivals, "swapping", known=state.current.hypothesis)
             better = [r for r in sound(ground, found[:1]) if r.cost.excess < state.current.cost.excess]
             if better and beats(ground, better[0], state.current):
                 state = replace(state, current=better[0])

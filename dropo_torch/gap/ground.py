@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Placed, Setting
-from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.evidence import Cost, Evidence
 from dropo_torch.gap.log import parts_of, since_known, spread
 from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, refit, resolved
 from dropo_torch.gap.result import Ranked
@@ -24,6 +24,9 @@ from dropo_torch.support.report import Report
 FEW, FEWER = 40, 10
 #: Residuals of a window from which on fewer windows do, which tell as much; the share of them that there are at least.
 RICH, SCARCE = 400, 0.5
+
+#: What a ground keeps that has nothing to do with where it reports.
+_KEPT = ("part", "candidates", "blocks", "_known", "_resolved")
 
 
 @dataclass(frozen=True)
@@ -141,6 +144,12 @@ class Ground:
     def at(self, state: State) -> Ground:
         """Return the ground with the noise, the windows with their starts, and the caps that a state has found."""
         return replace(self, few=state.few).on(state.noise, state.since, state.caps).begun(state.starts)
+
+    def reporting(self, report: Report) -> Ground:
+        """Return the ground that reports elsewhere, and knows what was fitted on it."""
+        other = replace(self, report=report)
+        other.__dict__.update({name: self.__dict__[name] for name in _KEPT if name in self.__dict__})
+        return other
 
     def begun(self, starts: np.ndarray | None) -> Ground:
         """Return the ground with windows that begin where a state has found; see :attr:`State.starts`."""
@@ -272,22 +281,26 @@ class Ground:
         focus = self.focus(beside, 2)
         before, first = focus.cost, len(beside.hypothesis.placed)
 
-        def rough(hypothesis: Hypothesis, most: int) -> Refit:
-            return refit(focus.evidence, hypothesis, linear=focus.fitted.linear, iterations=most, slopes=False)
+        def rough(hypothesis: Hypothesis, most: int, target: float = math.inf) -> Refit:
+            linear = focus.fitted.linear
+            return refit(focus.evidence, hypothesis, linear=linear, iterations=most, slopes=False, target=target)
 
-        found = []
+        def spare(best: Cost) -> float:
+            above = (tried.worse - 1) * max(best.misfit, 0.0) + self.rules.least * before.above(best)
+            return above + tried.sigmas * best.sigma
+
+        found, tried = [], self.rules.tried
+        reached = [] if known is None else [rough(known, iterations[0])]
+        target = min((r.loss + spare(r.cost) for r in reached if not focus.evidence.robust), default=math.inf)
         for number, group in enumerate(groups):
             self.report(stage, number / (len(groups) + 2))
-            found.append(rough((origin or beside.hypothesis).with_effects(group), iterations[0]))
+            found.append(rough((origin or beside.hypothesis).with_effects(group), iterations[0], target))
         found.sort(key=lambda r: r.cost.excess)
-        found[: most + 1] = [rough(r.hypothesis, iterations[1]) for r in found[: most + 1]]
+        found[: most + 1] = [rough(r.hypothesis, iterations[1], target) for r in found[: most + 1]]
         found.sort(key=lambda r: r.cost.excess)
         attempts = [a for r in found for a in self._ranked(r.hypothesis.placed[first:], r.cost.left_of(before), state)]
-        reached = [found[0].cost] if known is None else [found[0].cost, rough(known, iterations[0]).cost]
-        best = min(reached, key=lambda cost: cost.excess)
-        tried = self.rules.tried
-        near = best.excess + (tried.worse - 1) * max(best.misfit, 0.0)
-        near += self.rules.least * before.above(best) + tried.sigmas * best.sigma
+        best = min((r.cost for r in (found[0], *reached)), key=lambda cost: cost.excess)
+        near = best.excess + spare(best)
         full = []
         chosen = [r for r in _best_starts(found[: most + 1])[:most] if r.cost.excess <= near]
         chosen[1:] = [r for r in chosen[1:] if r.cost.left_of(before) <= hopeless]

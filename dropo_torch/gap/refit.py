@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -27,6 +28,8 @@ DAMPING, LEAST_DAMPING, MOST_DAMPING = 1e-3, 1e-9, 1e4
 LEAST_GAIN, LEAST_SHARE = 0.01, 1e-6
 #: Share of what is more than noise that must be gained at least once in so many iterations.
 SHARE, FEW_GAINS = 1e-4, 2
+#: Times the last gain that each step to come is expected to gain at most.
+PACE = 2.0
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
@@ -185,7 +188,7 @@ def beside(
 
 def refit(
     evidence: Evidence, hypothesis: Hypothesis, *, linear: Linearization | None = None, iterations: int = 12,
-    slopes: bool = True,
+    slopes: bool = True, target: float = math.inf,
 ) -> Refit:  # fmt: skip
     """Fit all numbers of a hypothesis by Levenberg-Marquardt on projected residuals.
 
@@ -197,17 +200,18 @@ def refit(
         linear: the linearization to use; by default at the hypothesis, and again at the result if that is far away.
         iterations: the most steps that make it better; others only shorten the next, and cost little.
         slopes: whether the result needs its derivatives; without them they may be zero.
+        target: loss that it must come down to, or is of no interest: one that would not at its pace ends early.
     """
     limits = limits_of(hypothesis, evidence.twin)
     first = evidence.linearize(hypothesis.variant) if linear is None else linear
-    last = _descent(evidence, hypothesis, first, limits, iterations)
+    last = _descent(evidence, hypothesis, first, limits, iterations, target)
     times = LINEARIZATIONS if evidence.twin.setting.signals.contacts.any() else 1
     for number in range(times if linear is None else 0):
         moved = _distance(last.here.hypothesis.vector, last.begin.hypothesis, limits) > FAR
         if not moved or (number and last.gain < LEAST_SHRUNK * last.begin.cost.misfit):
             break
         again = evidence.linearize(last.here.hypothesis.variant)
-        last = _descent(evidence, last.here.hypothesis, again, limits, AGAIN)
+        last = _descent(evidence, last.here.hypothesis, again, limits, AGAIN, math.inf)
     if slopes and not last.sloped:
         return _sloped(evidence, last.here, limits, last.residuals)
     return last.here
@@ -229,7 +233,7 @@ class _Descent:
 
 
 def _descent(
-    evidence: Evidence, hypothesis: Hypothesis, linear: Linearization, limits: Limits, iterations: int
+    evidence: Evidence, hypothesis: Hypothesis, linear: Linearization, limits: Limits, iterations: int, target: float
 ) -> _Descent:
     linear = evidence.counting(linear, hypothesis.variant)
     here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
@@ -250,6 +254,8 @@ def _descent(
         here, residuals, sloped = there, found, False
         small = small + 1 if gain < SHARE * here.cost.misfit else 0
         if gain < LEAST_GAIN + LEAST_SHARE * here.loss or small == FEW_GAINS:
+            break
+        if here.loss - PACE * gain * (iterations - taken) > target:
             break
     return _Descent(begin, here, residuals, sloped)
 

@@ -300,7 +300,7 @@ def with_ties(ended: Ended, end: float = math.inf) -> Naming:
     if not naming.named or naming.family:
         return naming
     try:
-        tied, shares, state = rivals_of_all(replace(ground, report=until(ground.report, end)), ended.state)
+        tied, shares, state = rivals_of_all(ground.reporting(until(ground.report, end)), ended.state)
     except OutOfTime as error:
         nothing, shares = ((),) * len(naming.final.hypothesis.placed), list(shares_of(ground, naming.final))
         unfinished = naming.unfinished or f"{error}, with all that was found named"
