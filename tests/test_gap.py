@@ -51,7 +51,7 @@ from dropo_torch.gap import search as searching
 from dropo_torch.gap.accept import accounts_finely, extend, imitates, is_done, is_needed, paired
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence, Linearization, cost_of, robust_factors
-from dropo_torch.gap.ground import Ground, Screening
+from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.locate import guilty, middles, part_of_log, regime, slopes
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.noise import Diverges, FreeForces, _relative_noise, free_forces
@@ -233,6 +233,12 @@ def test_a_mass_that_is_another_is_no_load(tmp_path: Path, monkeypatch: pytest.M
     plain = given.as_own(dataclasses.replace(problem, config=both), load)  # a mass and its center are no simpler
     assert plain is not None
     assert list(plain.config.parameters or ()) == ["pole_mass"]
+    shared = problem.config.model_copy(deep=True)  # one number for several bodies, as of what is fixed to each other
+    assert shared.parameters is not None
+    shared.parameters["pole_mass"]["name"] = [body]
+    of_several = given.as_own(dataclasses.replace(problem, config=shared), load)
+    assert of_several is not None
+    assert list(of_several.config.parameters or ()) == ["pole_mass"]
     elsewhere = dataclasses.replace(load, effects=(named,))
     assert given.as_own(problem, elsewhere) is None
     better = dataclasses.replace(load, reduced=(load.reduced[0], 0.5))  # what the mass alone cannot do
@@ -257,6 +263,39 @@ def test_masses_of_several_bodies_that_are_others_are_no_load(numbers: int, is_s
     )
     assert (plain is not None) == is_simpler
     assert plain is None or set(plain.config.parameters or ()) == {"cart_mass", "pole_mass"}
+
+
+def test_a_fit_that_would_not_come_near_at_its_pace_ends_early() -> None:
+    """A rival is of interest only where it comes near what is known; one that does goes on as if nothing were asked."""
+    scene = scene_of("joint_damping", "joint_friction")
+    ground = Ground(scene.evidence, (VOCABULARY["joint_damping"],))
+    (target, *_) = VOCABULARY["joint_damping"].targets(scene.setting)
+    begin = scene.begin.with_effects([Placed(VOCABULARY["joint_damping"], target, (0.0,))])
+    twin, spent = scene.twin, list[int]()
+
+    def fitted(goal: float) -> Refit:
+        before = twin.simulated_transitions
+        found = refit(ground.part, begin, target=goal) if goal < math.inf else refit(ground.part, begin)
+        spent.append(twin.simulated_transitions - before)
+        return found
+
+    whole = fitted(math.inf)
+    assert fitted(whole.loss * 1.01).loss == whole.loss
+    hopeless = fitted(1e-6 * whole.loss)
+    assert hopeless.loss >= whole.loss
+    assert spent[2] < spent[1] == spent[0]
+
+
+def test_of_one_effects_starts_the_best_is_fitted_in_full() -> None:
+    scene = scene_of("joint_damping")
+    ground, effect = Ground(scene.evidence, (VOCABULARY["joint_damping"],)), VOCABULARY["joint_damping"]
+    base = ground.refit(scene.begin)
+    state = State(scene.noise, scene.since, 1.0, base, NOTHING, base)
+    groups = [[Placed(effect, t, (value,))] for t in effect.targets(scene.setting) for value in (0.01, 0.3)]
+    full, after = ground.refits(state, base, groups, "refitting")
+    keys = [r.hypothesis.placed[-1].key for r in full]
+    assert len(keys) == len(set(keys))
+    assert len(after.attempts) == len(groups)
 
 
 # --- the whole ------------------------------------------------------------------------------------------------

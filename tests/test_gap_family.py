@@ -344,6 +344,19 @@ def test_the_family_is_none_where_one_effect_more_leaves_less(
     assert members.with_family(ground, SimpleNamespace(base=base), first).family == is_family  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize(("numbers", "left", "is_plainer"), [(5, 0.3, True), (6, 0.3, False), (5, 0.5, False)])
+def test_a_family_of_as_few_numbers_is_plainer(numbers: int, left: float, is_plainer: bool) -> None:
+    """A payload takes in so much of what two joints lack that their family leaves a tenth of what it leaves."""
+
+    def fit(numbers: int, left: float) -> Any:
+        cost = SimpleNamespace(left_of=lambda _: left)
+        return SimpleNamespace(cost=cost, hypothesis=SimpleNamespace(vector=np.zeros(numbers)))
+
+    ground: Any = SimpleNamespace(rules=Rules())
+    assert members.is_plainer(ground, [fit(4, 0.1)], fit(numbers, left)) == is_plainer
+    assert not members.is_plainer(ground, [], fit(numbers, left))
+
+
 def test_no_family_is_fitted_where_one_effect_more_leaves_noise_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     """Delays at all joints and one weak motor: as many members as joints would take most of the time."""
 
