@@ -271,11 +271,11 @@ def test_a_fit_that_would_not_come_near_at_its_pace_ends_early() -> None:
     ground = Ground(scene.evidence, (VOCABULARY["joint_damping"],))
     (target, *_) = VOCABULARY["joint_damping"].targets(scene.setting)
     begin = scene.begin.with_effects([Placed(VOCABULARY["joint_damping"], target, (0.0,))])
-    twin, spent = scene.twin, list[int]()
+    twin, spent, linear = scene.twin, list[int](), ground.part.linearize(begin.variant)
 
     def fitted(goal: float) -> Refit:
         before = twin.simulated_transitions
-        found = refit(ground.part, begin, target=goal) if goal < math.inf else refit(ground.part, begin)
+        found = refit(ground.part, begin, linear=linear, target=goal)
         spent.append(twin.simulated_transitions - before)
         return found
 
