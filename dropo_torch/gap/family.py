@@ -17,7 +17,7 @@ from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
 from dropo_torch.gap.accept import SOFT, beats, extend, is_of_step, sound, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.ground import Ground, State, scarcity
+from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
@@ -29,8 +29,8 @@ from dropo_torch.gap.sound import absurd
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
 #: One more of them, where what these leave is more than noise; and those on top of which it is.
 SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
-#: Windows of the first fit, and where each has many residuals.
-ROUGHLY, LEAST = 12, 6
+#: Windows of the first fit.
+ROUGHLY = 12
 
 #: What is reported.
 STAGE = "fitting friction, inertia, offset and delay of all joints"
@@ -143,7 +143,7 @@ def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
 def leaves_too_much(ground: Ground, begin: Hypothesis, rival: Hypothesis, most: float) -> bool:
     """Return whether the base family leaves more than a share of what a fitted rival leaves, on few windows."""
     ground.report(STAGE, 0.0)
-    few = ground.part.few(max(LEAST, round(ROUGHLY * scarcity(ground.evidence))))
+    few = ground.part.few(ROUGHLY)
     iterations = ground.rules.family.iterations
     rough = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
     return rough.cost.left_of(refit(few, rival, iterations=0, slopes=False).cost) > most

@@ -117,7 +117,12 @@ class State:
 
 
 def scarcity(evidence: Evidence) -> float:
-    """Return which share of the usual windows tells enough, as each has many residuals."""
+    """Return which share of the usual windows tells enough, as each has many residuals.
+
+    Where nothing touches, all do: a base family has many numbers, and windows cost little.
+    """
+    if not evidence.twin.setting.signals.contacts.any():
+        return 1.0
     return float(np.clip(RICH / max(evidence.num_rows, 1), SCARCE, 1.0))
 
 
