@@ -511,7 +511,7 @@ def test_ties_are_told_in_the_terminal(tmp_path: Path) -> None:
     text = console.export_text()
     assert (
         "This log is explained equally well by a spring between wrist and its parent joint or a constant external "
-        "force on hand, in place of a spring at wrist, or by a share of each."
+        "force on hand, in place of a spring at wrist; so may it be by a share of each."
     ) in " ".join(text.split())
 
 

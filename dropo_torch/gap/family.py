@@ -31,6 +31,8 @@ BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuato
 SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
 #: Windows of the first fit.
 ROUGHLY = 12
+#: Numbers that a base family may have more than effects that have about as many.
+ABOUT = 1
 
 #: What is reported.
 STAGE = "fitting friction, inertia, offset and delay of all joints"
@@ -119,7 +121,7 @@ def is_plainer(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
     nothing of the rest.
     """
     numbers = len(whole.hypothesis.vector)
-    alike = [r for r in beside[:1] if numbers <= len(r.hypothesis.vector) + 1]
+    alike = [r for r in beside[:1] if numbers <= len(r.hypothesis.vector) + ABOUT]
     return any(whole.cost.left_of(r.cost) <= ground.rules.family.clearer[1] for r in alike)
 
 

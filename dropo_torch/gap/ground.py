@@ -25,9 +25,6 @@ FEW, FEWER = 40, 10
 #: Residuals of a window from which on fewer windows do, which tell as much; the share of them that there are at least.
 RICH, SCARCE = 400, 0.5
 
-#: What a ground keeps that has nothing to do with where it reports.
-_KEPT = ("part", "candidates", "blocks", "_known", "_resolved")
-
 
 @dataclass(frozen=True)
 class Screening:
@@ -153,7 +150,7 @@ class Ground:
     def reporting(self, report: Report) -> Ground:
         """Return the ground that reports elsewhere, and knows what was fitted on it."""
         other = replace(self, report=report)
-        other.__dict__.update({name: self.__dict__[name] for name in _KEPT if name in self.__dict__})
+        vars(other).update({name: known for name, known in vars(self).items() if name not in vars(other)})
         return other
 
     def begun(self, starts: np.ndarray | None) -> Ground:

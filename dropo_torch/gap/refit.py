@@ -211,7 +211,7 @@ def refit(
         if not moved or (number and last.gain < LEAST_SHRUNK * last.begin.cost.misfit):
             break
         again = evidence.linearize(last.here.hypothesis.variant)
-        last = _descent(evidence, last.here.hypothesis, again, limits, AGAIN, math.inf)
+        last = _descent(evidence, last.here.hypothesis, again, limits, AGAIN, target)
     if slopes and not last.sloped:
         return _sloped(evidence, last.here, limits, last.residuals)
     return last.here

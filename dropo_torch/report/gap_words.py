@@ -219,9 +219,9 @@ def tabled(gap: Gap) -> list[tuple[str, str, str]]:
 
 
 def ambiguous(effect: NamedEffect) -> str:
-    """Return what explains the log as well as an effect, in a sentence: where two do, a share of each does, too."""
+    """Return what explains the log as well as an effect, in a sentence."""
     others, own = joined(rivals(effect), last="or", rest="one of {} more"), noun(effect.effect, effect.target)
-    return f"This log is explained equally well by {others}, in place of {own}, or by a share of each."
+    return f"This log is explained equally well by {others}, in place of {own}; so may it be by a share of each."
 
 
 def answer(gap: Gap) -> tuple[str, list[str]]:
