@@ -68,6 +68,34 @@ def p_of_gain(before: np.ndarray, after: np.ndarray, numbers: int) -> float:
     return min(1.0, 2 * min(p_of_ranks(before - after), p_of_share(before, after, numbers)))
 
 
+def p_of_ratio(gain: float, numbers: int) -> float:
+    """Return how likely noise alone lets numbers that are not there lower χ² by as much (Wilks' theorem).
+
+    Args:
+        gain: by how much χ² is lower.
+        numbers: how many are fitted more; one that is chosen among a few counts as fitted.
+    """
+    return float(stats.chi2.sf(max(gain, 0.0), max(numbers, 1)))
+
+
+def p_of_scores(scores: np.ndarray) -> float:
+    """Return how likely scores of independent blocks ``(B, p)`` have a mean as far from zero (Hotelling's test).
+
+    It holds whatever noise makes within a block. Directions in which no block has a score do not count.
+
+    Args:
+        scores: derivatives of each block's χ² by the numbers that are not there.
+    """
+    size = np.sqrt((scores**2).sum(0))
+    scores = scores[:, size > 0] / size[size > 0]
+    blocks, numbers = scores.shape
+    if not numbers or blocks <= numbers:
+        return 1.0
+    mean, covariance = scores.mean(0), np.cov(scores, rowvar=False).reshape(numbers, numbers)
+    distance = blocks * float(mean @ np.linalg.pinv(covariance, rcond=1e-10, hermitian=True) @ mean)
+    return float(stats.f.sf(distance * (blocks - numbers) / (numbers * (blocks - 1)), numbers, blocks - numbers))
+
+
 def least_surplus(surplus: np.ndarray, error: float) -> float:
     """Return by how much a hypothesis is worse, of blocks ``(B,)`` together, at least: Student's lower limit.
 

@@ -330,12 +330,16 @@ def _straight(evidence: Evidence, own: Refit) -> tuple[Evidence, Refit]:
 
 def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Naming:
     """What was found, without names: with them, open loop on unseen data is no better than a rival's."""
-    placed = naming.final.hypothesis.placed
-    names = " and ".join(p.effect.name.replace("_", " ") + (f" of {p.target}" if p.target else "") for p in placed)
+    names = _names_of(naming.final.hypothesis.placed)
     if naming.family:
         names = "friction, inertia, offset and delay of all joints"
     sizes = f"open loop {after.rollout_rmse:.3g} against {rival:.3g}"
     return _nameless(naming, f"with {names}, which would account for most of the misfit, {why} ({sizes})")
+
+
+def _names_of(placed: Sequence[Placed]) -> str:
+    """Effects and their places, as a sentence has them."""
+    return " and ".join(p.effect.name.replace("_", " ") + (f" of {p.target}" if p.target else "") for p in placed)
 
 
 def _spared(naming: Naming, absurd: Sequence[tuple[Placed, str]]) -> Naming:
@@ -350,7 +354,8 @@ def _keeping(naming: Naming, kept: Sequence[int]) -> Naming:
     hypothesis = naming.final.hypothesis
     rest = replace(hypothesis, placed=tuple(hypothesis.placed[k] for k in kept))
     ties, shares = tuple(naming.ties[k] for k in kept), tuple(naming.shares[k] for k in kept)
-    return replace(naming, final=refit(naming.evidence, rest, iterations=6), ties=ties, shares=shares)
+    faint = tuple(n for n, k in enumerate(kept) if k in naming.faint)
+    return replace(naming, final=refit(naming.evidence, rest, iterations=6), ties=ties, shares=shares, faint=faint)
 
 
 def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Rules) -> Naming | None:
@@ -415,6 +420,12 @@ def _notes(setting: Setting, naming: Naming, skill: bool, transitions: int) -> I
         yield (
             f"The time for the search was over ({naming.unfinished}): not everything was tried. "
             "--resume with a longer --time-limit goes on."
+        )
+    if naming.named and naming.faint:
+        faint = _names_of([naming.final.hypothesis.placed[k] for k in naming.faint])
+        yield (
+            f"Without {faint}, the residuals as a whole would look like noise, too: only along the "
+            "direction in which that changes the motion is there more than chance makes (a likelihood ratio)."
         )
     if still:
         yield f"No velocity of {', '.join(still)} is in this log: effects there cannot be judged."

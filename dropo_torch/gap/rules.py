@@ -26,12 +26,17 @@ class Chance:
         open: level up to which an effect that misses ``error`` on the windows that refits use is judged on all.
         blocks: stretches of the log that count as independent, at least, where it has as many windows: of fewer than
             about 15, no ranks are sure enough among hundreds of candidates.
+        judged: times that χ² along one direction may be what it is by noise, where all residuals together look like
+            noise: its size is only estimated, and it need not be white.
+        worth: share of χ² that an effect must explain there: less is not worth a name, however sure it is.
     """
 
     error: float = 0.01
     explore: float = 0.05
     open: float = 1.0
     blocks: int = 20
+    judged: float = 2.0
+    worth: float = 0.02
 
 
 @dataclass(frozen=True)

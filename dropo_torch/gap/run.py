@@ -28,6 +28,7 @@ from dropo_torch.gap.search import (
     Ended,
     Naming,
     believed,
+    beside_noise,
     instead_of_one,
     kept,
     leaves_wrong,
@@ -41,6 +42,9 @@ from dropo_torch.gap.verify import constant_velocity, cut_held, open_loop_error,
 from dropo_torch.problem import Problem
 from dropo_torch.support.report import Report
 from dropo_torch.support.threads import single_thread
+
+#: Suffix of the checkpoint of a search over the windows that stand out among others: of these, chance chooses too many.
+RARE = "-rare"
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -255,7 +259,8 @@ class _Searches:
         if self.checkpoint is not None:
             known = f"{self.scene.problem.fingerprint} {self.ground.rules} {[e.name for e in self.ground.effects]}"
             path = kept(self.checkpoint.with_stem(f"{self.checkpoint.stem}{suffix}"), known)
-        return search(ground, self.scene.begin, path, resume=self.resume, end=end, latest=self.end)
+        ended = search(ground, self.scene.begin, path, resume=self.resume, end=end, latest=self.end)
+        return beside_noise(ended, self.end) if suffix != RARE else ended
 
     def over_rare(self, nothing: Naming) -> Naming:
         """Search the windows that show something where others show nothing, if there are any."""
@@ -263,7 +268,7 @@ class _Searches:
         if rare is None:
             return nothing
         effects = tuple(e for e in self.ground.effects if not e.has("command"))
-        return with_ties(self.over("-rare", replace(self.ground, evidence=rare, effects=effects), self.end), self.end)
+        return with_ties(self.over(RARE, replace(self.ground, evidence=rare, effects=effects), self.end), self.end)
 
     def doubts(self, naming: Naming) -> bool:
         """Whether names leave a rest where there are contacts."""

@@ -26,6 +26,7 @@ from dropo_torch.gap.accept import (
     swap,
 )
 from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.faint import with_faint
 from dropo_torch.gap.family import fitted_family, has_family, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
@@ -66,6 +67,7 @@ class Naming:
         unfinished: the stage in which the time for the search was over, or empty.
         family: whether what is named is the base family.
         left_out: what this does without, and how large that may be.
+        faint: which of the named effects show only along their own direction: see :func:`with_faint`.
     """
 
     evidence: Evidence
@@ -82,6 +84,7 @@ class Naming:
     unfinished: str = ""
     family: bool = False
     left_out: tuple[Allowed, ...] = ()
+    faint: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -320,6 +323,28 @@ def continued(ground: Ground, state: State, unfinished: str) -> Ended:
         state = step(ground.at(state), state)
     ended = conclude(ground.at(state), state)
     return replace(ended, naming=replace(ended.naming, unfinished=unfinished))
+
+
+def beside_noise(ended: Ended, end: float = math.inf) -> Ended:
+    """Return where a search ended, with the effects that a likelihood ratio shows in what looked like noise.
+
+    Args:
+        ended: what was found, or nothing.
+        end: when no more are looked for, by ``time.monotonic``.
+    """
+    naming, ground = ended.naming, ended.ground
+    if naming.family or naming.unfinished or (naming.gap and not naming.named):
+        return ended
+    try:
+        state = with_faint(ground.reporting(until(ground.report, end)), ended.state)
+    except OutOfTime:
+        return ended
+    if state.current.hypothesis == ended.state.current.hypothesis:
+        return ended
+    here = ground.at(state)
+    naming = replace(naming, evidence=here.evidence, base=state.base, final=state.current, gap=True, named=True)
+    faint = tuple(range(len(ended.state.current.hypothesis.placed), len(state.current.hypothesis.placed)))
+    return Ended(here, state, replace(naming, attempts=state.attempts, faint=faint))
 
 
 def instead_of_one(ended: Ended) -> Ended:
