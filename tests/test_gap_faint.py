@@ -1,4 +1,4 @@
-"""Effects that all residuals together do not show, and logs in which there are none."""
+"""Effects that all residuals together do not show, and logs in which there are none, however noisy."""
 
 from __future__ import annotations
 
@@ -19,6 +19,7 @@ from dropo_torch.gap.refit import Refit, refit
 from dropo_torch.gap.rules import Rules, significant
 from dropo_torch.gap.run import _ground
 from dropo_torch.gap.search import start_anywhere
+from dropo_torch.report.gap_words import answer
 
 ERROR = Rules().chance.error
 
@@ -71,6 +72,20 @@ def test_what_a_finer_step_explains_as_well_is_no_faint_effect(monkeypatch: pyte
     monkeypatch.setattr(faint, "is_shown", asking)
     assert not find_gap(scene.problem, scene=scene).found
     assert asked == []  # what promised most, a late sensor, does no more than half of what the step does
+
+
+def test_noise_that_lasts_over_rows_is_no_gap_and_hides_none() -> None:
+    right = scene_of(RAIL, nothing, pushes, seed=31, lasting=0.6)
+    assert significant(start_anywhere(_ground(right, None), right.begin).base.cost, right.rules)
+    gap = find_gap(right.problem, scene=right)
+    assert gap.lasting
+    assert gap.verdict == "no gap"
+    assert "last" in gap.document()["verdict_reason"]
+    assert "Nothing is missing that predictions show" in answer(gap)[0]
+    wrong = scene_of(RAIL, creaks(0.5), pushes, seed=31, lasting=0.6)
+    gap = find_gap(wrong.problem, scene=wrong)
+    assert not gap.lasting
+    assert named(gap) == [("joint_damping", "rail")]
 
 
 def test_a_ratio_is_trusted_only_beside_noise_that_bends_no_window() -> None:

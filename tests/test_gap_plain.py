@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -113,6 +114,7 @@ def scene_of(
     xml: str, change: Change, commands: Callable[[np.ndarray, np.ndarray], np.ndarray],
     observation: tuple[str, ...] = ("qpos", "qvel"), shape: tuple[int, int] = (8, 150), seed: int = 5,
     begin: Callable[[mujoco.MjData, np.random.Generator], None] = sway, mask: tuple[str, ...] = (),
+    lasting: float = 0.0,
 ) -> Scene:  # fmt: skip
     """A log of episodes of so many transitions, by a model that differs from the user's ``xml``.
 
@@ -125,6 +127,7 @@ def scene_of(
         seed: of initial states, phases and noise.
         begin: sets the initial state of an episode.
         mask: columns that are not compared.
+        lasting: correlation of a row's noise with that of the next one.
     """
     own, truth = (mujoco.MjModel.from_xml_string(xml) for _ in range(2))
     change(truth)
@@ -141,7 +144,10 @@ def scene_of(
             if command is not None:
                 data.ctrl[:] = command
                 mujoco.mj_step(truth, data, 2)
-        measured = np.array(path) + noise * rng.standard_normal((len(path), columns.size))
+        drawn = rng.standard_normal((len(path), columns.size))
+        for row in range(1, len(drawn) if lasting else 0):
+            drawn[row] = lasting * drawn[row - 1] + math.sqrt(1 - lasting**2) * drawn[row]
+        measured = np.array(path) + noise * drawn
         before.append(measured[:-1])
         after.append(measured[1:])
         actions.append(signal)

@@ -223,6 +223,7 @@ def _put_together(
         refused=naming.refused,
         unfinished=naming.unfinished,
         own_step=fitted.own_step,
+        lasting=naming.lasting and not naming.gap,
         joints=joint_names(setting) if naming.family else {},
         left_out=_left_out(setting, naming.left_out),
         symbolic=describe(setting, before, guilty(before), rules.shown) if naming.gap and not naming.named else "",

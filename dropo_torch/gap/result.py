@@ -236,6 +236,8 @@ class Gap:
         refused: why what would account for the misfit has no name, or empty.
         unfinished: where the search was when its time was over, or empty.
         own_step: χ² per degree of freedom with the model's own step and with a finer one, if only that remains.
+        lasting: whether noise leaves more than that of single rows would: no effect explains any of it, and it does not
+            add up in longer predictions.
         joints: the joint at which each effect of the base family sits: of joints and actuators by name, in the model's
             order; empty where what was named is no such family.
         skill: whether the model as it is predicts held-out data better in open loop than constant velocity does.
@@ -273,6 +275,7 @@ class Gap:
     refused: str = ""
     unfinished: str = ""
     own_step: tuple[float, float] | None = None
+    lasting: bool = False
     joints: Mapping[str, str] = field(default_factory=dict)
     skill: bool = True
     forces: tuple[JointForce, ...] = ()
@@ -334,6 +337,11 @@ class Gap:
 
 def reason(gap: Gap) -> str:
     """Return in words what a verdict stands on."""
+    if gap.lasting:
+        return (
+            f"χ² per degree of freedom is {gap.reduced[1]:.3g}, but no effect explains any of it, and it does not add up "
+            "in longer predictions of unseen data: it is noise that lasts over rows, or stamps that jitter"
+        )
     if not gap.found:
         return "what remains is no more than noise"
     if gap.verdict == "unnamed":

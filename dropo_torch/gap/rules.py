@@ -155,6 +155,8 @@ class Sound:
             model's own error decides.
         wrong, right: χ² per degree of freedom from which on a window is wrong, or a log with many numbers, and below
             which a window is right.
+        idle: share of the excess that whatever was tried must leave, for it to be noise and no effect's; and χ² per
+            degree of freedom of long stretches then is within ``floor`` times that of windows.
     """
 
     pushes: float = 3.0
@@ -165,6 +167,7 @@ class Sound:
     model_error: float = 3.0
     wrong: float = 20.0
     right: float = 1.5
+    idle: float = 0.9
 
 
 @dataclass(frozen=True)

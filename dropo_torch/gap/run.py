@@ -20,7 +20,7 @@ from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.locate import places
 from dropo_torch.gap.noise import free_forces
 from dropo_torch.gap.outcome import make_result, with_forces
-from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.refit import Hypothesis, refit
 from dropo_torch.gap.result import Gap, Place, Score
 from dropo_torch.gap.rules import Rules, remains
 from dropo_torch.gap.scene import Scene, outstanding, prepare, searched
@@ -196,6 +196,26 @@ def _has_skill(scene: Scene, naming: Naming) -> bool:
     return has_skill(after, floor, constant_velocity(evidence, held.rollouts), scene.rules.sound)
 
 
+def _is_noise(scene: Scene, naming: Naming) -> bool:
+    """Return whether what has no name is noise: nothing that was tried explains any of it, and nothing adds up.
+
+    Noise that lasts over rows, or stamps that jitter, leave more in windows than the noise of single rows would, but
+    in stretches of unseen data that are as long as open-loop predictions, from the best start, no more than in those.
+    """
+    evidence, sound, cost = naming.evidence, scene.rules.sound, naming.base.cost
+    tried = [attempt.left for attempt in naming.attempts]
+    if naming.unfinished or evidence.rough or evidence.robust or cost.reduced > sound.wrong:
+        return False
+    if not tried or min(tried) < sound.idle:
+        return False
+    hypothesis = naming.base.hypothesis
+    stretches = cut_held(evidence, scene.held, hypothesis).rollouts
+    if not len(stretches):
+        return False
+    there = refit(replace(evidence.on(stretches), caps=1.0), hypothesis, iterations=0, slopes=False)
+    return there.cost.reduced <= sound.floor * cost.reduced
+
+
 def _name(
     scene: Scene, ground: Ground, checkpoint: Path | None = None, resume: bool = False, end: float = math.inf,
     decided: Callable[[Naming], bool] = lambda naming: False,
@@ -203,7 +223,7 @@ def _name(
     """Search; where nothing has a name, once more over shorter windows, and where there are contacts robustly.
 
     Where the windows show nothing, those that do are searched, if the log has any: but not for what remembers commands,
-    which acts throughout.
+    which acts throughout. Where they show what is noise, nothing is missing.
 
     Where there are contacts, long windows bend, and what is most of the gap there may be an effect of the wrong kind:
     names that leave a rest are then believed only if they leave none in shorter windows, in most of the log at least,
@@ -221,6 +241,8 @@ def _name(
         if not found[0].naming.gap:
             return searches.over_rare(last)
         if not last.named:
+            if _is_noise(scene, last):
+                return replace(last, gap=False, lasting=True, refused="")
             if decided(last):
                 return last
         elif not searches.doubts(last):

@@ -67,6 +67,7 @@ class Naming:
         unfinished: the stage in which the time for the search was over, or empty.
         family: whether what is named is the base family.
         left_out: what this does without, and how large that may be.
+        lasting: whether what is more than the noise that was told is noise, too.
         faint: which of the named effects show only along their own direction: see :func:`with_faint`.
     """
 
@@ -84,6 +85,7 @@ class Naming:
     unfinished: str = ""
     family: bool = False
     left_out: tuple[Allowed, ...] = ()
+    lasting: bool = False
     faint: tuple[int, ...] = ()
 
 

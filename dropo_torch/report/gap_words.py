@@ -10,7 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import all_of
-from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Remaining, Strength, fallen
+from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Remaining, Strength, fallen, reason
 from dropo_torch.gap.rules import Sound
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
@@ -241,6 +241,8 @@ def _answer(gap: Gap) -> tuple[str, list[str]]:
         if values := corrected(gap):
             return f"Nothing is missing beside other values of parameters: {joined(values, 6)}.", []
         fitted = " once the parameters of the config are fitted" if gap.declared else ""
+        if gap.lasting:
+            return f"Nothing is missing{fitted} that predictions show: {reason(gap)}.", []
         return f"Nothing is missing{fitted}: what remains is measurement noise.", []
     if not named:
         if gap.refused:
