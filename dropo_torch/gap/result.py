@@ -339,8 +339,8 @@ def reason(gap: Gap) -> str:
     """Return in words what a verdict stands on."""
     if gap.lasting:
         return (
-            f"χ² per degree of freedom is {gap.reduced[1]:.3g}, but no effect explains any of it, and it does not add up "
-            "in longer predictions of unseen data: it is noise that lasts over rows, or stamps that jitter"
+            f"χ² per degree of freedom is {gap.reduced[1]:.3g}, but no effect explains any of it, and it does not add "
+            "up in longer predictions of unseen data: it is noise that lasts over rows, or stamps that jitter"
         )
     if not gap.found:
         return "what remains is no more than noise"
