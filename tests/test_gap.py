@@ -1434,6 +1434,7 @@ def test_names_that_leave_nothing_are_believed_before_others(
     monkeypatch.setattr("dropo_torch.gap.run.searched", lambda scene: ((str(n), scene.evidence) for n in range(2)))
     monkeypatch.setattr("dropo_torch.gap.run.with_ties", lambda ended, end: ended.naming)
     monkeypatch.setattr("dropo_torch.gap.run.believed", lambda *_: None)
+    monkeypatch.setattr("dropo_torch.gap.run.beside_noise", lambda ended, end: ended)
     assert gap_package.name(scene).final is ready[chosen].naming.final
     assert len(list(waiting)) == len(ready) - asked
     late = dataclasses.replace(ready[0].naming, unfinished="refitting")
