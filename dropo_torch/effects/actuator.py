@@ -227,6 +227,7 @@ class ActuatorLag(ActuatorEffect):
 
     name = "actuator_lag"
     sentence = "actuator {target} follows its command with a first-order lag"
+    everywhere_like = ("actuator_delay",)
     shares = (0.4, 2.0, 5.0)
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:

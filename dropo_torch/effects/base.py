@@ -175,8 +175,8 @@ class Effect(abc.ABC):
         alone: whether it is looked for by itself; otherwise only in the place of a simpler one, or in the base family.
         known_as: name of the effect of which it is a kind, by which answers call it; none for its own.
         steps: whether it sets the physics step. It is then written first, for others may depend on that.
-        everywhere_like: names of effects that do the same if both are everywhere: what is late on the way to the robot
-            and on the way back.
+        everywhere_like: names of effects that do the same, or nearly, if both are everywhere: what is late on the way
+            to the robot and on the way back, and what follows late.
         differentiates: whether a velocity that is derived from a measured position shows it as the position does.
     """
 
