@@ -25,6 +25,8 @@ from dropo_torch.gap.screen import Beside, Candidate, Focus, left_by, nearer, sc
 AGAIN, FITTED = 12, 3
 #: Iterations of these fits.
 ITERATIONS = 6
+#: The stage as it is reported, and the share of it that has passed when candidates are fitted.
+STAGE, FITTING = "looking for what is faint", 0.6
 
 
 def may_tell(ground: Ground, fitted: Refit) -> bool:
@@ -60,7 +62,7 @@ def _shown(ground: Ground, state: State) -> Refit | None:
     hopeful = _hopeful(ground, state)
     focus, found = Focus(ground.part, state.current), list[Refit]()
     for number, candidate in enumerate(hopeful):
-        ground.report("looking for what is faint", 0.5 + 0.5 * number / len(hopeful))
+        ground.report(STAGE, FITTING + (1 - FITTING) * number / len(hopeful))
         start = whole.hypothesis.with_effects([nearer(focus, whole.hypothesis, candidate)])
         found.append(refit(every.part, start, linear=whole.linear, iterations=ITERATIONS))
     found.sort(key=lambda r: r.loss)
@@ -74,11 +76,12 @@ def _shown(ground: Ground, state: State) -> Refit | None:
 def _hopeful(ground: Ground, state: State) -> list[Candidate]:
     """The candidates that may show, as the windows that refits use have it, and with them the best finer step."""
     current, tried = state.current, ground.rules.tried
+    ground.report(STAGE, 0.0)
     if current.hypothesis.placed:
-        ranked = _promising(ground.focus(current), ground.screened(current))
+        looking = ground.reporting(lambda stage, share: ground.report(STAGE, FITTING * share))
+        ranked = _promising(ground.focus(current), looking.screened(current))
     else:
         ranked = _promising(state.first, state.first.ranked)
-    ground.report("looking for what is faint", 0.0)
     steps = [c for c in ranked if c.placed.effect.steps]
     focus, first = Focus(ground.part, current), [c for c in ranked if not c.placed.effect.steps][:AGAIN]
     again = _promising(focus, screen(focus, [c.start for c in (*first, *steps[:1])], tried))

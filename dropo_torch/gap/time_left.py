@@ -44,6 +44,7 @@ PAIRS = Stage("refitting pairs", 2.5, visits=0.3, rounds=True)
 PART = Stage("part of it is explained", 0.5, rounds=True)
 EXPLAINED = Stage("all but noise is explained", 0.9, like="log")
 CHECKING = Stage("checking", 0.4)
+SUBTLE = Stage("looking for what is faint", 1.5, visits=0.8)
 TIES = Stage("looking for ties", 3.2)
 VERIFYING = Stage("verifying", 1.8, like="log")
 #: What follows what where something is missing; after a round, the next one may begin.
@@ -63,6 +64,7 @@ PLAN = (
     CHECKING,
     Stage("judging on all windows", 1.0, visits=0.0),
     Stage("trying the names", 1.0, visits=0.0),
+    SUBTLE,
     TIES,
     Stage("fitting on all windows", 1.3),
     VERIFYING,
@@ -70,11 +72,11 @@ PLAN = (
     Stage("comparing forces", 2.0, visits=0.0),
 )
 #: And where nothing seems to be: all is done again on all windows.
-QUIET_PLAN = (QUIET, SCREENING, FITTING, QUIET, SCREENING, VERIFYING)
+QUIET_PLAN = (QUIET, SCREENING, FITTING, QUIET, SCREENING, SUBTLE, VERIFYING)
 #: Stages that tell that one effect does not explain all.
 HARD = (SHORT, PAIRS, PART)
 #: Stages that screen for themselves.
-SCREENING_TOO = (SWAPPING, TIES)
+SCREENING_TOO = (SWAPPING, SUBTLE, TIES)
 
 
 @dataclass(frozen=True)
