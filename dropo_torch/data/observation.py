@@ -18,7 +18,7 @@ any order, some of which may be missing or of no interest, and of sensors' value
 Joints without a column that the model's equality constraints determine, in closed loops or by coupling, are where these
 are met. A sensor that is a joint's encoder (``jointpos``, ``jointvel``, ``ballquat``, ``ballangvel``) stands for the
 columns of the state that it shows. With sensors, a state of which not every column is observed is estimated from the
-log.
+log; and so is that of a free body of which only the orientation is.
 """
 
 from __future__ import annotations
@@ -218,6 +218,7 @@ def parse_observation(
     columns, width = [c for c in listed if c is not None], len(listed)
     about |= {c: entry for sensor in sensors for c, entry in sensor.columns.items()}
     is_sensed = _names_sensors(entries or ()) and sorted(columns) != list(range(num_states))
+    is_sensed |= _floats_unseen(model, columns)
     twice = {c for c in columns if columns.count(c) > 1}
     if twice:
         raise InputError(f"observation: {about[min(twice)][0]} stands there twice; name each state column once")
@@ -248,6 +249,16 @@ def parse_observation(
 
 def _names_sensors(entries: Sequence[str]) -> bool:
     return any(_SENSOR.fullmatch(str(entry).strip()) for entry in entries)
+
+
+def _floats_unseen(model: mujoco.MjModel, columns: Sequence[int]) -> bool:
+    """Whether a free body's orientation is observed, and neither where it is nor how fast it moves."""
+    for joint in np.flatnonzero(model.jnt_type == mujoco.mjtJoint.mjJNT_FREE):
+        place, speed = int(model.jnt_qposadr[joint]), model.nq + int(model.jnt_dofadr[joint])
+        hidden = {*range(place, place + 3), *range(speed, speed + 3)}
+        if hidden.isdisjoint(columns) and {*range(place + 3, place + 7)} <= set(columns):
+            return True
+    return False
 
 
 def generic_observation(num_columns: int) -> Observation:

@@ -23,6 +23,8 @@ from dropo_torch.gap.screen import Beside, Candidate, Focus, left_by, nearer, sc
 
 #: Candidates that are screened again on the windows that refits use, and that are fitted on all, at most.
 AGAIN, FITTED = 12, 3
+#: Share of what a candidate must be worth that a prediction on few windows promises, at least.
+PROMISED = 0.5
 #: Iterations of these fits.
 ITERATIONS = 6
 #: The stage as it is reported, and the share of it that has passed when candidates are fitted.
@@ -55,14 +57,17 @@ def _shown(ground: Ground, state: State) -> Refit | None:
 
     What a finer step explains half as well is no effect of the robot.
     """
+    hopeful = _hopeful(ground, state)
+    if not hopeful:
+        return None
+    ground.report(STAGE, FITTING)
     every = replace(ground, few=len(ground.evidence.windows), caps=1.0)
     whole = refit(every.part, state.current.hypothesis, iterations=ITERATIONS)
     if not may_tell(every, whole):
         return None
-    hopeful = _hopeful(ground, state)
     focus, found = Focus(ground.part, state.current), list[Refit]()
     for number, candidate in enumerate(hopeful):
-        ground.report(STAGE, FITTING + (1 - FITTING) * number / len(hopeful))
+        ground.report(STAGE, FITTING + (1 - FITTING) * (number + 1) / (len(hopeful) + 1))
         start = whole.hypothesis.with_effects([nearer(focus, whole.hypothesis, candidate)])
         found.append(refit(every.part, start, linear=whole.linear, iterations=ITERATIONS))
     found.sort(key=lambda r: r.loss)
@@ -85,14 +90,20 @@ def _hopeful(ground: Ground, state: State) -> list[Candidate]:
     steps = [c for c in ranked if c.placed.effect.steps]
     focus, first = Focus(ground.part, current), [c for c in ranked if not c.placed.effect.steps][:AGAIN]
     again = _promising(focus, screen(focus, [c.start for c in (*first, *steps[:1])], tried))
-    share, before = len(ground.part.windows) / len(ground.evidence.windows), left_by(focus, [])
-    found = [c for c in again if not c.placed.effect.steps and _may_show(ground, c, (before - c.chi2) / share)]
+    before = left_by(focus, [])
+    found = [c for c in again if not c.placed.effect.steps and _may_show(ground, current, c, before - c.chi2)]
     return [*found[:FITTED], *(c for c in again if c.placed.effect.steps)] if found else []
 
 
-def _may_show(ground: Ground, candidate: Candidate, gain: float) -> bool:
-    """Whether a candidate with such a gain may show: unlikely by chance, were the noise known as it is."""
-    return p_of_ratio(gain, len(candidate.slope)) * ground.comparisons < 1
+def _may_show(ground: Ground, current: Refit, candidate: Candidate, gain: float) -> bool:
+    """Whether a candidate with such a gain on the windows that refits use may show on all.
+
+    That is unlikely by chance, were the noise known as it is, and it is near what it must be worth.
+    """
+    if gain < PROMISED * ground.rules.chance.worth * current.cost.degrees:
+        return False
+    share = len(ground.part.windows) / len(ground.evidence.windows)
+    return p_of_ratio(gain / share, len(candidate.slope)) * ground.comparisons < 1
 
 
 def _promising(beside: Beside, ranked: Sequence[Candidate]) -> list[Candidate]:

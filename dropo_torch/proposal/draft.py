@@ -133,7 +133,8 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         velocities, some = [], positions
     names = ", ".join(dict.fromkeys(p.label for p in lacking))
     notes += [f"velocities are derived from positions: {names} not logged"] if names else []
-    source["observations"] = [m.entry for m in positions + velocities]
+    senses = list(matching.of("sensor"))
+    source["observations"] = [m.entry for m in positions + senses + velocities]
     commands = matching.of("command")
     follows = not commands and bool(matching.lacks("command"))
     if not follows:
@@ -147,7 +148,7 @@ def _document(reading: Reading, *, derived: bool) -> tuple[dict[str, Any], list[
         notes += [] if whole else [f"rows {dt:.6g} s apart are no whole number of the model's steps: resampled"]
         notes += [] if clock.even or columns.apart else [_unevenness(clock, dt)]
     rates = _rates(some, reading.places)
-    entries = [m.place.entry for m in positions] + rates + [m.place.entry for m in velocities]
+    entries = [m.place.entry for m in positions + senses] + rates + [m.place.entry for m in velocities]
     document = {"model": reading.model, "data": source, "frame_skip": skip, "observation": entries}
     if some:
         document["mask"] = [p.label for p in reading.places if p.entry in rates]

@@ -14,7 +14,7 @@ from dropo_torch.effects.base import Setting, object_number
 from dropo_torch.parameters import object_names
 from dropo_torch.proposal.words import object_words, says_kind
 
-Kind = Literal["position", "velocity", "command", "marker"]
+Kind = Literal["position", "velocity", "command", "marker", "sensor"]
 #: Kinds of a place by what is measured there: an angle, a length, a component of a quaternion; of a command that turns
 #: and slides at once, both.
 Measure = Literal["angle", "length", "quaternion", "both"]
@@ -29,7 +29,7 @@ class Place:
 
     Attributes:
         label: what it is called, such as ``shoulder.position``.
-        kind: position, velocity or command; or marker, a coordinate of a thing's place.
+        kind: position, velocity or command; marker, a coordinate of a thing's place; or sensor, a value of one.
         measure: what is measured there.
         entry: its entry of a config's ``observation``; empty for a command.
         number: its column in ``[qpos, qvel]``, its actuator, or a marker's axis.

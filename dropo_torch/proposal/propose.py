@@ -26,6 +26,7 @@ from dropo_torch.proposal.columns import Columns, read_columns
 from dropo_torch.proposal.copies import drivable, motor_spec, out_of, write_copy
 from dropo_torch.proposal.draft import Draft, Reading, as_read, is_whole, make_draft
 from dropo_torch.proposal.drives import left_over
+from dropo_torch.proposal.floating import base_note, floating_base, with_base
 from dropo_torch.proposal.information import Information, Noise, information_of, measure_noise, noise_keys
 from dropo_torch.proposal.markers import with_markers
 from dropo_torch.proposal.matches import Matching
@@ -210,11 +211,11 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
     """Which column is which number of the model and when rows were taken, with the model of which they are rows."""
     places = places_of(robot.model)
     matching, clock = _matched(columns, places, find_clock(columns, robot.step, dt), robot.step)
-    matching = _without_dependent(matching, robot.model)
+    matching = with_base(_without_dependent(matching, robot.model), robot.model)
     matching, path = _marked(robot, columns, matching, clock)
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
-        matching = _without_dependent(matching, robot.model)
+        matching = with_base(_without_dependent(matching, robot.model), robot.model)
     if not robot.commanded:
         matching = _without_motors(matching)
     _check(matching, columns, robot.model, clock)
@@ -256,6 +257,8 @@ def _drafted(reading: Reading, robot: _Robot) -> Draft:
         draft = draft.noted(
             f"{', '.join(loops.names)}: no column shows them; they are where the model's equality constraints are met"
         )
+    if (base := floating_base(reading.matching, robot.model)) is not None:
+        draft = draft.noted(base_note(reading.matching, base))
     driven = robot.driven(reading.matching)
     if driven and (idle := [name for name in drivable(robot.model) if name not in driven]):
         draft = draft.noted(f"{', '.join(idle)}: no column is a force there; no motor was added")

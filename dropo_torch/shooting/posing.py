@@ -2,7 +2,7 @@
 
 Positions are the least squares of each row's columns, from those of the row before (inverse kinematics). Velocities are
 what gyroscopes and encoders say of them; those that none shows follow from the positions of some rows about each, which
-is no measurement: they are masked.
+is no measurement: they are masked. So is the place of a floating base that no column shows: it follows from its feet.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.errors import InputError
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.shooting.begin import scatter
+from dropo_torch.shooting.odometry import Base, base_motion, find_base, sinking
 from dropo_torch.support.rows import evenly
 
 _SENSOR = mujoco.mjtSensor
@@ -70,7 +71,8 @@ class Told:
     """What the columns of a log of sensors tell of its states.
 
     Attributes:
-        blind: the velocities that no column shows, by their labels, with the errors of those that are derived.
+        blind: the numbers of a state that no column shows, by their labels, with their errors as derived: velocities,
+            and where a floating base is.
         missed: root mean square of what the poses leave of each position feature, by its label.
     """
 
@@ -101,19 +103,48 @@ def posed_log(
     found = [reading.positions(path, noise, start) for start, path in enumerate(paths)]
     missed = reading.check(paths, found, noise)
     states = []
-    known, errors = np.ones(model.nv, dtype=bool), []
+    known, errors = np.ones(model.nq + model.nv, dtype=bool), []
     for path, positions in zip(paths, found, strict=True):
         rates, error = derived(model, positions, dt)
         velocities, told = reading.velocities(path, positions, rates)
-        known &= told
-        errors.append(error)
+        known[model.nq :] &= told
+        errors.append(np.concatenate([np.zeros(model.nq), error]))
         states.append(np.concatenate([positions, velocities], axis=1))
-    labels = parse_observation(model, None).labels[model.nq :]
+    if reading.base is not None:
+        known[reading.base.columns] = False
+        states, errors = _based(reading, paths, states, errors, log.actions, dt)
+    labels = parse_observation(model, None).labels
     error = np.sqrt(np.mean(np.square(errors), axis=0))
     blind = {labels[i]: float(error[i]) for i in np.flatnonzero(~known)}
     before, after = (np.concatenate(parts) for parts in ([s[:-1] for s in states], [s[1:] for s in states]))
     whole = Trajectories(before, after, log.actions, log.terminals, log.dt, log.source)
     return whole, Told(blind, missed)
+
+
+def _based(
+    reading: _Reading, paths: list[np.ndarray], states: list[np.ndarray], errors: list[np.ndarray],
+    commands: np.ndarray, dt: float,
+) -> tuple[list[np.ndarray], list[np.ndarray]]:  # fmt: skip
+    """States ``(T, nq + nv)`` of episodes and their errors ``(nq + nv,)``, with how the base moves in them."""
+    base, nq = reading.base, reading.size
+    assert base is not None
+    found, whole = [], []
+    begins = np.cumsum([0, *(len(own) - 1 for own in states)])
+    for path, own, error in zip(paths, states, errors, strict=True):
+        shown, site = reading.accelerations(path)
+        motion = base_motion(base, own[:, :nq], own[:, nq:], dt, accelerations=shown, site=site)
+        state, off = own.copy(), error.copy()
+        state[:, base.columns] = np.concatenate([motion.places, motion.velocities], axis=1)
+        off[base.columns] = np.append(np.full(3, motion.height_error), motion.speed_error)
+        found.append(state)
+        whole.append(off)
+    sunk = np.median([
+        sinking(base, state[:, :nq], state[:, nq:], commands[a : a + len(state) - 1], dt)
+        for a, state in zip(begins[:-1], found, strict=True)
+    ])  # fmt: skip
+    for state in found:
+        state[:, base.place] -= sunk * base.axes[:, 2]
+    return found, whole
 
 
 def column_noise(observation: Observation, log: Trajectories) -> np.ndarray:
@@ -132,7 +163,7 @@ class _Reading:
     def __init__(self, model: mujoco.MjModel, observation: Observation) -> None:
         self._model, self._data, self._observation = model, mujoco.MjData(model), observation
         self._features = Features.of(observation)
-        stage = self._stages()
+        self._stage = stage = self._stages()
         first = [*self._features.plain, *(q[0] for q in self._features.quaternions for _ in range(3))]
         self._of_positions = np.flatnonzero([stage[c] == 0 for c in first])
         self._of_velocities = np.flatnonzero([stage[c] == 1 for c in first])
@@ -150,6 +181,34 @@ class _Reading:
             usable = stage == mujoco.mjtStage.mjSTAGE_VEL or int(model.sensor_type[sensor]) in _PLACES
             found.append(2 if not usable else int(stage == mujoco.mjtStage.mjSTAGE_VEL))
         return found
+
+    @property
+    def size(self) -> int:
+        """Number of positions nq."""
+        return int(self._model.nq)
+
+    @cached_property
+    def base(self) -> Base | None:
+        """The floating base whose place no column shows, if there is ground on which it may stand."""
+        base = find_base(self._model)
+        if base is None:
+            return None
+        there = self._model.qpos0.copy()
+        there[base.place] += 1.0
+        moved = self._features.difference(self._at(there), self._at(self._model.qpos0))
+        return None if np.abs(moved[self._of_positions]).max() > 1e-9 else base
+
+    def accelerations(self, path: np.ndarray) -> tuple[np.ndarray | None, int]:
+        """Return what an accelerometer on the base shows, ``(T, 3)``, and its site; ``None`` without one."""
+        model, base = self._model, self.base
+        assert base is not None
+        own = model.body_weldid[model.jnt_bodyid[base.joint]]
+        for i in np.flatnonzero(model.sensor_type == int(_SENSOR.mjSENS_ACCELEROMETER)):
+            site, first = int(model.sensor_objid[i]), model.nq + model.nv + int(model.sensor_adr[i])
+            shown = [np.flatnonzero(self._observation.index == first + k) for k in range(3)]
+            if model.body_weldid[model.site_bodyid[site]] == own and all(c.size for c in shown):
+                return path[:, [int(c[0]) for c in shown]], site
+        return None, -1
 
     @property
     def _labels(self) -> list[str]:
@@ -214,7 +273,12 @@ class _Reading:
 
     def positions(self, path: np.ndarray, noise: np.ndarray, seed: int) -> np.ndarray:
         """Return the poses of an episode's rows ``(T, n)``, ``(T, nq)``."""
-        found = np.empty((len(path), self._model.nq))
+        found = np.tile(self._model.qpos0, (len(path), 1))
+        if (own := self._as_they_are(0)) is not None:
+            found[:, self._observation.index[own]] = path[:, own]
+            for position in found:
+                mujoco.mj_normalizeQuat(self._model, position)
+            return found
         tried = np.repeat(self._model.qpos0[None, None], TRIED, axis=1)
         scatter(self._model, tried, np.random.default_rng((SEED, seed)))
         position, _ = min((self._settled(path[0], p, noise, FIRST) for p in tried[0]), key=lambda x: x[1])
@@ -223,6 +287,17 @@ class _Reading:
             position, _ = self._settled(row, position, noise, LATER)
             found[t] = position
         return found
+
+    def _as_they_are(self, stage: int) -> np.ndarray | None:
+        """The observed columns that are all positions of a state (stage 0), or all velocities (1), and nothing else is.
+
+        All but those of a base that no column places; ``None`` where there are others.
+        """
+        nq, nv = self._model.nq, self._model.nv
+        every = range(nq, nq + nv) if stage else range(nq)
+        own = np.flatnonzero(np.array(self._stage) == stage)
+        wanted = set(every) - set(() if self.base is None else self.base.columns)
+        return own if set(self._observation.index[own].tolist()) == wanted else None
 
     def _unwound(self, position: np.ndarray) -> np.ndarray:
         """The same pose with joints that turn freely within half a turn of the model's own."""
@@ -247,6 +322,8 @@ class _Reading:
             error = np.full(self._model.nv, 1e12)
             error[: len(sizes)] = 1 / np.maximum(sizes, 1e-12)
             untold += (directions**2 * error[:, None] ** 2).sum(0) > UNTOLD**2
+        if self.base is not None:
+            untold[self.base.speed] = 0
         if (bad := np.flatnonzero(untold > SOME * len(some))).size:
             label = parse_observation(self._model, None).labels[self._model.nq + int(bad[0])]
             raise InputError(
@@ -282,6 +359,10 @@ class _Reading:
         if not rows.size:
             return derived, np.zeros(nv, dtype=bool)
         found, told = derived.copy(), np.ones(nv, dtype=bool)
+        if (own := self._as_they_are(1)) is not None:
+            shown = self._observation.index[own] - self._model.nq
+            found[:, shown] = path[:, own]
+            return found, np.isin(np.arange(nv), shown)
         for t, (row, position) in enumerate(zip(path, positions, strict=True)):
             zero = self._moving(position, np.zeros(nv))
             beside = [self._features.difference(self._moving(position, unit), zero) for unit in np.eye(nv)]
