@@ -214,3 +214,19 @@ def test_init_takes_a_log_of_encoders_and_an_imu(tmp_path: Path, gravity: float,
     assert set(problem.derived) == {labels[c] for c in base.columns}
     found = problem.trajectories.observations[:, 2]
     assert np.abs(found - walked.positions[: len(found), 2]).mean() < 1e-3
+
+
+def test_a_fit_takes_such_a_log(tmp_path: Path):
+    """It begins its transitions where the feet tell, with the noise that the config has of each column."""
+    walked = walk()
+    (tmp_path / "dog.xml").write_text(robot())
+    noise = [0.5 * TURN] * 4 + [JOINT] * 8 + [FORCE] * 3 + [GYRO] * 3 + [RATE] * 8
+    config = dropo.make_config({
+        "model": str(tmp_path / "dog.xml"), "frame_skip": SKIP, "observation": list(walked.entries), "noise": noise,
+        "lag": 15, "parameters": {"mass": {"field": "body_mass", "name": "trunk", "bounds": [3.0, 12.0]}},
+        "method": "laplace",
+    })  # fmt: skip
+    problem = dropo.make_problem(config, log=walked.log)
+    assert problem.observation.is_sensed
+    found = dropo.fit_problem(problem)
+    assert found.distribution.mean[0] == pytest.approx(6.0, rel=0.02)

@@ -23,6 +23,7 @@ from dropo_torch.fit import Fit, HistoryEntry, fit
 from dropo_torch.optimizers import Optimizer, Progress
 from dropo_torch.problem import Problem
 from dropo_torch.shooting import fit_sensed
+from dropo_torch.shooting.posing import is_placeable, posed
 
 __all__ = ["METHODS", "Mixture", "fit_problem", "make_search"]
 
@@ -73,7 +74,8 @@ def fit_problem(
 ) -> Fit:
     """Fit as the config says: by its method and its options; see :func:`dropo_torch.fit`.
 
-    Where the log does not show the states, they are estimated, too: :func:`dropo_torch.shooting.fit_sensed`.
+    Where the log does not show the states, they are estimated, too: :func:`dropo_torch.shooting.fit_sensed`; where it
+    lacks only where a floating base is, by leg odometry first: :func:`dropo_torch.shooting.posing.posed`.
 
     Args:
         problem: the config, its model and its log, of :func:`dropo_torch.make_problem`.
@@ -85,6 +87,8 @@ def fit_problem(
         InputError: options that the method does not have, a parameter without effect on this log, a checkpoint of
             another fit, or ``resume`` without one; of sensors, a model that diverges in every window.
     """
+    if is_placeable(problem):
+        problem = posed(problem)
     if problem.observation.is_sensed:
         make_search(problem)  # refuses options
         return fit_sensed(problem, checkpoint=checkpoint, resume=resume, on_progress=on_progress)

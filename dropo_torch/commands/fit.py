@@ -62,12 +62,15 @@ def run_fit(
     from dropo_torch.diagnostics import diagnose
     from dropo_torch.excitation import refuse_dead_parameters
     from dropo_torch.problem import logged_data, make_problem
+    from dropo_torch.shooting.posing import is_placeable, posed
     from dropo_torch.verdict import judge
 
     if log is not None:
         require("tensorboard", f"--log {log}")
     problem = make_problem(config)
     check_first(logged_data(problem), console, force=force)
+    if is_placeable(problem):
+        problem = posed(problem)
     continued = resume and (out / "checkpoint.bin").exists()
     make_search(problem)  # what it refuses, it refuses before an earlier run is moved aside
     if not (continued or problem.observation.is_sensed):  # such a fit looks at them once it has states
@@ -92,7 +95,7 @@ def run_fit(
 def _write(problem: Problem, result: Fit, diagnostics: Diagnostics, out: Path) -> None:
     from dropo_torch.report import write_fit_report
 
-    config = problem.config
+    config = problem.sensed or problem.config
     result.save(out / "fit.json")
     result.distribution.save(out / "distribution.yaml")
     portable = yaml.safe_dump(config.portable(), sort_keys=False, allow_unicode=True)

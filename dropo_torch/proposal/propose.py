@@ -35,7 +35,8 @@ from dropo_torch.proposal.places import Place, known_names, places_of
 from dropo_torch.proposal.text import config_text
 from dropo_torch.proposal.units import nearest_unit, rows_apart, with_velocity_units
 from dropo_torch.proposal.words import COUNTS, split
-from dropo_torch.shooting.posing import column_noise, posed
+from dropo_torch.shooting.odometry import SUNK
+from dropo_torch.shooting.posing import column_noise, is_placeable, posed
 from dropo_torch.simulators.hidden import prescribed_bodies, prescribed_names
 from dropo_torch.support.report import Report
 
@@ -151,6 +152,8 @@ def propose_config(
     noise, candidates, document = _with_noise(document, draft, reading.base)
     skip, step = document["frame_skip"], reading.timestep
     least = 1 if draft.smooth is None else math.ceil(0.5 / (draft.smooth.cutoff * skip * step))
+    if floating_base(reading.matching, robot.model) is not None:
+        least = max(least, math.ceil(SUNK / (skip * step)))
     found = information_of(noise.config, candidates, least=least, report=tell, log=noise.log)
     choice = _chosen(candidates, found, review)
     if not choice.chosen:
@@ -468,7 +471,11 @@ def _with_noise(
     noise = replace(noise, config=problem.config.model_copy(update=keys))
     if problem is given:
         return noise, candidates, document | keys
-    own = column_noise(given.observation, given.trajectories)  # a fit estimates it beside the states
+    own = column_noise(given.observation, given.trajectories)
+    if is_placeable(given):  # columns of the state have the noise that they have there
+        of_state = dict(zip(problem.observation.labels, noise.columns.tolist(), strict=True))
+        own = np.array([of_state.get(label, x) for label, x in zip(given.observation.labels, own, strict=True)])
+        document = document | {"noise": noise_keys(given, own)["noise"]}
     return replace(noise, columns=own, log=problem.trajectories), candidates, document
 
 

@@ -60,9 +60,8 @@ def _noise(document: dict[str, Any]) -> list[str]:
         return ["# A fit estimates the noise of every column, beside the states."]
     return [
         "# Standard deviation of the noise of each observed column, estimated from the log: what short stretches show",
-        "# although forces are free. ε, a variance, is small beside it.",
-        _key("noise", document["noise"]),
-        _key("epsilon", document["epsilon"]),
+        "# although forces are free." + (" ε, a variance, is small beside it." if "epsilon" in document else ""),
+        *(_key(name, document[name]) for name in ("noise", "epsilon") if name in document),
     ]
 
 

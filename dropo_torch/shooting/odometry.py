@@ -1,9 +1,9 @@
 """How the base of a robot moves that no column of a log places: by the feet that stand on the ground.
 
 Leg odometry: a foot that stands does not move, so that orientation, joints and their velocities tell how the base does.
-One linear smoother over an episode holds the place and velocity of the base and the places of all feet. An accelerometer
-says how the velocity changes. Which feet stand follows from how they move and how high they are (Bloesch et al., "State
-estimation for legged robots", 2012, there as a filter).
+One linear smoother over an episode holds the place and velocity of the base and the places of all feet. An
+accelerometer says how the velocity changes. Which feet stand follows from how they move and how high they are (Bloesch
+et al., "State estimation for legged robots", 2012, there as a filter).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PLACED, HEIGHT, SLIDING, SINKING, FLYING = 2e-4, 1e-3, 0.02, 0.1, 3.0
 LEAST, UNKNOWN = 0.2, 5.0
 #: Standard errors of velocities, m/s, and of heights, m, from which on the log does not tell them.
 UNTOLD_SPEED, UNTOLD_HEIGHT = 0.1, 0.01
-#: Rows after which feet have sunk into the ground as far as they do, s, and windows that show how far.
+#: Time after which feet have sunk into the ground as far as they do, s, and windows that show how far.
 SUNK, WINDOWS = 0.06, 40
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -17,6 +18,7 @@ from dropo_torch.data.features import Features
 from dropo_torch.data.observation import Observation, parse_observation
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.errors import InputError
+from dropo_torch.objective import LIMITS
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.shooting.begin import scatter
 from dropo_torch.shooting.odometry import Base, base_motion, find_base, sinking
@@ -41,6 +43,8 @@ DIFFERENCE, REST = 1e-6, 1e-9
 UNTOLD, SOME = 0.3, 0.02
 #: Sizes of its noise, and share of its spread, by which a column's poses may miss it typically.
 ASTRAY, MISSED = 6.0, 0.05
+#: ε relative to the noise, which it must not add to.
+BESIDE = 0.1
 #: The smallest noise of a column relative to the others' of its kind.
 LEAST = 1e-2
 #: Rows from which a velocity is derived, the most first; and by how much their residuals may exceed the noise.
@@ -62,8 +66,33 @@ def posed(problem: Problem) -> Problem:
     step = problem.trajectories.dt or problem.simulator.timestep or 1.0
     log, told = posed_log(problem.space.model, problem.observation, problem.trajectories, step)
     own = {"observation": None, "mask": [*told.blind], "noise": None, "trajectories": None}
+    own |= _state_noise(problem, told)
     config = problem.config.model_copy(update=own)
     return replace(make_problem(config, log=log, general=True), sensed=problem.config, derived=told.blind)
+
+
+def is_placeable(problem: Problem) -> bool:
+    """Return whether the log of a problem lacks no more of a state than where a floating base is, and its speed."""
+    model, observation = problem.space.model, problem.observation
+    return observation.is_sensed and model is not None and _Reading(model, observation).lacks_base_only
+
+
+def _state_noise(problem: Problem, told: Told) -> dict[str, Any]:
+    """The noise of a log of states, where its columns are that of the sensors or derived, and ε below it; or nothing.
+
+    Of a sensor that shows no number of the state itself, the noise of the states does not follow.
+    """
+    model, observation, given = problem.space.model, problem.observation, problem.config.noise
+    if given is None or model is None:
+        return {}
+    labels = parse_observation(model, None).labels
+    listed = np.broadcast_to(np.asarray(given, dtype=float), observation.size)
+    known = dict(zip(observation.labels, listed.tolist(), strict=True)) | told.blind
+    if not known.keys() >= set(labels):
+        return {}
+    noise = [known[label] for label in labels]
+    least = min((x for x in noise if x > 0), default=1.0)
+    return {"noise": noise, "epsilon": max((BESIDE * least) ** 2, LIMITS["epsilon"][0])}
 
 
 @dataclass(frozen=True)
@@ -186,6 +215,11 @@ class _Reading:
     def size(self) -> int:
         """Number of positions nq."""
         return int(self._model.nq)
+
+    @property
+    def lacks_base_only(self) -> bool:
+        """Whether columns are all positions and velocities of a state but those of a base, and no more of sensors."""
+        return self.base is not None and all(self._as_they_are(stage) is not None for stage in (0, 1))
 
     @cached_property
     def base(self) -> Base | None:
