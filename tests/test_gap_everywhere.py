@@ -28,13 +28,17 @@ SERVOS = """<mujoco><option timestep="0.005" integrator="implicitfast"/><worldbo
 LATE, SKIP, NOISE = 0.06, 6, 2e-4
 
 
-def late_servos(folder: Path, gain: float = 1.0) -> Problem:
-    """The log of three servos, all told 60 ms late, of which one may have another gain; positions only."""
+def late_servos(folder: Path, gain: float = 1.0, *, lags: bool = False) -> Problem:
+    """The log of three servos, all told 60 ms late, of which one may have another gain; positions only.
+
+    Where it ``lags``, the commands approach what they are told with that time constant, instead.
+    """
     rng, model = np.random.default_rng(5), mujoco.MjModel.from_xml_string(SERVOS)
     model.opt.timestep = 0.0025
     model.actuator_gainprm[1, 0] *= gain
     model.actuator_biasprm[1, 1] *= gain
     data, rows, sent = mujoco.MjData(model), [], []
+    follows = np.zeros(3)
     turns, phases = rng.uniform(1.5, 6.0, (3, 3)), rng.uniform(0, 6.28, (3, 3))
     for row in range(700):
         target = 0.25 * np.sin(turns * row * SKIP * 0.005 + phases).sum(1)
@@ -42,7 +46,8 @@ def late_servos(folder: Path, gain: float = 1.0) -> Problem:
             rows.append([row * SKIP * 0.005, *data.qpos + NOISE * rng.standard_normal(3), *target])
         for _ in range(2 * SKIP):
             sent.append(target)
-            data.ctrl[:] = sent[max(len(sent) - 1 - round(LATE / 0.0025), 0)]
+            follows += (target - follows) * (1 - np.exp(-0.0025 / LATE))
+            data.ctrl[:] = follows if lags else sent[max(len(sent) - 1 - round(LATE / 0.0025), 0)]
             mujoco.mj_step(model, data)
     np.savetxt(folder / "log.csv", rows, delimiter=",", header="t,q0,q1,q2,u0,u1,u2", comments="", fmt="%.9g")
     (folder / "arm.xml").write_text(SERVOS)
@@ -70,6 +75,14 @@ def test_servos_that_are_all_late_are_told_so_and_not_their_sensors(tmp_path: Pa
     if gain < 1:
         assert told["actuator_gain"].target == "m_lift"
         assert next(iter(told["actuator_gain"].parameters.values())).value == pytest.approx(gain, rel=0.02)
+
+
+def test_servos_that_all_lag_are_told_so_and_not_late(tmp_path: Path) -> None:
+    gap = find_gap(late_servos(tmp_path, lags=True))
+    (lag,) = [e for e in gap.effects if e.effect != "integration"]
+    assert (lag.effect, lag.target) == ("actuator_lag", "*")
+    for number in lag.parameters.values():
+        assert number.value == pytest.approx(LATE, abs=0.002)
 
 
 def test_what_is_late_at_a_joint_stands_at_its_sensor_and_at_its_servo(tmp_path: Path) -> None:

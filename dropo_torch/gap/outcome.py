@@ -58,6 +58,8 @@ UNSEEN = (
 #: Why unseen data refute names.
 UNSKILLED = "the model still predicts unseen data no better than constant velocity does"
 WORSE = "the model predicts unseen data worse than without them"
+#: Open-loop error on unseen data, relative to that of constant velocity, from which on no last fit would do better.
+HOPELESS = 1.5
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -125,6 +127,8 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         started: when it began, by ``time.perf_counter``.
         report: called with a stage and its share done.
     """
+    if naming.named and (unnamed := _hopeless(scene, naming)) is not None:
+        return make_result(scene, unnamed, started, report)
     fitted = _fitted_on_all(scene, naming, report)
     if fitted.last is not None and (fewer := _without_unsure(scene.setting, naming, fitted, scene.rules)) is not None:
         return make_result(scene, fewer, started, report)
@@ -134,6 +138,16 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
     if (unnamed := _refuted(naming, fitted, checked, scene.rules)) is not None:
         return make_result(scene, unnamed, started, report)
     return _put_together(scene, naming, fitted, checked, started, report)
+
+
+def _hopeless(scene: Scene, naming: Naming) -> Naming | None:
+    """What was found, without names, where no last fit would give these skill; else ``None``."""
+    evidence, best = naming.evidence, naming.final.hypothesis
+    held = cut_held(evidence, scene.held, best)
+    constant, (after, floor) = constant_velocity(evidence, held.rollouts), scores(evidence, held, best)
+    if has_skill(after, floor, HOPELESS * constant, scene.rules.sound):
+        return None
+    return _without_names(naming, UNSKILLED, after, constant)
 
 
 def _fitted_on_all(scene: Scene, naming: Naming, report: Report) -> _Fitted:
