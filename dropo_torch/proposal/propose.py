@@ -214,11 +214,11 @@ def _reading(robot: _Robot, columns: Columns, dt: float | None, review: Review |
     """Which column is which number of the model and when rows were taken, with the model of which they are rows."""
     places = places_of(robot.model)
     matching, clock = _matched(columns, places, find_clock(columns, robot.step, dt), robot.step)
-    matching = with_base(_without_dependent(matching, robot.model), robot.model)
+    matching = with_base(_without_dependent(matching, robot.model), robot.model, places)
     matching, path = _marked(robot, columns, matching, clock)
     if review is not None:
         matching, clock = review.columns(columns, matching, places), review.clock(clock)
-        matching = with_base(_without_dependent(matching, robot.model), robot.model)
+        matching = with_base(_without_dependent(matching, robot.model), robot.model, places)
     if not robot.commanded:
         matching = _without_motors(matching)
     _check(matching, columns, robot.model, clock)

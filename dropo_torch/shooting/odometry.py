@@ -85,6 +85,16 @@ class Base:
         place, speed, nq = self.place, self.speed, int(self.model.nq)
         return [*range(place.start, place.stop), *range(nq + speed.start, nq + speed.stop)]
 
+    def seat(self, sensor: int) -> Rotation | None:
+        """Return how a sensor's site, or body, is turned in the base; ``None`` where it is elsewhere, or relative."""
+        model, own = self.model, int(self.model.jnt_bodyid[self.joint])
+        number, kind = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
+        if int(model.sensor_refid[sensor]) >= 0:
+            return None
+        if kind == mujoco.mjtObj.mjOBJ_SITE and int(model.site_bodyid[number]) == own:
+            return Rotation.from_quat(model.site_quat[number], scalar_first=True)
+        return Rotation.identity() if kind == mujoco.mjtObj.mjOBJ_XBODY and number == own else None
+
     @cached_property
     def axes(self) -> np.ndarray:
         """The ground's axes, its normal last, as columns in the world, ``(3, 3)``."""

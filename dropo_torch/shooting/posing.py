@@ -13,6 +13,7 @@ from typing import Any
 
 import mujoco
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from dropo_torch.data.features import Features
 from dropo_torch.data.observation import Observation, parse_observation
@@ -74,7 +75,10 @@ def posed(problem: Problem) -> Problem:
 def is_placeable(problem: Problem) -> bool:
     """Return whether the log of a problem lacks no more of a state than where a floating base is, and its speed."""
     model, observation = problem.space.model, problem.observation
-    return observation.is_sensed and model is not None and _Reading(model, observation).lacks_base_only
+    if not observation.is_sensed or model is None:
+        return False
+    seat = _seat_of(model, observation)
+    return _Reading(model, observation if seat is None else seat.observation).lacks_base_only
 
 
 def _state_noise(problem: Problem, told: Told) -> dict[str, Any]:
@@ -87,6 +91,8 @@ def _state_noise(problem: Problem, told: Told) -> dict[str, Any]:
         return {}
     labels = parse_observation(model, None).labels
     listed = np.broadcast_to(np.asarray(given, dtype=float), observation.size)
+    if (seat := _seat_of(model, observation)) is not None:
+        observation, listed = seat.observation, seat.noise(listed)
     known = dict(zip(observation.labels, listed.tolist(), strict=True)) | told.blind
     if not known.keys() >= set(labels):
         return {}
@@ -123,6 +129,9 @@ def posed_log(
     Raises:
         InputError: see :func:`posed`.
     """
+    seat = _seat_of(model, observation)
+    if seat is not None:
+        observation, log = seat.observation, seat.seen(log)
     reading = _Reading(model, observation)
     ends = np.flatnonzero(log.terminals) + 1
     bounds = zip(np.append(0, ends[:-1]), ends, strict=True)
@@ -148,6 +157,77 @@ def posed_log(
     before, after = (np.concatenate(parts) for parts in ([s[:-1] for s in states], [s[1:] for s in states]))
     whole = Trajectories(before, after, log.actions, log.terminals, log.dt, log.source)
     return whole, Told(blind, missed)
+
+
+@dataclass(frozen=True)
+class _Seat:
+    """An IMU on a floating base: its orientation and its gyroscope as those of the base.
+
+    Attributes:
+        observation: of the base's columns in place of the sensors'.
+        turn: of the IMU in the base.
+        orientation, gyroscope: observed columns of w, x, y, z and of x, y, z; empty for none.
+    """
+
+    observation: Observation
+    turn: Rotation
+    orientation: tuple[int, ...]
+    gyroscope: tuple[int, ...]
+
+    def seen(self, log: Trajectories) -> Trajectories:
+        """Return the log with the base's columns."""
+        before, after = (self._turned(x) for x in (log.observations, log.next_observations))
+        return replace(log, observations=before, next_observations=after)
+
+    def _turned(self, rows: np.ndarray) -> np.ndarray:
+        found, place = rows.copy(), list(self.observation.log_columns)
+        if self.orientation:
+            own = [place[c] for c in self.orientation]
+            found[:, own] = (Rotation.from_quat(rows[:, own], scalar_first=True) * self.turn.inv()).as_quat(
+                scalar_first=True
+            )
+        if self.gyroscope:
+            own = [place[c] for c in self.gyroscope]
+            found[:, own] = self.turn.apply(rows[:, own])
+        return found
+
+    def noise(self, columns: np.ndarray) -> np.ndarray:
+        """Return the noise of the base's columns from that of the sensors', ``(n,)`` each."""
+        found = columns.copy()
+        if self.gyroscope:
+            own = list(self.gyroscope)
+            found[own] = np.sqrt(self.turn.as_matrix() ** 2 @ columns[own] ** 2)
+        return found
+
+
+def _seat_of(model: mujoco.MjModel, observation: Observation) -> _Seat | None:
+    """The IMU of which columns show the orientation, or the turning, of a floating base; ``None`` without one."""
+    base = find_base(model)
+    if base is None or not observation.is_sensed:
+        return None
+    columns, labels, units = (list(x) for x in (observation.columns, observation.labels, observation.units))
+    state = parse_observation(model, None)
+    found: dict[str, tuple[int, ...]] = {"orientation": (), "gyroscope": ()}
+    turns = []
+    shown = {
+        int(_SENSOR.mjSENS_FRAMEQUAT): ("orientation", base.turn.start, 4),
+        int(_SENSOR.mjSENS_GYRO): ("gyroscope", model.nq + base.rate.start, 3),
+    }
+    for i, kind in enumerate(model.sensor_type.tolist()):
+        first = model.nq + model.nv + int(model.sensor_adr[i])
+        name, into, size = shown.get(kind, ("", 0, 0))
+        own = tuple(columns.index(first + k) for k in range(size) if first + k in columns)
+        if not name or len(own) != size or found[name] or (seat := base.seat(i)) is None:
+            continue
+        found[name] = own
+        turns.append(seat)
+        for k, c in enumerate(own):
+            columns[c], labels[c], units[c] = into + k, state.labels[into + k], state.units[into + k]
+    same = all((turn * turns[0].inv()).magnitude() < 1e-9 for turn in turns)
+    if not turns or not same or len(set(columns)) != len(columns):
+        return None
+    changed = replace(observation, columns=tuple(columns), labels=tuple(labels), units=tuple(units))
+    return _Seat(changed, turns[0], found["orientation"], found["gyroscope"])
 
 
 def _based(
