@@ -250,7 +250,8 @@ def _pulls(base: Base, positions: np.ndarray, shown: np.ndarray | None, site: in
         data.qpos[:] = position
         mujoco.mj_kinematics(model, data)
         found[t] = data.site_xmat[site].reshape(3, 3) @ own
-    return found + model.opt.gravity, max(LEAST, float(noise_of(shown).max()))
+    between = np.diff(shown, 2, axis=0) / np.sqrt(6)  # noise, and what changes within a row, such as in impacts
+    return found + model.opt.gravity, max(LEAST, float(np.sqrt(np.mean(between**2, axis=0)).max()))
 
 
 class _Smoother:
@@ -260,6 +261,7 @@ class _Smoother:
         self._legs, self._dt, self._level = legs, dt, level
         self._rows, self._feet = legs.heights.shape
         self._size = 6 + 3 * self._feet
+        self._lasting = max(1.0, SUNK / dt)  # rows over which a foot that sinks is off alike
         self._diagonal = np.zeros((self._rows, self._size, self._size))
         self._below, self._force = np.zeros_like(self._diagonal), np.zeros((self._rows, self._size))
         gain, eye, none = 0.5 * (pulls[1:] + pulls[:-1]) * dt, np.eye(3), np.zeros(3)
@@ -297,13 +299,13 @@ class _Smoother:
         """Return the states ``(T, s)`` and their normal matrix where feet stand by so much, ``(T, F)``, each 0 to 1."""
         kept = self._diagonal.copy(), self._below.copy(), self._force.copy()
         legs, dt = self._legs, self._dt
-        still = np.array([SLIDING, SLIDING, SINKING])
+        still = np.array([SLIDING, SLIDING, SINKING * self._lasting**0.5])
         for i in range(self._feet):
             both = (stands[1:, i] * stands[:-1, i])[:, None]
             weight = both / (still * dt) ** 2 + (1 - both) / (FLYING * dt) ** 2
             self._link(-self._foot(i), self._foot(i), 0.5 * dt * (legs.rolling[1:, i] + legs.rolling[:-1, i]), weight)
             height = legs.centers[:, i, 2] - legs.heights[:, i] + self._level
-            self._own(self._foot(i)[2:], height[:, None], stands[:, i, None] / HEIGHT**2)
+            self._own(self._foot(i)[2:], height[:, None], stands[:, i, None] / (self._lasting * HEIGHT**2))
         chain = Chain.of(self._diagonal, self._below)
         state = chain.solve(self._force[..., None])[..., 0]
         self._diagonal, self._below, self._force = kept
