@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import dropo_torch as dropo
 from dropo_torch.commands.cli import main
@@ -37,7 +38,12 @@ def _leg(name: str, x: float, y: float) -> str:
       </body>"""
 
 
-def robot(floor: str = "<geom name='floor' type='plane' size='5 5 .1'/>") -> str:
+FLOOR = "<geom name='floor' type='plane' size='5 5 .1'/>"
+#: Sensors of an IMU that lies on its side.
+IMU = """<framequat name="imu_quat" objtype="site" objname="side"/><gyro name="imu_gyro" site="side"/>"""
+
+
+def robot(floor: str = FLOOR, sensors: str = "") -> str:
     servos = "".join(
         f'<position name="{n}_{j}_servo" joint="{n}_{j}" kp="80" kv="2.5"/>' for n in CORNERS for j in ("hip", "knee")
     )
@@ -49,12 +55,12 @@ def robot(floor: str = "<geom name='floor' type='plane' size='5 5 .1'/>") -> str
     <body name="trunk" pos="0 0 0.4">
       <freejoint name="root"/>
       <geom name="hull" type="box" size=".2 .09 .05" mass="6" contype="0" conaffinity="0"/>
-      <site name="imu" pos=".05 0 .02" euler="0 0 90"/>
+      <site name="imu" pos=".05 0 .02" euler="0 0 90"/><site name="side" euler="90 0 0"/>
       {"".join(_leg(n, x, y) for n, (x, y) in CORNERS.items())}
     </body>
   </worldbody>
   <actuator>{servos}</actuator>
-  <sensor><accelerometer name="imu_acc" site="imu"/></sensor>
+  <sensor><accelerometer name="imu_acc" site="imu"/>{sensors}</sensor>
 </mujoco>"""
 
 
@@ -187,8 +193,28 @@ def test_without_ground_the_log_does_not_tell_it():
         posed_log(model, observation, walked.log, DT)
 
 
-def _written(folder: Path, walked: Walk, gravity: float) -> Path:
-    (folder / "dog.xml").write_text(robot())
+def _on_its_side(walked: Walk) -> Walk:
+    """The same walk, as an IMU shows it that lies on its side."""
+    measured, side = walked.measured.copy(), Rotation.from_euler("x", 90, degrees=True)
+    turns = Rotation.from_quat(measured[:, :4], scalar_first=True) * side
+    measured[:, :4] = turns.as_quat(scalar_first=True)
+    measured[:, 15:18] = side.inv().apply(measured[:, 15:18])
+    model = mujoco.MjModel.from_xml_string(robot(sensors=IMU))
+    entries = ("sensor[imu_quat]", "qpos[7:]", "sensor[imu_acc]", "sensor[imu_gyro]", "qvel[6:]")
+    return replace(walked, model=model, measured=measured, entries=entries)
+
+
+def test_an_imu_may_be_turned_in_the_base():
+    expected, found = _posed(walk()), _posed(_on_its_side(walk()))
+    turns = [Rotation.from_quat(p[:, 3:7], scalar_first=True) for p in (expected[0], found[0])]
+    assert (turns[0] * turns[1].inv()).magnitude().max() < 1e-7
+    assert np.allclose(np.delete(expected[0], range(3, 7), 1), np.delete(found[0], range(3, 7), 1), atol=1e-7)
+    assert np.allclose(expected[1], found[1], atol=1e-6)
+    assert expected[2].keys() == found[2].keys()
+
+
+def _written(folder: Path, walked: Walk, gravity: float, sensors: str = "") -> Path:
+    (folder / "dog.xml").write_text(robot(sensors=sensors))
     joints = [f"{n}_{j}" for n in CORNERS for j in ("hip", "knee")]
     measured = walked.measured.copy()
     measured[:, 12:15] /= gravity
@@ -200,11 +226,11 @@ def _written(folder: Path, walked: Walk, gravity: float) -> Path:
     return folder / "robot.yaml"
 
 
-@pytest.mark.parametrize("gravity", [9.80665])
-def test_init_takes_a_log_of_encoders_and_an_imu(tmp_path: Path, gravity: float, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize("lies", [False, True])
+def test_init_takes_a_log_of_encoders_and_an_imu(tmp_path: Path, lies: bool, capsys: pytest.CaptureFixture[str]):
     """Its accelerometer may tell forces in g; what the base does is derived, and compared nowhere."""
     walked = walk()
-    config = _written(tmp_path, walked, gravity)
+    config = _written(tmp_path, _on_its_side(walked) if lies else walked, 9.80665, IMU if lies else "")
     assert main(["init", str(tmp_path / "dog.xml"), str(tmp_path / "log.csv"), "--out", str(config)]) == 0
     assert "follows from its feet while they stand and the accelerometer" in " ".join(capsys.readouterr().out.split())
     problem = posed(dropo.make_problem(dropo.load_config(config), general=True))
@@ -212,6 +238,7 @@ def test_init_takes_a_log_of_encoders_and_an_imu(tmp_path: Path, gravity: float,
     base = find_base(walked.model)
     assert base is not None
     assert set(problem.derived) == {labels[c] for c in base.columns}
+    assert problem.config.noise is not None
     found = problem.trajectories.observations[:, 2]
     assert np.abs(found - walked.positions[: len(found), 2]).mean() < 1e-3
 
