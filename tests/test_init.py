@@ -123,6 +123,7 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("u_V", "command", None, (), ()),
         ("battery_voltage", "other", None, (), ()),
         ("v", "velocity", None, (), ()),
+        ("imu_ay", "acceleration", None, ("imu",), ()),
     ],
 )
 def test_names_say_what_people_mean(

@@ -218,7 +218,7 @@ def _written(folder: Path, walked: Walk, gravity: float, sensors: str = "") -> P
     joints = [f"{n}_{j}" for n in CORNERS for j in ("hip", "knee")]
     measured = walked.measured.copy()
     measured[:, 12:15] /= gravity
-    header = ["t", *(f"imu_q{a}" for a in "wxyz"), *(f"{j}_pos" for j in joints), *(f"imu_acc_{a}" for a in "xyz")]
+    header = ["t", *(f"imu_q{a}" for a in "wxyz"), *(f"{j}_pos" for j in joints), *(f"imu_a{a}" for a in "xyz")]
     header += [*(f"imu_gyro_{a}" for a in "xyz"), *(f"{j}_vel" for j in joints), *(f"{j}_cmd" for j in joints)]
     commands = np.concatenate([walked.commands, walked.commands[-1:]])
     rows = np.column_stack([DT * np.arange(len(measured)), measured, commands])
@@ -241,6 +241,15 @@ def test_init_takes_a_log_of_encoders_and_an_imu(tmp_path: Path, lies: bool, cap
     assert problem.config.noise is not None
     found = problem.trajectories.observations[:, 2]
     assert np.abs(found - walked.positions[: len(found), 2]).mean() < 1e-3
+
+
+def test_where_a_base_is_no_other_column_tells(tmp_path: Path):
+    """As many columns as it has coordinates, that are called after something else, are not its place."""
+    config = _written(tmp_path, walk(), 1.0)
+    log = tmp_path / "log.csv"
+    log.write_text(log.read_text().replace("imu_ax,imu_ay,imu_az", "probe_a,probe_b,probe_c", 1))
+    assert main(["init", str(tmp_path / "dog.xml"), str(log), "--out", str(config)]) == 0
+    assert "probe" not in config.read_text()
 
 
 def test_a_fit_takes_such_a_log(tmp_path: Path):

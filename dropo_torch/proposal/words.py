@@ -87,6 +87,8 @@ _QUATERNION = _set("quat quaternion orientation rot rotation ori")
 _ANGULAR = _set("angular ang gyro omega angvel")
 _LINEAR = _set("linear lin linvel")
 _AXES = ("x", "y", "z")
+#: Kinds of short words of axes, where they are no positions.
+_MEANT: dict[str, Role] = {"velocity": "velocity", "angular": "velocity", "acceleration": "acceleration"}
 
 
 @dataclass(frozen=True)
@@ -190,7 +192,7 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
             axis = letter
             quaternion |= kind == "quaternion"
             angular |= kind == "angular"
-            roles.append("velocity" if kind in ("velocity", "angular") else "position")
+            roles.append(_MEANT.get(kind, "position"))
             continue
         role = "command" if word in driven or (percent and word in _OPENS) else _role(word)
         role = "other" if word in _VOLTAGE - driven else role
@@ -311,8 +313,10 @@ def _parts(word: str) -> tuple[str, ...]:
 
 
 def _short(word: str) -> tuple[str, str] | None:
-    """What ``qw``, ``vx``, ``wz`` and ``px`` mean: kind and axis; ``None`` for other words."""
-    kinds = {"q": "quaternion", "v": "velocity", "w": "angular", "p": "position", "d": "velocity"}
+    """What ``qw``, ``vx``, ``wz``, ``ax`` and ``px`` mean: kind and axis; ``None`` for other words."""
+    kinds = {
+        "q": "quaternion", "v": "velocity", "w": "angular", "p": "position", "d": "velocity", "a": "acceleration",
+    }  # fmt: skip
     if len(word) == 2 and word[0] in kinds and (word[1] in _AXES or word == "qw"):
         return kinds[word[0]], word[1]
     if len(word) == 4 and word[1:] == "dot" and word[0] in _AXES:
