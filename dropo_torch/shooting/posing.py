@@ -205,7 +205,7 @@ def _seat_of(model: mujoco.MjModel, observation: Observation) -> _Seat | None:
     base = find_base(model)
     if base is None or not observation.is_sensed:
         return None
-    columns, labels, units = (list(x) for x in (observation.columns, observation.labels, observation.units))
+    columns, labels, units = list(observation.columns), list(observation.labels), list(observation.units)
     state = parse_observation(model, None)
     found: dict[str, tuple[int, ...]] = {"orientation": (), "gyroscope": ()}
     turns = []
