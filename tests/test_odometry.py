@@ -243,6 +243,17 @@ def test_init_takes_a_log_of_encoders_and_an_imu(tmp_path: Path, lies: bool, cap
     assert np.abs(found - walked.positions[: len(found), 2]).mean() < 1e-3
 
 
+def test_what_a_config_masks_stays_masked(tmp_path: Path):
+    walked = walk()
+    (tmp_path / "dog.xml").write_text(robot())
+    config = dropo.make_config({
+        "model": str(tmp_path / "dog.xml"), "frame_skip": SKIP, "observation": list(walked.entries),
+        "mask": ["FL_hip.velocity", "imu_acc[x]"],
+    })  # fmt: skip
+    problem = posed(dropo.make_problem(config, log=walked.log, general=True))
+    assert problem.config.mask == [*problem.derived, "FL_hip.velocity"]
+
+
 def test_where_a_base_is_no_other_column_tells(tmp_path: Path):
     """As many columns as it has coordinates, that are called after something else, are not its place."""
     config = _written(tmp_path, walk(), 1.0)

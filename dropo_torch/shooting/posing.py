@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from dropo_torch.data.features import Features
+from dropo_torch.data.features import Features, masked_columns
 from dropo_torch.data.observation import Observation, parse_observation
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.errors import InputError
@@ -66,10 +66,21 @@ def posed(problem: Problem) -> Problem:
     assert problem.space.model is not None
     step = problem.trajectories.dt or problem.simulator.timestep or 1.0
     log, told = posed_log(problem.space.model, problem.observation, problem.trajectories, step)
-    own = {"observation": None, "mask": [*told.blind], "noise": None, "trajectories": None}
+    own = {"observation": None, "mask": [*told.blind, *_masked(problem, told)], "noise": None, "trajectories": None}
     own |= _state_noise(problem, told)
     config = problem.config.model_copy(update=own)
     return replace(make_problem(config, log=log, general=True), sensed=problem.config, derived=told.blind)
+
+
+def _masked(problem: Problem, told: Told) -> list[str]:
+    """The numbers of a state that the log shows and the config masks, such as velocities that are derived already."""
+    model, observation = problem.space.model, problem.observation
+    assert model is not None
+    masked = masked_columns(observation, problem.config.mask)
+    if (seat := _seat_of(model, observation)) is not None:
+        observation = seat.observation
+    of_state = set(parse_observation(model, None).labels) - told.blind.keys()
+    return [observation.labels[c] for c in sorted(masked) if observation.labels[c] in of_state]
 
 
 def is_placeable(problem: Problem) -> bool:
