@@ -30,8 +30,8 @@ ROUNDS = 5
 #: Standard deviations: of a foot's place about the base, m; of its height, m; of its speed along the ground and
 #: across it while it stands, and of it in the air, m/s.
 PLACED, HEIGHT, SLIDING, SINKING, FLYING = 2e-4, 1e-3, 0.02, 0.1, 3.0
-#: Standard deviation of accelerations, m/s²: the least of an accelerometer, and without one.
-LEAST, UNKNOWN = 0.2, 5.0
+#: Standard deviation of accelerations, m/s²: the least of what an accelerometer misses between rows, and without one.
+LEAST, UNKNOWN = 1.0, 5.0
 #: Standard errors of velocities, m/s, and of heights, m, from which on the log does not tell them.
 UNTOLD_SPEED, UNTOLD_HEIGHT = 0.1, 0.01
 #: Time after which feet have sunk into the ground as far as they do, s, and windows that show how far.
