@@ -105,6 +105,7 @@ def test_a_few_blocks_alone_show_nothing() -> None:
     assert damping.key == ("joint_damping", "rail")
     better = refit(ground.part, without.hypothesis.with_effects([damping]), linear=without.linear)
     assert is_shown(ground, without, better)
+    assert not is_shown(ground, without, better, named=1e9)
     few = np.where(np.arange(len(without.residual))[:, None] < 2, without.residual, 0.0)
     assert not is_shown(ground, replace(without, residual=few), better)
     assert not is_shown(ground, replace(without, loss=better.loss + 0.01 * better.cost.degrees), better)

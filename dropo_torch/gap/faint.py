@@ -75,7 +75,8 @@ def _shown(ground: Ground, state: State) -> Refit | None:
     if any(step and 2 * gain > gains[0][0] for gain, step in gains):
         return None
     best = sound(every, found[:1])
-    return best[0] if best and is_shown(every, whole, best[0]) else None
+    named = state.base.cost.reduced - state.current.cost.reduced
+    return best[0] if best and is_shown(every, whole, best[0], named) else None
 
 
 def _hopeful(ground: Ground, state: State) -> list[Candidate]:
@@ -112,16 +113,17 @@ def _promising(beside: Beside, ranked: Sequence[Candidate]) -> list[Candidate]:
     return sorted((c for c in ranked if not c.dead), key=lambda c: p_of_ratio(before - c.chi2, len(c.slope)))
 
 
-def is_shown(ground: Ground, without: Refit, better: Refit) -> bool:
+def is_shown(ground: Ground, without: Refit, better: Refit, named: float = 0.0) -> bool:
     """Return whether a likelihood ratio shows what one hypothesis has more than another, both fitted on all windows.
 
     Noise as the gate allows for it, several times in one direction, must not make as much; and no few blocks of the
-    log alone.
+    log alone. Nor must what names explain already, ``named`` χ² per degree of freedom, if they are off by a little: the
+    step of a simulation alone bends a lag by as much.
     """
     chance = ground.rules.chance
     numbers = len(better.hypothesis.vector) - len(without.hypothesis.vector)
     gain = (without.loss - better.loss) / max(better.cost.reduced, 1.0)
-    if gain < chance.worth * better.cost.degrees:
+    if gain < max(chance.worth, chance.beside * named) * better.cost.degrees:
         return False
     if p_of_ratio(gain / chance.judged, numbers) * ground.comparisons > chance.error:
         return False

@@ -29,6 +29,7 @@ class Chance:
         judged: times that χ² along one direction may be what it is by noise, where all residuals together look like
             noise: its size is only estimated, and it need not be white.
         worth: share of χ² that an effect must explain there: less is not worth a name, however sure it is.
+        beside: share that it must explain there of what is named already, which is right to no more than that.
     """
 
     error: float = 0.01
@@ -37,6 +38,7 @@ class Chance:
     blocks: int = 20
     judged: float = 2.0
     worth: float = 0.02
+    beside: float = 2e-5
 
 
 @dataclass(frozen=True)
