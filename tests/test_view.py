@@ -291,6 +291,18 @@ def test_other_motions_are_seen_from_above(tmp_path: Path) -> None:
     assert elevation == scene.ELEVATION
 
 
+def test_a_robot_that_walks_is_not_seen_from_straight_above():
+    """Its trunk moves over the ground by more than its feet rise."""
+    model = mujoco.MjModel.from_xml_string(
+        "<mujoco><worldbody><body><freejoint/><geom size='.1'/><body pos='.1 0 -.2'><joint axis='0 1 0'/>"
+        "<geom size='.03'/></body></body><body pos='1 0 0'><freejoint/><geom size='.1'/></body></worldbody></mujoco>"
+    )
+    assert make_scene(model).walks
+    flat = np.random.default_rng(1).normal(size=(20, 5, 3)) * [1.0, 1.0, 0.01]
+    assert direction(flat)[1] == -90.0
+    assert -45.0 < direction(flat, walks=True)[1] < 0.0
+
+
 def test_the_camera_follows_who_travels_and_sees_all_frames(tmp_path: Path) -> None:
     """What the log shows lies within the picture at every frame; a cart far down its track is followed."""
     for far, name in ((0.2, "near"), (20.0, "far")):

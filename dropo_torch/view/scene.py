@@ -60,12 +60,14 @@ class Scene:
         bodies: the moving bodies, ``(B,)``.
         rods: those of the shapes that are no geoms: they show bodies and joints where geoms do not.
         hidden: whether geoms of the groups that a viewer hides are shown, since no others move.
+        walks: whether a body moves freely that carries joints: from straight above, one would not see its legs.
     """
 
     shapes: tuple[Shape, ...]
     bodies: np.ndarray
     rods: tuple[Shape, ...]
     hidden: bool
+    walks: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,7 +97,14 @@ def make_scene(model: mujoco.MjModel) -> Scene:
         visible = np.ones(model.ngeom, dtype=bool)
     shapes = [Shape(int(model.geom_bodyid[g]), *geom_points(model, g)) for g in np.flatnonzero(visible).tolist()]
     rods = arms(model, shapes) if moves.any() else link_shapes(model, bodies)
-    return Scene((*(s for s in shapes if len(s.points)), *rods), bodies, tuple(rods), hidden)
+    return Scene((*(s for s in shapes if len(s.points)), *rods), bodies, tuple(rods), hidden, _walks(model))
+
+
+def _walks(model: mujoco.MjModel) -> bool:
+    """Whether a body moves freely that carries joints."""
+    free = model.jnt_type == int(mujoco.mjtJoint.mjJNT_FREE)
+    carried = model.body_rootid[model.jnt_bodyid[~free]]
+    return bool(np.isin(model.body_rootid[model.jnt_bodyid[free]], carried).any())
 
 
 def moving_bodies(model: mujoco.MjModel) -> np.ndarray:
@@ -233,7 +242,7 @@ def aim(scene: Scene, logged: np.ndarray, *simulated: np.ndarray) -> Camera:
     points = placed_points(scene, logged[chosen])
     if not points.size:
         return Camera(90.0, ELEVATION, np.zeros((count, 3)), 1.0, 1.0)
-    azimuth, elevation = direction(points)
+    azimuth, elevation = direction(points, walks=scene.walks)
     sides = np.stack(axes_of(azimuth, elevation))
     radius = max((s.radius for s in scene.shapes if s.body in scene.bodies), default=0.0)
     middle = 0.5 * (points.min(1) + points.max(1))
@@ -251,16 +260,16 @@ def aim(scene: Scene, logged: np.ndarray, *simulated: np.ndarray) -> Camera:
     return Camera(azimuth, elevation, centers, float(width), float(height))
 
 
-def direction(points: np.ndarray) -> tuple[float, float]:
+def direction(points: np.ndarray, *, walks: bool = False) -> tuple[float, float]:
     """Return azimuth and elevation from which the motion of points ``(S, P, 3)`` shows most.
 
-    Across the plane in which they move; of a motion along a line, or of none, horizontally; of any other, from
-    obliquely above.
+    Across the plane in which they move; of a motion along a line, or of none, horizontally; of any other, and of a
+    robot that ``walks`` over the ground, from obliquely above.
     """
     moved = (points - points.mean(0)).reshape(-1, 3)
     variance, vectors = np.linalg.eigh(moved.T @ moved / max(len(moved), 1))
     total = max(float(variance.sum()), 1e-300)
-    if variance[0] > FLAT * total:
+    if variance[0] > FLAT * total or (walks and abs(vectors[2, 0]) > 0.9):
         across = _horizontal(moved, points)
         azimuth = _azimuth(across) + TURN
         return azimuth, ELEVATION
