@@ -85,14 +85,14 @@ def _imu(matching: Matching, base: Base) -> int | None:
     """
     model, columns = base.model, _turning(matching, base)
     measured, words = _orientation(matching, base), set(columns[0].column.words.objects)
-    for i in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_FRAMEQUAT)):
-        seat = base.seat(int(i))
+    for i in base.sensors(mujoco.mjtSensor.mjSENS_FRAMEQUAT):
+        seat = base.seat(i)
         if seat is None or not model.sensor(i).name or seat.magnitude() < TURNED:
             continue
         own, there = _tilt(measured, base), _tilt(measured * seat.inv(), base)
         called = bool(words & {*object_words(model.sensor(i).name)[0]} - {*object_words(base.name)[0]})
         if there < own - UPRIGHT or (there < own + UPRIGHT and called):
-            return int(i)
+            return i
     return None
 
 
@@ -111,10 +111,10 @@ def _seated(matching: Matching, base: Base, seat: int) -> Matching:
     assert turn is not None
     name = model.sensor(seat).name
     gyros = [
-        model.sensor(i).name for i in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_GYRO))
-        if (own := base.seat(int(i))) is not None and (own * turn.inv()).magnitude() < 1e-9 and model.sensor(i).name
+        model.sensor(i).name for i in base.sensors(mujoco.mjtSensor.mjSENS_GYRO)
+        if (own := base.seat(i)) is not None and (own * turn.inv()).magnitude() < 1e-9 and model.sensor(i).name
     ]  # fmt: skip
-    found = []
+    found, spare = [], []
     for m in matching.matches:
         part = m.place.number - base.turn.start if m.place.kind == "position" else -1
         rate = m.place.number - int(model.nq) - base.rate.start if m.place.kind == "velocity" else -1
@@ -122,9 +122,11 @@ def _seated(matching: Matching, base: Base, seat: int) -> Matching:
             found.append(_moved(m, name, part))
         elif 0 <= rate < 3 and gyros:
             found.append(_moved(m, gyros[0], rate))
-        elif not 0 <= rate < 3:
+        elif 0 <= rate < 3:
+            spare.append(m.column)  # the model has no gyroscope as it is turned
+        else:
             found.append(m)
-    return replace(matching, matches=tuple(found))
+    return replace(matching, matches=tuple(found), unused=(*matching.unused, *spare))
 
 
 def _moved(match: Match, sensor: str, part: int) -> Match:
@@ -144,13 +146,14 @@ def base_note(matching: Matching, base: Base) -> str:
 
 def _accelerometer(matching: Matching, base: Base, seat: int | None) -> list[Match]:
     """The columns of an accelerometer on the base, which shows gravity where the base rests."""
-    sensors, groups = _sensors(base), _triples(matching.unused)
-    turns, turned = _orientation(matching, base), None if seat is None else base.seat(seat)
+    groups, turns = _triples(matching.unused), _orientation(matching, base)
+    turned = None if seat is None else base.seat(seat)
     turns = turns if turned is None else turns * turned.inv()
-    for name, site in sensors:
-        for group in sorted(groups, key=lambda g: -_alike(g["x"], name)):
+    for sensor in base.sensors(mujoco.mjtSensor.mjSENS_ACCELEROMETER):
+        name, own = base.model.sensor(sensor).name, base.seat(sensor)
+        for group in sorted(groups, key=lambda g: -_alike(g["x"], name)) if name and own is not None else ():
             values = np.stack([group[axis].values for axis in "xyz"], axis=1)
-            if (unit := _unit(values, turns, base, site)) is not None:
+            if (unit := _unit(values, turns * own, base)) is not None:
                 return [
                     Match(
                         Place(f"{name}[{axis}]", "sensor", "length", f"sensor[{name}][{i}]", i, -1, (), (), axis=axis),
@@ -165,17 +168,6 @@ def _called(unit: float) -> str:
     return dict(zip(UNITS, ("m/s²", "g", "mg"), strict=True))[unit]
 
 
-def _sensors(base: Base) -> list[tuple[str, int]]:
-    """Names and sites of the accelerometers on a base."""
-    model = base.model
-    body = model.body_weldid[model.jnt_bodyid[base.joint]]
-    return [
-        (model.sensor(i).name, int(model.sensor_objid[i]))
-        for i in np.flatnonzero(model.sensor_type == int(mujoco.mjtSensor.mjSENS_ACCELEROMETER))
-        if model.sensor(i).name and model.body_weldid[model.site_bodyid[model.sensor_objid[i]]] == body
-    ]
-
-
 def _triples(columns: Sequence[Column]) -> list[dict[str, Column]]:
     """Columns of accelerations along three axes."""
     groups: dict[tuple, dict[str, Column]] = {}
@@ -186,7 +178,7 @@ def _triples(columns: Sequence[Column]) -> list[dict[str, Column]]:
 
 
 def _alike(column: Column, name: str) -> int:
-    return len({*column.words.objects} & {*name.lower().split("_")})
+    return len({*column.words.objects} & {*object_words(name)[0]})
 
 
 def _orientation(matching: Matching, base: Base) -> Rotation:
@@ -198,13 +190,12 @@ def _orientation(matching: Matching, base: Base) -> Rotation:
     return Rotation.from_quat(turns, scalar_first=True)
 
 
-def _unit(values: np.ndarray, turns: Rotation, base: Base, site: int) -> float | None:
-    """The unit in which the mean of forces ``(N, 3)`` at a site holds the robot up, m/s²; ``None`` for none."""
-    seat = Rotation.from_quat(base.model.site_quat[site], scalar_first=True)
+def _unit(values: np.ndarray, turns: Rotation, base: Base) -> float | None:
+    """The unit in which the mean of forces ``(N, 3)`` in turning axes holds the robot up, m/s²; ``None`` for none."""
     known = np.isfinite(values).all(1)
     if not known.any():
         return None
-    mean, up = (turns[known] * seat).apply(values[known]).mean(0), -np.asarray(base.model.opt.gravity)
+    mean, up = turns[known].apply(values[known]).mean(0), -np.asarray(base.model.opt.gravity)
     misses = {unit: float(np.linalg.norm(unit * mean - up) / np.linalg.norm(up)) for unit in UNITS}
     best = min(misses, key=lambda unit: misses[unit])
     return best if misses[best] < MISSED else None

@@ -85,15 +85,24 @@ class Base:
         place, speed, nq = self.place, self.speed, int(self.model.nq)
         return [*range(place.start, place.stop), *range(nq + speed.start, nq + speed.stop)]
 
+    def sensors(self, kind: mujoco.mjtSensor) -> list[int]:
+        """Return the sensors of a kind that sit on the base, and are relative to nothing."""
+        found = np.flatnonzero(self.model.sensor_type == int(kind))
+        return [int(i) for i in found if self.model.sensor_refid[i] < 0 and self.seat(int(i)) is not None]
+
     def seat(self, sensor: int) -> Rotation | None:
-        """Return how a sensor's site, or body, is turned in the base; ``None`` where it is elsewhere, or relative."""
+        """Return how the site, or the body, of a sensor is turned in the base; ``None`` where it is elsewhere."""
         model, own = self.model, int(self.model.jnt_bodyid[self.joint])
         number, kind = int(model.sensor_objid[sensor]), int(model.sensor_objtype[sensor])
-        if int(model.sensor_refid[sensor]) >= 0:
+        if kind not in (int(mujoco.mjtObj.mjOBJ_SITE), int(mujoco.mjtObj.mjOBJ_XBODY)):
             return None
-        if kind == mujoco.mjtObj.mjOBJ_SITE and int(model.site_bodyid[number]) == own:
-            return Rotation.from_quat(model.site_quat[number], scalar_first=True)
-        return Rotation.identity() if kind == mujoco.mjtObj.mjOBJ_XBODY and number == own else None
+        is_site = kind == mujoco.mjtObj.mjOBJ_SITE
+        if model.body_weldid[model.site_bodyid[number] if is_site else number] != model.body_weldid[own]:
+            return None
+        data = mujoco.MjData(model)
+        mujoco.mj_kinematics(model, data)
+        there = np.reshape(data.site_xmat[number] if is_site else data.xmat[number], (3, 3))
+        return Rotation.from_matrix(np.reshape(data.xmat[own], (3, 3)).T @ there)
 
     @cached_property
     def axes(self) -> np.ndarray:
@@ -158,7 +167,7 @@ class Motion:
 
 def base_motion(
     base: Base, positions: np.ndarray, velocities: np.ndarray, dt: float, *, accelerations: np.ndarray | None,
-    site: int = -1, sunk: float = 0.0,
+    site: int = -1,
 ) -> Motion:  # fmt: skip
     """Return how a base moves, of which the log shows the orientation, the joints, and how they turn.
 
@@ -169,7 +178,6 @@ def base_motion(
         dt: seconds between rows.
         accelerations: what an accelerometer shows, ``(T, 3)``, or ``None``.
         site: where that is.
-        sunk: by how much feet that stand are below the ground, m.
 
     Raises:
         InputError: feet that hardly stand.
@@ -177,7 +185,7 @@ def base_motion(
     calm = smoothed(base, positions, velocities, dt)
     legs = _legs(base, calm, velocities, site)
     told, error = _pulls(base, calm, accelerations, site)
-    smoother = _Smoother(legs, told @ base.axes, error, dt, base.level - sunk)
+    smoother = _Smoother(legs, told @ base.axes, error, dt, base.level)
     stands = np.exp(-(((legs.heights - legs.heights.min(1, keepdims=True)) / LIFTED) ** 2))
     for _ in range(ROUNDS):
         state, chain = smoother.solved(stands)
@@ -375,9 +383,12 @@ def _fused(values: np.ndarray, rates: np.ndarray, dt: float, error: float | None
 
 def noise_of(values: np.ndarray) -> np.ndarray:
     """Return the noise that fourth differences of values ``(T, ...)`` show, ``(...)``."""
-    if len(values) < 5:
-        return np.zeros(values.shape[1:])
-    return np.asarray(1.4826 * np.median(np.abs(np.diff(values, 4, axis=0)), 0) / np.sqrt(70))
+    return scale_of(np.diff(values, 4, axis=0)) if len(values) > 4 else np.zeros(values.shape[1:])
+
+
+def scale_of(fourth: np.ndarray) -> np.ndarray:
+    """Return the noise that fourth differences ``(N, ...)`` show, ``(...)``."""
+    return np.asarray(1.4826 * np.median(np.abs(fourth), 0) / np.sqrt(70))
 
 
 def sinking(base: Base, positions: np.ndarray, velocities: np.ndarray, commands: np.ndarray, dt: float) -> float:

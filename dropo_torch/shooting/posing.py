@@ -22,7 +22,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.objective import LIMITS
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.shooting.begin import scatter
-from dropo_torch.shooting.odometry import Base, base_motion, find_base, sinking
+from dropo_torch.shooting.odometry import Base, base_motion, find_base, scale_of, sinking
 from dropo_torch.support.rows import evenly
 
 _SENSOR = mujoco.mjtSensor
@@ -105,11 +105,10 @@ def _state_noise(problem: Problem, told: Told) -> dict[str, Any]:
     if (seat := _seat_of(model, observation)) is not None:
         observation, listed = seat.observation, seat.noise(listed)
     known = dict(zip(observation.labels, listed.tolist(), strict=True)) | told.blind
-    if not known.keys() >= set(labels):
+    noise = [known.get(label, 0.0) for label in labels]
+    if min(noise) <= 0:  # one that is 0 is to be estimated
         return {}
-    noise = [known[label] for label in labels]
-    least = min((x for x in noise if x > 0), default=1.0)
-    return {"noise": noise, "epsilon": max((BESIDE * least) ** 2, LIMITS["epsilon"][0])}
+    return {"noise": noise, "epsilon": max((BESIDE * min(noise)) ** 2, LIMITS["epsilon"][0])}
 
 
 @dataclass(frozen=True)
@@ -220,15 +219,12 @@ def _seat_of(model: mujoco.MjModel, observation: Observation) -> _Seat | None:
     state = parse_observation(model, None)
     found: dict[str, tuple[int, ...]] = {"orientation": (), "gyroscope": ()}
     turns = []
-    shown = {
-        int(_SENSOR.mjSENS_FRAMEQUAT): ("orientation", base.turn.start, 4),
-        int(_SENSOR.mjSENS_GYRO): ("gyroscope", model.nq + base.rate.start, 3),
-    }
-    for i, kind in enumerate(model.sensor_type.tolist()):
-        first = model.nq + model.nv + int(model.sensor_adr[i])
-        name, into, size = shown.get(kind, ("", 0, 0))
+    shown = [(i, "orientation", base.turn.start, 4) for i in base.sensors(_SENSOR.mjSENS_FRAMEQUAT)]
+    shown += [(i, "gyroscope", model.nq + base.rate.start, 3) for i in base.sensors(_SENSOR.mjSENS_GYRO)]
+    for i, name, into, size in shown:
+        first, seat = model.nq + model.nv + int(model.sensor_adr[i]), base.seat(i)
         own = tuple(columns.index(first + k) for k in range(size) if first + k in columns)
-        if not name or len(own) != size or found[name] or (seat := base.seat(i)) is None:
+        if seat is None or len(own) != size or found[name]:
             continue
         found[name] = own
         turns.append(seat)
@@ -274,7 +270,7 @@ def column_noise(observation: Observation, log: Trajectories) -> np.ndarray:
     away = features.difference(path, np.broadcast_to(path[:1], path.shape))
     inside = np.flatnonzero(log.episodes[4:] == log.episodes[:-4]) if len(log) > 4 else np.array([], dtype=int)
     fourth = np.diff(away, 4, axis=0)[inside] if inside.size else away
-    return features.column_noise(_scale_of(fourth))
+    return features.column_noise(scale_of(fourth))
 
 
 class _Reading:
@@ -327,11 +323,10 @@ class _Reading:
         """Return what an accelerometer on the base shows, ``(T, 3)``, and its site; ``None`` without one."""
         model, base = self._model, self.base
         assert base is not None
-        own = model.body_weldid[model.jnt_bodyid[base.joint]]
-        for i in np.flatnonzero(model.sensor_type == int(_SENSOR.mjSENS_ACCELEROMETER)):
+        for i in base.sensors(_SENSOR.mjSENS_ACCELEROMETER):
             site, first = int(model.sensor_objid[i]), model.nq + model.nv + int(model.sensor_adr[i])
             shown = [np.flatnonzero(self._observation.index == first + k) for k in range(3)]
-            if model.body_weldid[model.site_bodyid[site]] == own and all(c.size for c in shown):
+            if all(c.size for c in shown):
                 return path[:, [int(c[0]) for c in shown]], site
         return None, -1
 
@@ -344,7 +339,7 @@ class _Reading:
         own = [self._features.difference(p, np.broadcast_to(p[:1], p.shape))[:, self._of_positions] for p in paths]
         fourth = np.concatenate([np.diff(p, 4, axis=0) for p in own])
         size = np.concatenate(own).std(0)
-        found = _scale_of(fourth) if len(fourth) else 1e-3 * size
+        found = scale_of(fourth) if len(fourth) else 1e-3 * size
         usual = float(np.median(found[found > 0])) if (found > 0).any() else 1e-6
         return np.maximum(found, max(LEAST * usual, 1e-9))
 
@@ -519,7 +514,7 @@ def derived(model: mujoco.MjModel, positions: np.ndarray, dt: float) -> tuple[np
     """
     away = _apart(model, positions, np.zeros(len(positions), dtype=int), np.arange(len(positions)))
     fourth = np.diff(away, 4, axis=0)
-    noise = _scale_of(fourth) if len(fourth) else np.zeros(model.nv)
+    noise = scale_of(fourth) if len(fourth) else np.zeros(model.nv)
     found, error = np.zeros((len(positions), model.nv)), np.zeros(model.nv)
     settled = np.zeros(model.nv, dtype=bool)
     for span in [s for s in SPANS if s <= len(positions)] or [len(positions)]:
@@ -560,8 +555,3 @@ def _apart(model: mujoco.MjModel, positions: np.ndarray, start: np.ndarray, end:
     for out, a, b in zip(found, start, end, strict=True):
         mujoco.mj_differentiatePos(model, out, 1.0, positions[a], positions[b])
     return found
-
-
-def _scale_of(fourth: np.ndarray) -> np.ndarray:
-    """The noise that fourth differences ``(N, k)`` show, ``(k,)``."""
-    return np.asarray(1.4826 * np.median(np.abs(fourth), 0) / np.sqrt(70))
