@@ -24,7 +24,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap import family as members
 from dropo_torch.gap.evidence import Cost, Linearization
-from dropo_torch.gap.family import base_family, not_needed, pushing, without_steps
+from dropo_torch.gap.family import base_family, excesses, not_needed, pushing, without_steps
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.limbs import alike, by_limbs, joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -61,10 +61,11 @@ def leg(damping: Triple = NONE, friction: Triple = NONE, rotor: Triple = NONE, o
     )
 
 
-def record(folder: Path, seed: int, *, slope: Triple = NONE, **truth: Triple) -> Path:
+def record(folder: Path, seed: int, *, slope: Triple = NONE, late: Triple = NONE, **truth: Triple) -> Path:
     """Write a noisy log of chirps of a leg with some truth, and a config with the leg as given.
 
-    Dry friction that changes along the range, by a slope, is written into the model before each step.
+    Dry friction that changes along the range, by a slope, is written into the model before each step. Commands act some
+    logged rows ``late``.
     """
     rng = np.random.default_rng(seed)
     model = mujoco.MjModel.from_xml_string(leg(**truth))
@@ -74,9 +75,9 @@ def record(folder: Path, seed: int, *, slope: Triple = NONE, **truth: Triple) ->
     phase = 2 * np.pi * (0.3 * time + 0.15 * time**2)
     targets = 0.5 * np.sin(phase[:, None] * rng.uniform(0.8, 1.2, 3) + rng.uniform(0, 6, 3))
     rows = []
-    for target in targets:
+    for row in range(len(targets)):
         rows.append(np.concatenate([data.qpos, data.qvel]))
-        data.ctrl[:] = target
+        data.ctrl[:] = targets[np.maximum(row - np.array(late, dtype=int), 0), range(3)]
         for _ in range(2):
             model.dof_frictionloss[:] = friction + slope * data.qpos
             mujoco.mj_step(model, data)
@@ -121,6 +122,26 @@ def test_the_offsets_of_a_leg_are_found_and_no_delay_is() -> None:
     numbers = told(everything())
     assert [numbers.get(("actuator_bias", j)) for j in JOINTS] == pytest.approx(OFFSET, rel=0.1)
     assert not any(effect == "actuator_delay" for effect, _ in numbers)
+
+
+def test_a_delay_of_one_servo_is_found_there_and_no_inertia_or_damping_in_its_place() -> None:
+    numbers = told(found(damping=DAMPING, friction=FRICTION, rotor=ROTOR, offset=OFFSET, late=(0, 3, 0)))
+    assert {key: n for key, n in numbers.items() if key[0] == "actuator_delay"} == {
+        ("actuator_delay", "knee"): pytest.approx(0.015, rel=0.1)
+    }
+    assert [numbers["joint_damping", j] for j in JOINTS] == pytest.approx(DAMPING, rel=0.1)
+    assert [numbers["armature", j] for j in JOINTS] == pytest.approx(ROTOR, rel=0.15)
+
+
+@pytest.mark.parametrize(("count", "whole"), [(6, True), (5, True), (4, False), (2, False)])
+def test_what_nearly_all_joints_need_all_joints_have(count: int, whole: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    kinds = [VOCABULARY["armature"], VOCABULARY["joint_damping"]]
+    monkeypatch.setattr(type(kinds[0]), "targets", lambda effect, setting: list("abcdef"))
+    monkeypatch.setattr(type(kinds[1]), "targets", lambda effect, setting: list("abcdef"))
+    placed: Any = [SimpleNamespace(effect=kind, key=(n, joint)) for n, kind in enumerate(kinds) for joint in "abcdef"]
+    idle = [*placed[count:6], *placed[6:]]
+    ground: Any = SimpleNamespace(setting=None, rules=Rules())
+    assert members.of_all_joints(ground, placed, idle) == ({p.key for p in placed[:6]} if whole else set())
 
 
 def test_what_a_family_does_without_is_limited() -> None:
@@ -191,7 +212,8 @@ def test_what_only_makes_up_for_the_step_is_no_member() -> None:
     more = [("actuator_bias", "shoulder_servo", (0.0,)), ("armature", "elbow", (0.0,))]
     placed = tuple(Placed(VOCABULARY[effect], target, values) for effect, target, values in (*true, *more))
     whole = ground.refit(Hypothesis(tuple(case.declared.values()), placed))
-    assert not_needed(ground, whole, whole.cost.excess + 4 * whole.cost.sigma) == []
+    least = 4 * whole.cost.sigma / np.sqrt(ground.part.chart.size)
+    assert not_needed(ground, whole, excesses(ground, whole) + least) == []
     assert {p.key for p in without_steps(ground, whole).hypothesis.placed} == {p.key for p in placed[:2]}
 
 

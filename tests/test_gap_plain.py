@@ -22,7 +22,7 @@ from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
 from dropo_torch.gap.accept import add, nonsense, undone
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.family import needed, not_needed
+from dropo_torch.gap.family import excesses, needed, not_needed
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.locate import regressors
 from dropo_torch.gap.log import cut_windows, spread
@@ -267,7 +267,7 @@ def test_friction_and_an_offset_that_undo_each_other_are_dropped_together() -> N
         Placed(VOCABULARY["actuator_bias"], "shoulder_motor", (-5 / 12,)),
     ]
     whole = ground.refit(Hypothesis((), (*true, *pair)))
-    most = whole.cost.excess + 4 * whole.cost.sigma
+    most = excesses(ground, whole) + 4 * whole.cost.sigma / np.sqrt(ground.part.chart.size)
     assert cancelling(scene.setting, whole) == [(2, 3)]
     assert not_needed(ground, whole, most) == []
     state = start(ground, scene.begin)

@@ -17,7 +17,7 @@ def named(value: float, *, steps: bool = False, numbers: int = 1) -> Any:
     """An effect with so many numbers, absent at 0."""
     quantities = tuple(Quantity(f"n{i}", "-", 0.0, -10.0, 10.0, 1.0) for i in range(numbers))
     effect = SimpleNamespace(quantities=lambda setting, target: quantities, steps=steps)
-    return SimpleNamespace(effect=effect, target=None, values=(value,) * numbers)
+    return SimpleNamespace(effect=effect, target=None, values=(value,) * numbers, key=None)
 
 
 def left(monkeypatch: pytest.MonkeyPatch, family: bool, entries: list[tuple[Any, float]]) -> tuple[list[int], int]:
@@ -25,9 +25,14 @@ def left(monkeypatch: pytest.MonkeyPatch, family: bool, entries: list[tuple[Any,
     placed = [p for p, _ in entries]
     monkeypatch.setattr(outcome, "_keeping", lambda naming, kept: replaced(naming, kept))
     monkeypatch.setattr(outcome, "replace", lambda naming, **new: SimpleNamespace(**{**vars(naming), **new}))
-    naming: Any = SimpleNamespace(family=family, kept=list(range(len(placed))), left_out=())
+    monkeypatch.setattr(outcome, "_beside_fewer", lambda last, off, out: (off, halves))  # nothing is entangled
+    vector = np.array([v for p in placed for v in p.values])
+    halves = np.concatenate([np.full(len(p.values), half) for p, half in entries])
+    hypothesis = SimpleNamespace(placed=placed, declared=(), vector=vector)
+    naming: Any = SimpleNamespace(everywhere=(), family=family, kept=list(range(len(placed))), left_out=())
     fitted: Any = SimpleNamespace(
-        last=SimpleNamespace(fit=SimpleNamespace(hypothesis=SimpleNamespace(placed=placed))),
+        last=SimpleNamespace(fit=SimpleNamespace(hypothesis=hypothesis, scale=np.ones(len(vector)))),
+        halves=halves,
         of_names=[np.full(len(p.values), half) for p, half in entries],
     )
     found: Any = outcome._without_unsure(None, naming, fitted, Rules())  # type: ignore[arg-type]
@@ -46,7 +51,7 @@ def replaced(naming: Any, kept: list[int]) -> Any:
         (False, [(named(0.1), 0.5)], [0], 0),  # alone, it is all that explains the gap
         (False, [(named(0.3), 0.5), (named(0.4), 0.5), (named(1.0), 0.1)], [1, 2], 0),  # one after the other
         (True, [(named(1.0), 0.5), (named(0.8), 0.5), (named(2.0), 0.5)], [0, 2], 1),
-        (True, [(named(0.5), 0.5), (named(0.8), 0.5), (named(0.1), 0.5), (named(2.0), 0.5)], [1, 3], 2),
+        (True, [(named(0.5), 0.5), (named(0.8), 0.5), (named(0.1), 0.5), (named(2.0), 0.5)], [3], 3),
         (True, [(named(0.1, steps=True), 0.5), (named(0.1, numbers=2), 0.5), (named(2.0), 0.5)], [0, 1, 2], 0),
         (True, [(named(2.0), np.inf), (named(2.0), 0.5), (named(-2.0), 0.5)], [0, 1, 2], 0),
     ],

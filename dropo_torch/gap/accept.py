@@ -29,6 +29,8 @@ from dropo_torch.gap.sound import absurd
 
 #: Dry friction as MuJoCo has it by default.
 SOFT = "joint_soft_friction"
+#: Windows of a first fit, and the share that it must come down to there for one of all to be worth its time.
+ROUGHLY, LIKELY = 12, 0.5
 
 
 def beats(ground: Ground, better: Refit, worse: Refit) -> bool:
@@ -328,7 +330,11 @@ def with_soft_friction(ground: Ground, fitted: Refit) -> Refit:
         return fitted
     ground.report("refining", 0.5)
     placed = [Placed(soft, p.target).at(found[i]) if i in found else p for i, p in enumerate(fitted.hypothesis.placed)]
-    softer = ground.refit(replace(fitted.hypothesis, placed=tuple(placed)))
+    hypothesis, few = replace(fitted.hypothesis, placed=tuple(placed)), ground.part.few(ROUGHLY)
+    rough = refit(few, hypothesis, iterations=2, slopes=False).cost
+    if rough.left_of(refit(few, fitted.hypothesis, iterations=0, slopes=False).cost) > LIKELY:
+        return fitted
+    softer = ground.refit(hypothesis)
     return softer if softer.cost.left_of(fitted.cost) < 1 - ground.rules.most else fitted
 
 

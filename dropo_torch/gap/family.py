@@ -7,7 +7,7 @@ one effect after another finds these: each alone explains next to nothing while 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Container, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -15,24 +15,25 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Effect, Placed, Setting
 from dropo_torch.effects.joint import JointFrictionSlope
-from dropo_torch.gap.accept import SOFT, beats, extend, is_of_step, sound, with_soft_friction
+from dropo_torch.gap.accept import ROUGHLY, SOFT, beats, extend, is_of_step, sound, with_soft_friction
 from dropo_torch.gap.cancel import cancelling
 from dropo_torch.gap.ground import Ground, State
-from dropo_torch.gap.limbs import joint_of
+from dropo_torch.gap.limbs import joint_of, joint_of_column
 from dropo_torch.gap.refit import Hypothesis, Refit, half_widths, refit, resolved
 from dropo_torch.gap.rules import remains, significant
 from dropo_torch.gap.screen import nearer
-from dropo_torch.gap.shares import offsets
+from dropo_torch.gap.shares import MANY, offsets
 from dropo_torch.gap.sound import absurd
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
 #: One more of them, where what these leave is more than noise; and those on top of which it is.
 SLOPE, FRICTION = "joint_friction_slope", "joint_friction"
-#: Windows of the first fit.
-ROUGHLY = 12
 #: Numbers that a base family may have more than effects that have about as many.
 ABOUT = 1
+
+#: Iterations of a fit without some of its delays.
+AGAIN = 12
 
 #: What is reported.
 STAGE = "fitting friction, inertia, offset and delay of all joints"
@@ -147,22 +148,83 @@ def leaves_too_much(ground: Ground, begin: Hypothesis, rival: Hypothesis, most: 
     ground.report(STAGE, 0.0)
     few = ground.part.few(ROUGHLY)
     iterations = ground.rules.family.iterations
-    rough = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
+    fits = _in_turn(ground, begin, lambda h: refit(few, h, iterations=iterations, slopes=False))
+    rough = min(fits, key=lambda r: r.loss)
     return rough.cost.left_of(refit(few, rival, iterations=0, slopes=False).cost) > most
 
 
 def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
-    """Return the base family fitted at every joint: first without delays, which otherwise stand for the rest."""
+    """Return the base family fitted at every joint, with delays where inertia and damping do not do as well.
+
+    A delay of a servo, its inertia and its damping nearly stand for each other. So all joints are fitted without delays
+    first, and a joint has one only where the log is clearly nearer with it, or where its inertia or damping would have
+    to vanish in its place.
+    """
     ground.report(STAGE, 0.1)
-    return _in_turn(ground, begin, lambda h: ground.refit(h, iterations=ground.rules.family.iterations))
+    prompt, late = _in_turn(ground, begin, lambda h: ground.refit(h, iterations=ground.rules.family.iterations))
+    return without_needless_delays(ground, prompt, late)
 
 
-def _in_turn(ground: Ground, begin: Hypothesis, fit: Callable[[Hypothesis], Refit]) -> Refit:
-    """The base family as it is fitted without delays, or with delays from there on."""
+def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit:
+    """Return a fit with delays without those of joints at which the numbers of the fit without any do as well.
+
+    Args:
+        ground: what the search stands on.
+        prompt: the fit without delays.
+        late: the fit with them.
+    """
+    most, setting = tolerated(ground, late), ground.setting
+    numbers, placed = {p.key: p for p in prompt.hypothesis.placed}, late.hypothesis.placed
+
+    def fitted(joints: Collection[int | None], iterations: int) -> Refit:
+        kept = [p for p in placed if not (p.effect.is_filter and joint_of(setting, p) in joints)]
+        moved = [numbers.get(p.key, p) if joint_of(setting, p) in joints else p for p in kept]
+        hypothesis = replace(late.hypothesis, placed=tuple(moved))
+        return refit(ground.part, hypothesis, linear=late.linear, iterations=iterations, slopes=iterations > 0)
+
+    vanishing = {joint_of(setting, p) for p in numbers.values() if is_absent(ground, p)}
+    joints = dict.fromkeys(j for p in placed if p.effect.is_filter and (j := joint_of(setting, p)) not in vanishing)
+    over = {j: float((excesses(ground, fitted([j], 0)) / most).max()) for j in joints}
+    idle = sorted((j for j in joints if over[j] <= 1), key=over.__getitem__)
+    while idle:
+        fewer = fitted(idle, AGAIN)
+        if (excesses(ground, fewer) <= most).all():
+            return fewer
+        idle = idle[: len(idle) // 2]
+    return late
+
+
+def is_absent(ground: Ground, placed: Placed) -> bool:
+    """Return whether a member is held at a bound of physics at which there is nothing of it, such as no inertia."""
+    (quantity, *_), near = placed.effect.quantities(ground.setting, placed.target), ground.rules.sound.edge
+    bound = quantity.neutral in (quantity.low, quantity.high)
+    return bound and abs(placed.values[0] - quantity.neutral) <= near * quantity.scale
+
+
+def excesses(ground: Ground, fitted: Refit) -> np.ndarray:
+    """Return the excess in the columns of each joint and, at last, in all others, ``(J + 1,)``."""
+    part, setting = ground.part, ground.setting
+    known = setting.observation.labels
+    joints = [joint_of_column(setting, label) if label in known else None for label in part.chart.labels]
+    weights = np.where(fitted.linear.weights > 0, fitted.linear.weights, 1.0)
+    of_rows = (fitted.residual**2 - 2 * np.log(weights)) * np.reshape(part.caps, (-1, 1)) ** 2
+    of_features = of_rows.reshape(-1, part.chart.size).sum(0) - fitted.cost.degrees / part.chart.size
+    last = setting.model.njnt
+    return np.bincount([last if j is None else j for j in joints], of_features, last + 1)
+
+
+def tolerated(ground: Ground, whole: Refit) -> np.ndarray:
+    """Return the excess at each joint, ``(J + 1,)``, up to which a family with fewer members is about as good."""
+    rules, own = ground.rules, excesses(ground, whole)
+    sigma = whole.cost.sigma / np.sqrt(max(len(ground.part.chart.labels), 1))
+    return own + np.maximum(rules.family.spare * own, rules.alike.sigmas * sigma)
+
+
+def _in_turn(ground: Ground, begin: Hypothesis, fit: Callable[[Hypothesis], Refit]) -> tuple[Refit, Refit]:
+    """The base family as it is fitted without delays, and with delays from there on."""
     family = base_family(ground.setting, ground.effects)
     prompt = fit(begin.with_effects([p for p in family if not p.effect.is_filter]))
-    late = fit(prompt.hypothesis.with_effects([p for p in family if p.effect.is_filter]))
-    return late if late.loss < prompt.loss else prompt
+    return prompt, fit(prompt.hypothesis.with_effects([p for p in family if p.effect.is_filter]))
 
 
 def softened(ground: Ground, whole: Refit) -> Refit | None:
@@ -208,17 +270,19 @@ def pushing(setting: Setting, hypothesis: Hypothesis) -> list[Placed]:
 
 def needed(ground: Ground, whole: Refit) -> Refit | None:
     """Return a fitted family without members that are absurd or not needed; ``None`` if that comes to no end."""
-    rules, most, tried = ground.rules.family, math.inf, math.inf
+    rules, tried = ground.rules.family, math.inf
+    most = nothing = np.full(ground.setting.model.njnt + 1, math.inf)
     for number in range(rules.rounds):
         ground.report(STAGE, 0.5 + 0.5 * number / rules.rounds)
         idle = [placed for placed, _ in absurd(ground.part, whole, ground.rules.sound)]
         idle += pushing(ground.setting, whole.hypothesis)
         if idle:
-            whole, most = _without(ground, whole, idle), math.inf
+            whole, most = _without(ground, whole, idle), nothing
             continue
-        spare = max(rules.spare * whole.cost.misfit, ground.rules.alike.sigmas * whole.cost.sigma)
-        most = min(most, whole.cost.excess + spare)
+        most = np.minimum(most, tolerated(ground, whole))
         idle = not_needed(ground, whole, most)
+        if remains(whole.cost, ground.rules):
+            idle = not_needed(ground, whole, most, of_all_joints(ground, whole.hypothesis.placed, idle))
         idle = idle[: int(min(len(idle), tried))]
         if not idle:
             undone = _without_what_cancels(ground, whole, most)
@@ -227,18 +291,18 @@ def needed(ground: Ground, whole: Refit) -> Refit | None:
             whole = undone
             continue
         fewer = _without(ground, whole, idle)
-        if fewer.cost.excess <= most:
+        if (excesses(ground, fewer) <= most).all():
             whole, tried = fewer, math.inf
         else:  # by the derivatives it would not have mattered: half as many, the least needed
             tried = len(idle) // 2
-    return whole if math.isfinite(most) else None
+    return whole if np.isfinite(most).all() else None
 
 
-def _without_what_cancels(ground: Ground, whole: Refit, most: float) -> Refit:
+def _without_what_cancels(ground: Ground, whole: Refit, most: np.ndarray) -> Refit:
     """Return a fitted family without the first two members that undo each other, if any can go; else the same."""
     for pair in cancelling(ground.setting, whole):
         fewer = _without(ground, whole, [whole.hypothesis.placed[i] for i in pair])
-        if fewer.cost.excess <= most:
+        if (excesses(ground, fewer) <= most).all():
             return fewer
     return whole
 
@@ -264,31 +328,57 @@ def _without(ground: Ground, whole: Refit, idle: Sequence[Placed]) -> Refit:
     return ground.refit(replace(whole.hypothesis, placed=placed))
 
 
-def not_needed(ground: Ground, whole: Refit, most: float) -> list[Placed]:
-    """Return members without which a fit stays about as good, by its derivatives, the least needed first.
+def of_all_joints(ground: Ground, placed: Sequence[Placed], idle: Sequence[Placed] = ()) -> set[tuple[str, str | None]]:
+    """Return the members of kinds of which nearly all joints need one: then all of them have it.
+
+    Where a model's own error and not the noise decides, whether one joint's friction is needed is a matter of chance,
+    and whether a robot's joints have friction is not.
+
+    Args:
+        ground: what the search stands on.
+        placed: the members of a family.
+        idle: those of them that are not needed.
+    """
+    out, found = {p.key for p in idle}, set[tuple[str, str | None]]()
+    for kind in dict.fromkeys(p.effect for p in placed):
+        own, every = [p.key for p in placed if p.effect is kind], len(kind.targets(ground.setting))
+        if len(own) >= MANY and len([key for key in own if key not in out]) >= ground.rules.family.nearly * every:
+            found |= set(own)
+    return found
+
+
+def not_needed(
+    ground: Ground, whole: Refit, most: np.ndarray, spared: Container[tuple[str, str | None]] = ()
+) -> list[Placed]:
+    """Return members without which a fit stays as good at their joints, by its derivatives, the least needed first.
 
     One after another: of two that do the same, one stays.
 
     Args:
         ground: what the search stands on.
         whole: a fit of the family.
-        most: excess up to which members are dropped.
+        most: excess at each joint up to which members are dropped there, ``(J + 1,)``.
+        spared: members that stay.
     """
     first, (slope, _) = len(whole.hypothesis.declared), whole.weighted(ground.part.caps)
-    normal, off, rows = slope @ slope.T, offsets(ground.setting, whole), np.arange(len(slope))
-    idle: list[Placed] = []
-    while len(rows) > first:
-        gone = np.setdiff1d(np.arange(len(slope)), rows)
+    normal, off = slope @ slope.T, offsets(ground.setting, whole)
+    every, placed = np.arange(len(slope)), whole.hypothesis.placed
+    joints = np.array([-1] * first + [-1 if (j := joint_of(ground.setting, p)) is None else j for p in placed])
+    spare, gone, kept = most - excesses(ground, whole), list[int](), set[int]()
+    asked = [i for i in every[first:] if placed[i - first].key not in spared]
+    while waiting := [i for i in asked if i not in gone and joints[i] not in kept]:
+        rows = np.setdiff1d(every, gone)
         inverse = np.linalg.pinv(normal[np.ix_(rows, rows)], rcond=1e-12, hermitian=True)
-        there = off[rows] + inverse @ normal[np.ix_(rows, gone)] @ off[gone]  # what dropping the others has moved
-        costs = there**2 / np.maximum(np.diag(inverse), 1e-300)
-        weakest = first + int(np.argmin(costs[first:]))
-        rest = np.delete(rows, weakest)
-        if whole.cost.excess + _cost_without(normal, off, rest) > most:
-            break
-        idle.append(whole.hypothesis.placed[rows[weakest] - first])
-        rows = rest
-    return idle
+        lost = normal[np.ix_(rows, np.array(gone, dtype=int))] @ off[gone]
+        there = off[rows] + inverse @ lost  # what dropping the others has moved
+        costs = dict(zip(rows, there**2 / np.maximum(np.diag(inverse), 1e-300), strict=True))
+        weakest = min(waiting, key=lambda i: costs[i] / max(spare[joints[i]], 1e-300))
+        there_gone = [i for i in [*gone, weakest] if joints[i] == joints[weakest]]
+        if _cost_without(normal, off, np.setdiff1d(every, there_gone)) > spare[joints[weakest]]:
+            kept.add(int(joints[weakest]))
+        else:
+            gone.append(int(weakest))
+    return [placed[i - first] for i in gone]
 
 
 def _cost_without(normal: np.ndarray, off: np.ndarray, rows: np.ndarray) -> float:

@@ -16,7 +16,7 @@ from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, residual_pictures, told_when
 from dropo_torch.gap.noise import FreeForces, free_forces
-from dropo_torch.gap.refit import Hypothesis, Refit, Resolved, half_widths, refit, resolved
+from dropo_torch.gap.refit import Z90, Hypothesis, Refit, Resolved, half_widths, refit, resolved, standard_errors
 from dropo_torch.gap.renew import moved, noise_beside
 from dropo_torch.gap.result import (
     FAMILY,
@@ -33,6 +33,7 @@ from dropo_torch.gap.result import (
 from dropo_torch.gap.rules import Rules, remains, significant
 from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
+from dropo_torch.gap.shares import offsets
 from dropo_torch.gap.sound import absurd, has_skill
 from dropo_torch.gap.starts import straightened
 from dropo_torch.gap.suggest import excite, suggest
@@ -60,6 +61,8 @@ UNSKILLED = "the model still predicts unseen data no better than constant veloci
 WORSE = "the model predicts unseen data worse than without them"
 #: Open-loop error on unseen data, relative to that of constant velocity, from which on no last fit would do better.
 HOPELESS = 1.5
+#: Share that better starts of windows must leave by themselves for a fit with them to be of use.
+NEARER = 0.5
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -339,6 +342,9 @@ def _straight(evidence: Evidence, own: Refit) -> tuple[Evidence, Refit]:
     if windows is None:
         return evidence, own
     straight = replace(evidence, windows=windows)
+    there = refit(straight, own.hypothesis, iterations=0, slopes=False)
+    if there.cost.left_of(own.cost) > NEARER and there.cost.reduced > evidence.rules.sound.wrong:
+        return evidence, own
     there = refit(straight, own.hypothesis, iterations=6)
     return (evidence, own) if significant(there.cost, evidence.rules) else (straight, there)
 
@@ -374,26 +380,61 @@ def _keeping(naming: Naming, kept: Sequence[int]) -> Naming:
 
 
 def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Rules) -> Naming | None:
-    """What was found without names that may as well be absent: the less sure half of a family's, or one; else ``None``.
+    """What was found without names that may as well be absent: one, or of a family all, in turn; else ``None``.
 
     What remains that noise does not make is alike from row to row. It widens intervals, by which an effect of one
-    number may be nothing that misfit alone takes for needed.
+    number may be nothing that misfit alone takes for needed. Of two members of a family that do the same, one stays,
+    and what all joints have, each does.
     """
     assert fitted.last is not None
-    placed, family = fitted.last.fit.hypothesis.placed, naming.family
-    halves, sure = fitted.of_names, dict[int, float]()
-    for index, (p, half) in enumerate(zip(placed, halves, strict=True)):
-        (quantity, *more), (value, *_) = p.effect.quantities(setting, p.target), p.values
-        if np.isfinite(half[0]) and not (more or quantity.discrete or p.effect.steps):
-            sure[index] = abs(value - quantity.neutral) / max(half[0], 1e-300)
-    least = rules.family.sure if family else 1.0
-    unsure = sorted((index for index in sure if sure[index] < least), key=sure.__getitem__)
-    idle = unsure[: (len(unsure) + 1) // 2 if family else 1]
-    if not idle or len(idle) == len(placed):
+    placed, family, idle = fitted.last.fit.hypothesis.placed, naming.family, list[int]()
+    least, spared = rules.family.sure if family else 1.0, naming.everywhere
+    while len(idle) < len(placed) - 1:
+        sureness = _sureness(setting, fitted, idle, rules.sound.edge).items()
+        sure = {k: s for k, s in sureness if s < least and (s == 0 or placed[k].key not in spared)}
+        if not sure or (idle and not family):
+            break
+        idle.append(min(sure, key=sure.__getitem__))
+    if not idle:
         return None
     found = _keeping(naming, [k for k in range(len(placed)) if k not in idle])
-    allowed = [(placed[k], halves[k]) for k in idle if family]
+    allowed = [(placed[k], fitted.of_names[k]) for k in idle if family]
     return replace(found, left_out=(*found.left_out, *allowed))
+
+
+def _sureness(setting: Setting, fitted: _Fitted, gone: Sequence[int], edge: float) -> dict[int, float]:
+    """By how many half-widths of its interval each name of one number differs from none, without some others.
+
+    By 0 where it is within an ``edge``, in scales, of none, as at a bound of physics.
+    To first order, by the derivatives of the last fit; none of names that are a choice, or of which nothing is known.
+    """
+    assert fitted.last is not None
+    last, found, first = fitted.last, dict[int, float](), len(fitted.last.fit.hypothesis.declared)
+    sizes = [len(p.values) for p in last.fit.hypothesis.placed]
+    starts = first + np.concatenate([[0], np.cumsum(sizes)]).astype(int)
+    out = [n for k in gone for n in range(starts[k], starts[k + 1])]
+    off, halves = offsets(setting, last.fit) * last.fit.scale, fitted.halves
+    if out:
+        off, halves = _beside_fewer(last, off, np.array(out))
+    for index, p in enumerate(last.fit.hypothesis.placed):
+        quantity, *more = p.effect.quantities(setting, p.target)
+        at = starts[index]
+        if index not in gone and np.isfinite(halves[at]) and not (more or quantity.discrete or p.effect.steps):
+            away = abs(float(off[at])) if abs(off[at]) > edge * quantity.scale else 0.0
+            found[index] = away / max(float(halves[at]), 1e-300)
+    return found
+
+
+def _beside_fewer(last: Resolved, off: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Offsets from none and half-widths ``(q,)`` of all numbers of a fit, where some are none; 0 of these."""
+    rest = np.setdiff1d(np.arange(len(off)), out)
+    slope, scale = last.fit.weighted(1.0)[0], last.fit.scale
+    moved = np.linalg.lstsq(slope[rest].T, slope[out].T @ (off[out] / scale[out]), rcond=1e-12)[0] * scale[rest]
+    fewer = replace(last.fit, slope=last.fit.slope[rest], scale=scale[rest])
+    errors = Z90 * standard_errors(fewer, last.evidence.windows.episodes)
+    offsets_there, halves = np.zeros(len(off)), np.zeros(len(off))
+    offsets_there[rest], halves[rest] = off[rest] + moved, np.hypot(errors, last.error[rest])
+    return offsets_there, halves
 
 
 def _nameless(naming: Naming, reason: str) -> Naming:

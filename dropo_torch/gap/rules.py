@@ -120,7 +120,10 @@ class Family:
         rest: share of the first excess that the family may leave even if this is more than ``sound.wrong``: with much
             motion and little noise, the last hundredth of a real robot's misfit is.
         members: of it, so many must be needed at half of the joints.
-        spare: share of the excess that it leaves by which dropping the members least needed may raise it.
+        spare: share of the excess that it leaves at a joint by which dropping the members least needed there may raise
+            it.
+        nearly: share of the joints that must need a member of a kind for all of them to have it, where what remains is
+            more than noise.
         sloped: share of the excess that it must leave at most where dry friction changes along the joints' ranges.
         sure: half-widths of its 90 % interval by which a member must in the end differ from none.
         iterations, rounds: of its fit, and how often those not needed are dropped, at most.
@@ -134,6 +137,7 @@ class Family:
     rest: float = 0.02
     members: int = 2
     spare: float = 0.03
+    nearly: float = 0.75
     sloped: float = 0.7
     sure: float = 1.8
     iterations: int = 24

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from dropo_torch.gap.accept import (
 )
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.faint import with_faint
-from dropo_torch.gap.family import fitted_family, has_family, whole_family, with_family
+from dropo_torch.gap.family import fitted_family, has_family, of_all_joints, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -67,6 +68,7 @@ class Naming:
         unfinished: the stage in which the time for the search was over, or empty.
         family: whether what is named is the base family.
         left_out: what this does without, and how large that may be.
+        everywhere: members of this that all joints have, since nearly all need them.
         lasting: whether what is more than the noise that was told is noise, too.
         faint: which of the named effects show only along their own direction: see :func:`with_faint`.
     """
@@ -85,6 +87,7 @@ class Naming:
     unfinished: str = ""
     family: bool = False
     left_out: tuple[Allowed, ...] = ()
+    everywhere: frozenset[tuple[str, str | None]] = frozenset()
     lasting: bool = False
     faint: tuple[int, ...] = ()
 
@@ -406,8 +409,10 @@ def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
     reasons = nonsense(ground, current)
     if reasons or not family_accounts(current, state.base, ground.rules):
         return replace(unnamed, attempts=state.attempts, refused=reasons[0] if reasons else LEAVES)
-    beside = with_absent(ground, current)
+    beside, rests = with_absent(ground, current), remains(current.cost, ground.rules)
+    whole = frozenset(of_all_joints(ground, current.hypothesis.placed)) if rests else frozenset[Any]()
     return replace(
-        unnamed, refused="", final=current, named=True, family=True, ties=family_ties(ground, current, beside),
+        unnamed, refused="", final=current, named=True, family=True, everywhere=whole,
+        ties=family_ties(ground, current, beside),
         left_out=left_out(ground, current, beside), shares=shares_of(ground, current), attempts=state.attempts,
     )  # fmt: skip
