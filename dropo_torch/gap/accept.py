@@ -331,8 +331,8 @@ def with_soft_friction(ground: Ground, fitted: Refit) -> Refit:
     ground.report("refining", 0.5)
     placed = [Placed(soft, p.target).at(found[i]) if i in found else p for i, p in enumerate(fitted.hypothesis.placed)]
     hypothesis, few = replace(fitted.hypothesis, placed=tuple(placed)), ground.part.few(ROUGHLY)
-    rough = refit(few, hypothesis, iterations=2, slopes=False).cost
-    if rough.left_of(refit(few, fitted.hypothesis, iterations=0, slopes=False).cost) > LIKELY:
+    own, rough = (refit(few, h, iterations=2, slopes=False).cost for h in (fitted.hypothesis, hypothesis))
+    if rough.left_of(own) > LIKELY:
         return fitted
     softer = ground.refit(hypothesis)
     return softer if softer.cost.left_of(fitted.cost) < 1 - ground.rules.most else fitted
