@@ -182,10 +182,10 @@ def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit
         hypothesis = replace(late.hypothesis, placed=tuple(moved))
         return refit(ground.part, hypothesis, linear=late.linear, iterations=iterations, slopes=iterations > 0)
 
-    vanishing = {joint_of(setting, p) for p in numbers.values() if is_absent(ground, p)}
+    vanishing = {joint_of(setting, p) for p in numbers.values() if is_absent(setting, p, ground.rules.sound.edge)}
     joints = dict.fromkeys(j for p in placed if p.effect.is_filter and (j := joint_of(setting, p)) not in vanishing)
-    over = {j: float((excesses(ground, fitted([j], 0)) / most).max()) for j in joints}
-    idle = sorted((j for j in joints if over[j] <= 1), key=over.__getitem__)
+    over = {j: float((excesses(ground, fitted([j], 0)) - most).max()) for j in joints}
+    idle = sorted((j for j in joints if over[j] <= 0), key=over.__getitem__)
     while idle:
         fewer = fitted(idle, AGAIN)
         if (excesses(ground, fewer) <= most).all():
@@ -194,11 +194,11 @@ def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit
     return late
 
 
-def is_absent(ground: Ground, placed: Placed) -> bool:
-    """Return whether a member is held at a bound of physics at which there is nothing of it, such as no inertia."""
-    (quantity, *_), near = placed.effect.quantities(ground.setting, placed.target), ground.rules.sound.edge
+def is_absent(setting: Setting, placed: Placed, edge: float) -> bool:
+    """Return whether a member is within an ``edge``, in scales, of a bound of physics at which there is nothing of it."""
+    quantity = placed.effect.quantities(setting, placed.target)[0]
     bound = quantity.neutral in (quantity.low, quantity.high)
-    return bound and abs(placed.values[0] - quantity.neutral) <= near * quantity.scale
+    return bound and abs(placed.values[0] - quantity.neutral) <= edge * quantity.scale
 
 
 def excesses(ground: Ground, fitted: Refit) -> np.ndarray:

@@ -12,7 +12,7 @@ from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Quantity, Setting, all_of
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence
-from dropo_torch.gap.family import joint_names
+from dropo_torch.gap.family import is_absent, joint_names
 from dropo_torch.gap.forces.view import ForceView
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, residual_pictures, told_when
 from dropo_torch.gap.noise import FreeForces, free_forces
@@ -388,10 +388,10 @@ def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Ru
     """
     assert fitted.last is not None
     placed, family, idle = fitted.last.fit.hypothesis.placed, naming.family, list[int]()
-    least, spared = rules.family.sure if family else 1.0, naming.everywhere
+    least, edge = rules.family.sure if family else 1.0, rules.sound.edge
+    spared = {k for k, p in enumerate(placed) if p.key in naming.everywhere and not is_absent(setting, p, edge)}
     while len(idle) < len(placed) - 1:
-        sureness = _sureness(setting, fitted, idle, rules.sound.edge).items()
-        sure = {k: s for k, s in sureness if s < least and (s == 0 or placed[k].key not in spared)}
+        sure = {k: s for k, s in _sureness(setting, fitted, idle).items() if s < least and k not in spared}
         if not sure or (idle and not family):
             break
         idle.append(min(sure, key=sure.__getitem__))
@@ -402,10 +402,9 @@ def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Ru
     return replace(found, left_out=(*found.left_out, *allowed))
 
 
-def _sureness(setting: Setting, fitted: _Fitted, gone: Sequence[int], edge: float) -> dict[int, float]:
+def _sureness(setting: Setting, fitted: _Fitted, gone: Sequence[int]) -> dict[int, float]:
     """By how many half-widths of its interval each name of one number differs from none, without some others.
 
-    By 0 where it is within an ``edge``, in scales, of none, as at a bound of physics.
     To first order, by the derivatives of the last fit; none of names that are a choice, or of which nothing is known.
     """
     assert fitted.last is not None
@@ -420,8 +419,7 @@ def _sureness(setting: Setting, fitted: _Fitted, gone: Sequence[int], edge: floa
         quantity, *more = p.effect.quantities(setting, p.target)
         at = starts[index]
         if index not in gone and np.isfinite(halves[at]) and not (more or quantity.discrete or p.effect.steps):
-            away = abs(float(off[at])) if abs(off[at]) > edge * quantity.scale else 0.0
-            found[index] = away / max(float(halves[at]), 1e-300)
+            found[index] = abs(float(off[at])) / max(float(halves[at]), 1e-300)
     return found
 
 
