@@ -195,7 +195,7 @@ def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit
 
 
 def is_absent(setting: Setting, placed: Placed, edge: float) -> bool:
-    """Return whether a member is within an ``edge``, in scales, of a bound of physics at which there is nothing of it."""
+    """Return whether a member is within an ``edge``, in scales, of a bound of physics where nothing is left of it."""
     quantity = placed.effect.quantities(setting, placed.target)[0]
     bound = quantity.neutral in (quantity.low, quantity.high)
     return bound and abs(placed.values[0] - quantity.neutral) <= edge * quantity.scale
