@@ -24,7 +24,7 @@ from dropo_torch.errors import InputError
 from dropo_torch.gap import Gap, NamedEffect, Strength, find_gap, open_loop
 from dropo_torch.gap import family as members
 from dropo_torch.gap.evidence import Cost, Linearization
-from dropo_torch.gap.family import base_family, excesses, not_needed, pushing, without_steps
+from dropo_torch.gap.family import base_family
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.limbs import alike, by_limbs, joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -32,6 +32,7 @@ from dropo_torch.gap.rules import Rules, family_accounts
 from dropo_torch.gap.scene import prepare
 from dropo_torch.gap.search import Naming, leaves_wrong, resort, start
 from dropo_torch.gap.shares import shares_of
+from dropo_torch.gap.spare import excesses, not_needed, of_all_joints, pushing, without_steps
 from dropo_torch.report.gap_words import answer, by_joint
 
 Triple = tuple[float, ...]
@@ -141,7 +142,7 @@ def test_what_nearly_all_joints_need_all_joints_have(count: int, whole: bool, mo
     placed: Any = [SimpleNamespace(effect=kind, key=(n, joint)) for n, kind in enumerate(kinds) for joint in "abcdef"]
     idle = [*placed[count:6], *placed[6:]]
     ground: Any = SimpleNamespace(setting=None, rules=Rules())
-    assert members.of_all_joints(ground, placed, idle) == ({p.key for p in placed[:6]} if whole else set())
+    assert of_all_joints(ground, placed, idle) == ({p.key for p in placed[:6]} if whole else set())
 
 
 def test_what_a_family_does_without_is_limited() -> None:

@@ -22,7 +22,6 @@ from dropo_torch.effects.actuator import unit_of
 from dropo_torch.gap import Gap, Hypothesis, Scene, find_gap, prepare
 from dropo_torch.gap.accept import add, nonsense, undone
 from dropo_torch.gap.cancel import cancelling
-from dropo_torch.gap.family import excesses, needed, not_needed
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.locate import regressors
 from dropo_torch.gap.log import cut_windows, spread
@@ -31,6 +30,7 @@ from dropo_torch.gap.outcome import merge_families
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import NamedEffect, Place, Strength
 from dropo_torch.gap.search import Ended, Naming, start, start_anywhere, with_ties
+from dropo_torch.gap.spare import excesses, needed, not_needed
 from dropo_torch.gap.ties import _one_for_two, canonical, rivals_of_all, size
 from dropo_torch.gap.verify import constant_velocity, cut_held, position_features
 from dropo_torch.problem import make_problem

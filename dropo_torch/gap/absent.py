@@ -10,11 +10,12 @@ import numpy as np
 from dropo_torch.effects import find_effect
 from dropo_torch.effects.base import Placed
 from dropo_torch.gap.accept import SOFT
-from dropo_torch.gap.family import BASE, FRICTION, SLOPE, base_family
+from dropo_torch.gap.family import BASE, SLOPE, base_family
 from dropo_torch.gap.ground import Ground
 from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import LEAST_DAMPING, Z90, Hypothesis, Refit, limits_of, newton_step, refit, standard_errors
 from dropo_torch.gap.shares import offsets
+from dropo_torch.gap.spare import FRICTION
 
 #: An effect, and the half-widths of the 90 % intervals of its numbers.
 Allowed = tuple[Placed, np.ndarray]

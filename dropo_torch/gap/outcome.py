@@ -12,7 +12,7 @@ from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import Placed, Quantity, Setting, all_of
 from dropo_torch.gap.course import courses
 from dropo_torch.gap.evidence import Cost, Evidence
-from dropo_torch.gap.family import is_absent, joint_names
+from dropo_torch.gap.family import joint_names
 from dropo_torch.gap.forces.view import ForceView
 from dropo_torch.gap.locate import dof_names, force_unit, guilty, places, residual_pictures, told_when
 from dropo_torch.gap.noise import FreeForces, free_forces
@@ -35,6 +35,7 @@ from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.shares import offsets
 from dropo_torch.gap.sound import absurd, has_skill
+from dropo_torch.gap.spare import is_absent
 from dropo_torch.gap.starts import straightened
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe

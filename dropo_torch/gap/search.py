@@ -28,7 +28,7 @@ from dropo_torch.gap.accept import (
 )
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.faint import with_faint
-from dropo_torch.gap.family import fitted_family, has_family, of_all_joints, whole_family, with_family
+from dropo_torch.gap.family import fitted_family, has_family, whole_family, with_family
 from dropo_torch.gap.ground import Ground, Screening, State
 from dropo_torch.gap.limit import OutOfTime, until
 from dropo_torch.gap.refit import Hypothesis, Refit
@@ -36,6 +36,7 @@ from dropo_torch.gap.renew import noise_beside, renewed, restarted, with_base
 from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, family_accounts, may_leave, remains, significant
 from dropo_torch.gap.shares import shares_of
+from dropo_torch.gap.spare import of_all_joints
 from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
 from dropo_torch.support.checkpoint import Checkpoint
 
