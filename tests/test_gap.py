@@ -230,19 +230,20 @@ def test_a_mass_that_is_another_is_no_load(tmp_path: Path, monkeypatch: pytest.M
     assert list(held.config.parameters or ()) == ["pole_mass"]
     center = {"field": "body_ipos", "index": 2, "name": body, "bounds": [-0.5, 0.5]}
     both = problem.config.model_copy(update={"parameters": {**(problem.config.parameters or {}), "center": center}})
-    plain = given.as_own(dataclasses.replace(problem, config=both), load)  # a mass and its center are no simpler
+    scene = prepare(given.as_given(problem))
+    plain = given.as_own(dataclasses.replace(problem, config=both), load, scene)  # a mass and its center: no simpler
     assert plain is not None
     assert list(plain.config.parameters or ()) == ["pole_mass"]
     shared = problem.config.model_copy(deep=True)  # one number for several bodies, as of what is fixed to each other
     assert shared.parameters is not None
     shared.parameters["pole_mass"]["name"] = [body]
-    of_several = given.as_own(dataclasses.replace(problem, config=shared), load)
+    of_several = given.as_own(dataclasses.replace(problem, config=shared), load, scene)
     assert of_several is not None
     assert list(of_several.config.parameters or ()) == ["pole_mass"]
     elsewhere = dataclasses.replace(load, effects=(named,))
-    assert given.as_own(problem, elsewhere) is None
+    assert given.as_own(problem, elsewhere, scene) is None
     better = dataclasses.replace(load, reduced=(load.reduced[0], 0.5))  # what the mass alone cannot do
-    assert given.as_own(problem, better) is None
+    assert given.as_own(problem, better, scene) is None
 
 
 @pytest.mark.parametrize(("numbers", "is_simpler"), [(1, False), (4, True)])
@@ -258,9 +259,8 @@ def test_masses_of_several_bodies_that_are_others_are_no_load(numbers: int, is_s
     (named,) = found(("joint_damping",)).effects
     strengths = dict.fromkeys("abcd"[:numbers], next(iter(named.parameters.values())))
     load = dataclasses.replace(named, effect="payload", target=carriage, parameters=strengths)
-    plain = given.as_own(
-        dataclasses.replace(problem, config=config), dataclasses.replace(found(("joint_damping",)), effects=(load,))
-    )
+    gap, scene = dataclasses.replace(found(("joint_damping",)), effects=(load,)), prepare(given.as_given(problem))
+    plain = given.as_own(dataclasses.replace(problem, config=config), gap, scene)
     assert (plain is not None) == is_simpler
     assert plain is None or set(plain.config.parameters or ()) == {"cart_mass", "pole_mass"}
 

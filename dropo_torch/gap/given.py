@@ -19,7 +19,7 @@ from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.refit import refit
 from dropo_torch.gap.result import Gap
 from dropo_torch.gap.run import find_gap
-from dropo_torch.gap.scene import Scene, prepare
+from dropo_torch.gap.scene import Scene, prepare, with_parameters
 from dropo_torch.problem import Problem, make_problem
 from dropo_torch.shooting.posing import posed
 from dropo_torch.support.report import Report
@@ -97,12 +97,13 @@ def find_gap_as_given(
             time_limit=max(end - time.monotonic(), 0.0),
         )  # fmt: skip
 
-    first = sought(held, path, scene or prepare(held), share_of(end, 1))
+    scene = scene or prepare(held)
+    first = sought(held, path, scene, share_of(end, 1))
     if _RANKS[first.verdict] == 0:
-        if (plain := as_own(problem, first)) is None:
+        if (plain := as_own(problem, first, scene)) is None:
             return held, first
         other = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}-own")
-        second = sought(plain, other, prepare(plain), end)
+        second = sought(plain, other, with_parameters(scene, plain), end)
         return (plain, _both(first, second)) if _RANKS[second.verdict] == 0 else (held, first)
     if first.verdict == "partly explained" and first.closed >= ENOUGH:
         return held, replace(first, notes=(*first.notes, _HELD))
@@ -116,7 +117,7 @@ def find_gap_as_given(
     return held, _both(second, first)
 
 
-def as_own(problem: Problem, gap: Gap) -> Problem | None:
+def as_own(problem: Problem, gap: Gap, scene: Scene) -> Problem | None:
     """Return a problem in which masses that the config has make up for what was named at their bodies, if they do.
 
     What sits on a body has more numbers than the mass of the body itself, which may just be another than the model's.
@@ -126,6 +127,7 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
     Args:
         problem: the model, its parameters, and the log.
         gap: what explains the log in the model as given.
+        scene: what that was found on.
     """
     bodies = {e.target for e in gap.effects if e.effect in MASSIVE}
     if not bodies:
@@ -136,15 +138,15 @@ def as_own(problem: Problem, gap: Gap) -> Problem | None:
     every = list(masses)
     named = sum(len(e.parameters) for e in gap.effects)
     for free in (own, every if len(own) < len(every) <= named else []):
-        if free and (plain := _as_good(problem, free, gap)) is not None:
+        if free and (plain := _as_good(problem, free, gap, scene)) is not None:
             return plain
     return None
 
 
-def _as_good(problem: Problem, free: Sequence[str], gap: Gap) -> Problem | None:
+def _as_good(problem: Problem, free: Sequence[str], gap: Gap, scene: Scene) -> Problem | None:
     """A problem in which some parameters are free, if with these it leaves no more than what was named."""
     plain = as_given(problem, free)
-    scene = prepare(plain)
+    scene = with_parameters(scene, plain)
     left = refit(scene.evidence, scene.begin, slopes=False).cost.reduced
     named = max(gap.reduced[1], 0.0 if gap.own_step is None else gap.own_step[0])
     return plain if left <= AS_GOOD * named else None

@@ -138,6 +138,18 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
 
 
+def with_parameters(scene: Scene, problem: Problem) -> Scene:
+    """Return a scene with the declared parameters of another problem of the same model and log; windows and noise stay.
+
+    Args:
+        scene: of the log.
+        problem: with the other parameters.
+    """
+    begin, twin = Hypothesis(tuple(start_values(problem).tolist())), _twin(problem, scene.setting)
+    evidence = replace(scene.evidence, twin=twin, begin=begin.variant)
+    return replace(scene, problem=problem, twin=twin, evidence=evidence, begin=begin)
+
+
 def _noisy_starts(problem: Problem, setting: Setting) -> list[int]:
     """Columns of joints whose velocities are masked, where contacts or stops bend what begins at single rows."""
     if not (problem.config.keeps_noise and setting.has_impacts):
