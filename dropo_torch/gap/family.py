@@ -150,8 +150,8 @@ def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
     """Return the base family fitted at every joint, with delays where inertia and damping do not do as well.
 
     A delay of a servo, its inertia and its damping nearly stand for each other. So all joints are fitted without delays
-    first, and a joint has one only where the log is clearly nearer with it, or where its inertia or damping would have
-    to vanish in its place.
+    first, and a joint has one only where that leaves much less at it, or where its inertia or damping would have to
+    vanish in its place.
     """
     ground.report(STAGE, 0.1)
     prompt, late = _in_turn(ground, begin, lambda h: ground.refit(h, iterations=ground.rules.family.iterations))
@@ -166,7 +166,7 @@ def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit
         prompt: the fit without delays.
         late: the fit with them.
     """
-    most, setting = tolerated(ground, late), ground.setting
+    most, setting = tolerated(ground, late, 1 / ground.rules.family.delayed - 1), ground.setting
     numbers, placed = {p.key: p for p in prompt.hypothesis.placed}, late.hypothesis.placed
 
     def fitted(joints: Collection[int | None], iterations: int) -> Refit:

@@ -122,6 +122,7 @@ class Family:
         members: of it, so many must be needed at half of the joints.
         spare: share of the excess that it leaves at a joint by which dropping the members least needed there may raise
             it.
+        delayed: share of the excess at a joint that a delay there must leave at most.
         nearly: share of the joints that must need a member of a kind for all of them to have it, where what remains is
             more than noise.
         sloped: share of the excess that it must leave at most where dry friction changes along the joints' ranges.
@@ -137,6 +138,7 @@ class Family:
     rest: float = 0.02
     members: int = 2
     spare: float = 0.03
+    delayed: float = 0.7
     nearly: float = 0.75
     sloped: float = 0.7
     sure: float = 1.8

@@ -37,11 +37,16 @@ def excesses(ground: Ground, fitted: Refit) -> np.ndarray:
     return np.bincount([last if j is None else j for j in joints], of_features, last + 1)
 
 
-def tolerated(ground: Ground, whole: Refit) -> np.ndarray:
-    """Return the excess at each joint, ``(J + 1,)``, up to which a family with fewer members is about as good."""
-    rules, own = ground.rules, excesses(ground, whole)
-    sigma = whole.cost.sigma / np.sqrt(max(len(ground.part.chart.labels), 1))
-    return own + np.maximum(rules.family.spare * own, rules.alike.sigmas * sigma)
+def tolerated(ground: Ground, whole: Refit, share: float) -> np.ndarray:
+    """Return the excess at each joint, ``(J + 1,)``, up to which a family with fewer members does as well.
+
+    Args:
+        ground: what the search stands on.
+        whole: a fit of the family.
+        share: of its excess at a joint, by which that may be larger.
+    """
+    own, sigma = excesses(ground, whole), whole.cost.sigma / np.sqrt(max(len(ground.part.chart.labels), 1))
+    return own + np.maximum(share * own, ground.rules.alike.sigmas * sigma)
 
 
 def needed(ground: Ground, whole: Refit) -> Refit | None:
@@ -55,7 +60,7 @@ def needed(ground: Ground, whole: Refit) -> Refit | None:
         if idle:
             whole, most = _without(ground, whole, idle), nothing
             continue
-        most = np.minimum(most, tolerated(ground, whole))
+        most = np.minimum(most, tolerated(ground, whole, rules.spare))
         idle = not_needed(ground, whole, most)
         if remains(whole.cost, ground.rules):
             idle = not_needed(ground, whole, most, of_all_joints(ground, whole.hypothesis.placed, idle))
