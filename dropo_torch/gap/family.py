@@ -182,7 +182,7 @@ def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit
     while idle:
         fewer = fitted(idle, AGAIN)
         if (excesses(ground, fewer) <= most).all():
-            return fewer
+            return ground.refit(fewer.hypothesis)
         idle = idle[: len(idle) // 2]
     return late
 
