@@ -16,7 +16,7 @@ from dropo_torch.gap.rules import Rules
 def named(value: float, *, steps: bool = False, numbers: int = 1) -> Any:
     """An effect with so many numbers, absent at 0."""
     quantities = tuple(Quantity(f"n{i}", "-", 0.0, -10.0, 10.0, 1.0) for i in range(numbers))
-    effect = SimpleNamespace(quantities=lambda setting, target: quantities, steps=steps)
+    effect = SimpleNamespace(name="some", quantities=lambda setting, target: quantities, steps=steps)
     return SimpleNamespace(effect=effect, target=None, values=(value,) * numbers, key=None)
 
 
@@ -29,7 +29,8 @@ def left(monkeypatch: pytest.MonkeyPatch, family: bool, entries: list[tuple[Any,
     vector = np.array([v for p in placed for v in p.values])
     halves = np.concatenate([np.full(len(p.values), half) for p, half in entries])
     hypothesis = SimpleNamespace(placed=placed, declared=(), vector=vector)
-    naming: Any = SimpleNamespace(everywhere=(), family=family, kept=list(range(len(placed))), left_out=())
+    final = SimpleNamespace(hypothesis=hypothesis)
+    naming: Any = SimpleNamespace(final=final, everywhere=(), family=family, kept=list(range(len(placed))), left_out=())
     fitted: Any = SimpleNamespace(
         last=SimpleNamespace(fit=SimpleNamespace(hypothesis=hypothesis, scale=np.ones(len(vector)))),
         halves=halves,
@@ -60,3 +61,10 @@ def test_what_may_as_well_be_nothing_has_no_name(
     family: bool, entries: list[tuple[Any, float]], kept: list[int], known: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert left(monkeypatch, family, entries) == (kept, known)
+
+
+def test_a_slope_of_friction_goes_with_the_friction(monkeypatch: pytest.MonkeyPatch) -> None:
+    slope = SimpleNamespace(**{**vars(named(1.0)), "key": "slope"})
+    monkeypatch.setattr(outcome, "pushing", lambda setting, hypothesis: [slope])
+    entries = [(named(0.1), 0.5), (slope, 0.5), (named(2.0), 0.5)]
+    assert left(monkeypatch, True, entries) == ([2], 2)

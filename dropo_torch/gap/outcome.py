@@ -35,7 +35,7 @@ from dropo_torch.gap.scene import Scene
 from dropo_torch.gap.search import Naming
 from dropo_torch.gap.shares import offsets
 from dropo_torch.gap.sound import absurd, has_skill
-from dropo_torch.gap.spare import is_absent
+from dropo_torch.gap.spare import is_absent, pushing
 from dropo_torch.gap.starts import straightened
 from dropo_torch.gap.suggest import excite, suggest
 from dropo_torch.gap.symbolic import describe
@@ -60,6 +60,8 @@ UNSEEN = (
 #: Why unseen data refute names.
 UNSKILLED = "the model still predicts unseen data no better than constant velocity does"
 WORSE = "the model predicts unseen data worse than without them"
+#: Why a base family has no names of which none is sure.
+NOTHING_SURE = "of friction, inertia, offset and delay, the log may as well lack each"
 #: Open-loop error on unseen data, relative to that of constant velocity, from which on no last fit would do better.
 HOPELESS = 1.5
 #: Share that better starts of windows must leave by themselves for a fit with them to be of use.
@@ -398,6 +400,12 @@ def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Ru
         idle.append(min(sure, key=sure.__getitem__))
     if not idle:
         return None
+    if family:  # a slope of friction that is left without friction goes with it
+        rest = replace(naming.final.hypothesis, placed=tuple(p for k, p in enumerate(placed) if k not in idle))
+        lone = [p.key for p in pushing(setting, rest)]
+        idle += [k for k, p in enumerate(placed) if p.key in lone]
+        if len(idle) == len(placed):
+            return _nameless(naming, NOTHING_SURE)
     found = _keeping(naming, [k for k in range(len(placed)) if k not in idle])
     allowed = [(placed[k], fitted.of_names[k]) for k in idle if family]
     return replace(found, left_out=(*found.left_out, *allowed))

@@ -153,15 +153,19 @@ def _without_what_cancels(ground: Ground, whole: Refit, most: np.ndarray) -> Ref
 def without_steps(ground: Ground, whole: Refit) -> Refit:
     """Return the family without members that only make up for the model's own step.
 
-    Where a finer step is better, the interval that a member has there must not hold its neutral value.
+    Where a finer step is better, the interval that a member has there must not hold its neutral value, unless all
+    joints have it. A slope of friction that is left without friction goes with it.
     """
     last = resolved(ground.part, whole)
     if last.fit is whole:
         return whole
     first, off = len(whole.hypothesis.declared), offsets(ground.setting, last.fit) * last.fit.scale
-    within = np.abs(off[first:]) < half_widths(last)[first:]
-    idle = [p for p, absent in zip(whole.hypothesis.placed, within, strict=True) if absent]
-    return _without(ground, whole, idle) if idle else whole
+    within, placed = np.abs(off[first:]) < half_widths(last)[first:], whole.hypothesis.placed
+    spared = of_all_joints(ground, placed) if remains(last.fit.cost, ground.rules) else set()
+    idle = [p for p, absent in zip(placed, within, strict=True) if absent and p.key not in spared]
+    fewer = _without(ground, whole, idle) if idle else whole
+    pushes = pushing(ground.setting, fewer.hypothesis)
+    return _without(ground, fewer, pushes) if pushes else fewer
 
 
 def _without(ground: Ground, whole: Refit, idle: Sequence[Placed]) -> Refit:
