@@ -23,11 +23,12 @@ from dropo_torch.gap.spare import FRICTION, STAGE, excesses, is_absent, needed, 
 
 #: The effects of a joint, or of the actuator that drives it. Each is one number.
 BASE = ("armature", "joint_damping", "joint_friction", "actuator_bias", "actuator_delay")
+#: The one of them for which a delay stands most.
+INERTIA = "armature"
 #: One more of them, where what these leave is more than noise; and those on top of which it is.
 SLOPE = "joint_friction_slope"
 #: Numbers that a base family may have more than effects that have about as many.
 ABOUT = 1
-
 #: Iterations of a fit without some of its delays.
 AGAIN = 12
 
@@ -150,8 +151,8 @@ def fitted_family(ground: Ground, begin: Hypothesis) -> Refit:
     """Return the base family fitted at every joint, with delays where inertia and damping do not do as well.
 
     A delay of a servo, its inertia and its damping nearly stand for each other. So all joints are fitted without delays
-    first, and a joint has one only where that leaves much less at it, or where its inertia or damping would have to
-    vanish in its place.
+    first, and a joint has one only where that leaves much less at it, or where its inertia would have to vanish in
+    its place.
     """
     ground.report(STAGE, 0.1)
     prompt, late = _in_turn(ground, begin, lambda h: ground.refit(h, iterations=ground.rules.family.iterations))
@@ -175,7 +176,8 @@ def without_needless_delays(ground: Ground, prompt: Refit, late: Refit) -> Refit
         hypothesis = replace(late.hypothesis, placed=tuple(moved))
         return refit(ground.part, hypothesis, linear=late.linear, iterations=iterations, slopes=iterations > 0)
 
-    vanishing = {joint_of(setting, p) for p in numbers.values() if is_absent(setting, p, ground.rules.sound.edge)}
+    rotors = [p for p in numbers.values() if p.effect.name == INERTIA]
+    vanishing = {joint_of(setting, p) for p in rotors if is_absent(setting, p, ground.rules.sound.edge)}
     joints = dict.fromkeys(j for p in placed if p.effect.is_filter and (j := joint_of(setting, p)) not in vanishing)
     over = {j: float((excesses(ground, fitted([j], 0)) - most).max()) for j in joints}
     idle = sorted((j for j in joints if over[j] <= 0), key=over.__getitem__)
