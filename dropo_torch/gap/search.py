@@ -6,7 +6,6 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -411,7 +410,7 @@ def conclude_family(ground: Ground, state: State, unnamed: Naming) -> Naming:
     if reasons or not family_accounts(current, state.base, ground.rules):
         return replace(unnamed, attempts=state.attempts, refused=reasons[0] if reasons else LEAVES)
     beside, rests = with_absent(ground, current), remains(current.cost, ground.rules)
-    whole = frozenset(of_all_joints(ground, current.hypothesis.placed)) if rests else frozenset[Any]()
+    whole = frozenset(of_all_joints(ground, current.hypothesis.placed) if rests else ())
     return replace(
         unnamed, refused="", final=current, named=True, family=True, everywhere=whole,
         ties=family_ties(ground, current, beside),
