@@ -404,7 +404,7 @@ def test_what_is_one_effect_is_not_told_as_two() -> None:
     ground = ground.at(state)
     two = ground.refit(state.base.hypothesis.with_effects(forces))
     assert two.cost.reduced == pytest.approx(1, abs=0.1)
-    tied, _, found = rivals_of_all(ground, replace(state, current=two))
+    tied, _, found = rivals_of_all(ground, replace(state, current=two), {})
     assert [p.key for p in found.current.hypothesis.placed] == [("gravity_tilt", None)]
     assert abs(found.current.hypothesis.placed[0].values[1]) == pytest.approx(0.1, abs=1e-3)
     assert tied == [()]

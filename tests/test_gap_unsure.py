@@ -23,7 +23,7 @@ def named(value: float, *, steps: bool = False, numbers: int = 1) -> Any:
 def left(monkeypatch: pytest.MonkeyPatch, family: bool, entries: list[tuple[Any, float]]) -> tuple[list[int], int]:
     """Which of several effects with half-widths stay, and of how many it stays known what they may be."""
     placed = [p for p, _ in entries]
-    monkeypatch.setattr(outcome, "_keeping", lambda naming, kept: replaced(naming, kept))
+    monkeypatch.setattr(outcome, "_keeping", lambda naming, kept, near: replaced(naming, kept))
     monkeypatch.setattr(outcome, "replace", lambda naming, **new: SimpleNamespace(**{**vars(naming), **new}))
     monkeypatch.setattr(outcome, "_beside_fewer", lambda last, off, out: (off, halves))  # nothing is entangled
     vector = np.array([v for p in placed for v in p.values])

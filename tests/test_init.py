@@ -15,6 +15,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import yaml
+from scipy.interpolate import CubicSpline
 
 import dropo_torch as dropo
 from benchmarks.init.systems import ROBOTS
@@ -782,11 +783,17 @@ def test_commands_that_are_surely_exchanged_are_put_right(tmp_path: Path) -> Non
     assert not [f for f in found.findings if f.sure]
 
 
-def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
-    tmp_path: Path, log: tuple[np.ndarray, ...]
-) -> None:
-    t, q, _, u = log
-    late = t + 2e-3 * np.random.default_rng(3).uniform(-1, 1, len(t))
+def unevenly(jitter: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A log whose rows were taken when their stamps say: these, positions, and commands in force."""
+    rng = np.random.default_rng(3)
+    t, q, _, u = recorded(cartpole(), 8, 4, push, noise=(0.0, 0.0))
+    taken = t + jitter * rng.uniform(-1, 1, len(t))
+    row = np.clip(np.searchsorted(t, taken, side="right") - 1, 0, len(t) - 1)
+    return taken, CubicSpline(t, q)(taken) + 1e-3 * rng.standard_normal(q.shape), u[row]
+
+
+def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(tmp_path: Path) -> None:
+    late, q, u = unevenly(2e-3)
     model, data = written(tmp_path, {"time": late, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]})
     found = dropo.propose_config(model, data, out=tmp_path / "robot.yaml")
     options = found.document["data"]["preprocess"]
@@ -801,16 +808,33 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(
 
 
 @pytest.mark.parametrize(("jitter", "words"), [(0.0, ""), (2e-3, r"time stamps jitter by \d+% of 0.0\d+ s and ")])
-def test_rows_that_are_missing_are_told_as_such(
-    jitter: float, words: str, tmp_path: Path, log: tuple[np.ndarray, ...]
-) -> None:
-    t, q, _, u = log
-    late = t + jitter * np.random.default_rng(3).uniform(-1, 1, len(t))
-    kept = np.setdiff1d(np.arange(len(t)), [50, 120, 121, 200])
+def test_rows_that_are_missing_are_told_as_such(jitter: float, words: str, tmp_path: Path) -> None:
+    late, q, u = unevenly(jitter)
+    kept = np.setdiff1d(np.arange(len(late)), [50, 120, 121, 200])
     frame = {"time": late, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]}
     files = written(tmp_path, {name: values[kept] for name, values in frame.items()})
     notes = dropo.propose_config(*files, out=tmp_path / "robot.yaml").draft.notes
     assert any(re.fullmatch(f"{words}4 rows are missing: resampled", note) for note in notes)
+
+
+@pytest.mark.parametrize("gone", [(), (50, 120, 121, 200)])
+def test_rows_that_were_taken_evenly_are_read_so_although_stamps_jitter(
+    gone: tuple[int, ...], tmp_path: Path, log: tuple[np.ndarray, ...]
+) -> None:
+    """A logger that stamps rows when it receives them; where some are missing, an episode begins."""
+    t, q, v, u = log
+    stamps = t + 4e-3 * np.random.default_rng(3).uniform(-1, 1, len(t))
+    kept = np.setdiff1d(np.arange(len(t)), gone)
+    frame = {"time": stamps, "x": q[:, 0], "theta": q[:, 1], "dx": v[:, 0], "dtheta": v[:, 1], "u": u[:, 0]}
+    files = written(tmp_path, {name: values[kept] for name, values in frame.items()})
+    found = dropo.propose_config(*files, out=tmp_path / "robot.yaml")
+    data = found.document["data"]
+    assert data["dt"] == pytest.approx(t[1] - t[0], rel=2e-3)
+    assert "time" not in data
+    assert "preprocess" not in data
+    assert len(data.get("breaks", [])) == (3 if gone else 0)
+    assert "what was measured is the smoother if rows are even" in " ".join(found.clock.why)
+    assert not [f for f in found.findings if f.sure]
 
 
 HOVER = """

@@ -65,7 +65,9 @@ NOTHING_SURE = "of friction, inertia, offset and delay, the log may as well lack
 #: Open-loop error on unseen data, relative to that of constant velocity, from which on no last fit would do better.
 HOPELESS = 1.5
 #: Share that better starts of windows must leave by themselves for a fit with them to be of use.
-NEARER = 0.5
+NEARER = 0.25
+#: Windows on which that is tried first: those with the largest misfit.
+WORST = 12
 #: Median of χ² of one degree of freedom.
 MEDIAN = 0.455
 
@@ -76,6 +78,7 @@ class _Fitted:
 
     Attributes:
         evidence: all windows, with the noise that they show.
+        weighed: the same with the weights of the last fit.
         final: the last fit.
         last: the same as the step of the simulation leaves it; ``None`` where nothing is named.
         rest: the fit as noise alone weighs the residuals.
@@ -85,6 +88,7 @@ class _Fitted:
     """
 
     evidence: Evidence
+    weighed: Evidence
     final: Refit
     last: Resolved | None
     rest: Refit
@@ -98,6 +102,10 @@ class _Fitted:
         hypothesis = self.final.hypothesis
         sizes = [len(hypothesis.declared), *(len(p.values) for p in hypothesis.placed)]
         return np.split(self.halves, np.cumsum(sizes)[:-1])[1:]
+
+
+#: A last fit, the same as noise alone weighs the residuals, their misfit with the model's own step, and the weights.
+_Last = tuple[Resolved, Refit, Cost, Evidence]
 
 
 @dataclass(frozen=True)
@@ -124,7 +132,10 @@ class _Checked:
         return self.after.rollout_rmse / max(self.floor.rollout_rmse, 1e-300)
 
 
-def make_result(scene: Scene, naming: Naming, started: float, report: Report = lambda stage, share: None) -> Gap:
+def make_result(
+    scene: Scene, naming: Naming, started: float, report: Report = lambda stage, share: None,
+    weighed: Evidence | None = None,
+) -> Gap:  # fmt: skip
     """Fit what was named on all windows, score it on held-out data, and put everything together.
 
     Args:
@@ -132,12 +143,13 @@ def make_result(scene: Scene, naming: Naming, started: float, report: Report = l
         naming: what it found.
         started: when it began, by ``time.perf_counter``.
         report: called with a stage and its share done.
+        weighed: all windows with the weights that a last fit with more names ended with; found here by default.
     """
-    if naming.named and (unnamed := _hopeless(scene, naming)) is not None:
+    if naming.named and weighed is None and (unnamed := _hopeless(scene, naming)) is not None:
         return make_result(scene, unnamed, started, report)
-    fitted = _fitted_on_all(scene, naming, report)
+    fitted = _fitted_on_all(scene, naming, report, weighed)
     if fitted.last is not None and (fewer := _without_unsure(scene.setting, naming, fitted, scene.rules)) is not None:
-        return make_result(scene, fewer, started, report)
+        return make_result(scene, fewer, started, report, fitted.weighed)
     checked = _checked(scene, naming, fitted, report)
     if not naming.gap and checked.astray > scene.rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(checked.astray))
@@ -156,18 +168,20 @@ def _hopeless(scene: Scene, naming: Naming) -> Naming | None:
     return _without_names(naming, UNSKILLED, after, constant)
 
 
-def _fitted_on_all(scene: Scene, naming: Naming, report: Report) -> _Fitted:
-    """The last fit, and the declared parameters alone."""
+def _fitted_on_all(scene: Scene, naming: Naming, report: Report, weighed: Evidence | None) -> _Fitted:
+    """The last fit, with weights that are found or given, and the declared parameters alone."""
     evidence, alone = naming.evidence, naming.base
     if not naming.named:
-        return _Fitted(evidence, naming.final, None, naming.final, alone, None, np.zeros(0))
+        return _Fitted(evidence, evidence, naming.final, None, naming.final, alone, None, np.zeros(0))
     report("fitting on all windows", 0.0)
-    last, rest, own = _last_fit(evidence, scene.noisy, naming.final.hypothesis)
+    hypothesis = naming.final.hypothesis
+    found = _last_fit(evidence, scene.noisy, hypothesis) if weighed is None else _as_weighed(weighed, hypothesis)
+    last, rest, own, weighed = found
     if not np.array_equal(last.evidence.noise, evidence.noise):
         evidence = replace(evidence, noise=last.evidence.noise)
         alone = refit(evidence, alone.hypothesis, iterations=0, slopes=False)
     step = _own_step(own, rest.cost, scene.rules)
-    return _Fitted(evidence, last.fit, last, rest, alone, step, half_widths(last))
+    return _Fitted(evidence, weighed, last.fit, last, rest, alone, step, half_widths(last))
 
 
 def _checked(scene: Scene, naming: Naming, fitted: _Fitted, report: Report) -> _Checked:
@@ -308,10 +322,10 @@ def _force_pictures(setting: Setting, view: ForceView) -> tuple[Residuals, ...]:
     )  # fmt: skip
 
 
-def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> tuple[Resolved, Refit, Cost]:
+def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> _Last:
     """Fit the named effects on all windows, as they are weighted and stepped in the end.
 
-    And as noise alone weighs them, and the misfit that they have so with the model's own step.
+    And as noise alone weighs them, the misfit that they have so with the model's own step, and the weights.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
     error of a real model grows with the lead, and differs between columns. The noise is told once more, by all windows
@@ -336,20 +350,39 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
         evidence = replace(evidence, model_error=smooth.ravel())
         own = refit(evidence, own.hypothesis, iterations=6)
         final = resolved(evidence, own, anew=True)
-    return final, rest, with_own_step
+    return final, rest, with_own_step, evidence
+
+
+def _as_weighed(weighed: Evidence, hypothesis: Hypothesis) -> _Last:
+    """The last fit with the weights that one of more effects has found."""
+    own = refit(weighed, hypothesis, iterations=6)
+    final = resolved(weighed, own, anew=True)
+    stepped, plain = (
+        refit(replace(e, model_error=np.ones_like(e.model_error)), f.hypothesis, iterations=0, slopes=False)
+        for e, f in ((final.evidence, final.fit), (weighed, own))
+    )
+    return final, stepped, plain.cost, weighed
 
 
 def _straight(evidence: Evidence, own: Refit) -> tuple[Evidence, Refit]:
     """Windows that begin where they fit best, and the fit on them, if that leaves nothing where something is left."""
-    windows = straightened(evidence, own.hypothesis.variant) if significant(own.cost, evidence.rules) else None
-    if windows is None:
+    if not significant(own.cost, evidence.rules) or not _helps_the_worst(evidence, own):
+        return evidence, own
+    if (windows := straightened(evidence, own.hypothesis.variant)) is None:
         return evidence, own
     straight = replace(evidence, windows=windows)
-    there = refit(straight, own.hypothesis, iterations=0, slopes=False)
-    if there.cost.left_of(own.cost) > NEARER and there.cost.reduced > evidence.rules.sound.wrong:
-        return evidence, own
     there = refit(straight, own.hypothesis, iterations=6)
     return (evidence, own) if significant(there.cost, evidence.rules) else (straight, there)
+
+
+def _helps_the_worst(evidence: Evidence, own: Refit) -> bool:
+    """Return whether better starts take much of the misfit of the windows that have the most."""
+    few = evidence.select(np.sort(np.argsort(-own.cost.windows)[:WORST]))
+    if (windows := straightened(few, own.hypothesis.variant)) is None:
+        return False
+    here = refit(few, own.hypothesis, iterations=0, slopes=False).cost
+    there = refit(replace(few, windows=windows), own.hypothesis, iterations=6, slopes=False).cost
+    return there.left_of(here) <= NEARER
 
 
 def _without_names(naming: Naming, why: str, after: Score, rival: float) -> Naming:
@@ -373,13 +406,14 @@ def _spared(naming: Naming, absurd: Sequence[tuple[Placed, str]]) -> Naming:
     return _keeping(naming, kept) if naming.family and kept else _nameless(naming, absurd[0][1])
 
 
-def _keeping(naming: Naming, kept: Sequence[int]) -> Naming:
-    """What was found, with some of its names only."""
-    hypothesis = naming.final.hypothesis
+def _keeping(naming: Naming, kept: Sequence[int], near: Hypothesis | None = None) -> Naming:
+    """What was found, with some of its names only; ``near`` that, with all of them, is the best fit already."""
+    hypothesis = near or naming.final.hypothesis
     rest = replace(hypothesis, placed=tuple(hypothesis.placed[k] for k in kept))
     ties, shares = tuple(naming.ties[k] for k in kept), tuple(naming.shares[k] for k in kept)
     faint = tuple(n for n, k in enumerate(kept) if k in naming.faint)
-    return replace(naming, final=refit(naming.evidence, rest, iterations=6), ties=ties, shares=shares, faint=faint)
+    final = refit(naming.evidence, rest, iterations=6 if near is None else 1, slopes=False)
+    return replace(naming, final=final, ties=ties, shares=shares, faint=faint)
 
 
 def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Rules) -> Naming | None:
@@ -406,7 +440,8 @@ def _without_unsure(setting: Setting, naming: Naming, fitted: _Fitted, rules: Ru
         idle += [k for k, p in enumerate(placed) if p.key in lone]
         if len(idle) == len(placed):
             return _nameless(naming, NOTHING_SURE)
-    found = _keeping(naming, [k for k in range(len(placed)) if k not in idle])
+    kept = [k for k in range(len(placed)) if k not in idle]
+    found = _keeping(naming, kept, fitted.last.fit.hypothesis)
     allowed = [(placed[k], fitted.of_names[k]) for k in idle if family]
     return replace(found, left_out=(*found.left_out, *allowed))
 

@@ -30,6 +30,9 @@ LEAST_GAIN, LEAST_SHARE = 0.01, 1e-6
 SHARE, FEW_GAINS = 1e-4, 2
 #: Times the last gain that each step to come is expected to gain at most.
 PACE = 2.0
+#: Free numbers from which on a step's own change of the residuals corrects their derivatives, which then serve for the
+#: next one, if it has gained this share of what they promised.
+MANY, KEPT = 12, 0.5
 #: Ridge of a step, and its longest move relative to a parameter's scale.
 RIDGE, LONGEST = 1e-12, 5.0
 #: Ridge in units of a damping that rejected steps have raised: what has next to no influence here moves the least.
@@ -235,29 +238,52 @@ class _Descent:
 def _descent(
     evidence: Evidence, hypothesis: Hypothesis, linear: Linearization, limits: Limits, iterations: int, target: float
 ) -> _Descent:
+    """Levenberg-Marquardt; derivatives by many numbers are carried on as long as steps gain what they promise.
+
+    Only what derivatives taken where the fit stands say ends it.
+    """
     linear = evidence.counting(linear, hypothesis.variant)
     here, residuals = _at(evidence, hypothesis, linear, limits, hypothesis.vector)
-    begin, damping, sloped, taken, small = here, DAMPING, False, 0, 0
+    begin, damping, taken, small, many = here, DAMPING, 0, 0, limits.free.sum() >= MANY
+    sloped = carried = False
     while taken < iterations and damping <= MOST_DAMPING:
-        if not sloped:
+        if not (sloped or carried):
             here, sloped = _sloped(evidence, here, limits, residuals), True
         trial = here.hypothesis.vector + newton_step(here, limits, evidence.caps, damping) * limits.scale
         trial = here.hypothesis.settled(np.clip(trial, limits.low, limits.high))
         trial = np.clip(trial, limits.low, limits.high)
-        if _distance(trial, here.hypothesis, limits) < LEAST_MOVE:
+        near = _distance(trial, here.hypothesis, limits) < LEAST_MOVE
+        if near and sloped:
             break
-        there, found = _at(evidence, hypothesis, linear, limits, trial)
+        there, found = (here, residuals) if near else _at(evidence, hypothesis, linear, limits, trial)
         if not there.loss < here.loss:
-            damping *= 6
+            damping, carried = damping if carried else damping * 6, False
             continue
         gain, damping, taken = here.loss - there.loss, max(damping / 8, LEAST_DAMPING), taken + 1
-        here, residuals, sloped = there, found, False
         small = small + 1 if gain < SHARE * here.cost.misfit else 0
-        if gain < LEAST_GAIN + LEAST_SHARE * here.loss or small == FEW_GAINS:
+        over = gain < LEAST_GAIN + LEAST_SHARE * here.loss or small >= FEW_GAINS
+        was_sloped, sloped = sloped, False
+        carried = many and not over and gain > KEPT * _promised(here, there, evidence.caps)
+        here, residuals = (_corrected(here, there) if carried else there), found
+        if over and was_sloped:
             break
         if here.loss - PACE * gain * (iterations - taken) > target:
             break
     return _Descent(begin, here, residuals, sloped)
+
+
+def _promised(here: Refit, there: Refit, caps: np.ndarray | float) -> float:
+    """What a step gains by the derivatives where it begins."""
+    slope, residual = here.weighted(caps)
+    left = residual + ((there.hypothesis.vector - here.hypothesis.vector) / here.scale) @ slope
+    return float(residual @ residual - left @ left)
+
+
+def _corrected(here: Refit, there: Refit) -> Refit:
+    """A fit after a step with the derivatives before it, corrected to what it changed (Broyden 1965)."""
+    step = (there.hypothesis.vector - here.hypothesis.vector) / here.scale
+    wrong = there.residual - here.residual - np.tensordot(step, here.slope, 1)
+    return replace(there, slope=here.slope + step[:, None, None] * (wrong / (step @ step)))
 
 
 def _distance(vector: np.ndarray, other: Hypothesis, limits: Limits) -> float:
@@ -393,13 +419,14 @@ def resolved(evidence: Evidence, fitted: Refit, *, anew: bool = False) -> Resolv
         fitted: the fit under the model's own step. Its derivatives serve for the finer ones, too.
         anew: whether to fit with the derivatives of the finer steps where more than noise remains with the others:
             what a coarse step distorts may be far from where it is with a finer one. Such fits are not extrapolated.
+            Derivatives by many numbers would take too long: those of the coarse step serve, as far as they are right.
     """
     vector, finest = fitted.hypothesis.vector, finest_step(evidence, fitted.hypothesis)
     if finest is None:
         return Resolved(fitted, evidence, np.zeros(len(vector)))
     finer, coarser = (_stepped(evidence, fitted, step) for step in (finest, finest.at((2 * finest.values[0],))))
     anew = anew and finer.fit.loss < fitted.loss and remains(finer.fit.cost, evidence.rules)
-    if anew := anew and step_may_explain(evidence, fitted):
+    if anew := anew and len(vector) < MANY and step_may_explain(evidence, fitted):
         finer = _anew(finer)
         coarser = _nearest(
             coarser.evidence, finer.fit, finer.fit.hypothesis, limits_of(fitted.hypothesis, evidence.twin)
@@ -522,7 +549,7 @@ def _nearest(evidence: Evidence, fitted: Refit, trial: Hypothesis, limits: Limit
         there = _fitted(evidence, trial, found[0], fitted.slope, fitted.linear, fitted.scale)
         if best is not None and there.loss >= best.loss:
             break
-        best = there
+        best = there if best is None else _corrected(best, there)
         move = newton_step(best, limits, evidence.caps, LEAST_DAMPING)
         if np.abs(move).max(initial=0.0) < LEAST_MOVE:
             break

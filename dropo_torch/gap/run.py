@@ -16,6 +16,7 @@ from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.forces.motion import has_forces
 from dropo_torch.gap.forces.view import ForceView, force_view
 from dropo_torch.gap.ground import Ground
+from dropo_torch.gap.limbs import joint_of_column
 from dropo_torch.gap.limit import share_of
 from dropo_torch.gap.locate import places
 from dropo_torch.gap.noise import free_forces
@@ -184,8 +185,17 @@ def _view(scene: Scene, ground: Ground, named: Sequence[Placed]) -> ForceView | 
     ground.report("comparing forces", 0.0)
     setting = replace(scene.setting, model=problem.space.apply(np.array(scene.begin.declared)))
     rules = scene.rules.forces
-    view = force_view(setting, scene.train, scene.held, ground.effects, rules, named)
+    view = force_view(setting, scene.train, scene.held, ground.effects, rules, named, _position_noise(scene))
     return None if view is None or not view.placed or (named and not view.beats_rival(rules)) else view
+
+
+def _position_noise(scene: Scene) -> dict[int, float]:
+    """The standard deviations of the joints' measured positions, by the joints' numbers."""
+    setting, chart = scene.setting, scene.evidence.chart
+    places = dict(zip(setting.observation.labels, setting.observation.index.tolist(), strict=True))
+    told = dict(zip(chart.labels, scene.evidence.noise.tolist(), strict=True))
+    positions = (label for label in chart.labels if 0 <= places.get(label, -1) < setting.model.nq)
+    return {j: told[label] for label in positions if (j := joint_of_column(setting, label)) is not None}
 
 
 def _has_skill(scene: Scene, naming: Naming) -> bool:

@@ -36,7 +36,7 @@ from dropo_torch.gap.result import Ranked
 from dropo_torch.gap.rules import accounts, family_accounts, may_leave, remains, significant
 from dropo_torch.gap.shares import shares_of
 from dropo_torch.gap.spare import of_all_joints
-from dropo_torch.gap.ties import canonical, rivals_of_all, surpasses
+from dropo_torch.gap.ties import alike_everywhere, canonical, rivals_of_all, surpasses, with_those
 from dropo_torch.support.checkpoint import Checkpoint
 
 #: The screening before there is one.
@@ -307,12 +307,14 @@ def with_ties(ended: Ended, end: float = math.inf) -> Naming:
     naming, ground = ended.naming, ended.ground
     if not naming.named or naming.family:
         return naming
+    state, everywhere = alike_everywhere(ground, ended.state)  # one fit, for which there is always time
     try:
-        tied, shares, state = rivals_of_all(ground.reporting(until(ground.report, end)), ended.state)
+        tied, shares, state = rivals_of_all(ground.reporting(until(ground.report, end)), state, everywhere)
     except OutOfTime as error:
-        nothing, shares = ((),) * len(naming.final.hypothesis.placed), list(shares_of(ground, naming.final))
+        alike = tuple(with_those(everywhere, state, ((),) * len(state.current.hypothesis.placed)))
+        shares = list(shares_of(ground, state.current))
         unfinished = naming.unfinished or f"{error}, with all that was found named"
-        return replace(naming, ties=nothing, shares=tuple(shares), unfinished=unfinished)
+        return replace(naming, final=state.current, ties=alike, shares=tuple(shares), unfinished=unfinished)
     if surpasses(ground, state.current, ended.state.current):
         return with_ties(continued(ground, state, naming.unfinished), end)
     state, told = canonical(ground, state, tied)

@@ -54,13 +54,23 @@ def ties(ground: Ground, state: State, index: int) -> tuple[tuple[Refit, ...], f
     return tied, without.cost.excess - current.cost.excess, replace(state, current=best, attempts=found.attempts)
 
 
-def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]], list[float], State]:
+#: What may stand in the place of an effect that is everywhere, by its effect and target.
+Everywhere = Mapping[tuple[str, str | None], Placed]
+
+
+def rivals_of_all(
+    ground: Ground, state: State, everywhere: Everywhere
+) -> tuple[list[tuple[Placed, ...]], list[float], State]:
     """Return the ties of every named effect, with one effect in the place of two wherever it does for both.
 
     A search that takes one effect at a time may have explained by two, each a part of it, what one explains alone.
     Where a rival surpasses one of them, it is no tie: the state has it in its place, and the others are not looked at.
+
+    Args:
+        ground: what the search stands on.
+        state: where it stands.
+        everywhere: of :func:`alike_everywhere`.
     """
-    state, everywhere = _alike_everywhere(ground, state)
     while True:
         tied, shares = list[tuple[Refit, ...]](), list[float]()
         known = families(state.current.hypothesis.placed)
@@ -73,26 +83,22 @@ def rivals_of_all(ground: Ground, state: State) -> tuple[list[tuple[Placed, ...]
                 continue
             rivals, share, state = ties(ground, state, index)
             if state.current is not before:
-                return _with_those(everywhere, state, tied), shares, state
+                return with_those(everywhere, state, tied), shares, state
             tied.append(rivals)
             shares.append(share)
         if (fewer := _one_for_two(ground, state, tied)) is None:
-            return _with_those(everywhere, state, tied), shares, state
+            return with_those(everywhere, state, tied), shares, state
         state = replace(state, current=fewer)
 
 
-#: What may stand in the place of an effect that is everywhere, by its effect and target.
-Everywhere = Mapping[tuple[str, str | None], Placed]
-
-
-def _with_those(everywhere: Everywhere, state: State, tied: Sequence[tuple[Refit, ...]]) -> list[tuple[Placed, ...]]:
-    """What ties with each named effect, also of what is everywhere."""
+def with_those(everywhere: Everywhere, state: State, tied: Sequence[tuple[Refit, ...]]) -> list[tuple[Placed, ...]]:
+    """Return what ties with each named effect, also of what is everywhere."""
     own = state.current.hypothesis.placed[: len(tied)]
     return [told(t) or tuple(filter(None, [everywhere.get(p.key)])) for p, t in zip(own, tied, strict=True)]
 
 
-def _alike_everywhere(ground: Ground, state: State) -> tuple[State, Everywhere]:
-    """The state, and what does the same at all joints as an effect at many places of it: what is late both ways.
+def alike_everywhere(ground: Ground, state: State) -> tuple[State, Everywhere]:
+    """Return the state, and what does the same at all joints as an effect at many places of it: what is late both ways.
 
     Of these, the one that the vocabulary lists first is named.
     """
@@ -125,11 +131,16 @@ def _by_joints(setting: Setting, named: Sequence[Placed], others: Sequence[Place
 def _in_the_place_of(
     setting: Setting, members: Sequence[Placed], effect: Effect, placed: Sequence[Placed]
 ) -> list[Placed]:
-    """An effect at all joints at which another one is, where it is not already; none if it cannot be at one of them."""
+    """An effect at all joints at which another one is, where it is not already; none if it cannot be at one of them.
+
+    In the place of what is everywhere it is everywhere, too: a joint that nothing drives has no actuator to be late.
+    """
     places: dict[int | None, list[str | None]] = {}
     for target in effect.targets(setting):
         places.setdefault(_joint(setting, Placed(effect, target)), []).append(target)
-    size = {_joint(setting, p): p.values for p in members}
+    size, usual = {_joint(setting, p): p.values for p in members}, members[0].values
+    if {p.target for p in members} == set(members[0].effect.targets(setting)):
+        size = {joint: size.get(joint, usual) for joint in places}
     if None in size or not size.keys() <= places.keys():
         return []
     taken = {p.key for p in placed}

@@ -11,6 +11,7 @@ import numpy as np
 from dropo_torch.data.readers import are_dates, dates_in_seconds
 from dropo_torch.errors import InputError
 from dropo_torch.proposal.columns import Column, Columns
+from dropo_torch.proposal.evenly import Evenly, evenly
 from dropo_torch.proposal.words import TIME_UNITS, split, time_unit
 
 #: Units of time stamps, the likeliest first, and seconds between rows that a robot's log may have.
@@ -42,6 +43,7 @@ class Clock:
         summed: the two columns, of whole seconds and of their nanoseconds, of which ``column`` is the sum; empty for
             one of its own.
         missing: rows that are missing between others, episodes aside.
+        by_rows: whether rows were taken evenly, by what was measured, although stamps jitter: these are not read then.
     """
 
     column: Column | None
@@ -55,6 +57,7 @@ class Clock:
     why: tuple[str, ...]
     summed: tuple[Column, ...] = ()
     missing: int = 0
+    by_rows: bool = False
 
     @property
     def columns(self) -> tuple[Column, ...]:
@@ -118,10 +121,43 @@ def find_clock(columns: Columns, timestep: float, dt: float | None = None) -> Cl
         why.append(f"they begin anew, or leave a gap, at {len(breaks)} rows: an episode begins there")
     near = within < MISSING
     jitter = float(np.std(within[near])) if near.any() else 0.0
-    return Clock(
+    clock = Clock(
         column, unit, float(within.mean()) * median * unit if even else median * unit, even, jitter, episode,
         empty.terminals, breaks, tuple(why), summed or (), int((np.round(within[~near]) - 1).sum()),
     )  # fmt: skip
+    rows = None if even else _rows(columns, clock, stamps, median)
+    return clock if rows is None else _by_rows(clock, rows, unit)
+
+
+def _rows(columns: Columns, clock: Clock, stamps: np.ndarray, median: float) -> Evenly | None:
+    """How rows are evenly spaced, if they are although their stamps are not; and none or few of them are missing."""
+    starts = clock.starts(len(columns), columns.parts)
+    taken = [c.values for c in columns.numeric if c.words.role not in ("time", "episode", "flag")]
+    signals = [v for v in taken if np.isfinite(v).all() and not _goes_one_way(v, starts)]
+    found = evenly(stamps, starts, np.stack(signals, 1), median) if signals else None
+    if found is None:
+        return None
+    starts[found.missing] = True
+    return found if _are_long(np.flatnonzero(starts), len(columns)) else None
+
+
+def _goes_one_way(values: np.ndarray, starts: np.ndarray) -> bool:
+    """Whether a column only rises or only falls within an episode, as a counter or another clock does."""
+    change = np.diff(values)[~starts[1:]]
+    return bool((change >= 0).all() or (change <= 0).all())
+
+
+def _by_rows(clock: Clock, rows: Evenly, unit: float) -> Clock:
+    """The clock by which rows are even whatever their stamps, and begin anew where some are missing."""
+    told = (
+        f"they jitter by {clock.jitter:.0%}, but what was measured is the smoother if rows are even: they are taken to "
+        f"be {rows.dt * unit:.4g} s apart"
+    )
+    breaks = tuple(sorted({*clock.breaks, *rows.missing.tolist()}))
+    more = (f"rows are missing at {len(rows.missing)} places: an episode begins there",) if len(rows.missing) else ()
+    return replace(
+        clock, dt=rows.dt * unit, even=True, breaks=breaks, why=(*clock.why, told, *more), missing=0, by_rows=True
+    )
 
 
 def _breaks(spacing: np.ndarray, known: np.ndarray, gap: float) -> np.ndarray:
@@ -131,8 +167,12 @@ def _breaks(spacing: np.ndarray, known: np.ndarray, gap: float) -> np.ndarray:
 
 def _leaves_enough(spacing: np.ndarray, known: np.ndarray, gap: float) -> bool:
     """Whether most rows are in long pieces between gaps."""
-    ends = np.union1d(np.flatnonzero(known), _breaks(spacing, known, gap))
-    sizes = np.diff(np.append(ends, len(known)))
+    return _are_long(np.union1d(np.flatnonzero(known), _breaks(spacing, known, gap)), len(known))
+
+
+def _are_long(starts: np.ndarray, rows: int) -> bool:
+    """Whether most rows are in pieces that are long enough to compare."""
+    sizes = np.diff(np.append(starts, rows))
     return bool(sizes[sizes >= PIECE].sum() >= MOST * sizes.sum())
 
 

@@ -165,7 +165,7 @@ def _source(reading: Reading) -> dict[str, Any]:
     source |= {"stamps": dict(columns.stamps)} if columns.stamps else {}
     if columns.apart is not None:
         pass  # time stamps are the signals' own
-    elif clock.column is None:
+    elif clock.column is None or clock.by_rows:
         source["dt"] = float(f"{clock.dt:.6g}")
     else:
         source["time"] = clock.entry

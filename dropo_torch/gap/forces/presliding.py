@@ -17,10 +17,12 @@ from dropo_torch.gap.rules import Forces
 
 #: Displacements that are tried, by the measured range of the joint.
 SHARES = tuple(1e-4 * 2.0**n for n in range(10))
+#: The one of friction that does not give; and in units of a position's noise, which hides those up to the last one.
+AT_ONCE, HIDDEN = 3e-6, (1.0, 2.0, 4.0)
 #: Factors that are tried next to the best of them, in turn.
 FINER = ((2.0**-0.5, 2.0**0.5), (2.0**-0.25, 2.0**0.25), (2.0**-0.125, 2.0**0.125))
 #: Speeds below which friction that depends on the velocity alone may fall, by the joint's root mean square.
-SPEEDS = (AT_REST, 0.05, 0.1, 0.2)
+SPEEDS = (0.25 * AT_REST, 0.5 * AT_REST, AT_REST, 0.05, 0.1, 0.2)
 #: Relative step of the derivative by a displacement.
 STEP = 0.1
 
@@ -31,10 +33,13 @@ class Giving:
 
     Attributes:
         displacements: of those that do.
+        sharpness: of those that do not: the speed, by the joint's root mean square, below which they fall; or, with a
+            minus, the motion in which they turn, which is no more than the noise of positions hides.
         rivals: the other of the two kinds of friction, where unseen blocks leave open which one it is.
     """
 
     displacements: Mapping[int, float] = field(default_factory=dict)
+    sharpness: Mapping[int, float] = field(default_factory=dict)
     rivals: Mapping[int, Placed] = field(default_factory=dict)
 
 
@@ -65,8 +70,9 @@ def built_up(setting: Setting, parts: Sequence[Stretch], joint: str | None, disp
 
 
 def displacements(
-    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces
-) -> Giving:
+    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, rules: Forces,
+    noise: Mapping[int, float],
+) -> Giving:  # fmt: skip
     """Return where friction gives before it slides, over which displacements, and where that is left open.
 
     At all joints with friction together it must leave less of unseen blocks than friction that depends on the velocity
@@ -80,55 +86,73 @@ def displacements(
         regression: of these.
         chosen: the columns that explain unseen blocks, ``(P,)`` bool.
         rules: thresholds.
+        noise: standard deviations of the joints' measured positions, by their numbers.
     """
     tried = {
-        number: _displacement(setting, parts, found, regression, chosen, number)
+        number: _displacement(setting, parts, found, regression, chosen, number, noise)
         for number in np.unique(found.owner[chosen]).tolist()
         if found.placed[number].effect.name == FRICTION
     }
-    clear = {n for n, (_, less) in tried.items() if less.mean() > 1 - rules.gives}
-    if clear and chance_of(np.sum([less for _, less in tried.values()], axis=0)) > rules.error:
+    clear = {n for n, (_, less, _) in tried.items() if less.mean() > 1 - rules.gives}
+    if clear and chance_of(np.sum([less for _, less, _ in tried.values()], axis=0)) > rules.error:
         clear = set()
     rivals = {}
-    for n, (displacement, less) in tried.items():
+    for n, (displacement, less, _) in tried.items():
         if n in clear and chance_of(less) > rules.error:
             rivals[n] = found.placed[n]
         elif n not in clear and -least_surplus(-less, rules.error) > (1 - rules.gives) * len(less):
             rivals[n] = Placed(find_effect(PRESLIDING), found.placed[n].target, (0.0, displacement))
-    return Giving({n: tried[n][0] for n in clear}, rivals)
+    return Giving(
+        {n: tried[n][0] for n in sorted(clear)}, {n: tried[n][2] for n in tried if n not in clear}, rivals
+    )  # fmt: skip
 
 
 def _displacement(
-    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, number: int
-) -> tuple[float, np.ndarray]:
-    """The best displacement of a friction, and how much less of its joint it leaves in each unseen block ``(B,)``.
+    setting: Setting, parts: Sequence[Stretch], found: Terms, regression: Regression, chosen: np.ndarray, number: int,
+    noise: Mapping[int, float],
+) -> tuple[float, np.ndarray, float]:  # fmt: skip
+    """The best displacement of a friction, how much less of its joint it leaves in each unseen block ``(B,)``, and the
+    sharpness of the best friction that depends on the velocity, or its sign, alone.
 
-    This is relative to the mean square that the best friction leaves which depends on the velocity alone.
+    What is left is relative to the mean square that this one leaves.
     """
     joint, column = found.placed[number].target, int(np.flatnonzero(found.owner == number)[0])
     dof, width = setting.dof(joint), float(np.ptp(setting.signals.position[setting.coordinate(joint)]))
 
     def left(values: np.ndarray) -> np.ndarray:
-        columns = regression.columns.copy()
-        columns[column] = values
-        return np.asarray(unseen(replace(regression, columns=columns), chosen)[:, dof])
+        return np.asarray(unseen(regression.with_column(column, values), chosen)[:, dof])
 
-    plain = min((left(sharp(setting, parts, joint, speed)) for speed in SPEEDS), key=np.mean)
+    hidden = [noise.get(setting.joint(joint), 0.0) * times for times in HIDDEN]
+    shapes = {-AT_ONCE * width, *(-d for d in hidden if d > AT_ONCE * width), *SPEEDS}
+    plain = {shape: left(_plain(setting, parts, joint, shape)) for shape in sorted(shapes)}
+    sharpest = min(plain, key=lambda speed: float(plain[speed].mean()))
     tried: dict[float, np.ndarray] = {}
     best, near = width, SHARES
     for nearer in (*FINER, ()):
-        tried |= {best * share: left(built_up(setting, parts, joint, best * share)) for share in near}
+        shown = [best * share for share in near if best * share > hidden[-1]]
+        tried |= {d: left(built_up(setting, parts, joint, d)) for d in shown}
+        if not tried:
+            return best, np.zeros_like(plain[sharpest]), sharpest
         best, near = min(tried, key=lambda d: float(tried[d].mean())), nearer
-    return best, (plain - tried[best]) / max(float(plain.mean()), 1e-300)
+    less = (plain[sharpest] - tried[best]) / max(float(plain[sharpest].mean()), 1e-300)
+    return best, less, sharpest
 
 
-def giving(setting: Setting, parts: Sequence[Stretch], found: Terms, given: Mapping[int, float]) -> Terms:
-    """Return terms in which some frictions, by the number of their effect, build up over displacements."""
+def _plain(setting: Setting, parts: Sequence[Stretch], joint: str | None, sharpness: float) -> np.ndarray:
+    """Forces ``(N, nv)`` that a unit of friction needs which does not give; see :attr:`Giving.sharpness`."""
+    shape = sharp if sharpness > 0 else built_up
+    return shape(setting, parts, joint, abs(sharpness))
+
+
+def giving(setting: Setting, parts: Sequence[Stretch], found: Terms, bent: Giving) -> Terms:
+    """Return terms in which frictions build up over displacements, or turn as sharply as is found."""
     placed, columns, low = list(found.placed), found.columns.copy(), found.low.copy()
-    for number, displacement in given.items():
+    for number, displacement in bent.displacements.items():
         joint, at = placed[number].target, found.owner == number
         placed[number] = Placed(find_effect(PRESLIDING), joint, (0.0, displacement))
         columns[at], low[at] = built_up(setting, parts, joint, displacement), 0.0
+    for number, sharpness in bent.sharpness.items():
+        columns[found.owner == number] = _plain(setting, parts, placed[number].target, sharpness)
     return replace(found, placed=tuple(placed), columns=columns, low=low)
 
 

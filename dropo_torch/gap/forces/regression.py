@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -56,6 +56,18 @@ class Regression:
         every = np.concatenate([self.columns, self.signal[None]])
         parts = (every[:, self.blocks == name] for name in self.names)
         return np.stack([np.einsum("pnj,qnj->jpq", part, part) for part in parts])
+
+    def with_column(self, index: int, values: np.ndarray) -> Regression:
+        """Return the same with another column ``(N, J)`` in the place of one."""
+        columns = self.columns.copy()
+        columns[index] = values
+        other, every = replace(self, columns=columns), np.concatenate([columns, self.signal[None]])
+        rows = [self.blocks == name for name in self.names]
+        new = np.stack([np.einsum("nj,qnj->jq", values[own], every[:, own]) for own in rows])
+        products = self.products.copy()
+        products[:, :, index], products[:, :, :, index] = new, new
+        vars(other).update(products=products, names=self.names, counts=self.counts)
+        return other
 
     def left(self, coefficients: np.ndarray) -> np.ndarray:
         """Return what coefficients ``(P,)`` leave of the signal, ``(N, J)``."""

@@ -71,7 +71,7 @@ def terms(setting: Setting, parts: Sequence[Stretch], placed: Sequence[Placed]) 
     missing, columns = [], []
     for part in parts:
         missing.append(part.compared(part.force - needed(setting.model, part)))
-        columns.append(np.stack([part.compared(c) for p in placed for c in _columns(setting, part, p)]))
+        columns.append(np.stack([part.compared(c) for p in placed for c in columns_of(setting, part, p)]))
     return Terms(
         tuple(placed), np.concatenate(missing), np.concatenate(columns, 1), owner, low - neutral, high - neutral,
         np.where(names == CENTER, scale, np.inf), np.repeat(np.arange(len(parts)), [len(m) for m in missing]),
@@ -91,8 +91,8 @@ def needed(model: mujoco.MjModel, part: Stretch) -> np.ndarray:
     return found
 
 
-def _columns(setting: Setting, part: Stretch, placed: Placed) -> list[np.ndarray]:
-    """Forces ``(N, nv)`` that a unit of each of an effect's numbers needs."""
+def columns_of(setting: Setting, part: Stretch, placed: Placed) -> list[np.ndarray]:
+    """Return the forces ``(N, nv)`` that a unit of each of an effect's numbers needs, from its values on."""
     model, zero = setting.model, np.zeros(part.velocity.shape)
     if placed.effect.name == FRICTION:
         return [_against(setting, part, placed.target, AT_REST)]
@@ -120,7 +120,8 @@ def _against(setting: Setting, part: Stretch, joint: str | None, at_rest: float)
 def _slope(setting: Setting, part: Stretch, placed: Placed, number: int) -> np.ndarray:
     """Forces ``(N, nv)`` that a unit of one of an effect's numbers needs, by a difference within its bounds."""
     quantity = placed.effect.quantities(setting, placed.target)[number]
-    ends = np.clip(quantity.neutral + STEP * quantity.scale * np.array([-1.0, 1.0]), quantity.low, quantity.high)
+    steps = STEP * quantity.scale * np.array([-1.0, 1.0])
+    ends = np.clip(placed.values[number] + steps, quantity.low, quantity.high)
     found = []
     for end in ends:
         values, moved = np.array(placed.values), copy.copy(setting.model)

@@ -14,6 +14,7 @@ import numpy as np
 from dropo_torch.data.trajectory import Trajectories
 from dropo_torch.effects.base import Effect, Placed, Setting, find_effect
 from dropo_torch.gap.forces.motion import FORCES, KEPT, has_forces, highest_frequency, stretches
+from dropo_torch.gap.forces.payload import PAYLOAD, in_one_place, with_payload
 from dropo_torch.gap.forces.presliding import Giving, displacements, giving, halves
 from dropo_torch.gap.forces.regression import (
     GAIN,
@@ -84,7 +85,7 @@ class ForceView:
 
 def force_view(
     setting: Setting, train: Trajectories, held: Trajectories, known: Sequence[Effect], rules: Forces,
-    rival: Sequence[Placed] = (),
+    rival: Sequence[Placed] = (), noise: Mapping[int, float] | None = None,
 ) -> ForceView | None:  # fmt: skip
     """Return what the forces at the joints say; ``None`` where the log has not all of them, or is too short.
 
@@ -95,6 +96,7 @@ def force_view(
         known: the vocabulary.
         rules: thresholds.
         rival: effects that predictions named, with values.
+        noise: standard deviations of the joints' measured positions, by their numbers, where they are known.
     """
     if not has_forces(setting):
         return None
@@ -111,19 +113,24 @@ def force_view(
     chosen = select(regression, seen.owner, _families(seen))
     bent = Giving()
     if find_effect(PRESLIDING) in known:
-        bent = displacements(setting, parts, seen, regression, chosen, rules)
-    if bent.displacements:
-        seen, last = (giving(setting, p, t, bent.displacements) for p, t in ((parts, seen), (others, last)))
+        bent = displacements(setting, parts, seen, regression, chosen, rules, noise or {})
+    if bent.displacements or bent.sharpness:
+        seen, last = (giving(setting, p, t, bent) for p, t in ((parts, seen), (others, last)))
         regression = _regression(seen, blocks)
         chosen = select(regression, seen.owner, _families(seen))
-    chosen = _settled(seen, regression, chosen, rules)
+    chosen, missing = _settled(seen, regression, chosen, rules), last.missing
+    if find_effect(PAYLOAD) in known and (heavy := in_one_place(setting, parts, seen, regression, chosen)) is not None:
+        chosen = np.append(_without(seen, chosen, CENTER), np.ones(len(heavy.values), dtype=bool))
+        seen, last = (with_payload(setting, p, t, heavy) for p, t in ((parts, seen), (others, last)))
+        regression = _regression(seen, blocks)
+        chosen = _settled(seen, regression, chosen, rules)
     found = fit(regression, chosen)
     named = ForceView(
-        np.concatenate([part.compared(part.velocity) for part in others]), last.missing,
+        np.concatenate([part.compared(part.velocity) for part in others]), missing,
         _regression(last, last.episodes).left(found), left_by_rival,
     )  # fmt: skip
     if not chosen.any() or named.share(named.left) > rules.left:
-        return replace(named, left=last.missing)
+        return replace(named, left=missing)
     return replace(
         named,
         placed=tuple(_moved(seen.placed[i], found[seen.owner == i]) for i in np.unique(seen.owner[chosen])),
@@ -132,6 +139,11 @@ def force_view(
         ties=_ties(seen, regression, chosen, bent.rivals),
         left_out=_left_out(seen, regression, chosen),
     )
+
+
+def _without(found: Terms, chosen: np.ndarray, name: str) -> np.ndarray:
+    """The chosen columns ``(P,)`` bool that are not those of some effect."""
+    return chosen & ~np.array([p.effect.name == name for p in found.placed])[found.owner]
 
 
 def _moved(placed: Placed, numbers: np.ndarray) -> Placed:
