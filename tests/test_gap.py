@@ -1361,9 +1361,47 @@ def test_noise_that_is_told_is_that_of_all_windows(wrong: float) -> None:
     """Refits use a part of them, which may be off by chance; so may what the last fit starts with."""
     scene, truth = scene_of("joint_damping"), np.array(hidden("joint_damping").noise)
     evidence = dataclasses.replace(scene.evidence, noise=wrong * truth)
-    last, rest, own = outcome._last_fit(evidence, scene.noisy, true(hidden("joint_damping")))
+    last, rest, own, _ = outcome._last_fit(evidence, scene.noisy, true(hidden("joint_damping")), math.inf)
     assert last.evidence.noise == pytest.approx(truth, rel=0.07)
     assert outcome._own_step(own, rest.cost, scene.rules) is None  # it was the noise, and no step
+
+
+def test_after_the_end_better_starts_of_windows_are_not_looked_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene, truth = scene_of("joint_damping"), true(hidden("joint_damping"))
+    looked: list[Any] = []
+
+    def straight(evidence: Any, own: Any) -> tuple[Any, Any]:
+        looked.append(own)
+        return evidence, own
+
+    monkeypatch.setattr(outcome, "_straight", straight)
+    (late, *_), (in_time, *_) = (
+        outcome._last_fit(scene.evidence, scene.noisy, truth, e) for e in (-math.inf, math.inf)
+    )
+    assert len(looked) == 1
+    assert late.fit.hypothesis.vector == pytest.approx(in_time.fit.hypothesis.vector)
+
+
+def test_derivatives_by_many_numbers_are_carried_to_where_fresh_ones_lead(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With fewer simulations; and a fit ends only where fresh ones say so."""
+    scene, truth, taken = scene_of("joint_damping"), true(hidden("joint_damping")), list[int]()
+    begin, original = truth.at(0.6 * truth.vector), refitting._differences
+
+    def counted(*args: Any) -> Any:
+        taken.append(len(args[4]))
+        return original(*args)
+
+    monkeypatch.setattr(refitting, "_differences", counted)
+    found = []
+    for many in (99, 1):
+        monkeypatch.setattr(refitting, "MANY", many)
+        taken.clear()
+        found.append((refitting.refit(scene.evidence, begin), len(taken)))
+    (fresh, often), (carried, seldom) = found
+    assert seldom < often
+    assert carried.hypothesis.vector == pytest.approx(fresh.hypothesis.vector, rel=1e-3)
+    assert carried.loss == pytest.approx(fresh.loss, rel=1e-4)
+    assert carried.slope == pytest.approx(fresh.slope, rel=1e-2, abs=1e-2 * np.abs(fresh.slope).max())
 
 
 def test_members_of_a_family_are_not_swapped() -> None:

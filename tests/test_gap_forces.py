@@ -48,13 +48,16 @@ ARM = """
   </actuator>
 </mujoco>
 """
+HAND = '<geom type="capsule" fromto="0 0 0 .2 0 0" size=".03" mass=".6"/>'
+#: What the hand carries, beside its own middle.
+CARRIED = '<geom type="sphere" pos=".15 .04 .03" size=".001" mass="{}"/>'
 JOINTS, GEARS = ("base", "shoulder", "elbow"), np.array([1.0, 2.0, 1.0])
 
 
 def recorded(
     seed: int, *, friction: tuple[float, ...] = (0, 0, 0), offset: float = 0.0, center: float = 0.0,
     ripple: float = 0.03, dt: float = 0.005, seconds: float = 40.0, gives: tuple[float, ...] = (0, 0, 0),
-    at_rest: float = 0.01,
+    at_rest: float = 0.01, carried: float = 0.0, noise: float = 1e-5,
 ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
     """Return rows of positions and velocities, and torques, of joints that follow sines exactly.
 
@@ -67,7 +70,7 @@ def recorded(
     size, phase = draw.uniform(0.1, 0.35, (3, 3)), draw.uniform(0, 6.28, (3, 3))
     waves = [size * speed**k * np.sin(speed * times[:, None, None] + phase + 0.5 * k * np.pi) for k in range(3)]
     position, velocity, acceleration = (w.sum(-1) for w in waves)
-    model = mujoco.MjModel.from_xml_string(ARM)
+    model = mujoco.MjModel.from_xml_string(ARM.replace(HAND, HAND + CARRIED.format(carried) if carried else HAND))
     model.body("fore").ipos[2] += center
     model.body_sameframe[model.body("fore").id] = 0
     data, torque = mujoco.MjData(model), np.empty((n, 3))
@@ -79,10 +82,10 @@ def recorded(
         bent = dahl(position[:, joint], 0.5 * dt, gives[joint])[1::2]
         torque[:, joint] += friction[joint] * (bent - np.tanh(velocity[1::2, joint] / at_rest))
     middle, waves = times[1::2, None], draw.uniform(0.3, 3, 12)
-    noise = sum(draw.normal(0, 1, 3) * np.sin(2 * np.pi * f * middle + draw.uniform(0, 6, 3)) for f in waves) / 6**0.5
-    rows = np.concatenate([position[::2] + draw.normal(0, 1e-5, (n + 1, 3)),
+    rough = sum(draw.normal(0, 1, 3) * np.sin(2 * np.pi * f * middle + draw.uniform(0, 6, 3)) for f in waves) / 6**0.5
+    rows = np.concatenate([position[::2] + draw.normal(0, noise, (n + 1, 3)),
                            velocity[::2] + draw.normal(0, 1e-3, (n + 1, 3))], 1)  # fmt: skip
-    return rows, (torque + ripple * np.abs(torque).max(0) * noise) / GEARS
+    return rows, (torque + ripple * np.abs(torque).max(0) * rough) / GEARS
 
 
 def dahl(position: np.ndarray, step: float, displacement: float, fine: int = 40) -> np.ndarray:
@@ -109,10 +112,12 @@ def problem_of(folder: Path, seed: int, model: str = ARM, **truth: Any) -> Probl
     return dropo.make_problem(dropo.load_config(folder / "arm.yaml"), general=True)
 
 
-def view_of(problem: Problem, effects: Sequence[Effect] = tuple(VOCABULARY.values())) -> ForceView | None:
+def view_of(
+    problem: Problem, effects: Sequence[Effect] = tuple(VOCABULARY.values()), noise: dict[int, float] | None = None
+) -> ForceView | None:
     log = problem.trajectories
     train, held = hold_out(replace(log, dt=log.dt or problem.simulator.timestep))
-    return force_view(make_setting(problem, train), train, held, effects, Forces())
+    return force_view(make_setting(problem, train), train, held, effects, Forces(), (), noise)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -127,6 +132,29 @@ def test_friction_offset_and_center_are_named(tmp_path: Path, seed: int) -> None
     assert found["actuator_bias", "m2"] == pytest.approx(0.2, abs=0.02)
     assert found["center_of_mass", "fore"][2] == pytest.approx(0.05, abs=0.005)
     assert (view.after < 0.2 * view.before).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_what_a_hand_carries_is_one_mass_in_one_place(tmp_path: Path, seed: int) -> None:
+    """It shifts the center of mass of everything from a body on: no such shifts of several bodies are named."""
+    truth = {"friction": (0.5, 0.8, 0.3), "carried": 0.4, "ripple": 0.02}
+    view = view_of(problem_of(tmp_path, seed, **truth))
+    found = {p.key: np.array(p.values) for p in view.placed}
+    assert {*found} == {*(("joint_friction", j) for j in JOINTS), ("payload", "hand")}
+    assert [found["joint_friction", j][0] for j in JOINTS] == pytest.approx(truth["friction"], rel=0.03)
+    mass, along, _, above = found["payload", "hand"]  # how far it is beside, the elbow's torque does not say
+    assert mass == pytest.approx(0.4, rel=0.05)
+    assert (along, above) == pytest.approx((0.15, 0.03), abs=0.01)
+    (halves,) = (h for p, h in zip(view.placed, view.halves, strict=True) if p.key == ("payload", "hand"))
+    assert (np.abs(found["payload", "hand"] - [0.4, 0.15, 0.04, 0.03]) < 3 * halves).all()
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_displacement_that_the_noise_of_positions_hides_is_none(tmp_path: Path, seed: int) -> None:
+    """Where positions are noisy, friction that turns a little late beats one that turns with every row of noise."""
+    problem = problem_of(tmp_path, seed, friction=(0.5, 0.8, 0.3), at_rest=1e-4, ripple=0.02, noise=2e-4)
+    told = view_of(problem, noise=dict.fromkeys(range(3), 2e-4))
+    assert {p.key for p in told.placed} == {("joint_friction", j) for j in JOINTS}
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -134,7 +135,7 @@ class _Checked:
 
 def make_result(
     scene: Scene, naming: Naming, started: float, report: Report = lambda stage, share: None,
-    weighed: Evidence | None = None,
+    weighed: Evidence | None = None, end: float = math.inf,
 ) -> Gap:  # fmt: skip
     """Fit what was named on all windows, score it on held-out data, and put everything together.
 
@@ -144,18 +145,19 @@ def make_result(
         started: when it began, by ``time.perf_counter``.
         report: called with a stage and its share done.
         weighed: all windows with the weights that a last fit with more names ended with; found here by default.
+        end: when what only refines the last fit is left out, by ``time.monotonic``.
     """
     if naming.named and weighed is None and (unnamed := _hopeless(scene, naming)) is not None:
-        return make_result(scene, unnamed, started, report)
-    fitted = _fitted_on_all(scene, naming, report, weighed)
+        return make_result(scene, unnamed, started, report, end=end)
+    fitted = _fitted_on_all(scene, naming, report, weighed, end)
     if fitted.last is not None and (fewer := _without_unsure(scene.setting, naming, fitted, scene.rules)) is not None:
-        return make_result(scene, fewer, started, report, fitted.weighed)
+        return make_result(scene, fewer, started, report, fitted.weighed, end)
     checked = _checked(scene, naming, fitted, report)
     if not naming.gap and checked.astray > scene.rules.sound.astray:
         naming = replace(naming, gap=True, refused=UNSEEN.format(checked.astray))
     if (unnamed := _refuted(naming, fitted, checked, scene.rules)) is not None:
-        return make_result(scene, unnamed, started, report)
-    return _put_together(scene, naming, fitted, checked, started, report)
+        return make_result(scene, unnamed, started, report, end=end)
+    return _put_together(scene, naming, fitted, checked, started, report, end)
 
 
 def _hopeless(scene: Scene, naming: Naming) -> Naming | None:
@@ -168,14 +170,14 @@ def _hopeless(scene: Scene, naming: Naming) -> Naming | None:
     return _without_names(naming, UNSKILLED, after, constant)
 
 
-def _fitted_on_all(scene: Scene, naming: Naming, report: Report, weighed: Evidence | None) -> _Fitted:
+def _fitted_on_all(scene: Scene, naming: Naming, report: Report, weighed: Evidence | None, end: float) -> _Fitted:
     """The last fit, with weights that are found or given, and the declared parameters alone."""
     evidence, alone = naming.evidence, naming.base
     if not naming.named:
         return _Fitted(evidence, evidence, naming.final, None, naming.final, alone, None, np.zeros(0))
     report("fitting on all windows", 0.0)
     hypothesis = naming.final.hypothesis
-    found = _last_fit(evidence, scene.noisy, hypothesis) if weighed is None else _as_weighed(weighed, hypothesis)
+    found = _last_fit(evidence, scene.noisy, hypothesis, end) if weighed is None else _as_weighed(weighed, hypothesis)
     last, rest, own, weighed = found
     if not np.array_equal(last.evidence.noise, evidence.noise):
         evidence = replace(evidence, noise=last.evidence.noise)
@@ -211,7 +213,7 @@ def _refuted(naming: Naming, fitted: _Fitted, checked: _Checked, rules: Rules) -
 
 
 def _put_together(
-    scene: Scene, naming: Naming, fitted: _Fitted, checked: _Checked, started: float, report: Report
+    scene: Scene, naming: Naming, fitted: _Fitted, checked: _Checked, started: float, report: Report, end: float
 ) -> Gap:
     """The result that people and programs read."""
     problem, twin, setting, rules = scene.problem, scene.twin, scene.setting, scene.rules
@@ -233,7 +235,7 @@ def _put_together(
         before=checked.given,
         after=checked.after,
         noise_floor=checked.floor,
-        next_experiment=_next_experiment(naming, fitted.final, report),
+        next_experiment=_next_experiment(naming, fitted.final, report, end),
         found=naming.gap,
         declared=dict(zip(problem.space.names, declared, strict=True)),
         fitted=_fitted(problem.space, evidence, best, fitted),
@@ -322,17 +324,19 @@ def _force_pictures(setting: Setting, view: ForceView) -> tuple[Residuals, ...]:
     )  # fmt: skip
 
 
-def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis) -> _Last:
+def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis, end: float) -> _Last:
     """Fit the named effects on all windows, as they are weighted and stepped in the end.
 
     And as noise alone weighs them, the misfit that they have so with the model's own step, and the weights.
 
     Where the model's own error and not the noise decides, each residual weighs by its own size over the windows: the
     error of a real model grows with the lead, and differs between columns. The noise is told once more, by all windows
-    and beside a finer step where that is better, for what the model's own step leaves passes for noise.
+    and beside a finer step where that is better, for what the model's own step leaves passes for noise. After the
+    ``end``, better starts of windows are not looked for, and weights are found once.
     """
     own = refit(evidence, hypothesis, iterations=6)
-    evidence, own = _straight(evidence, own)
+    if time.monotonic() < end:
+        evidence, own = _straight(evidence, own)
     final = resolved(evidence, own, anew=True)
     noise = noise_beside(final.evidence, short, final.fit)
     if moved(noise, evidence.noise, evidence.rules):
@@ -341,7 +345,8 @@ def _last_fit(evidence: Evidence, short: Windows | None, hypothesis: Hypothesis)
         final = resolved(evidence, own, anew=True)
     rest, with_own_step = final.fit, own.cost
     for _ in range(ROUNDS):
-        if final.fit.cost.reduced < evidence.rules.sound.model_error:
+        weighed = rest is not final.fit
+        if final.fit.cost.reduced < evidence.rules.sound.model_error or (weighed and time.monotonic() > end):
             break
         size = np.sqrt(np.median(final.fit.residual**2, axis=0) / MEDIAN) * evidence.model_error
         lead = size.reshape(-1, evidence.chart.size)
@@ -603,10 +608,10 @@ def merge_families(effects: tuple[NamedEffect, ...], setting: Setting) -> tuple[
     return tuple(kept)
 
 
-def _next_experiment(naming: Naming, final: Refit, report: Report) -> str | None:
+def _next_experiment(naming: Naming, final: Refit, report: Report, end: float) -> str | None:
     """What motion would tell tied effects apart, the first that are told so, or would show what this log cannot."""
     rivals: list[tuple[int, Placed]] = [(i, other) for i, tied in enumerate(naming.ties) for other in tied]
-    if not rivals:
+    if not rivals or time.monotonic() > end:
         return excite(naming.first.silent)
     best, said = final.hypothesis, ""
     rivals = rivals[: 1 if naming.family else RIVALS]

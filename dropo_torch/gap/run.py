@@ -164,7 +164,7 @@ def find_gap(
         return has_forces(scene.setting) and not _has_skill(scene, naming) and view(()) is not None
 
     naming = _name(scene, ground, checkpoint, resume, end, forces_decide)
-    gap = make_result(scene, naming, started, report)
+    gap = make_result(scene, naming, started, report, end=end)
     if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
         return gap
     refused = gap.verdict == "unnamed"  # names that unseen data refute are no rivals
