@@ -80,7 +80,7 @@ class Regression:
         return np.maximum(sums, 0.0) / self.counts[:, None]
 
 
-def fit(regression: Regression, chosen: np.ndarray, without: int | None = None) -> np.ndarray:
+def fit(regression: Regression, chosen: np.ndarray) -> np.ndarray:
     """Return coefficients ``(P,)`` within their bounds, zero for columns that are not chosen, ``(P,)`` bool.
 
     Every output weighs by what is left of it in the end; a prior counts as much as one independent row.
@@ -88,18 +88,34 @@ def fit(regression: Regression, chosen: np.ndarray, without: int | None = None) 
     Args:
         regression: the signal and all columns.
         chosen: the columns to use, ``(P,)`` bool.
-        without: number of the block that is left out, if any.
     """
-    found, picked = np.zeros(len(chosen)), np.flatnonzero(chosen)
-    used = np.delete(np.arange(len(regression.names)), [] if without is None else [without])
-    products, rows = regression.products[used].sum(0), regression.counts[used].sum()
-    variance = products[:, -1, -1] / rows
+    (found,) = _fits(regression, chosen, regression.products.sum(0)[None], regression.counts.sum()[None])
+    return found
+
+
+def fits_without(regression: Regression, chosen: np.ndarray) -> np.ndarray:
+    """Return the coefficients that all blocks but one have, without each in turn, ``(B, P)``; see :func:`fit`."""
+    products, counts = regression.products, regression.counts
+    return _fits(regression, chosen, products.sum(0) - products, counts.sum() - counts)
+
+
+def _fits(regression: Regression, chosen: np.ndarray, products: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Coefficients ``(F, P)`` of F fits at once, by products ``(F, J, P + 1, P + 1)`` over so many rows ``(F,)``."""
+    picked, found = np.flatnonzero(chosen), np.zeros((len(rows), len(chosen)))
+    used = np.append(picked, len(chosen))
+    products, low, high = products[:, :, used[:, None], used], regression.low[picked], regression.high[picked]
+    variance, prior = products[..., -1, -1] / rows[:, None], regression.correlated / regression.prior[picked] ** 2
     for _ in range(WEIGHTED if picked.size else 0):
-        weighted = (products / np.maximum(variance, 1e-300)[:, None, None]).sum(0)
-        normal = weighted[np.ix_(picked, picked)] + np.diag(regression.correlated / regression.prior[picked] ** 2)
-        found[picked] = _solved(normal, weighted[picked, -1], regression.low[picked], regression.high[picked])
-        full = np.append(-found, 1.0)
-        variance = np.einsum("p,jpq,q->j", full, products, full) / rows
+        weighted = np.einsum("fjpq,fj->fpq", products, 1 / np.maximum(variance, 1e-300))
+        normal, right = weighted[:, :-1, :-1] + np.diag(prior), weighted[:, :-1, -1]
+        size = np.sqrt(np.maximum(np.diagonal(normal, axis1=1, axis2=2), 1e-300))
+        matrix = normal / (size[:, :, None] * size[:, None]) + RIDGE * np.eye(len(picked))
+        free = np.linalg.solve(matrix, (right / size)[..., None])[..., 0] / size
+        for number in np.flatnonzero(((free < low) | (free > high)).any(1)):
+            free[number] = _solved(normal[number], right[number], low, high)
+        full = np.concatenate([-free, np.ones((len(rows), 1))], 1)
+        variance = np.einsum("fp,fjpq,fq->fj", full, products, full, optimize=True) / rows[:, None]
+        found[:, picked] = free
     return found
 
 
@@ -109,16 +125,14 @@ def _solved(normal: np.ndarray, right: np.ndarray, low: np.ndarray, high: np.nda
     matrix = normal / np.outer(size, size) + RIDGE * np.eye(len(size))
     factor = linalg.cholesky(matrix)
     target = linalg.solve_triangular(factor, right / size, trans="T")
-    free = linalg.solve_triangular(factor, target) / size
-    if (free >= low).all() and (free <= high).all():
-        return np.asarray(free)
     return np.asarray(optimize.lsq_linear(factor, target, (low * size, high * size), method="bvls").x / size)
 
 
 def unseen(regression: Regression, chosen: np.ndarray) -> np.ndarray:
     """Return the mean squares of every block ``(B, J)`` by the coefficients that all others have."""
-    blocks = range(len(regression.names))
-    return np.stack([regression.squares(fit(regression, chosen, without=b))[b] for b in blocks])
+    full = np.concatenate([-fits_without(regression, chosen), np.ones((len(regression.names), 1))], 1)
+    sums = np.einsum("bp,bjpq,bq->bj", full, regression.products, full, optimize=True)
+    return np.asarray(np.maximum(sums, 0.0) / regression.counts[:, None])
 
 
 def score(squares: np.ndarray) -> float:
@@ -227,8 +241,7 @@ def half_widths(regression: Regression, chosen: np.ndarray) -> np.ndarray:
 def _standard_errors(regression: Regression, chosen: np.ndarray) -> np.ndarray:
     """Standard errors of coefficients ``(P,)``, by how they move without a block."""
     count = len(regression.names)
-    moved = np.stack([fit(regression, chosen, without=b) for b in range(count)])
-    return np.asarray(np.sqrt((count - 1) * moved.var(0)))
+    return np.asarray(np.sqrt((count - 1) * fits_without(regression, chosen).var(0)))
 
 
 def widest(regression: Regression, chosen: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
