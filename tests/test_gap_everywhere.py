@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import mujoco
 import numpy as np
 import pytest
 
 import dropo_torch as dropo
+from dropo_torch.data.observation import parse_observation
 from dropo_torch.effects import Placed, find_effect
 from dropo_torch.gap import find_gap, prepare
 from dropo_torch.gap.limbs import joint_of_column
@@ -95,3 +98,22 @@ def test_what_is_late_at_a_joint_stands_at_its_sensor_and_at_its_servo(tmp_path:
     assert [(p.target, p.values) for p in back] == [(p.target, p.values) for p in servos]
     assert _in_the_place_of(setting, sensors, late, [*sensors, servos[0]]) == back[1:]
     assert joint_of_column(setting, "bend.velocity") == joint_of_column(setting, "bend.position") == 2
+
+
+def test_what_is_late_at_all_sensors_stands_at_all_servos_although_one_joint_has_none() -> None:
+    """A leg on a rail: nothing drives the rail, and what the servos get late, it shows late."""
+    model = mujoco.MjModel.from_xml_string(SERVOS.replace('<position name="m_bend" joint="bend" kp="25"/>', ""))
+    observation = parse_observation(model, ["qpos"])
+    setting: Any = SimpleNamespace(model=model, observation=observation, column=observation.labels.index)
+    setting.joint = lambda name: model.joint(name).id
+    late, told = find_effect("actuator_delay"), find_effect("sensor_delay")
+    labels = list(observation.labels)
+    sensors = [Placed(told, label, (0.01,)) for label in labels]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(told), "targets", lambda effect, setting: labels)
+        patch.setattr(type(late), "targets", lambda effect, setting: ["m_pan", "m_lift"])
+        there = _in_the_place_of(setting, sensors, late, sensors)
+        assert [(p.target, p.values) for p in there] == [("m_pan", (0.01,)), ("m_lift", (0.01,))]
+        back = _in_the_place_of(setting, there, told, there)
+        assert {p.target for p in back} == {*labels}
+        assert _in_the_place_of(setting, sensors[1:], late, sensors) == []  # one of the others is not late

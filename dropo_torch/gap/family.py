@@ -129,9 +129,11 @@ def has_family(ground: Ground) -> bool:
 def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
     """Return the fitted base family with the members that are needed, if several are at several joints."""
     whole = needed(ground, fitted)
-    for refined in (softened, with_slopes, softened):
-        whole = None if whole is None else refined(ground, whole)
-    whole = None if whole is None else without_steps(ground, whole)
+    whole = None if whole is None else softened(ground, whole)
+    sloped = None if whole is None else with_slopes(ground, whole)
+    if sloped is not None and sloped is not whole:
+        sloped = softened(ground, sloped)
+    whole = None if sloped is None else without_steps(ground, sloped)
     if whole is None or not spread_out(ground.setting, whole.hypothesis, ground.rules.family.members):
         return None
     return whole
