@@ -9,9 +9,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy import ndimage
 
 #: Rows of a span by which the time between rows is found, and how often what is near it is looked for anew.
 SPAN, TIMES = 15, 4
+#: Steps by which stamps may become later, jitter aside, where no row is missing.
+LEVEL = 0.5
+#: Rows that are numbered at once; and how many such pieces tell the time between rows.
+LONG, MOST_PIECES = 5000, 8
 #: Steps by which stamps must be late in all to count as much as a missing row; and missing rows, at most.
 JUMP, MANY = 2.0, 2000
 #: Rows on either side from which one is interpolated.
@@ -42,21 +47,27 @@ def evenly(stamps: np.ndarray, starts: np.ndarray, signals: np.ndarray, dt: floa
         signals: what was measured, ``(N, C)``.
         dt: roughly the time between rows.
     """
-    pieces = [p for p in np.split(np.arange(len(stamps)), np.flatnonzero(starts[1:]) + 1) if len(p) > 2 * SPAN]
+    episodes = np.split(np.arange(len(stamps)), np.flatnonzero(starts[1:]) + 1)
+    pieces = [e[at : at + LONG + SPAN] for e in episodes for at in range(0, len(e), LONG)]  # each reaches into the next
+    pieces = [p for p in pieces if len(p) > 2 * SPAN]
     if not pieces:
         return None
     times = [stamps[p] - stamps[p[0]] for p in pieces]
-    dt, numbers = _numbered(times, _rate(times, dt))
+    few = times[:: -(-len(times) // MOST_PIECES)]
+    dt = _rate_of_least_delay(few, _rate(few, dt))
+    numbers = _all_numbers(times, dt)[0]
+    dt = _spacing(times, numbers, [np.zeros(len(n)) for n in numbers])
     nearer = np.concatenate([_nearer(stamps[p], dt * n, signals[p]) for p, n in zip(pieces, numbers, strict=True)])
     told = nearer[np.isfinite(nearer)]
     share = float(told.mean()) if told.size else 0.0
     if told.size < ENOUGH or share < MOST or (share - 0.5) * 2 * np.sqrt(told.size) < SIGMAS:
         return None
-    return Evenly(dt, np.concatenate([p[1:][np.diff(n) > 1] for p, n in zip(pieces, numbers, strict=True)]))
+    missing = [p[1:][np.diff(n) > 1] for p, n in zip(pieces, numbers, strict=True)]
+    return Evenly(dt, np.unique(np.concatenate(missing)))
 
 
-def _numbered(times: list[np.ndarray], dt: float) -> tuple[float, list[np.ndarray]]:
-    """The time between rows for which stamps are the least late, and the rows' numbers, from near that on.
+def _rate_of_least_delay(times: list[np.ndarray], dt: float) -> float:
+    """The time between rows for which stamps are the least late, from near that on.
 
     With a wrong one, rows seem to be missing now and then. What stretches without a missing row say is not misled by
     that, but by late stamps beside one that is.
@@ -65,14 +76,13 @@ def _numbered(times: list[np.ndarray], dt: float) -> tuple[float, list[np.ndarra
     for _ in range(TIMES):
         ones = [np.zeros(len(n)) for n in numbers]
         gaps = [np.cumsum(np.diff(n, prepend=n[0] - 1) != 1) for n in numbers]
-        trials = [
-            (d, *_all_numbers(times, d)) for d in (_spacing(times, numbers, gaps), _spacing(times, numbers, ones))
-        ]
+        rates = (_spacing(times, numbers, parts) for parts in (gaps, ones))
+        trials = [(d, *_all_numbers(times, d)) for d in rates]
         best, found, late = min(trials, key=lambda trial: trial[2])
         if late >= least:
             break
         dt, numbers, least = best, found, late
-    return _spacing(times, numbers, [np.zeros(len(n)) for n in numbers]), numbers
+    return dt
 
 
 def _all_numbers(times: list[np.ndarray], dt: float) -> tuple[list[np.ndarray], float]:
@@ -92,6 +102,8 @@ def _numbers(stamps: np.ndarray) -> tuple[np.ndarray, float]:
     counts = np.arange(np.floor(late.min()), np.ceil(late.max()) + 1)
     if len(counts) > MANY:
         return row.astype(float), np.inf
+    if np.ptp(ndimage.median_filter(late, SPAN)) < LEVEL:  # none is missing
+        return row.astype(float), float(np.minimum(np.abs(late[:, None] - counts), 1.0).sum(0).min())
     best, came = np.minimum(np.abs(late[0] - counts), 1.0), np.zeros((len(stamps), len(counts)), dtype=np.int16)
     for index in row[1:]:
         fewer = np.minimum.accumulate(best)
