@@ -549,7 +549,7 @@ def _nearest(evidence: Evidence, fitted: Refit, trial: Hypothesis, limits: Limit
         there = _fitted(evidence, trial, found[0], fitted.slope, fitted.linear, fitted.scale)
         if best is not None and there.loss >= best.loss:
             break
-        best = there if best is None else _corrected(best, there)
+        best = _corrected(best, there) if best is not None and limits.free.sum() >= MANY else there
         move = newton_step(best, limits, evidence.caps, LEAST_DAMPING)
         if np.abs(move).max(initial=0.0) < LEAST_MOVE:
             break
