@@ -39,7 +39,8 @@ def in_one_place(
     effect, most = find_effect(PAYLOAD), score(unseen(regression, chosen)) + GAIN
     begun = [Placed(effect, t, _begin(setting, t)) for t in effect.targets(setting)]
     tried = [_fitted(setting, parts, found, regression, chosen & ~centers, p, 1) for p in begun]
-    for _, placed in sorted(tried, key=lambda item: item[0])[:BODIES]:
+    heavy = [item for item in tried if item[1].values[0] > 0]
+    for _, placed in sorted(heavy, key=lambda item: item[0])[:BODIES]:
         left, there = _fitted(setting, parts, found, regression, chosen & ~centers, placed, STEPS)
         if left <= most and not _at_bounds(setting, there):
             return there
@@ -84,7 +85,7 @@ def _fitted(
         wider = replace(regression, columns=more.columns, low=more.low, high=more.high, prior=more.prior)
         own = np.arange(len(more.owner)) >= len(found.owner)
         columns = np.append(chosen, own[own])
-        left = min(left, score(unseen(wider, columns)))
+        left = score(unseen(wider, columns))
         moved = np.array([0.0, *placed.values[1:]]) + fit(wider, columns)[own]
         moved = placed.effect.settle(np.array(placed.values), moved)
         placed = placed.at(np.clip(moved, *np.array(limits).T))
