@@ -1382,6 +1382,19 @@ def test_after_the_end_better_starts_of_windows_are_not_looked_for(monkeypatch: 
     assert late.fit.hypothesis.vector == pytest.approx(in_time.fit.hypothesis.vector)
 
 
+def test_a_last_fit_with_known_weights_ends_where_one_that_finds_them_does() -> None:
+    """Where the model's error and not the noise decides, and wherever it begins."""
+    scene, truth = scene_of("joint_damping"), true(hidden("joint_damping"))
+    wrong = dataclasses.replace(scene.evidence, noise=0.3 * np.array(hidden("joint_damping").noise))
+    last, rest, own, weighed = outcome._last_fit(wrong, None, truth, math.inf)
+    assert own.reduced > scene.rules.sound.model_error
+    assert weighed.model_error.max() > 1.5
+    again, stepped, plain, same = outcome._as_weighed(weighed, truth.at(0.7 * truth.vector))
+    assert same is weighed
+    assert again.fit.hypothesis.vector == pytest.approx(last.fit.hypothesis.vector, rel=1e-3)
+    assert (stepped.cost.reduced, plain.reduced) == pytest.approx((rest.cost.reduced, own.reduced), rel=0.02)
+
+
 def test_derivatives_by_many_numbers_are_carried_to_where_fresh_ones_lead(monkeypatch: pytest.MonkeyPatch) -> None:
     """With fewer simulations; and a fit ends only where fresh ones say so."""
     scene, truth, taken = scene_of("joint_damping"), true(hidden("joint_damping")), list[int]()

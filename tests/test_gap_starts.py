@@ -11,12 +11,15 @@ import pytest
 
 import dropo_torch as dropo
 from dropo_torch.data.observation import parse_observation
+from dropo_torch.effects import find_effect
+from dropo_torch.effects.base import Placed
 from dropo_torch.effects.engine import Variant
-from dropo_torch.gap import Hypothesis, find_gap, prepare, renew
+from dropo_torch.gap import Hypothesis, find_gap, outcome, prepare, renew
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.ground import FEWER, Ground, State
 from dropo_torch.gap.log import cut_windows
 from dropo_torch.gap.refit import refit
+from dropo_torch.gap.rules import significant
 from dropo_torch.gap.scene import _cut
 from dropo_torch.gap.search import NOTHING
 from dropo_torch.gap.smooth import WIDTHS, begun_smoothly, half_widths
@@ -86,6 +89,15 @@ def test_true_model_leaves_noise_where_impacts_bend_windows(bouncing: Evidence) 
 def test_windows_of_a_simulation_without_impacts_stay(bouncing: Evidence, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(type(bouncing.twin.setting), "has_impacts", False)
     assert straightened(bouncing, TRUE.variant) is None
+
+
+@pytest.mark.parametrize("force", [0.0, 2.0])
+def test_last_fit_begins_windows_anew_only_where_that_helps_the_worst(bouncing: Evidence, force: float) -> None:
+    push = Placed(find_effect("external_force"), "ball", (force, 0.0, 0.0))
+    own = refit(bouncing, TRUE.with_effects([push]), iterations=0)
+    assert significant(own.cost, bouncing.rules)
+    evidence, there = outcome._straight(bouncing, own)
+    assert (evidence.windows.starts is None) == (there is own) == (force > 0)
 
 
 def test_starts_are_known_by_episode_and_step(bouncing: Evidence) -> None:
