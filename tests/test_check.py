@@ -26,6 +26,8 @@ from benchmarks.measured_logs import measured_logs
 from benchmarks.wrong_logs import FAULTS, THROWN, Fault, Log, examined, good
 from dropo_torch.commands.cli import main
 from dropo_torch.data.examination import Finding, Rules, examine
+from dropo_torch.data.examination.lag import find_lag
+from dropo_torch.data.examination.record import Record
 from dropo_torch.data.observation import generic_observation, parse_observation
 from dropo_torch.data.readers import read_trajectories
 from dropo_torch.data.trajectory import Origin, Trajectories
@@ -379,6 +381,28 @@ def test_uneven_stamps_are_sure_only_where_they_are_refused() -> None:
     stamped = replace(log, origin=origin, dt=0.02)
     assert ("jitter", "sure") in names(arm_findings(stamped, tolerance=0.05))
     assert [f for f in arm_findings(stamped) if f.sure] == []
+
+
+@pytest.mark.parametrize(("late", "noise"), [(0.0, 1e-4), (1e-3, 1e-4), (4e-3, 1e-3)])
+def test_by_how_much_a_velocity_comes_late_is_told_to_a_part_of_a_row(late: float, noise: float) -> None:
+    """Whatever the noises of both are, and also where single rows show nothing but noise."""
+    rng, time = np.random.default_rng(5), 0.008 * np.arange(4000)
+    tones = rng.uniform(0.5, 6.0, (6, 3))
+
+    def path(at: np.ndarray, order: int) -> np.ndarray:
+        return sum(w**order * a * np.sin(w * at + p + order * np.pi / 2) for w, a, p in tones) / 6
+
+    q = path(time, 0) + noise * rng.standard_normal(len(time))
+    v = path(time - late, 1) + 10 * noise * rng.standard_normal(len(time))
+    log = Trajectories.of_samples(np.stack([q, v], 1), np.zeros((len(time) - 1, 1)), dt=0.008, source="log")
+    model = mujoco.MjModel.from_xml_string(
+        '<mujoco><worldbody><body><joint name="j"/><geom size=".1"/></body></worldbody></mujoco>'
+    )
+    record_ = Record.of(log, parse_observation(model, ["j.position", "j.velocity"], 2), model, 4)
+    lag = find_lag(record_, record_.pairs[0])
+    assert lag is not None
+    assert lag.seconds == pytest.approx(late, abs=4 * lag.error)
+    assert lag.error < 4e-4
 
 
 def test_thresholds_can_be_changed() -> None:

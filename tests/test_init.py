@@ -807,6 +807,23 @@ def test_velocities_that_were_not_logged_are_derived_and_jitter_is_resampled(tmp
     assert any(re.fullmatch(r"time stamps jitter by \d+% of 0.0\d+ s: resampled", n) for n in found.draft.notes)
 
 
+@pytest.mark.parametrize("late", [0.0, 2e-3, 12e-3])
+def test_velocities_that_follow_late_are_derived(late: float, tmp_path: Path, log: tuple[np.ndarray, ...]) -> None:
+    """A filter and not the robot made them late. By a tenth of a row, they stay."""
+    t, q, v, u = log
+    passed = v.copy()
+    for row in range(1, len(v)):
+        passed[row] += (passed[row - 1] - v[row]) * np.exp(-(t[row] - t[row - 1]) / late) if late else 0.0
+    passed += 1e-3 * np.random.default_rng(3).standard_normal(v.shape)
+    frame = {"t": t, "x": q[:, 0], "theta": q[:, 1], "dx": passed[:, 0], "dtheta": passed[:, 1], "u": u[:, 0]}
+    found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
+    derived = found.document["data"].get("preprocess", {}).get("derive", [])
+    assert derived == (["x", "theta"] if late > 5e-3 else [])
+    notes = [n for n in found.draft.notes if "all velocities are derived" in n]
+    assert len(notes) == (late > 5e-3)
+    assert all("the velocity comes" in n for n in notes)
+
+
 @pytest.mark.parametrize(("jitter", "words"), [(0.0, ""), (2e-3, r"time stamps jitter by \d+% of 0.0\d+ s and ")])
 def test_rows_that_are_missing_are_told_as_such(jitter: float, words: str, tmp_path: Path) -> None:
     late, q, u = unevenly(jitter)

@@ -57,6 +57,7 @@ class FreeForces:
         forces: mean free force in each window, ``(W, nv)``.
         errors: their standard errors at that noise, ``(W, nv)``.
         windows: the short windows.
+        left: χ² per degree of freedom that they leave in each window at that noise, ``(W,)``.
     """
 
     noise: np.ndarray
@@ -64,6 +65,7 @@ class FreeForces:
     forces: np.ndarray
     errors: np.ndarray
     windows: Windows
+    left: np.ndarray
 
 
 class Diverges(InputError):
@@ -198,10 +200,14 @@ def _free_forces(evidence: Evidence, sizes: np.ndarray, *, known: bool, variant:
     if not known:
         telling = shows_noise(windows.measured[usable])
         relative, unsure = _relative_noise(residual[telling], slope[telling], counted[telling], m)
-    coefficients, errors = _solve(residual, slope, np.tile(1 / relative, residual.shape[1] // m))
+    factor = np.tile(1 / relative, residual.shape[1] // m)
+    coefficients, errors = _solve(residual, slope, factor)
     forces, standard_errors = np.full((2, len(windows), nv), np.nan)
     forces[usable], standard_errors[usable] = (x[:, m::ORDER] * scale for x in (coefficients, errors))
-    return FreeForces(np.maximum(evidence.noise * relative, FLOOR * sizes), unsure, forces, standard_errors, windows)
+    left, rest = np.full(len(windows), np.nan), residual + np.einsum("wnq,wq->wn", slope, coefficients)
+    left[usable] = ((rest * factor) ** 2).sum(-1) / np.maximum(counted.sum(-1) - slope.shape[-1], 1)
+    noise = np.maximum(evidence.noise * relative, FLOOR * sizes)
+    return FreeForces(noise, unsure, forces, standard_errors, windows, left)
 
 
 def shows_noise(measured: np.ndarray) -> np.ndarray:

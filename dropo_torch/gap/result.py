@@ -208,6 +208,30 @@ class JointForce:
 
 
 @dataclass(frozen=True)
+class Disturbance:
+    """A push that is no part of the robot, for a span of the log.
+
+    Attributes:
+        episode: of the log, counted from 0.
+        begin, end: seconds since the episode began.
+        body: on which one constant force explains it; ``None`` where none does.
+        force: that force at the body's center, in the world's directions, in N, ``(3,)``; ``None`` where there is none.
+        joint: the joint at which it stands out most.
+        moment: the largest force that this joint would need besides.
+        unit: of that.
+    """
+
+    episode: int
+    begin: float
+    end: float
+    body: str | None
+    force: tuple[float, float, float] | None
+    joint: str
+    moment: float
+    unit: str
+
+
+@dataclass(frozen=True)
 class Gap:
     """The result of ``dropo gap``.
 
@@ -243,6 +267,7 @@ class Gap:
         skill: whether the model as it is predicts held-out data better in open loop than constant velocity does.
         forces: unexplained forces of the joints, where these decided and not predictions: the log has the force of
             every joint, and the model as it is has no skill.
+        disturbances: pushes that are no part of the robot; the spans of the log that have them were left out.
     """
 
     where: tuple[Place, ...]
@@ -279,6 +304,7 @@ class Gap:
     joints: Mapping[str, str] = field(default_factory=dict)
     skill: bool = True
     forces: tuple[JointForce, ...] = ()
+    disturbances: tuple[Disturbance, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -308,6 +334,7 @@ class Gap:
             "where": [asdict(place) for place in self.where],
             "effects": [_effect(e) for e in self.effects],
             "forces": [asdict(f) for f in self.forces] or None,
+            "disturbances": [asdict(d) for d in self.disturbances],
             "gap": {
                 name: {key: getattr(getattr(self, name), key) for key in ("mse", "log_likelihood", "rollout_rmse")}
                 for name in ("before", "after", "noise_floor")

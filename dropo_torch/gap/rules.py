@@ -292,6 +292,26 @@ class Forces:
 
 
 @dataclass(frozen=True)
+class Disturbed:
+    """When spans of the log are told as pushes that are no part of the robot.
+
+    Attributes:
+        share: share of the log that stands out, at most; the rest looks like noise.
+        spans: spans, at most.
+        sure: standard errors of a joint's free force, by which it is one; and
+        left: χ² per degree of freedom that free forces may leave.
+        near: distance of a joint's position, velocity and commands from those of another time, in their standard
+            deviations, within which it moved alike there.
+    """
+
+    share: float = 0.1
+    spans: int = 6
+    sure: float = 5.0
+    left: float = 2.0
+    near: float = 0.5
+
+
+@dataclass(frozen=True)
 class Rules:
     """Thresholds of the naming; the same for every log, since all they compare is in units of the noise.
 
@@ -308,7 +328,7 @@ class Rules:
         imitating: the share where what is named has more numbers than are ``free``, and is still wrong.
         least: share of the first excess below which an effect is not named.
         effects: the most effects that are named.
-        chance, alike, tried, family, sound, cut, weighed, forces, shown: see there.
+        chance, alike, tried, family, sound, cut, weighed, forces, disturbed, shown: see there.
     """
 
     gate: float = 5.0
@@ -329,6 +349,7 @@ class Rules:
     cut: Cut = field(default_factory=Cut)
     weighed: Weighed = field(default_factory=Weighed)
     forces: Forces = field(default_factory=Forces)
+    disturbed: Disturbed = field(default_factory=Disturbed)
     shown: Shown = field(default_factory=Shown)
 
 

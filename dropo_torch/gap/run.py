@@ -12,6 +12,7 @@ import numpy as np
 
 from dropo_torch.effects import VOCABULARY, Effect, Placed
 from dropo_torch.errors import InputError
+from dropo_torch.gap.disturbed import undisturbed
 from dropo_torch.gap.evidence import Evidence
 from dropo_torch.gap.forces.motion import has_forces
 from dropo_torch.gap.forces.view import ForceView, force_view
@@ -46,6 +47,8 @@ from dropo_torch.support.threads import single_thread
 
 #: Suffix of the checkpoint of a search over the windows that stand out among others: of these, chance chooses too many.
 RARE = "-rare"
+#: Suffix of the checkpoint of a search without the spans in which something pushed.
+CALM = "-calm"
 
 
 def locate(scene: Scene, *, effects: Sequence[Effect] | None = None, rules: Rules | None = None) -> tuple[Place, ...]:
@@ -149,10 +152,25 @@ def find_gap(
         InputError: a log or simulator in which nothing can be looked for (see :func:`prepare`), an empty vocabulary, or
             a checkpoint of another search.
     """
-    started = time.perf_counter()
+    started, end = time.perf_counter(), time.monotonic() + time_limit
     report("preparing", 0.0)
     scene = _ruled(scene or prepare(problem, rules), rules)
-    ground, end = replace(_ground(scene, effects), report=report), time.monotonic() + time_limit
+    scene, pushes = undisturbed(scene, scene.begin, scene.noise)
+    ground = replace(_ground(scene, effects), report=report)
+    naming, gap = _found(scene, ground, checkpoint, resume, started, end)
+    if not pushes and gap.verdict in ("unnamed", "partly explained") and time.monotonic() < end:
+        calm, pushes = undisturbed(scene, naming.final.hypothesis, naming.evidence.noise)  # beside what was named
+        if pushes:
+            path = None if checkpoint is None else checkpoint.with_stem(f"{checkpoint.stem}{CALM}")
+            ground = replace(_ground(calm, effects), report=report)
+            naming, gap = _found(calm, ground, path, resume, started, end)
+    return replace(gap, disturbances=pushes)
+
+
+def _found(
+    scene: Scene, ground: Ground, checkpoint: Path | None, resume: bool, started: float, end: float
+) -> tuple[Naming, Gap]:
+    """What a search named, and what is made of it: where predictions have no skill, forces at the joints may decide."""
     views: dict[tuple[Placed, ...], ForceView | None] = {}
 
     def view(named: tuple[Placed, ...]) -> ForceView | None:
@@ -164,13 +182,13 @@ def find_gap(
         return has_forces(scene.setting) and not _has_skill(scene, naming) and view(()) is not None
 
     naming = _name(scene, ground, checkpoint, resume, end, forces_decide)
-    gap = make_result(scene, naming, started, report, end=end)
+    gap = make_result(scene, naming, started, ground.report, end=end)
     if gap.skill or gap.verdict not in ("unnamed", "partly explained"):
-        return gap
+        return naming, gap
     refused = gap.verdict == "unnamed"  # names that unseen data refute are no rivals
     if (decided := view(() if refused else naming.final.hypothesis.placed)) is None:
-        return gap
-    return replace(with_forces(scene, gap, decided), seconds=time.perf_counter() - started)
+        return naming, gap
+    return naming, replace(with_forces(scene, gap, decided), seconds=time.perf_counter() - started)
 
 
 def _view(scene: Scene, ground: Ground, named: Sequence[Placed]) -> ForceView | None:

@@ -118,6 +118,11 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
     train, held = hold_out(replace(log, dt=log.dt or problem.simulator.timestep))
     if not np.ptp(train.observations, axis=0).any():
         raise InputError(f"data: nothing moves in {train.source}: no observed column ever changes")
+    return _scene(problem, train, held, rules or Rules())
+
+
+def _scene(problem: Problem, train: Trajectories, held: Trajectories, rules: Rules) -> Scene:
+    """What a search works on, of a log that is cut into its two parts."""
     begin, plain = Hypothesis(tuple(start_values(problem).tolist())), make_setting(problem, train)
     waves = ripples(_twin(problem, plain), train, begin.variant)
     smoothed = half_widths(train, plain.observation, _noisy_starts(problem, plain))
@@ -131,11 +136,20 @@ def prepare(problem: Problem, rules: Rules | None = None) -> Scene:
         noise = free_forces(twin, short, begin.variant).noise
     else:
         noise = Features.of(problem.observation).feature_noise(given.numpy())
-    rules = rules or Rules()
     shortest = cut_windows(train, setting.observation, rules.cut.lengths[-1], since=since)
     whole = Evidence(twin, shortest, noise, begin.variant, rough=True, rules=rules)
     evidence = _choose_windows(whole, train, begin, since)
     return Scene(problem, setting, twin, train, held, since, noise, evidence, begin)
+
+
+def without_rows(scene: Scene, train: np.ndarray, held: np.ndarray) -> Scene:
+    """Return what a search works on without some rows of the log: the scene is made anew, the model's sizes, too.
+
+    Args:
+        scene: of the log.
+        train, held: which rows of its two parts stay, bool.
+    """
+    return _scene(scene.problem, scene.train.select(train), scene.held.select(held), scene.rules)
 
 
 def with_parameters(scene: Scene, problem: Problem) -> Scene:
@@ -235,14 +249,7 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
     observation = twin.setting.observation
     windows = spread(cut_windows(train, observation, evidence.windows.length, since=since), ALL)
     windows = begun_smoothly(windows, train, observation, twin.setting.signals.smoothed)
-    odds = []
-    for rows in np.array_split(np.arange(len(windows)), max(1, -(-len(windows) // MOST))):
-        part = evidence.on(windows.select(rows))
-        linear = part.linearize(base.variant)
-        chi2 = (part.project(part.residuals([base.variant])[0][0], linear) ** 2).sum(-1) / rules.sound.rest
-        degrees = np.maximum((linear.weights > 0).sum(-1) - part.chart.size, 1)
-        odds.append(np.where(linear.counted, stats.chi2.logsf(chi2, degrees), 0.0))
-    chance = np.concatenate(odds)
+    chance = odds(evidence, windows, base.variant)[0]
     order = np.argsort(chance, kind="stable")
     far = order[chance[order] < np.log(rules.chance.error / max(len(order), 1))]
     if not far.size:
@@ -250,6 +257,29 @@ def outstanding(scene: Scene, evidence: Evidence, base: Hypothesis) -> Evidence 
     others, count = np.sort(order[len(far) :]), BESIDE - min(RARE, len(far))
     beside = others[evenly(len(others), min(count, len(others)))]
     return evidence.on(windows.select(np.sort(np.concatenate([far[:RARE], beside]))))
+
+
+def odds(evidence: Evidence, windows: Windows, variant: Variant) -> tuple[np.ndarray, np.ndarray]:
+    """Return how little chance leaves so much in each of many windows.
+
+    Args:
+        evidence: gives the noise.
+        windows: stretches of the log; how many does not matter.
+        variant: the hypothesis.
+
+    Returns:
+        Logarithms of the chance ``(W,)``, 0 where nothing is known, for noise that may be larger than was told; and χ²
+        per degree of freedom, ``(W,)``.
+    """
+    chance, reduced = np.zeros(len(windows)), np.zeros(len(windows))
+    for rows in np.array_split(np.arange(len(windows)), max(1, -(-len(windows) // MOST))):
+        part = evidence.on(windows.select(rows))
+        linear = part.linearize(variant)
+        chi2 = (part.project(part.residuals([variant])[0][0], linear) ** 2).sum(-1)
+        degrees = np.maximum((linear.weights > 0).sum(-1) - part.chart.size, 1)
+        found = stats.chi2.logsf(chi2 / evidence.rules.sound.rest, degrees)
+        chance[rows], reduced[rows] = np.where(linear.counted, (found, chi2 / degrees), 0.0)
+    return chance, reduced
 
 
 def _choose_windows(whole: Evidence, train: Trajectories, begin: Hypothesis, since: np.ndarray) -> Evidence:

@@ -29,6 +29,8 @@ CURED = (
     "degrees", "motor_side", "units", "sign", "order", "wraps", "quaternion_order", "joined", "frame_skip", "delay",
     "dropouts", "jitter", "next_observations", "joint_sign", "action_sign", "action_order",
 )  # fmt: skip
+#: Findings for which measured velocities are not used, and what is said of them.
+UNFIT = {"angular_frame": "angular velocities are in the world's frame", "lag": "{}"}
 #: Examinations at most: each may find what the one before hid.
 ROUNDS = 8
 #: A power that noise does not have: times that of the highest quarter of frequencies.
@@ -101,9 +103,10 @@ def make_draft(reading: Reading) -> Draft:
     """
     document, notes, smooth = _document(reading, derived=False)
     logged, findings, cured = _cured(document, reading)
-    if any(f.name == "angular_frame" for f in findings):
+    told = {f.name: f.what for f in findings}
+    if reasons := [why.format(told[name]) for name, why in UNFIT.items() if name in told]:
         document, notes, smooth = _document(reading, derived=True)
-        notes += ["angular velocities are in the world's frame: all velocities are derived"]
+        notes += [f"{'; '.join(reasons)}: all velocities are derived"]
         logged, findings, cured = _cured(document, reading)
     return Draft(document, logged, findings, (*notes, *cured), smooth and _as_cured(smooth, document, reading.matching))
 

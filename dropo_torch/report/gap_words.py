@@ -10,7 +10,7 @@ import numpy as np
 
 from dropo_torch.effects import VOCABULARY
 from dropo_torch.effects.base import all_of
-from dropo_torch.gap.result import FAMILY, Gap, NamedEffect, Place, Remaining, Strength, fallen, reason
+from dropo_torch.gap.result import FAMILY, Disturbance, Gap, NamedEffect, Place, Remaining, Strength, fallen, reason
 from dropo_torch.gap.rules import Sound
 from dropo_torch.report.formatting import joined, number, percent, plain, short, with_unit
 
@@ -226,6 +226,25 @@ def ambiguous(effect: NamedEffect) -> str:
 
 def answer(gap: Gap) -> tuple[str, list[str]]:
     """Return what is missing in a sentence or two, and the items of a list that they announce, if any."""
+    sentence, items = _with_values(gap)
+    return (f"{pushes(gap.disturbances)} {sentence}" if gap.disturbances else sentence), items
+
+
+def pushes(found: Sequence[Disturbance]) -> str:
+    """Return when and where something pushed that is no part of the robot, in two sentences."""
+    several, told = len({d.episode for d in found} | {0}) > 1, list[str]()
+    for d in found:
+        size = f"at {d.joint}, up to {plain(d.moment)} {d.unit}"
+        if d.body is not None and d.force is not None:
+            size += f", as a force of some {short(float(np.linalg.norm(d.force)))} N on {d.body} would"
+        when = f" of episode {d.episode}" if several else ""
+        told.append(f"from {d.begin:.2f} to {d.end:.2f} s{when} {size}")
+    rest = "that span" if len(told) == 1 else "those spans"
+    return f"Something pushed that is no part of the robot: {'; '.join(told)}. Without {rest} of the log:"
+
+
+def _with_values(gap: Gap) -> tuple[str, list[str]]:
+    """The answer, with other values of the config's parameters."""
     sentence, items = _answer(gap)
     if not any(map(is_named, gap.effects)) or gap.forces or not (values := corrected(gap)):
         return sentence, items

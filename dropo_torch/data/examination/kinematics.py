@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dropo_torch.data.examination.finding import Finding, confidence
+from dropo_torch.data.examination.lag import lagging
 from dropo_torch.data.examination.prediction import Reading, better_reading
 from dropo_torch.data.examination.record import Pair, Record, entry, resampled, windows
 from dropo_torch.data.examination.rules import Rules
@@ -54,7 +55,10 @@ def velocities(record: Record, rules: Rules) -> list[Finding]:
             evidence={c.name: own[c].share for c in odd},
             advice="derive them: data: {observations: [the positions], preprocess: {dt: SECONDS, cutoff: HZ}}",
         ))  # fmt: skip
-    return found + _delays(record, clear, rules)
+    delays = _delays(record, clear, rules)
+    if found or any(finding.sure for finding in delays):
+        return found + delays
+    return lagging(record, clear, rules) or delays
 
 
 def likeness(record: Record, position: int, velocity: int) -> Likeness:

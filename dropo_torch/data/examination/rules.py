@@ -38,6 +38,7 @@ class Rules:
         common: relative spread of the slopes of most columns that count as one: then it is the time step.
         late: what the best shift of a velocity leaves of the misfit without one, doubtful; filters do this.
         sure_late: the same, sure: a shift by a whole row and little else.
+        lag: share of a row by which a velocity comes after that of its position, from which on it is told.
         hold: share of rows in which a moving column stands still that is told; polled buses repeat some.
         sure_hold: the same, sure: the sensor is slower than the log.
         frozen: rows that a column stands still while it is said to move.
@@ -81,6 +82,7 @@ class Rules:
     common: float = 0.25
     late: float = 0.7
     sure_late: float = 0.25
+    lag: float = 0.15
     hold: float = 0.03
     sure_hold: float = 0.3
     frozen: int = 10

@@ -1,0 +1,234 @@
+"""Unknown pushes: spans of the log in which a force acts that the same motion at other times does not show.
+
+Somebody leans on the arm, a cable snags, a crate is bumped into. No number of a model stands for that, and what such
+rows say about the robot is wrong. A push is told by what it is not: most of the log looks like noise beside the model,
+some spans do not, a force leaves nothing in them, and the joints were at the same places, as fast and under the same
+commands at times when no force was missing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import mujoco
+import numpy as np
+from scipy.spatial import cKDTree
+
+from dropo_torch.effects.actuator import driven_joint
+from dropo_torch.effects.base import Setting
+from dropo_torch.gap.evidence import Evidence
+from dropo_torch.gap.locate import dof_names, force_unit, middles
+from dropo_torch.gap.log import cut_windows, episode_bounds, spread
+from dropo_torch.gap.noise import LENGTH, FreeForces, free_forces
+from dropo_torch.gap.refit import Hypothesis
+from dropo_torch.gap.result import Disturbance
+from dropo_torch.gap.scene import Scene, odds, without_rows
+from dropo_torch.gap.twin import Windows
+
+#: Seconds of a window, about, and its logged steps at most; windows of a first look; and of one at the whole log.
+SECONDS, LONGEST, FEW, ALL = 0.08, 30, 24, 600
+#: Seconds that a push lasts at least, and windows without one between two that belong together.
+LEAST, APART = 0.05, 2
+#: Quantiles of a joint's motion elsewhere within which it was in a span.
+USUAL = (0.01, 0.99)
+#: Share of the forces' mean squares that one on a body explains, at least, for the body to be named; and by how much
+#: more another may leave that explains it alike.
+EXPLAINED, ALIKE = 0.8, 1.05
+
+
+@dataclass(frozen=True)
+class Span:
+    """Rows of the log in which something pushed.
+
+    Attributes:
+        first, last: rows, the last one not among them.
+        told: what it was.
+    """
+
+    first: int
+    last: int
+    told: Disturbance
+
+
+def undisturbed(scene: Scene, hypothesis: Hypothesis, noise: np.ndarray) -> tuple[Scene, tuple[Disturbance, ...]]:
+    """Return a scene without the spans in which something pushed, and what was told of these.
+
+    Args:
+        scene: of the log.
+        hypothesis: beside which they are looked for.
+        noise: standard deviation of each feature, ``(m,)``.
+    """
+    spans = find_spans(scene, hypothesis, noise)
+    if not spans:
+        return scene, ()
+    kept = np.ones(len(scene.train) + len(scene.held), dtype=bool)
+    for span in spans:
+        kept[span.first : span.last] = False
+    parts = np.split(kept, [len(scene.train)])
+    if not all(part.any() for part in parts):
+        return scene, ()
+    return without_rows(scene, *parts), tuple(span.told for span in spans)
+
+
+def find_spans(scene: Scene, hypothesis: Hypothesis, noise: np.ndarray) -> tuple[Span, ...]:
+    """Return the spans in which something pushed; none where joints touch something, or are free.
+
+    Args:
+        scene: of the log.
+        hypothesis: beside which they are looked for.
+        noise: standard deviation of each feature, ``(m,)``.
+    """
+    setting, rules = scene.setting, scene.rules.disturbed
+    kinds = (int(mujoco.mjtJoint.mjJNT_SLIDE), int(mujoco.mjtJoint.mjJNT_HINGE))
+    if setting.signals.contacts.any() or not np.isin(setting.model.jnt_type, kinds).all():
+        return ()
+    evidence = replace(scene.evidence, noise=noise, model_error=1.0, caps=1.0)
+    windows = _all_windows(scene, hypothesis)
+    if not len(windows) or not _is_right(evidence, spread(windows, FEW), hypothesis):
+        return ()
+    rows = np.unique(np.linspace(0, len(windows) - 1, min(ALL, len(windows))).round().astype(int))
+    (chance, reduced), least = np.zeros((2, len(windows))), np.log(evidence.rules.chance.error / len(windows))
+    chance[rows], reduced[rows] = odds(evidence, windows.select(rows), hypothesis.variant)
+    far = chance < least
+    if not far.any() or far[rows].mean() > rules.share:
+        return ()
+    if len(rows) < len(windows):  # between those that were looked at
+        more = _between(far, rows)
+        chance[more], reduced[more] = odds(evidence, windows.select(more), hypothesis.variant)
+        far = chance < least
+    runs = _runs(np.flatnonzero(far), windows)
+    if len(runs) > rules.spans:
+        return ()
+    calm = windows.select(np.setdiff1d(rows, np.concatenate([np.arange(a - 1, b + 1) for a, b in runs])))
+    spans = [_span(scene, evidence, hypothesis, windows, run, calm) for run in runs]
+    lost = [float(reduced[a:b].sum()) for a, b in runs]
+    most = sum(x for x, span in zip(lost, spans, strict=True) if span is not None) > scene.rules.most * sum(lost)
+    return tuple(span for span in spans if span is not None) if most else ()
+
+
+def _all_windows(scene: Scene, hypothesis: Hypothesis) -> Windows:
+    """Short windows of the whole log, one after the other; their episodes are those of its two parts in turn."""
+    setting, parts, found = scene.setting, (scene.train, scene.held), list[Windows]()
+    length = int(np.clip(round(SECONDS / setting.signals.timestep), LENGTH, LONGEST))
+    for part in parts:
+        since = scene.twin.settled(hypothesis.variant, part.commands)
+        found.append(cut_windows(part, setting.observation, length, since=since))
+    return _joined(*found)
+
+
+def _joined(first: Windows, second: Windows) -> Windows:
+    """The windows of two logs of the same columns, the episodes of the second after those of the first."""
+    both = (first, second)
+    wide = max(w.commands.shape[1] for w in both)
+    commands = [np.pad(w.commands, ((0, 0), (0, wide - w.commands.shape[1]), (0, 0)), "edge") for w in both]
+    names = [n for n in ("measured", "rates", "steps", "unseen", "gains") if getattr(first, n) is not None]
+    arrays: dict[str, Any] = {n: np.concatenate([getattr(w, n) for w in both]) for n in names}
+    episodes = np.concatenate([first.episodes, second.episodes + len(first.commands)])
+    return replace(first, **arrays, episodes=episodes, commands=np.concatenate(commands))
+
+
+def _is_right(evidence: Evidence, windows: Windows, hypothesis: Hypothesis) -> bool:
+    """Return whether most windows look like noise."""
+    reduced = odds(evidence, windows, hypothesis.variant)[1]
+    return float(np.median(reduced)) < evidence.rules.sound.right
+
+
+def _between(far: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """The windows between those of a first look ``rows`` that stand out and their neighbors that do not."""
+    ends = [(rows[max(k - 1, 0)], rows[min(k + 1, len(rows) - 1)]) for k in np.flatnonzero(far[rows]).tolist()]
+    return np.setdiff1d(np.concatenate([np.arange(a, b + 1) for a, b in ends]), rows)
+
+
+def _runs(far: np.ndarray, windows: Windows) -> list[tuple[int, int]]:
+    """Windows that stand out one after the other, the first and the one after the last."""
+    new = (np.diff(far) > APART + 1) | (np.diff(windows.episodes[far]) != 0)
+    ends = zip(far[np.append(True, new)], far[np.append(new, True)], strict=True)
+    return [(int(first), int(last) + 1) for first, last in ends]
+
+
+def _span(
+    scene: Scene, evidence: Evidence, hypothesis: Hypothesis, windows: Windows, run: tuple[int, int], calm: Windows
+) -> Span | None:
+    """What a run of windows shows, if it is a push."""
+    setting, rules = scene.setting, scene.rules.disturbed
+    own = windows.select(np.arange(*run))
+    if (own.steps[-1] - own.steps[0] + own.length) * setting.signals.timestep < LEAST:
+        return None
+    free = free_forces(scene.twin, own, hypothesis.variant, evidence.noise)
+    known = np.isfinite(free.forces).all(1)
+    if not known.any() or np.median(free.left[known]) > rules.left:
+        return None
+    sure = np.sqrt(np.nanmean((free.forces / free.errors) ** 2, axis=0))
+    pushed = np.flatnonzero(sure > rules.sure)
+    if not pushed.size or not all(_is_usual(setting, own, calm, int(dof), rules.near) for dof in pushed):
+        return None
+    return _told(scene, own, free, int(sure.argmax()))
+
+
+def _is_usual(setting: Setting, own: Windows, calm: Windows, dof: int, near: float) -> bool:
+    """Whether a joint was where, as fast and under the commands as at other times."""
+    model, joint = setting.model, int(setting.model.dof_jntid[dof])
+    driven = [i for i in range(model.nu) if i < model.nactuator and driven_joint(model, i) == joint]
+
+    def signals(windows: Windows) -> np.ndarray:
+        position, velocity, commands = middles(setting, windows)
+        ctrl = [commands[:, model.actuator_ctrladr[i]] for i in driven]
+        return np.stack([position[:, model.jnt_qposadr[joint]], velocity[:, dof], *ctrl], 1)
+
+    there, here = signals(calm), signals(own)
+    low, high = np.quantile(there, USUAL, axis=0)
+    size = np.maximum(there.std(0), 1e-12)
+    inside = ((here >= low) & (here <= high)).all(1)
+    distance, _ = cKDTree(there / size).query(here / size)
+    return bool(np.mean(inside & (distance < near)) > 0.5)
+
+
+def _told(scene: Scene, own: Windows, free: FreeForces, dof: int) -> Span:
+    """A push, with its time and what was pushed."""
+    setting, dt, length = scene.setting, scene.setting.signals.timestep, own.length
+    unseen = len(scene.train)
+    bounds = episode_bounds(scene.train) + [(a + unseen, b + unseen) for a, b in episode_bounds(scene.held)]
+    first, end = bounds[own.episodes[0]]
+    begin, last = int(first + own.steps[0]), int(first + own.steps[-1] + length)
+    episodes = scene.problem.trajectories.episodes
+    episode = int(episodes[begin])
+    since = int(np.flatnonzero(episodes == episode)[0])
+    body, force = _on_body(setting, own, free)
+    told = Disturbance(
+        episode, (begin - since) * dt, (last - since) * dt, body, force,
+        dof_names(setting.model)[dof], float(np.nanmax(np.abs(free.forces[:, dof]))), force_unit(setting.model, dof),
+    )  # fmt: skip
+    return Span(max(begin - length, first), min(last + length, end), told)
+
+
+def _on_body(setting: Setting, own: Windows, free: FreeForces) -> tuple[str | None, tuple[float, float, float] | None]:
+    """The body on which one force at its center explains what the joints needed best, and that force in newtons.
+
+    Of bodies that explain it nearly alike, the one nearest to the base; none where no force on a single body does.
+    """
+    model, found = setting.model, list[tuple[float, int, np.ndarray]]()
+    position, _, _ = middles(setting, own)
+    known = np.isfinite(free.forces).all(1)
+    target = (free.forces / free.errors)[known].ravel()
+    for body in range(1, model.nbody):
+        slope = np.stack([_jacobian(setting, q, body) for q in position[known]]) / free.errors[known][:, None]
+        matrix = slope.swapaxes(1, 2).reshape(len(target), 3)
+        force, *_ = np.linalg.lstsq(matrix, target, rcond=1e-3)
+        found.append((float(((target - matrix @ force) ** 2).sum()), body, force))
+    least = min(left for left, _, _ in found)
+    left, body, force = next(f for f in found if f[0] <= ALIKE * least + 1e-12)
+    if left > (1 - EXPLAINED) * float((target**2).sum()):
+        return None, None
+    return setting.names("body")[body], (float(force[0]), float(force[1]), float(force[2]))
+
+
+def _jacobian(setting: Setting, position: np.ndarray, body: int) -> np.ndarray:
+    """How a body's center moves with the joints, ``(3, nv)``."""
+    model, jacobian = setting.model, np.zeros((3, setting.model.nv))
+    data = mujoco.MjData(model)
+    data.qpos[:] = position
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_jacBodyCom(model, data, jacobian, None, body)
+    return jacobian
