@@ -85,8 +85,12 @@ def find_spans(scene: Scene, hypothesis: Hypothesis, noise: np.ndarray) -> tuple
         return ()
     evidence = replace(scene.evidence, noise=noise, model_error=1.0, caps=1.0)
     windows = _all_windows(scene, hypothesis)
-    if not len(windows) or not _is_right(evidence, spread(windows, FEW), hypothesis):
+    if not len(windows):
         return ()
+    typical = float(np.median(odds(evidence, spread(windows, FEW), hypothesis.variant)[1]))
+    if typical > rules.typical:
+        return ()
+    evidence = replace(evidence, noise=noise * max(typical, 1.0) ** 0.5)
     rows = np.unique(np.linspace(0, len(windows) - 1, min(ALL, len(windows))).round().astype(int))
     (chance, reduced), least = np.zeros((2, len(windows))), np.log(evidence.rules.chance.error / len(windows))
     chance[rows], reduced[rows] = odds(evidence, windows.select(rows), hypothesis.variant)
@@ -126,12 +130,6 @@ def _joined(first: Windows, second: Windows) -> Windows:
     arrays: dict[str, Any] = {n: np.concatenate([getattr(w, n) for w in both]) for n in names}
     episodes = np.concatenate([first.episodes, second.episodes + len(first.commands)])
     return replace(first, **arrays, episodes=episodes, commands=np.concatenate(commands))
-
-
-def _is_right(evidence: Evidence, windows: Windows, hypothesis: Hypothesis) -> bool:
-    """Return whether most windows look like noise."""
-    reduced = odds(evidence, windows, hypothesis.variant)[1]
-    return float(np.median(reduced)) < evidence.rules.sound.right
 
 
 def _between(far: np.ndarray, rows: np.ndarray) -> np.ndarray:
@@ -210,6 +208,8 @@ def _on_body(setting: Setting, own: Windows, free: FreeForces) -> tuple[str | No
     model, found = setting.model, list[tuple[float, int, np.ndarray]]()
     position, _, _ = middles(setting, own)
     known = np.isfinite(free.forces).all(1)
+    if known[1:-1].any():  # at its ends, a push fills windows in part
+        known[[0, -1]] = False
     target = (free.forces / free.errors)[known].ravel()
     for body in range(1, model.nbody):
         slope = np.stack([_jacobian(setting, q, body) for q in position[known]]) / free.errors[known][:, None]

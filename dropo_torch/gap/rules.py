@@ -296,7 +296,8 @@ class Disturbed:
     """When spans of the log are told as pushes that are no part of the robot.
 
     Attributes:
-        share: share of the log that stands out, at most; the rest looks like noise.
+        typical: χ² per degree of freedom of a typical stretch, at most; as if that were noise, others stand out.
+        share: share of the log that stands out, at most.
         spans: spans, at most.
         sure: standard errors of a joint's free force, by which it is one; and
         left: χ² per degree of freedom that free forces may leave.
@@ -304,6 +305,7 @@ class Disturbed:
             deviations, within which it moved alike there.
     """
 
+    typical: float = 3.0
     share: float = 0.1
     spans: int = 6
     sure: float = 5.0
