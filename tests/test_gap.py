@@ -929,7 +929,8 @@ def test_whole_vocabulary_names_one_effect(cart: Path) -> None:
 NUMBER = (int, float)
 CONTRACT: dict[str, Any] = {
     "schema": str, "verdict": str, "verdict_reason": str, "remaining": (dict, type(None)), "where": list,
-    "effects": list, "forces": (list, type(None)), "gap": dict, "next_experiment": (str, type(None)), "declared": dict,
+    "effects": list, "forces": (list, type(None)), "disturbances": list, "gap": dict,
+    "next_experiment": (str, type(None)), "declared": dict,
     "noise": dict, "chi2_per_degree": dict, "own_step": (list, type(None)), "unfinished": (str, type(None)),
     "ranking": list, "left_out": list, "cannot_judge": list, "symbolic": (str, type(None)),
     "notes": list, "backend": str, "simulated_transitions": int, "seconds": float, "seed": int,

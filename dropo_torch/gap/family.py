@@ -17,7 +17,7 @@ from dropo_torch.gap.accept import ROUGHLY, SOFT, beats, extend, is_of_step, sou
 from dropo_torch.gap.ground import Ground, State
 from dropo_torch.gap.limbs import joint_of
 from dropo_torch.gap.refit import Hypothesis, Refit, refit
-from dropo_torch.gap.rules import remains, significant
+from dropo_torch.gap.rules import near, remains, significant
 from dropo_torch.gap.screen import nearer
 from dropo_torch.gap.spare import FRICTION, STAGE, excesses, is_absent, needed, tolerated, without_steps
 
@@ -48,9 +48,10 @@ def base_family(setting: Setting, known: Sequence[Effect] | None = None) -> list
 def with_family(ground: Ground, state: State, found: State) -> State:
     """Put the base family in the place of the first effects found, where these leave much and it leaves far less.
 
-    At several joints several members must be needed: what sits at one joint, or is of one kind, the search names
-    one by one. What a coarse step does to stiff servos is no member, although inertia, friction and delay of every
-    joint together make up for it. Where the first effects are not one effect at several joints already, it must
+    At several joints several members must be needed: what sits at one of them, or is of one kind, the search names
+    one by one. A robot of one joint has them all there. What a coarse step does to stiff servos is no member, although
+    inertia, friction and delay of every joint together make up for it. Where the first effects are not one effect at
+    several joints already, and the robot has more joints than one, it must
     leave next to nothing of what they leave. What ends at a bound of physics is no member. Where one effect more
     beside the first ones leaves no more than noise, or less than the family that leaves more, the search goes on with
     these.
@@ -63,8 +64,10 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     rules = ground.rules.family
     if not has_family(ground) or not significant(found.current.cost, ground.rules):
         return found
-    kind = one_kind(found.current.hypothesis)
-    best = found if found.done or kind else extend(ground, found)  # what contains the first effects may be the truth
+    kind = one_kind(found.current.hypothesis) or len(joints_of(ground)) == 1
+    best = (
+        found if found.done or one_kind(found.current.hypothesis) else extend(ground, found)
+    )  # what contains the first effects may be the truth
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
         return found
@@ -104,8 +107,12 @@ def with_one_more(ground: Ground, found: State) -> list[Refit]:
 
 
 def is_surpassed(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
-    """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more."""
-    return significant(whole.cost, ground.rules) and any(r.cost.excess < whole.cost.excess for r in beside)
+    """Return whether one effect more beside the first ones leaves less than the base family, where that leaves more.
+
+    By more than hypotheses differ that are about as good: the three may be members of the family themselves.
+    """
+    most = whole.cost.excess - near(whole.cost, ground.rules)
+    return significant(whole.cost, ground.rules) and any(r.cost.excess < most for r in beside)
 
 
 def is_plainer(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
@@ -121,9 +128,14 @@ def is_plainer(ground: Ground, beside: Sequence[Refit], whole: Refit) -> bool:
 
 
 def has_family(ground: Ground) -> bool:
-    """Return whether the model has joints enough for a base family, and touches nothing."""
-    joints = {joint_of(ground.setting, p) for p in base_family(ground.setting, ground.effects)} - {None}
-    return not ground.setting.signals.contacts.any() and len(joints) >= ground.rules.family.joints
+    """Return whether the model has joints with a base family, and touches nothing."""
+    return not ground.setting.signals.contacts.any() and bool(joints_of(ground))
+
+
+def joints_of(ground: Ground) -> set[int]:
+    """Return the joints at which members of the base family can sit."""
+    found = (joint_of(ground.setting, p) for p in base_family(ground.setting, ground.effects))
+    return {joint for joint in found if joint is not None}
 
 
 def whole_family(ground: Ground, fitted: Refit) -> Refit | None:
@@ -228,11 +240,11 @@ def promised_gain(ground: Ground, whole: Refit, larger: Hypothesis) -> float:
 
 
 def spread_out(setting: Setting, hypothesis: Hypothesis, members: int) -> bool:
-    """Return whether at least half of the joints, and two, have so many members each."""
+    """Return whether at least half of the joints, and two where there are more, have so many members each."""
     joints = [joint_of(setting, p) for p in hypothesis.placed]
     every = {joint_of(setting, p) for p in base_family(setting)} - {None}
     rich = sum(joints.count(j) >= members for j in every)
-    return rich >= max(2, 0.5 * len(every))
+    return rich >= max(min(2, len(every)), 0.5 * len(every))
 
 
 def one_kind(hypothesis: Hypothesis) -> bool:

@@ -111,14 +111,11 @@ class Family:
 
     Attributes:
         left: share of the excess that these must leave for it to be tried.
-        clearer: share of what they leave below which it takes their place: of effects at some joints, and of one effect
-            at three or more.
+        clearer: share of what they leave below which it takes their place: of effects at some joints; and of one effect
+            at three or more, or at a robot's only joint.
         hopeless: times that share which all members together may leave for those that are needed to be looked for; dry
             friction that creeps at rest, or changes along the range, then makes it smaller.
         instead: share of what named effects leave below which it takes their place in the end, where this is wrong.
-        joints: the least that the model has.
-        rest: share of the first excess that the family may leave even if this is more than ``sound.wrong``: with much
-            motion and little noise, the last hundredth of a real robot's misfit is.
         members: of it, so many must be needed at half of the joints.
         spare: share of the excess that it leaves at a joint by which dropping the members least needed there may raise
             it.
@@ -134,8 +131,6 @@ class Family:
     clearer: tuple[float, float] = (0.05, 0.4)
     hopeless: float = 6.0
     instead: float = 0.5
-    joints: int = 2
-    rest: float = 0.02
     members: int = 2
     spare: float = 0.03
     delayed: float = 0.7
@@ -416,12 +411,12 @@ def accounts(named: Refit, base: Refit, rules: Rules) -> bool:
 
 
 def family_accounts(named: Refit, base: Refit, rules: Rules) -> bool:
-    """Return whether a base family removes as much of the excess as it must, and leaves little that is wrong.
+    """Return whether a base family removes as much of the excess as it must.
 
-    Its members are each needed beside all others, so their number does not count against them.
+    Its members are each needed beside all others, so their number does not count against them; nor does what is wrong
+    besides: with much motion and little noise, the last hundredths of a real robot's misfit are many times the noise.
     """
-    most = 1 - rules.accounted if named.cost.reduced <= rules.sound.wrong else rules.family.rest
-    return named.cost.left_of(base.cost) <= most
+    return named.cost.left_of(base.cost) <= 1 - rules.accounted
 
 
 def clears(base: Refit, current: Refit, rules: Rules) -> bool:
