@@ -49,6 +49,9 @@ class Config(pydantic.BaseModel):
     trajectories: int | Annotated[list[int], Field(min_length=1)] | None = _key(
         None, "how many of the log's episodes to use (the first ones), or which, counted from 0", "model and log"
     )
+    leave_out: list[tuple[int, float, float]] = _key(
+        [], "spans of these that are not used: [episode, begin, end], in seconds since it began", "model and log"
+    )
     frame_skip: int | None = _key(None, "physics steps per logged transition", "model and log", ge=1, le=1_000_000)
     observation: list[str] | None = _key(
         None, "what the log's columns are, such as ['qpos[1:]', qvel]", "model and log"

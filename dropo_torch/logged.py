@@ -6,6 +6,7 @@ Nothing heavy is imported for it, so that it takes no longer than it must.
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -128,17 +129,45 @@ def log_of(config: Config, model: mujoco.MjModel | None, tolerance: float = TOLE
 
 
 def used(config: Config, log: Trajectories) -> Trajectories:
-    """Return the episodes of a log that a config uses.
+    """Return the episodes of a log that a config uses, without the spans that it leaves out.
 
     Raises:
-        InputError: episodes that the log does not have.
+        InputError: episodes or spans that the log does not have, or spans that leave nothing.
     """
     wanted = config.trajectories
     if isinstance(wanted, int):
         if not 1 <= wanted <= log.num_episodes:
             raise InputError(f"trajectories: {wanted} asked for; {log.source} has {log.num_episodes}")
         wanted = list(range(wanted))
-    return log if wanted is None else log.select_episodes(wanted)
+    log = log if wanted is None else log.select_episodes(wanted)
+    return without_spans(log, config.leave_out) if config.leave_out else log
+
+
+def without_spans(log: Trajectories, spans: Sequence[tuple[int, float, float]]) -> Trajectories:
+    """Return a log without spans of its episodes, which end there and begin anew.
+
+    Args:
+        log: the log.
+        spans: episode, counted from 0, and begin and end in seconds since it began.
+
+    Raises:
+        InputError: a span that the log does not have, spans that leave nothing, or rows whose time is unknown.
+    """
+    if log.dt is None:
+        raise InputError(f"leave_out: {log.source} has no time stamps; say data: {{dt: SECONDS}}")
+    episodes, kept = log.episodes, np.ones(len(log), dtype=bool)
+    rows = np.arange(len(log)) - np.searchsorted(episodes, episodes)
+    for episode, begin, end in spans:
+        length = int((episodes == episode).sum()) * log.dt
+        if not 0 <= begin < end or begin >= length:
+            has = f"lasts {length:g} s" if length else f"is none of {log.num_episodes}"
+            raise InputError(
+                f"leave_out: [{episode}, {begin:g}, {end:g}] is no span of {log.source}: episode {episode} {has}"
+            )
+        kept &= (episodes != episode) | ((rows + 1) * log.dt <= begin + 1e-9) | (rows * log.dt >= end - 1e-9)
+    if not kept.any():
+        raise InputError(f"leave_out: nothing of {log.source} is left")
+    return log.select(kept)
 
 
 def frame_skip_of(config: Config, model: mujoco.MjModel | None, trajectories: Trajectories) -> int:

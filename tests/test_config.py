@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 
 from dropo_torch.config import KEYS, Config, load_config, make_config, parse_overrides
+from dropo_torch.data.trajectory import Trajectories, concatenate
 from dropo_torch.errors import InputError
+from dropo_torch.logged import used
 
 
 @pytest.mark.parametrize("text", ["1e-5", "1E-5", "1.0e-5", "1.e-05", "+1e-5", ".1e-4", "0.00001", "1e-5 # small"])
@@ -97,3 +100,33 @@ def test_a_config_cannot_be_changed() -> None:
 
 def test_an_input_error_is_one_line() -> None:
     assert str(InputError("a\n  b\t c ")) == "a b c"
+
+
+@pytest.mark.parametrize(
+    ("spans", "left", "episodes"),
+    [([], 20, 2), ([(0, 0.2, 0.5)], 17, 3), ([(0, 0.25, 0.45)], 17, 3), ([(1, 0.0, 0.3), (1, 0.9, 9.0)], 16, 2)],
+)
+def test_spans_that_are_left_out_end_episodes(spans: list[tuple[int, float, float]], left: int, episodes: int) -> None:
+    """Transitions that begin or end within a span are not used; those beside it are."""
+    log = concatenate([Trajectories.of_samples(r := np.arange(11.0)[:, None], r[:-1], dt=0.1, source="log")] * 2)
+    config = make_config({"model": "m.xml", "leave_out": spans})
+    found = used(config, log)
+    assert (len(found), found.num_episodes) == (left, episodes)
+    assert set(found.observations.ravel()) <= set(range(10))
+    if spans == [(0, 0.2, 0.5)]:
+        assert found.observations.ravel().tolist() == [0, 1, 5, 6, 7, 8, 9, *range(10)]
+
+
+@pytest.mark.parametrize(
+    ("spans", "words"),
+    [
+        ([(2, 0.0, 1.0)], r"\[2, 0, 1\] is no span of log.*: episode 2 is none of 2"),
+        ([(0, 1.2, 1.4)], r"\[0, 1.2, 1.4\] is no span of log.*: episode 0 lasts 1 s"),
+        ([(0, 0.4, 0.4)], "no span"),
+        ([(0, 0.0, 2.0), (1, 0.0, 2.0)], "nothing of log.* is left"),
+    ],
+)
+def test_spans_that_a_log_does_not_have_are_refused(spans: list[tuple[int, float, float]], words: str) -> None:
+    log = concatenate([Trajectories.of_samples(r := np.arange(11.0)[:, None], r[:-1], dt=0.1, source="log")] * 2)
+    with pytest.raises(InputError, match=f"leave_out: .*{words}"):
+        used(make_config({"model": "m.xml", "leave_out": spans}), log)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import dropo_torch as dropo
-from dropo_torch.gap import find_gap, prepare
+from dropo_torch.gap import add, find_gap, prepare
 from dropo_torch.gap.disturbed import find_spans, undisturbed
 from dropo_torch.gap.result import Disturbance
 from dropo_torch.gap.scene import Scene
@@ -94,11 +94,19 @@ def test_the_rest_of_the_log_names_what_is_missing(friction: float, tmp_path: Pa
     """Also where the pushes stand out only beside what is named."""
     scene = scene_of(tmp_path, pushed=PUSHED, friction=friction)
     gap = find_gap(scene.problem, scene=scene)
+    (tmp_path / "out").mkdir()
     assert [(e.effect, e.target) for e in gap.effects] == [("joint_friction", "shoulder")] * (friction > 0)
     if friction:
         assert gap.effects[0].parameters["friction"].value == pytest.approx(friction, rel=0.05)
     assert gap.remaining is None
     assert len(gap.disturbances) == len(gap.document()["disturbances"]) == len(PUSHED)
+    add(scene.problem, gap, tmp_path / "out")
+    if friction:  # a fit is not told by the pushes either
+        config = dropo.load_config(tmp_path / "out" / "config.yaml")
+        assert [episode for episode, *_ in config.leave_out] == [0] * len(PUSHED)
+        fitted = dropo.make_problem(config).trajectories
+        assert ROWS - 200 < len(fitted) < ROWS - sum(b - a for a, b in PUSHED)
+        assert fitted.num_episodes == len(PUSHED) + 1
     sentence, _ = answer(gap)
     assert sentence.startswith("Something pushed that is no part of the robot: from ")
 

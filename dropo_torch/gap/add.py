@@ -40,6 +40,8 @@ _Specifications = dict[str, dict[str, Any]]
 
 #: Half widths of a number's interval that its search box reaches, and the box's least half width, relative.
 REACH, LEAST = 4.0, 0.2
+#: Seconds before and after a push that are left out with it.
+BESIDE = 0.1
 
 
 def named(gap: Gap, setting: Setting) -> dict[Placed, dict[str, tuple[float, float]]]:
@@ -103,9 +105,19 @@ def add(problem: Problem, gap: Gap, folder: Path) -> list[str]:
     if problem.sensed is not None and (model is None or rest):
         return [*notes, "No config.yaml was written: effects that MJCF cannot express do not go with a log of sensors."]
     config = problem.sensed or _with_noise(problem, np.array(gap.noise))
+    if gap.disturbances and config.leave_out:
+        notes.append("config.yaml leaves out what it did, and not the pushes: add their spans to leave_out.")
+    elif gap.disturbances:
+        config = config.model_copy(update={"leave_out": pushed_spans(gap)})
     options = {"whole": problem.sensed is not None}
     write_config(config, problem.space, setting, list(found), ranges, model, folder / "config.yaml", **options)
     return notes
+
+
+def pushed_spans(gap: Gap) -> list[tuple[int, float, float]]:
+    """Return the spans that a config leaves out, for something pushed in them that is no part of the robot."""
+    ends = ((d.episode, max(d.begin - BESIDE, 0.0), d.end + BESIDE) for d in gap.disturbances)
+    return [(episode, float(f"{begin:.6g}"), float(f"{end:.6g}")) for episode, begin, end in ends]
 
 
 def _place(placed: Placed) -> str:

@@ -53,7 +53,9 @@ def as_given(problem: Problem, free: Collection[str] = ()) -> Problem:
     config = problem.config
     kept = {name: entry for name, entry in (config.parameters or {}).items() if "effect" in entry or name in free}
     held = config.model_copy(update={"parameters": kept, "as_given": False})
-    made = make_problem(held.model_copy(update={"trajectories": None}), log=problem.trajectories, general=True)
+    made = make_problem(
+        held.model_copy(update={"trajectories": None, "leave_out": []}), log=problem.trajectories, general=True
+    )
     sensed = problem.sensed
     if sensed is not None:
         sensed = sensed.model_copy(update={"parameters": kept or None, "as_given": False})

@@ -189,7 +189,9 @@ def prepare(config: Config, seconds: float, at: Path | None = None, gap: Path | 
         drives, limits.reach, _places(drives, model, begin), steps=steps, timestep=step, waves=given.waves,
         frequency=given.frequency or _frequency(seconds, step),
     )  # fmt: skip
-    alone = config.model_copy(update={"data": None, "trajectories": None, "frame_skip": problem.simulator.frame_skip})
+    alone = config.model_copy(
+        update={"data": None, "trajectories": None, "leave_out": [], "frame_skip": problem.simulator.frame_skip}
+    )
     return Ground(
         alone, problem, has_log, noise_source, given, model, point, values, starts, settled, drives,
         Tracker(model, drives, step, limits.force), family, limits, known, steps, ties,

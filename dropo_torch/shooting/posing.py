@@ -66,7 +66,13 @@ def posed(problem: Problem) -> Problem:
     assert problem.space.model is not None
     step = problem.trajectories.dt or problem.simulator.timestep or 1.0
     log, told = posed_log(problem.space.model, problem.observation, problem.trajectories, step)
-    own = {"observation": None, "mask": [*told.blind, *_masked(problem, told)], "noise": None, "trajectories": None}
+    own = {
+        "observation": None,
+        "mask": [*told.blind, *_masked(problem, told)],
+        "noise": None,
+        "trajectories": None,
+        "leave_out": [],
+    }
     own |= _state_noise(problem, told)
     config = problem.config.model_copy(update=own)
     return replace(make_problem(config, log=log, general=True), sensed=problem.config, derived=told.blind)
