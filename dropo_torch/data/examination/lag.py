@@ -14,6 +14,9 @@ from dropo_torch.data.examination.rules import Rules
 
 #: Seconds on each side over which columns are smoothed, rows at least and at most, and the polynomial's degree.
 HALF, ROWS, DEGREE = 0.02, (2, 12), 3
+#: Change of a velocity's change from row to row, by its standard deviation, from which on rows do not resolve it; and
+#: the share of a row by which it must then be late.
+BENT, UNRESOLVED = 0.1, 0.6
 #: Stretches of the log that count as independent.
 BLOCKS = 20
 
@@ -64,13 +67,26 @@ def find_lag(record: Record, c: Pair) -> Lag | None:
     return Lag(seconds, float(np.sqrt(BLOCKS / (BLOCKS - 1) * (spread**2).sum()) / below.sum()))
 
 
+def _least(record: Record, c: Pair, rules: Rules) -> float:
+    """Seconds from which on a velocity may be called late: more than half a row where it bends from row to row.
+
+    A velocity that follows each row's command within the row is that of the row before, half a row late.
+    """
+    change = np.diff(record.before[:, c.velocity])[~record.parted[:-1]]
+    bends = float(np.abs(np.diff(change)).mean()) > BENT * float(record.before[:, c.velocity].std())
+    assert record.step is not None
+    assert record.model is not None
+    return max((UNRESOLVED if bends else rules.lag) * record.step, float(record.model.opt.timestep))
+
+
 def lagging(record: Record, pairs: Sequence[Pair], rules: Rules) -> list[Finding]:
     """Return the velocities that surely come later than the positions say, by more than a physics step makes."""
     if record.step is None or record.model is None:
         return []
-    least = max(rules.lag * record.step, float(record.model.opt.timestep))
     told = {c: lag for c in pairs if (lag := find_lag(record, c)) is not None}
-    late = {c: lag for c, lag in told.items() if lag.seconds > max(least, rules.significance * lag.error)}
+    late = {
+        c: lag for c, lag in told.items() if lag.seconds > max(_least(record, c, rules), rules.significance * lag.error)
+    }
     if not late:
         return []
     columns = [c.velocity for c in late]
