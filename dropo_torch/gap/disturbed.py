@@ -25,6 +25,7 @@ from dropo_torch.gap.refit import Hypothesis
 from dropo_torch.gap.result import Disturbance
 from dropo_torch.gap.scene import Scene, odds, without_rows
 from dropo_torch.gap.twin import Windows
+from dropo_torch.support.rows import evenly
 
 #: Seconds of a window, about, and its logged steps at most; windows of a first look; and of one at the whole log.
 SECONDS, LONGEST, FEW, ALL = 0.08, 30, 24, 600
@@ -91,7 +92,7 @@ def find_spans(scene: Scene, hypothesis: Hypothesis, noise: np.ndarray) -> tuple
     if typical > rules.typical:
         return ()
     evidence = replace(evidence, noise=noise * max(typical, 1.0) ** 0.5)
-    rows = np.unique(np.linspace(0, len(windows) - 1, min(ALL, len(windows))).round().astype(int))
+    rows = evenly(len(windows), ALL)
     (chance, reduced), least = np.zeros((2, len(windows))), np.log(evidence.rules.chance.error / len(windows))
     chance[rows], reduced[rows] = odds(evidence, windows.select(rows), hypothesis.variant)
     far = chance < least

@@ -19,11 +19,12 @@ import mujoco
 import yaml
 
 import dropo_torch as dropo
-from dropo_torch.gap import Hypothesis, Scene, name, open_loop, prepare
+from dropo_torch.gap import Hypothesis, Naming, Scene, name, open_loop, prepare
 
 HERE = Path(__file__).parent
 LOGS = {"double": [f"trajectory_0{i}.csv" for i in range(4)], "simple": ["ddp.csv"]}
 SECONDS = (0.1, 0.3, 1.0)
+TORQUES = {"commanded": "tau_con", "measured": "tau_meas"}
 #: Least moment of inertia about the center of mass, as a share of that about the joint.
 LEAST = 0.1
 
@@ -32,6 +33,16 @@ def scene_of(kind: str, folder: Path, **overrides: object) -> Scene:
     """Return what a search works on, of the model as it is given."""
     given = {"data.path": [str((folder / log).resolve()) for log in LOGS[kind]], **overrides}
     return prepare(dropo.make_problem(dropo.load_config(HERE / f"{kind}.yaml", given), general=True))
+
+
+def scenes_of(kind: str, folder: Path) -> dict[str, Scene]:
+    """Return what is searched, by what is added to its label: of the double pendulum, with either torque."""
+    if kind == "simple":
+        return {"": scene_of(kind, folder)}
+    return {
+        f", {torque} torque": scene_of(kind, folder, **{"data.actions": [f"{column}1", f"{column}2"]})
+        for torque, column in TORQUES.items()
+    }
 
 
 def published_model(numbers: Mapping[str, float]) -> str:
@@ -65,7 +76,7 @@ def published(folder: Path, out: Path) -> dict[str, Scene]:
     for path in sorted(folder.glob("identified_model_*.yml")):
         model = out / f"{path.stem}.xml"
         model.write_text(published_model(yaml.safe_load(path.read_text())))
-        for torque, column in (("commanded", "tau_con"), ("measured", "tau_meas")):
+        for torque, column in TORQUES.items():
             columns = {"data.actions": [f"{column}1", f"{column}2"], "model": str(model.resolve())}
             found[f"{path.stem}, {torque} torque"] = scene_of("double", folder, **columns)
     return found
@@ -74,6 +85,17 @@ def published(folder: Path, out: Path) -> dict[str, Scene]:
 def errors(scene: Scene, hypothesis: Hypothesis) -> list[float]:
     """Return the errors over all horizons, in thousandths."""
     return [1e3 * open_loop(scene, hypothesis, s)[0] for s in SECONDS]
+
+
+def tell(scene: Scene, naming: Naming) -> None:
+    """Print what was named, and the declared parameters beside it."""
+    for placed in naming.final.hypothesis.placed:
+        numbers = placed.summary(scene.setting)
+        print(f"{placed.effect.name} of {placed.target}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items()))
+    declared = dict(zip(scene.problem.space.names, naming.final.hypothesis.declared, strict=True))
+    print("".join(f"{parameter}: {value:.4g}\n" for parameter, value in declared.items()), end="")
+    if not naming.named:
+        print(f"nothing has a name: {naming.refused or 'no known effect accounts for the misfit'}")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -86,16 +108,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if not (path := given.folder / log).is_file():
             parser.error(f"{path}: no such file; expected the folder of the publishers' {given.kind} pendulum")
     given.out.mkdir(parents=True, exist_ok=True)
-    scene = scene_of(given.kind, given.folder)
-    print("looking for what the model lacks", file=sys.stderr, flush=True)
-    naming = name(scene)
-    for placed in naming.final.hypothesis.placed:
-        numbers = placed.summary(scene.setting)
-        print(f"{placed.effect.name} of {placed.target}: " + ", ".join(f"{k} {v:.4g}" for k, v in numbers.items()))
-    declared = dict(zip(scene.problem.space.names, naming.final.hypothesis.declared, strict=True))
-    print("".join(f"{parameter}: {value:.4g}\n" for parameter, value in declared.items()), end="")
-    if not naming.named:
-        print(f"nothing has a name: {naming.refused or 'no known effect accounts for the misfit'}")
+    scenes = scenes_of(given.kind, given.folder)
+    scene, found = next(iter(scenes.values())), {}
+    for label, own in scenes.items():
+        print(f"looking for what the model lacks{label}", file=sys.stderr, flush=True)
+        found[label] = name(own)
+        print(f"found{label}:")
+        tell(own, found[label])
     print(f"\nopen-loop error of positions, mrad, over {', '.join(f'{s:g}' for s in SECONDS)} s of unseen motion")
     rows = {
         "constant velocity": [1e3 * open_loop(scene, scene.begin, s)[1] for s in SECONDS],
@@ -103,10 +122,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
     }
     if given.kind == "double":
         rows |= {label: errors(s, s.begin) for label, s in published(given.folder, given.out).items()}
-    if scene.begin.declared:
-        rows["with the declared parameters fitted"] = errors(scene, naming.base.hypothesis)
-    if naming.named:
-        rows["with what was found"] = errors(scene, naming.final.hypothesis)
+    for label, naming in found.items():
+        if scene.begin.declared:
+            rows[f"with the declared parameters fitted{label}"] = errors(scenes[label], naming.base.hypothesis)
+        if naming.named:
+            rows[f"with what was found{label}"] = errors(scenes[label], naming.final.hypothesis)
     for label, values in rows.items():
         print(f"{label:<44}" + "".join(f"{v:>9.1f}" for v in values))
 
