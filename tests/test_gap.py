@@ -2001,7 +2001,8 @@ def test_a_force_that_is_missing_in_a_part_of_the_log_is_told_so(begins: bool, s
     late = windows.steps >= 48 if single else windows.episodes >= 1
     wave = 30 * np.sin(np.arange(len(windows)))
     forces = wave * (late if begins else ~late) + np.random.default_rng(0).standard_normal(len(windows))
-    free = FreeForces(scene.noise, scene.noise, np.stack([forces, wave], 1), np.ones((len(windows), 2)), windows)
+    found_at = np.stack([forces, wave], 1)
+    free = FreeForces(scene.noise, scene.noise, found_at, np.ones((len(windows), 2)), windows, np.ones(len(windows)))
     assert part_of_log(scene.setting, free, 0) == words
     assert not part_of_log(scene.setting, free, 1)
 
@@ -2019,7 +2020,7 @@ def test_a_formula_says_of_what_it_is_a_share() -> None:
     velocity = middles(scene.setting, windows)[1][:, 0]
     for force, words in ((np.full(len(windows), 5.0), "≈ 5 (100 % "), (5 + 3 * velocity, "≈ 5 + 3·v(rail) (100 % ")):
         forces = np.stack([force + 1e-3 * draw.normal(size=len(force)), force], 1)
-        free = FreeForces(scene.noise, scene.noise, forces, forces, windows)
+        free = FreeForces(scene.noise, scene.noise, forces, forces, windows, np.ones(len(windows)))
         assert describe(scene.setting, free, 0, Rules().shown) == f"force at rail {words}of its mean square)"
 
 
