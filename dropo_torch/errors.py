@@ -37,7 +37,7 @@ class UnsupportedModel(InputError):
 def choices(name: object, available: Iterable[object]) -> str:
     """Return ``"; did you mean 'x'? (there are: x, y, z)"`` for an unknown ``name``."""
     names = [str(a) for a in available]
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6)
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.6 if len(str(name)) > 3 else 0.5)
     hint = f"; did you mean {near[0]!r}?" if near else ""
     shown = ", ".join(names[:20]) + (", ..." if len(names) > 20 else "")
     return f"{hint} (there are: {shown})" if names else f"{hint} (there are none)"
