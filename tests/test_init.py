@@ -19,10 +19,14 @@ from scipy.interpolate import CubicSpline
 
 import dropo_torch as dropo
 from benchmarks.init.systems import ROBOTS
+from benchmarks.unseen.record import write
+from benchmarks.unseen.robots import ROBOTS as UNSEEN
 from dropo_torch.commands.cli import main
 from dropo_torch.gap import find_gap
 from dropo_torch.gap.given import as_given
+from dropo_torch.models.load import load_model
 from dropo_torch.parameters import ParameterSpace
+from dropo_torch.proposal import propose
 from dropo_torch.proposal.candidates import Candidate, decides
 from dropo_torch.proposal.choice import choose
 from dropo_torch.proposal.clock import find_clock
@@ -125,6 +129,9 @@ def written(folder: Path, frame: dict[str, np.ndarray], xml: str = CARTPOLE, nam
         ("battery_voltage", "other", None, (), ()),
         ("v", "velocity", None, (), ()),
         ("imu_ay", "acceleration", None, ("imu",), ()),
+        ("az_deg", "", math.pi / 180, ("az",), ()),
+        ("az_rate", "velocity", None, ("az",), ()),
+        ("az_torque", "effort", None, ("az",), ()),
     ],
 )
 def test_names_say_what_people_mean(
@@ -969,6 +976,17 @@ def test_derived_velocities_are_compared_nowhere(tmp_path: Path, log: tuple[np.n
     frame = {"t": t, "x": q[:, 0], "theta": q[:, 1], "u": u[:, 0]}  # nothing touches
     found = dropo.propose_config(*written(tmp_path, frame), out=tmp_path / "robot.yaml")
     assert found.document["mask"] == [f"{joint}.velocity" for joint in ("slider", "hinge")]
+
+
+@pytest.mark.parametrize("name", sorted(UNSEEN))
+def test_columns_of_robots_with_logs_of_all_kinds_are_matched(name: str, tmp_path: Path) -> None:
+    """An azimuth may be called az, and a free body otherwise in the log."""
+    path, log = write(UNSEEN[name], tmp_path, 5, 4.0)
+    model = load_model(path)
+    columns = read_columns(log, known_names(model))
+    robot = propose._robot(model, path, tmp_path / "robot.yaml", columns)
+    matching = propose._reading(robot, columns, None, None).matching
+    assert len(matching.of("position")) >= len(UNSEEN[name].log.positions)
 
 
 RAIL = """

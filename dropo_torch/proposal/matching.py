@@ -382,13 +382,15 @@ def _families(free: Sequence[Column], wanted: Sequence[Place]) -> list[list[Colu
 def _in_order(places: Sequence[Place], free: Sequence[Column], found: dict[str, Match]) -> list[Match]:
     """Places that nothing told apart, in the order of as many columns without a name.
 
-    Where a free body is, no columns are that are called after something else: an IMU's accelerations are not.
+    Where a free body is, no columns are that are called after something else, and not by its axes: an IMU's
+    accelerations are not.
     """
     wanted = [p for p in places if p.label not in found and p.kind == "position" and not p.optional]
     nameless = [c for c in free if not is_taken(c, found) and c.words.role in ("", "position") and c.moves]
     if not wanted or len(wanted) != len(nameless):
         return []
-    if any(p.axis and c.words.objects for p, c in zip(wanted, nameless, strict=True)):
+    named = ((p.axis, c.words) for p, c in zip(wanted, nameless, strict=True))
+    if any(axis and words.objects and words.axis != axis for axis, words in named):
         return []
     return [Match(p, c, 1.0, "guess", "the order of columns") for p, c in zip(wanted, nameless, strict=True)]
 

@@ -187,6 +187,8 @@ def read_name(name: str, known: Sequence[str] = ()) -> Words:
         words = [word for word in words if word not in _CURRENT]
     for word in words:
         short = _short(word)
+        if short is not None and short[0] == "acceleration" and (scale or any(map(_role, words))):
+            short = None  # az_deg and az_rate are an azimuth's
         if short is not None:
             kind, letter = short
             axis = letter
