@@ -64,10 +64,9 @@ def with_family(ground: Ground, state: State, found: State) -> State:
     rules = ground.rules.family
     if not has_family(ground) or not significant(found.current.cost, ground.rules):
         return found
-    kind = one_kind(found.current.hypothesis) or len(joints_of(ground)) == 1
-    best = (
-        found if found.done or one_kind(found.current.hypothesis) else extend(ground, found)
-    )  # what contains the first effects may be the truth
+    same = one_kind(found.current.hypothesis)
+    kind = same or len(joints_of(ground)) == 1
+    best = found if found.done or same else extend(ground, found)  # what contains the first effects may be the truth
     cost = best.current.cost
     if not significant(cost, ground.rules) or cost.left_of(state.base.cost) < rules.left:
         return found

@@ -46,8 +46,7 @@ def find_lag(record: Record, c: Pair) -> Lag | None:
     half = int(np.clip(round(HALF / step), *ROWS))
     kernels = [savgol_coeffs(2 * half + 1, DEGREE, deriv=d, delta=step) for d in (0, 1, 2)]
     off, paths = list[np.ndarray](), list[np.ndarray]()
-    for run in np.unique(record.runs):
-        rows = np.flatnonzero(record.runs == run)
+    for rows in np.split(np.arange(len(record.runs)), np.flatnonzero(np.diff(record.runs)) + 1):
         if len(rows) < 2 * half + 2 or record.cut[rows].any():
             continue
         position = np.concatenate([[0.0], np.cumsum(record.steps[rows, c.position])])
