@@ -73,7 +73,7 @@ def test_pushes_are_dated_and_the_force_is_that_of_the_push(tmp_path: Path) -> N
         assert span.last >= last
         assert told.body == "lower"
         assert told.force is not None
-        assert told.force[:2] == pytest.approx(force[:2], abs=1.2)
+        assert told.force[:2] == pytest.approx(force[:2], abs=1.0)
     calm, told_too = undisturbed(scene, scene.begin, scene.noise)
     assert told_too == tuple(span.told for span in spans)
     assert len(calm.train) + len(calm.held) == ROWS - 1 - sum(s.last - s.first for s in spans)
