@@ -8,13 +8,13 @@ from __future__ import annotations
 import pathlib
 from collections.abc import Callable, Sequence
 
-from dropo_torch.effects import actuator, body, contact, joint, presliding, sensor, world
+from dropo_torch.effects import actuator, body, contact, elastic, joint, presliding, sensor, world
 from dropo_torch.effects.base import VOCABULARY, Effect, Placed, Quantity, Setting, Signals, find_effect
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.errors import InputError
 from dropo_torch.support.usercode import load_callable, user_code
 
-for _module in (joint, presliding, body, world, actuator, sensor, contact):
+for _module in (joint, presliding, elastic, body, world, actuator, sensor, contact):
     for _class in vars(_module).values():  # in the order in which they stand there
         if isinstance(_class, type) and issubclass(_class, Effect) and hasattr(_class, "name"):
             VOCABULARY[_class.name] = _class()

@@ -15,13 +15,14 @@ import numpy as np
 import torch
 
 from dropo_torch.data.observation import Observation
+from dropo_torch.effects.drive import Drive
 from dropo_torch.effects.path import SensedPath
 from dropo_torch.errors import InputError, choices
 from dropo_torch.parameters import object_names, object_number
 
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
 #: The methods by which an effect acts on a simulation.
-Method = Literal["apply", "force", "wrench", "command", "sense"]
+Method = Literal["apply", "force", "force_under", "wrench", "command", "sense"]
 #: Share of its start that an amount is at least, where a prediction of places is divided by it.
 LEAST_AMOUNT = 0.2
 
@@ -254,6 +255,17 @@ class Effect(abc.ABC):
         It is called once in every physics step, first with :meth:`recall`. By default, a force remembers nothing.
         """
         return self.force(setting, target, values, position, velocity), memory
+
+    def force_under(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        memory: np.ndarray, drive: Drive,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """Return :meth:`force_after` of one that depends on what the actuators give.
+
+        It is called in the place of :meth:`force_after` where it is overridden; :meth:`force` is then that without any
+        drive.
+        """
+        return self.force_after(setting, target, values, position, velocity, memory)
 
     def wrench(self, setting: Setting, target: str | None, values: np.ndarray) -> np.ndarray:
         """Return constant world-frame forces and torques on the bodies' centers ``(nbody, 6)``, of values ``(p,)``."""

@@ -12,6 +12,7 @@ import mujoco.batch
 import numpy as np
 
 from dropo_torch.effects.base import Effect, Method, Placed, Setting, apply_all
+from dropo_torch.effects.drive import Drive, Drives
 from dropo_torch.models.constants import derive
 from dropo_torch.models.load import quiet_mujoco
 from dropo_torch.parameters import ParameterSpace
@@ -80,6 +81,13 @@ def forces_of(variants: Sequence[Variant], each: int) -> list[Force]:
     return found
 
 
+def drives_of(forces: Iterable[Force], models: Models, each: int = 1) -> Drives | None:
+    """Return the laws of the actuators of models, each in ``each`` rows; ``None`` where no force depends on them."""
+    if not any(f.effect.has("force_under") for f in forces):
+        return None
+    return Drives.of([m for m in models if m is not None], each)
+
+
 class Forces:
     """The forces of effects that depend on the state, at states half a physics step ahead.
 
@@ -95,8 +103,9 @@ class Forces:
             self._position = self._velocity = slice(None)
 
     def __call__(
-        self, acting: Iterable[Force], position: np.ndarray, velocity: np.ndarray, before: np.ndarray, step: float
-    ) -> np.ndarray:
+        self, acting: Iterable[Force], position: np.ndarray, velocity: np.ndarray, before: np.ndarray, step: float,
+        drive: Drive | None = None,
+    ) -> np.ndarray:  # fmt: skip
         """Return generalized forces ``(R, nv)``.
 
         Args:
@@ -104,6 +113,7 @@ class Forces:
             position, velocity: the states, ``(R, nq)`` and ``(R, nv)``.
             before: velocities a physics step ago, ``(R, nv)``; those of the states at an episode's start.
             step: seconds of a physics step.
+            drive: the actuators, where an effect depends on them.
         """
         ahead = position.copy()
         ahead[:, self._position] += 0.5 * step * velocity[:, self._velocity]
@@ -113,7 +123,11 @@ class Forces:
                 own = self._setting, f.target, f.values
                 if f.memory.now is None:
                     f.memory.now = f.effect.recall(*own, position[f.rows], velocity[f.rows])
-                found, f.memory.now = f.effect.force_after(*own, ahead[f.rows], then[f.rows], f.memory.now)
+                now = *own, ahead[f.rows], then[f.rows], f.memory.now
+                if drive is not None and f.effect.has("force_under"):
+                    found, f.memory.now = f.effect.force_under(*now, drive.at(f.rows))
+                else:
+                    found, f.memory.now = f.effect.force_after(*now)
                 out[f.rows] += found if np.isfinite(found).all() else np.nan_to_num(found)
         return out
 
@@ -244,12 +258,14 @@ class VariantEngine:
             path = worlds.rollout(states, inputs, held * finer, applied=applied, wrenched=wrenched)
             return path[:, every // held - 1 :: every // held].reshape(num_k, num_w, -1, states.shape[1])
         out, before = np.empty((len(states), total // every, states.shape[1])), states[:, nq:]
-        width = control.shape[2] + outer.shape[1] + self._base.nv
+        width, drives = control.shape[2] + outer.shape[1] + self._base.nv, drives_of(forces, models, num_w)
         stepper = worlds.stepper(states, width, 1, applied=True, wrenched=wrenched)
         for step in range(total):
             for _ in range(finer):
                 states = stepper.states
-                found = self._forces(forces, states[:, :nq], states[:, nq:], before, self._base.opt.timestep / finer)
+                now = states[:, :nq], states[:, nq:]
+                drive = None if drives is None else Drive(drives, control[:, step], self._base.opt.timestep / finer)
+                found = self._forces(forces, *now, before, self._base.opt.timestep / finer, drive)
                 if applied:
                     found = found + pushed[:, step // skip]
                 before = states[:, nq:]
@@ -278,6 +294,7 @@ class VariantEngine:
         batch, control = self._batch(rows), signals.reshape(rows, self.lead + total, -1)
         self._begin(batch, models, variants, starts, control[:, : self.lead])
         control, forces = control[:, self.lead :], forces_of(variants, num_w)
+        drives = drives_of(forces, models, num_w)
         qpos, qvel, ctrl, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
         held = 1 if forces or _varies(control, every) else every  # steps of the base between changes
         calls, steps = (finer, 1) if forces else (1, finer * held)
@@ -286,7 +303,8 @@ class VariantEngine:
             ctrl[:] = control[:, step]
             for _ in range(calls):
                 if forces:
-                    found = self._forces(forces, qpos, qvel, before, self._base.opt.timestep / finer)
+                    drive = None if drives is None else Drive(drives, control[:, step], self._base.opt.timestep / finer)
+                    found = self._forces(forces, qpos, qvel, before, self._base.opt.timestep / finer, drive)
                     applied[:], before = found, qvel.copy()
                 if pushes is not None:
                     held_pushes = np.repeat(pushes[:, step // self._setting.frame_skip], num_w, axis=0)

@@ -9,6 +9,7 @@ import numpy as np
 
 from dropo_torch.data.observation import joint_name
 from dropo_torch.effects.base import Effect, Placed, Quantity, Setting, Signals, by_product, object_number
+from dropo_torch.effects.drive import Drive, driven_joints
 
 _HINGE, _SLIDE = int(mujoco.mjtJoint.mjJNT_HINGE), int(mujoco.mjtJoint.mjJNT_SLIDE)
 
@@ -187,6 +188,15 @@ class JointStribeck(JointEffect):
         return out
 
 
+#: Physics steps in which friction that is a force, and no constraint, stops a joint that is slow.
+STOPS = 4.0
+
+
+def stopping(model: mujoco.MjModel, dof: int, velocity: np.ndarray) -> np.ndarray:
+    """Return the sizes ``(R,)`` of forces that stop a joint of velocities ``(R,)`` in a few physics steps."""
+    return np.asarray(model.dof_M0[dof] * np.abs(velocity) / (STOPS * model.opt.timestep))
+
+
 class JointFrictionSlope(JointEffect):
     """Dry friction that is larger at one end of a joint's range than at the other, as where a linkage drives it.
 
@@ -199,8 +209,6 @@ class JointFrictionSlope(JointEffect):
     positional = True
     alone = False
     sentence = "dry friction in {target} that changes along its range"
-    #: Physics steps in which its part of the friction stops a joint that is slow.
-    STOPS = 4.0
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
         low, high = setting.signals.position[setting.coordinate(target)]
@@ -220,9 +228,45 @@ class JointFrictionSlope(JointEffect):
     ) -> np.ndarray:
         m, dof, out = setting.model, setting.dof(target), np.zeros_like(velocity)
         level = values[:, 0] * (position[:, setting.coordinate(target)] - self.middle(m, target))
-        stopping = m.dof_M0[dof] * np.abs(velocity[:, dof]) / (self.STOPS * m.opt.timestep)
-        out[:, dof] = -np.sign(velocity[:, dof]) * np.sign(level) * np.minimum(np.abs(level), stopping)
+        most = stopping(m, dof, velocity[:, dof])
+        out[:, dof] = -np.sign(velocity[:, dof]) * np.sign(level) * np.minimum(np.abs(level), most)
         return out
+
+
+class JointLoadFriction(JointEffect):
+    """Dry friction that grows with the load, as of a gear whose teeth press harder on each other.
+
+    On top of the dry friction that the joint has otherwise, a share of the size of what its actuators give acts against
+    the motion. Near rest this part is no larger than what stops the joint within a few physics steps; what holds it
+    there is its other dry friction.
+    """
+
+    name = "joint_load_friction"
+    sentence = "dry friction in {target} that grows with the force that drives it"
+
+    def targets(self, setting: Setting) -> list[str | None]:
+        """Return every such joint that is driven, by actuators whose forces follow from command and state."""
+        driven = driven_joints(setting.model)
+        return [t for t in super().targets(setting) if setting.joint(t) in driven]
+
+    def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
+        return (Quantity("coefficient", "-", 0.0, 0.0, 0.9, 0.2),)
+
+    def force(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        """Return the forces under no load: none."""
+        return np.zeros_like(velocity)
+
+    def force_under(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        memory: np.ndarray, drive: Drive,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        dof, out = setting.dof(target), np.zeros_like(velocity)
+        given, _, _ = drive.given(dof, position[:, setting.coordinate(target)], velocity[:, dof])
+        level = values[:, 0] * np.abs(given)
+        out[:, dof] = -np.sign(velocity[:, dof]) * np.minimum(level, stopping(setting.model, dof, velocity[:, dof]))
+        return out, memory
 
 
 class JointStiffness(JointEffect):

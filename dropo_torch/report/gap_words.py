@@ -32,6 +32,8 @@ _NOUNS = {
     "joint_soft_friction": "dry (Coulomb) friction in {0} that creeps at rest",
     "joint_presliding": "dry friction in {0} that gives elastically before it slides",
     "joint_friction_slope": "dry friction in {0} that changes along its range",
+    "joint_load_friction": "dry friction in {0} that grows with the force that drives it",
+    "joint_elasticity": "a transmission of {0} that gives (elasticity between motor and joint)",
     "joint_stiffness": "a spring at {0}",
     "joint_cogging": "a force at {0} that is periodic in its position (cogging)",
     "armature": "rotor or gear inertia (armature) at {0}",

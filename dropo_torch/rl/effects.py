@@ -6,6 +6,7 @@ from __future__ import annotations
 import copy
 import itertools
 import math
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import mujoco
@@ -15,6 +16,7 @@ import torch
 from torch.nn.functional import pad
 
 from dropo_torch.data.observation import parse_observation
+from dropo_torch.effects.drive import Drive, Drives
 from dropo_torch.effects.engine import Force, Forces, Memory, ModelRefused, Variant, VariantEngine
 from dropo_torch.effects.filters import extended, filters_of, observed_rates, rate_columns, sensed
 from dropo_torch.effects.path import SensedPath
@@ -44,7 +46,8 @@ def inside_model(space: ParameterSpace, effects: EffectSet) -> tuple[mujoco.MjMo
     """
     assert space.model is not None
     applied = effects.having("apply")
-    if any(e.varies for e in applied.entries) or overlap(applied, space) is not None:
+    own = any(e.varies for e in applied.entries) or overlap(applied, space) is not None
+    if own or len(effects.having("force_under")):
         return copy.copy(space.model), 1, True
     model = apply_native(space.model, applied) if len(applied) else copy.copy(space.model)
     return model, finer_steps(space.model, model, applied), False
@@ -98,24 +101,25 @@ class RowModels:
         effects: the effects.
 
     Attributes:
+        models: of each simulation.
         finer: steps of each simulation's model in one of the given model's, ``(N,)``.
     """
 
     def __init__(self, batch: mujoco.batch.Batch, space: ParameterSpace, effects: EffectSet) -> None:
         self._batch, self._space, self._effects = batch, space, effects
         self._engine = VariantEngine(effects.setting, space, num_threads=1)
-        self._models = [batch.model] * batch.nsim
+        self.models = [batch.model] * batch.nsim
         self.finer = np.ones(batch.nsim, dtype=int)
 
     def write(self, ids: np.ndarray, values: np.ndarray) -> None:
         """Give simulations ``ids`` the models of values ``(k, d)``; the others are untouched."""
         for row, vector in zip(ids, values, strict=True):
             try:
-                self._models[row] = self._engine.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
+                self.models[row] = self._engine.model(Variant(tuple(vector.tolist()), self._effects.at(vector)))
             except ModelRefused as error:
                 raise _refused(self._space, vector, str(error)) from None
-            self.finer[row] = finer_steps(self._effects.setting.model, self._models[row], self._effects)
-        self._batch.set_models(self._models)
+            self.finer[row] = finer_steps(self._effects.setting.model, self.models[row], self._effects)
+        self._batch.set_models(self.models)
 
 
 def _refused(space: ParameterSpace, values: np.ndarray, reason: str) -> InputError:
@@ -129,6 +133,7 @@ class RowForces:
     Args:
         batch: the batch.
         effects: the effects.
+        models: of each simulation, where they have their own; needed by forces that depend on the actuators'.
 
     Attributes:
         any: whether there are forces that depend on the state.
@@ -136,7 +141,12 @@ class RowForces:
         memory: what the forces remember, ``(N, k)``.
     """
 
-    def __init__(self, batch: mujoco.batch.Batch, effects: EffectSet) -> None:
+    def __init__(
+        self, batch: mujoco.batch.Batch, effects: EffectSet, models: Sequence[mujoco.MjModel] | None = None
+    ) -> None:
+        self._models, self._drives = models, None
+        if models is not None and len(effects.having("force_under")):
+            self._drives, self._ctrl = Drives.of(models), batch.bind("ctrl")
         self._setting, self._forces = effects.setting, Forces(effects.setting)
         self._entries, self._wrenches = (effects.having(method).entries for method in ("force", "wrench"))
         self._qpos, self._qvel = batch.bind("qpos"), batch.bind("qvel")
@@ -157,6 +167,8 @@ class RowForces:
         """Give simulations ``ids`` the numbers in values ``(k, d)``."""
         for entry, own in zip(self._entries, self._values, strict=True):
             own[ids] = entry.values(values)
+        if self._drives is not None and self._models is not None:
+            self._drives.numbers[:, ids] = Drives.of([self._models[i] for i in ids]).numbers
 
     def restart(self, ids: np.ndarray, values: np.ndarray) -> None:
         """Begin episodes in simulations whose states have just been set, with values ``(k, d)``."""
@@ -175,7 +187,10 @@ class RowForces:
             Force(e.effect, e.target, own[ids] if e.varies else own[:1], slice(None), Memory(part[ids]))
             for e, own, part in zip(self._entries, self._values, self._parts, strict=True)
         ]
-        self._force[ids] = self._forces(acting, self._qpos[ids], velocity, self.before[ids], step)
+        drive = None
+        if self._drives is not None:
+            drive = Drive(self._drives, self._ctrl, step).at(ids)
+        self._force[ids] = self._forces(acting, self._qpos[ids], velocity, self.before[ids], step, drive)
         for force, part in zip(acting, self._parts, strict=True):
             part[ids] = force.memory.now
         self.before[ids] = velocity

@@ -96,7 +96,8 @@ class MujocoStepper(BatchStepper):
         self._models: RowModels | RowFields = (
             RowModels(self._batch, space, effects) if varies else RowFields(self._batch, space.on(model), finer)
         )
-        self._forces = RowForces(self._batch, effects)
+        own = self._models.models if isinstance(self._models, RowModels) else None
+        self._forces = RowForces(self._batch, effects, own)
 
     def reset(self, rows: torch.Tensor, states: torch.Tensor, values: torch.Tensor) -> None:
         """Start new episodes; see :meth:`BatchStepper.reset`."""
