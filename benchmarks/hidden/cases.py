@@ -18,7 +18,7 @@ import numpy as np
 
 from benchmarks.hidden.systems import CORE, SYSTEMS, System, fine, load
 from benchmarks.hidden.ties import exact_ties
-from benchmarks.hidden.truths import Before, Case, Effect, Recording, make_case, make_recording, observed
+from benchmarks.hidden.truths import DT, Before, Case, Effect, Recording, make_case, make_recording, observed
 from dropo_torch.parameters import ParameterSpace
 
 #: The gap that a single effect is given, in units of the noise; and the least with which a case is kept.
@@ -57,6 +57,8 @@ OPTIONS: dict[str, Mapping[str, tuple[str | None, ...]]] = {
     "joint_quadratic_damping": _JOINTS,
     "joint_friction": _JOINTS,
     "joint_stribeck": _JOINTS,
+    "joint_load_friction": {"torque_arm": _ARM, "servo_arm": _SERVO[:2], "cart_pole": ("rail",), "furuta": ("turn",)},
+    "joint_elasticity": {"torque_arm": _ARM, "servo_arm": _SERVO[:2], "cart_pole": ("rail",), "furuta": ("turn",)},
     "joint_stiffness": {**_JOINTS, "hopper": _LEG},
     "joint_cogging": _JOINTS,
     "armature": {**_JOINTS, "hopper": _LEG},
@@ -544,6 +546,16 @@ def _ripple(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
     return lambda s: {"amplitude": 0.5 * s * t, "frequency": frequency, "phase": phase}
 
 
+def _elasticity(_t: float, _v: float, i: float, rng: np.random.Generator) -> Draw:
+    rotor, ratio = i * rng.uniform(0.1, 0.5), rng.uniform(0.05, 0.2)
+
+    def draw(size: float) -> dict[str, float]:
+        stiffness = 0.02 * i / (DT**2 * size)
+        return {"stiffness": stiffness, "damping": 2 * ratio * math.sqrt(stiffness * rotor), "inertia": rotor}
+
+    return draw
+
+
 def _uneven(t: float, _v: float, _i: float, rng: np.random.Generator) -> Draw:
     waves, phase = rng.uniform(3.0, 8.0), rng.uniform(-np.pi, np.pi)
     return lambda s: {"friction": 0.3 * s * t, "waves": waves, "phase": phase}
@@ -585,6 +597,8 @@ DRAWS: dict[str, Callable[[System, str | None, np.random.Generator], Draw]] = {
     "joint_quadratic_damping": _joint_draw(lambda t, v, i, r: lambda s: {"coefficient": s * t / v**2}),
     "joint_friction": _joint_draw(lambda t, v, i, r: lambda s: {"friction": 0.4 * s * t}),
     "joint_stribeck": _joint_draw(_stribeck),
+    "joint_load_friction": _joint_draw(lambda t, v, i, r: lambda s: {"coefficient": 0.6 * s}),
+    "joint_elasticity": _joint_draw(_elasticity),
     "joint_stiffness": _joint_draw(_stiffness),
     "joint_cogging": _joint_draw(_cogging),
     "armature": _joint_draw(lambda t, v, i, r: lambda s: {"armature": s * i}),

@@ -232,8 +232,8 @@ def _dry_friction(plant: Plant, joint: str, level: Callable[[float, float], floa
 
     def force(p: Plant) -> None:
         v = float(p.v[i])
-        limit = level(float(p.middle_q[j]), abs(v))
         mujoco.mj_forwardSkip(p.model, p.data, mujoco.mjtStage.mjSTAGE_VEL, 1)
+        limit = level(float(p.middle_q[j]), abs(v))
         mujoco.mj_solveM(p.model, p.data, column, unit)
         stopping = -(v / p.h + float(p.data.qacc[i])) / column[0, i]
         p.force[i] += min(max(stopping, -limit), limit)
@@ -274,6 +274,42 @@ def _coupling(plant: Plant, joint: str, stiffness: float) -> Force:
     return force
 
 
+def _load_friction(plant: Plant, joint: str, coefficient: float) -> Force:
+    i = plant.dof(joint)
+    return _dry_friction(plant, joint, lambda _q, _v: coefficient * abs(float(plant.data.qfrc_actuator[i])))
+
+
+#: Steps of a rotor in a fine step.
+_ROTOR_STEPS = 8
+
+
+def _elasticity(plant: Plant, joint: str, stiffness: float, damping: float, inertia: float) -> Force:
+    """A rotor of its own, which the joint's actuator drives in place of the joint, and a spring between the two."""
+    i, j, model = plant.dof(joint), plant.address(joint), plant.model
+    own = [a for a in range(model.nu) if model.actuator_trnid[a, 0] == model.joint(joint).id]
+    gear, rotor = model.actuator_gear[own, 0], np.full(2, np.nan)
+    stiff, damp = ((gear**2 * model.actuator_biasprm[own, k]).sum() for k in (1, 2))
+
+    def forget() -> None:
+        rotor[:] = np.nan
+
+    def force(p: Plant) -> None:
+        mujoco.mj_fwdActuation(p.model, p.data)
+        given, q, v = float(p.data.qfrc_actuator[i]), float(p.middle_q[j]), float(p.middle_v[i])
+        if np.isnan(rotor[0]):
+            rotor[:] = q + given / (stiffness - stiff), v
+        h, pull = p.h / _ROTOR_STEPS, 0.0
+        for _ in range(_ROTOR_STEPS):
+            spring = stiffness * (rotor[0] - q) + damping * (rotor[1] - v)
+            rotor[1] += h * (given + stiff * (rotor[0] - q) + damp * (rotor[1] - v) - spring) / inertia
+            rotor[0] += h * rotor[1]
+            pull += spring / _ROTOR_STEPS
+        p.force[i] += pull - given
+
+    plant.memories.append(forget)
+    return force
+
+
 def _stribeck_level(coulomb: float, static: float, velocity: float) -> Callable[[float, float], float]:
     return lambda _q, speed: coulomb + (static - coulomb) * math.exp(-((speed / velocity) ** 2))
 
@@ -288,10 +324,12 @@ JOINT_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     ),
     "joint_friction": lambda p, j, x: _dry_friction(p, j, lambda _q, _v: x["friction"]),
     "joint_stribeck": lambda p, j, x: _dry_friction(p, j, _stribeck_level(x["coulomb"], x["static"], x["velocity"])),
+    "joint_load_friction": lambda p, j, x: _load_friction(p, j, x["coefficient"]),
+    "joint_elasticity": lambda p, j, x: _elasticity(p, j, x["stiffness"], x["damping"], x["inertia"]),
     "joint_coupling": lambda p, j, x: _coupling(p, j, x["stiffness"]),
 }
 #: Those with sticking, which are evaluated last; and the one of them that no vocabulary knows.
-DRY, UNEVEN = ("joint_friction", "joint_stribeck"), "uneven_friction"
+DRY, UNEVEN = ("joint_friction", "joint_stribeck", "joint_load_friction"), "uneven_friction"
 
 
 # --- forces on bodies -----------------------------------------------------------------------------------------
@@ -556,6 +594,9 @@ def _change_model(model: mujoco.MjModel, e: Effect) -> None:
     x = e.parameters
     if e.name == "armature":
         model.dof_armature[model.joint(e.target).dofadr[0]] += x["armature"]
+    elif e.name == "joint_elasticity":
+        dof = model.joint(e.target).dofadr[0]
+        model.dof_armature[dof] = max(model.dof_armature[dof] - x["inertia"], 0.0)
     elif e.name == "center_of_mass":
         model.body(e.target).ipos[:] += (x["x"], x["y"], x["z"])
     elif e.name == "inertia" and x["factor"] < 1:
