@@ -113,11 +113,28 @@ def test_friction_grows_with_the_load() -> None:
         assert np.allclose(braked, plain, atol=1e-9)
 
 
+@pytest.mark.parametrize(("share", "holds"), [(0.9, True), (0.5, False)])
+def test_friction_under_load_holds_at_rest(share: float, holds: bool) -> None:
+    """The motor gives 0.6 of what gravity takes: a friction of 0.9 of what it gives holds the rest, half of it not."""
+    model = rigid(MOTOR)
+    data = mujoco.MjData(model)
+    data.qpos[:] = (0.4, np.pi / 2 - 0.4)  # the forearm hangs
+    mujoco.mj_forward(model, data)
+    command = np.full(60, 0.5 * 0.6 * data.qfrc_bias[0])
+    effect = {"effect": "joint_load_friction", "target": "shoulder", "coefficient": share}
+    path = simulated(model, effect, command, (*data.qpos, 0.0, 0.0))
+    assert (np.abs(path[-1, 0] - 0.4) < 2e-3) == holds
+
+
 def test_friction_under_load_only_brakes() -> None:
     model = rigid(MOTOR)
     effect = {"effect": "joint_load_friction", "target": "shoulder", "coefficient": 0.9}
-    path = simulated(model, effect, np.full(30, 3.0), (-1.2, 0.0, 1e-4, 0.0))
-    assert (path[:, 2] > -1e-3).all()
+    path = simulated(model, effect, np.full(60, 0.0), (0.4, np.pi / 2 - 0.4, -1.0, 0.0))
+    free = simulated(model, {**effect, "coefficient": 0.0}, np.full(60, 0.0), (0.4, np.pi / 2 - 0.4, -1.0, 0.0))
+    assert np.array_equal(path, free)  # nothing drives it
+    path = simulated(model, effect, np.full(60, 2.0), (0.4, np.pi / 2 - 0.4, -1.0, 0.0))
+    speed = path[:, 2]
+    assert (np.diff(np.sign(np.round(speed, 3))) != 0).sum() <= 2  # it does not rattle
 
 
 def test_drives_give_what_mujoco_says() -> None:

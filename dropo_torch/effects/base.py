@@ -22,7 +22,7 @@ from dropo_torch.parameters import object_names, object_number
 
 Kind = Literal["joint", "body", "world", "actuator", "sensor", "geom"]
 #: The methods by which an effect acts on a simulation.
-Method = Literal["apply", "force", "force_under", "wrench", "command", "sense"]
+Method = Literal["apply", "force", "force_under", "replay", "wrench", "command", "sense"]
 #: Share of its start that an amount is at least, where a prediction of places is divided by it.
 LEAST_AMOUNT = 0.2
 
@@ -245,6 +245,19 @@ class Effect(abc.ABC):
     ) -> np.ndarray:
         """Return what a force remembers of the past where a simulation begins, ``(R, k)``; by default, nothing."""
         return np.zeros((len(position), 0))
+
+    def replay(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        drives: Sequence[Drive],
+    ) -> np.ndarray:  # fmt: skip
+        """Return :meth:`recall` where the log shows the past: the states of P rows before, and the one that begins.
+
+        Args:
+            setting, target, values: see :meth:`recall`.
+            position, velocity: the states, ``(R, P + 1, nq)`` and ``(R, P + 1, nv)``; NaN before an episode begins.
+            drives: the actuators under the commands that follow each of the P rows before; a step is a row.
+        """
+        return self.recall(setting, target, values, position[:, -1], velocity[:, -1])
 
     def force_after(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,

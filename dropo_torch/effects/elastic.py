@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import mujoco
 import numpy as np
 
@@ -16,14 +19,17 @@ LEAST_ROTOR = 0.01
 #: Frequencies from which a search begins, in radians of a logged step; the rotor's inertia there, relative to the
 #: joint's, and the spring's damping, relative to the critical one.
 FREQUENCIES, ROTOR, DAMPED = (0.05, 0.15, 0.4), 0.2, 0.1
+#: Steps of the rotor from one row of the log to the next.
+STEPS = 2
 
 
 class JointElasticity(JointEffect):
     """A gear, belt or cable that gives: the actuators drive a rotor, which pulls the joint through a spring.
 
     The log shows the joint, behind the spring; servos see the rotor, where their encoders are. Of the joint's armature
-    the rotor's ``inertia`` no longer moves with it. A simulation begins with the rotor as fast as the joint, and with
-    the spring as far deflected as what the actuators give there holds it.
+    the rotor's ``inertia`` no longer moves with it. What the log shows before a simulation tells how the rotor moves
+    where it begins; where nothing does, it is as fast as the joint there, and the spring as far deflected as what the
+    actuators give holds it.
     """
 
     name = "joint_elasticity"
@@ -77,24 +83,47 @@ class JointElasticity(JointEffect):
         """Return what is not known yet, for it depends on the actuators: position and velocity of the rotor, NaN."""
         return np.full((len(position), 2), np.nan)
 
+    def replay(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
+        drives: Sequence[Drive],
+    ) -> np.ndarray:  # fmt: skip
+        """Return the rotor's position and velocity, which turned under the commands while the joint moved as logged."""
+        q, v = position[..., setting.coordinate(target)], velocity[..., setting.dof(target)]
+        rotor = np.full((len(q), 2), np.nan)
+        for row, drive in enumerate(drives):
+            for a in (np.arange(STEPS) + 0.5) / STEPS:  # the joint's motion between two rows is a line
+                q_now, v_now = ((1 - a) * x[:, row] + a * x[:, row + 1] for x in (q, v))
+                short = replace(drive, step=drive.step / STEPS)
+                rotor = self._turned(setting, target, values, q_now, v_now, rotor, short)[1]
+        return rotor
+
     def force_under(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
         memory: np.ndarray, drive: Drive,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        dof, coordinate, step = setting.dof(target), setting.coordinate(target), drive.step
-        q, v = position[:, coordinate], velocity[:, dof]
+        dof, out = setting.dof(target), np.zeros_like(velocity)
+        q, v = position[:, setting.coordinate(target)], velocity[:, dof]
+        out[:, dof], rotor = self._turned(setting, target, values, q, v, memory, drive)
+        return out, rotor
+
+    def _turned(
+        self, setting: Setting, target: str | None, values: np.ndarray, q: np.ndarray, v: np.ndarray,
+        rotor: np.ndarray, drive: Drive,
+    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
+        """The spring's force on the joint in a step at whose middle that is at ``q`` with ``v``; the rotor after it.
+
+        By the implicit midpoint rule, which is stable however stiff spring and servo are.
+        """
+        dof, step = setting.dof(target), drive.step
         stiffness, damping, inertia = values.T
-        rotor = np.maximum(inertia, LEAST_ROTOR * self.own_inertia(setting, target))
-        angle, speed = memory.T
-        begins = np.isnan(angle)
-        if begins.any():
+        inertia = np.maximum(inertia, LEAST_ROTOR * self.own_inertia(setting, target))
+        angle, speed = rotor.T
+        if (begins := np.isnan(angle)).any():
             given, stiff, _ = drive.given(dof, q, v)
-            angle = np.where(begins, q + given / (stiffness + stiff), angle)
-            speed = np.where(begins, v, speed)
+            angle, speed = np.where(begins, q + given / (stiffness + stiff), angle), np.where(begins, v, speed)
         given, stiff, damp = drive.given(dof, angle, speed)
-        half = 0.5 * step  # the implicit midpoint rule: stable, however stiff spring and servo are
+        half = 0.5 * step
         pull = given + damp * speed + stiffness * (q - angle) + damping * v
-        mean = (rotor * speed + half * pull) / (rotor + half * (damp + damping) + half**2 * (stiff + stiffness))
-        out = np.zeros_like(velocity)
-        out[:, dof] = stiffness * (angle + half * mean - q) + damping * (mean - v)
-        return out, np.stack([angle + step * mean, 2 * mean - speed], 1)
+        mean = (inertia * speed + half * pull) / (inertia + half * (damp + damping) + half**2 * (stiff + stiffness))
+        force = stiffness * (angle + half * mean - q) + damping * (mean - v)
+        return force, np.stack([angle + step * mean, 2 * mean - speed], 1)

@@ -81,6 +81,19 @@ def forces_of(variants: Sequence[Variant], each: int) -> list[Force]:
     return found
 
 
+@dataclass(frozen=True)
+class Past:
+    """What the log shows of the rows before simulations, P of them.
+
+    Attributes:
+        states: before each of these rows and where simulations begin, ``(W, P + 1, nq + nv)``; NaN where there is none.
+        commands: as they act in these rows, ``(K, W, P, nu)``.
+    """
+
+    states: np.ndarray
+    commands: np.ndarray
+
+
 def drives_of(forces: Iterable[Force], models: Models, each: int = 1) -> Drives | None:
     """Return the laws of the actuators of models, each in ``each`` rows; ``None`` where no force depends on them."""
     if not any(f.effect.has("force_under") for f in forces):
@@ -197,7 +210,7 @@ class VariantEngine:
 
     def paths(
         self, variants: Sequence[Variant], models: Models, starts: np.ndarray,
-        signals: np.ndarray, *, fine: bool = False, pushes: np.ndarray | None = None,
+        signals: np.ndarray, *, fine: bool = False, pushes: np.ndarray | None = None, past: Past | None = None,
     ) -> np.ndarray:  # fmt: skip
         """Simulate.
 
@@ -209,6 +222,7 @@ class VariantEngine:
                 ``(K, W, lead + S, nu)``.
             fine: return the states after every physics step instead of every logged one.
             pushes: further generalized forces in every logged step, ``(K, S / skip, nv)``; none by default.
+            past: what was before, for forces that remember it; by default they begin with what they recall.
 
         Returns:
             States ``(K, W, S, nq + nv)`` or ``(K, W, S / skip, nq + nv)``, NaN where a simulation diverged or has no
@@ -223,7 +237,8 @@ class VariantEngine:
         for (finer, *_), members in groups.items():
             rows = members if len(members) < len(variants) else slice(None)  # all of them need no copy
             own, their = [models[k] for k in members], [variants[k] for k in members]
-            given = starts[rows], signals[rows], None if pushes is None else pushes[rows], finer, every
+            before = None if past is None else Past(past.states, past.commands[rows])
+            given = starts[rows], signals[rows], None if pushes is None else pushes[rows], finer, every, before
             found = self._by_warp(own, their, *given)
             out[rows] = found if found is not None else self._by_mujoco(own, their, *given)
         return out
@@ -236,7 +251,7 @@ class VariantEngine:
 
     def _by_warp(
         self, models: Models, variants: Sequence[Variant], starts: np.ndarray, signals: np.ndarray,
-        pushes: np.ndarray | None, finer: int, every: int,
+        pushes: np.ndarray | None, finer: int, every: int, past: Past | None,
     ) -> np.ndarray | None:  # fmt: skip
         """Do what :meth:`_by_mujoco` does with Warp, or return ``None`` where it cannot."""
         if self._warp is None or len(self._filters):
@@ -259,6 +274,7 @@ class VariantEngine:
             return path[:, every // held - 1 :: every // held].reshape(num_k, num_w, -1, states.shape[1])
         out, before = np.empty((len(states), total // every, states.shape[1])), states[:, nq:]
         width, drives = control.shape[2] + outer.shape[1] + self._base.nv, drives_of(forces, models, num_w)
+        self._replay(forces, drives, past)
         stepper = worlds.stepper(states, width, 1, applied=True, wrenched=wrenched)
         for step in range(total):
             for _ in range(finer):
@@ -277,7 +293,7 @@ class VariantEngine:
 
     def _by_mujoco(
         self, models: Models, variants: Sequence[Variant], starts: np.ndarray, signals: np.ndarray,
-        pushes: np.ndarray | None, finer: int, every: int,
+        pushes: np.ndarray | None, finer: int, every: int, past: Past | None,
     ) -> np.ndarray:  # fmt: skip
         """Return states after each logged (or physics) step, ``(K, W, S / every, nq + nv)``.
 
@@ -288,6 +304,7 @@ class VariantEngine:
             pushes: further generalized forces, as for :meth:`paths`.
             finer: steps of the models that make one of the base's.
             every: steps of the base from one wanted state to the next.
+            past: see :meth:`paths`.
         """
         num_k, num_w, total = *signals.shape[:2], signals.shape[2] - self.lead
         rows, nq = num_k * num_w, self._base.nq
@@ -295,6 +312,7 @@ class VariantEngine:
         self._begin(batch, models, variants, starts, control[:, : self.lead])
         control, forces = control[:, self.lead :], forces_of(variants, num_w)
         drives = drives_of(forces, models, num_w)
+        self._replay(forces, drives, past)
         qpos, qvel, ctrl, applied = (batch.bind(name) for name in ("qpos", "qvel", "ctrl", "qfrc_applied"))
         held = 1 if forces or _varies(control, every) else every  # steps of the base between changes
         calls, steps = (finer, 1) if forces else (1, finer * held)
@@ -322,6 +340,20 @@ class VariantEngine:
         out[failed] = np.nan
         batch.set_models(None)
         return out.reshape(num_k, num_w, *out.shape[1:])
+
+    def _replay(self, forces: Sequence[Force], drives: Drives | None, past: Past | None) -> None:
+        """Let forces remember the past, each in its rows."""
+        if past is None or drives is None:
+            return
+        (num_k, num_w, count, _), nq, row = past.commands.shape, self._base.nq, self._setting.signals.timestep
+        states = np.broadcast_to(past.states, (num_k, *past.states.shape)).reshape(num_k * num_w, count + 1, -1)
+        commands = past.commands.reshape(num_k * num_w, count, -1)
+        for f in forces:
+            if f.effect.has("replay"):
+                own, given = states[f.rows], [Drive(drives, commands[:, i], row).at(f.rows) for i in range(count)]
+                f.memory.now = f.effect.replay(
+                    self._setting, f.target, f.values, own[..., :nq], own[..., nq:], given
+                )  # fmt: skip
 
     def _begin(
         self, batch: mujoco.batch.Batch, models: Models, variants: Sequence[Variant], starts: np.ndarray,

@@ -237,12 +237,14 @@ class JointLoadFriction(JointEffect):
     """Dry friction that grows with the load, as of a gear whose teeth press harder on each other.
 
     On top of the dry friction that the joint has otherwise, a share of the size of what its actuators give acts against
-    the motion. Near rest this part is no larger than what stops the joint within a few physics steps; what holds it
-    there is its other dry friction.
+    the motion, and holds the joint at rest: there it is what stops the joint in a physics step, beside all else that
+    acted in the step before.
     """
 
     name = "joint_load_friction"
     sentence = "dry friction in {target} that grows with the force that drives it"
+    #: Share of the joint's inertia in the model's first configuration that it surely has in others.
+    SURE = 0.5
 
     def targets(self, setting: Setting) -> list[str | None]:
         """Return every such joint that is driven, by actuators whose forces follow from command and state."""
@@ -258,15 +260,23 @@ class JointLoadFriction(JointEffect):
         """Return the forces under no load: none."""
         return np.zeros_like(velocity)
 
+    def recall(
+        self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
+    ) -> np.ndarray:
+        """Return the force, none, and the velocity of the step before, ``(R, 2)``."""
+        now = velocity[:, setting.dof(target)]
+        return np.stack([np.zeros_like(now), now], 1)
+
     def force_under(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
         memory: np.ndarray, drive: Drive,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
         dof, out = setting.dof(target), np.zeros_like(velocity)
         given, _, _ = drive.given(dof, position[:, setting.coordinate(target)], velocity[:, dof])
-        level = values[:, 0] * np.abs(given)
-        out[:, dof] = -np.sign(velocity[:, dof]) * np.minimum(level, stopping(setting.model, dof, velocity[:, dof]))
-        return out, memory
+        level, (last, before), now = values[:, 0] * np.abs(given), memory.T, velocity[:, dof]
+        inertia = self.SURE / setting.model.dof_invweight0[dof]
+        out[:, dof] = np.clip(last - inertia * (2 * now - before) / drive.step, -level, level)
+        return out, np.stack([out[:, dof], now], 1)
 
 
 class JointStiffness(JointEffect):

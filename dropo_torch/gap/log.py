@@ -44,9 +44,11 @@ def cut_windows(
     bounds, commands = episode_bounds(log), log.commands
     begin = np.zeros(len(bounds), dtype=int) if since is None else since
     observed, following = observation.observed(log.observations), observation.observed(log.next_observations)
-    found = []
+    found, paths = [], np.empty((len(bounds), commands.shape[1], observed.shape[1]))
     for e, (a, b) in enumerate(bounds):
         path = np.concatenate([observed[a : a + 1], following[a:b]])
+        paths[e, : b - a] = observed[a:b]
+        paths[e, b - a :] = following[b - 1]
         slope = np.gradient(path, axis=0)
         starts = range(int(begin[e]), b - a - length + 1, stride or length + 1)
         found += [(path[s : s + length + 1], slope[s], e, s) for s in starts]
@@ -57,7 +59,7 @@ def cut_windows(
         np.reshape(measured, (-1, length + 1, observation.size)),
         np.reshape(rates, (-1, observation.size)) / (log.dt or 1.0),
         np.array(episodes, dtype=int), np.array(steps, dtype=int), commands,
-        None if log.unseen is None else log.unseen[rows], gains=_gains(log, observation, rows, length),
+        None if log.unseen is None else log.unseen[rows], gains=_gains(log, observation, rows, length), observed=paths,
     )  # fmt: skip
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -10,7 +11,7 @@ import numpy as np
 import torch
 
 from dropo_torch.effects.base import Placed, Setting, applied, find_effect
-from dropo_torch.effects.engine import Variant, VariantEngine, parts, whole_ratio
+from dropo_torch.effects.engine import Past, Variant, VariantEngine, parts, whole_ratio
 from dropo_torch.effects.filters import (
     Filter,
     extended,
@@ -27,6 +28,8 @@ from dropo_torch.simulators.hidden import filters_known
 
 #: Bytes of filtered commands that are kept; of the last candidate, in any case.
 KEPT = 2**27
+#: Seconds, and rows at most, before a window from which what a force remembers is replayed.
+PAST, MOST_PAST = 0.3, 150
 #: Sets of initial states that are kept where loops have to be closed.
 CLOSED = 16
 
@@ -45,6 +48,8 @@ class Windows:
         starts: observed columns from which they are simulated, ``(W, n)``; by default :attr:`usual`.
         smooth: these columns by the rows around, ``(W, n)``, where single rows are too noisy to begin at.
         gains: noise of each column at each instant relative to that of a sample, ``(W, L + 1, n)``; 1 by default.
+        observed: observed columns of every episode at every logged step, the last ones repeated, ``(E, N, n)``, where
+            what was before a window is known.
     """
 
     measured: np.ndarray
@@ -56,6 +61,7 @@ class Windows:
     starts: np.ndarray | None = None
     smooth: np.ndarray | None = None
     gains: np.ndarray | None = None
+    observed: np.ndarray | None = None
 
     def __len__(self) -> int:
         """Return the number of windows."""
@@ -183,7 +189,8 @@ class Twin:
                 signals = np.stack([self._signals(v, given) for v in chosen])
                 forces = None if pushes is None else pushes[part]
                 own = [models[k] for k in part]
-                path = self._engine.paths(chosen, own, states, signals, fine=fine, pushes=forces)
+                past = self._past(chosen, given)
+                path = self._engine.paths(chosen, own, states, signals, fine=fine, pushes=forces, past=past)
                 truth = np.concatenate([states[:, :, None, index], path[..., index]], 2)
                 for k, columns in zip(part, truth, strict=True):
                     out[k, rows], valid[k, rows] = self._shown(variants[k], columns, length)
@@ -287,9 +294,31 @@ class Twin:
         there = SensedPath.of(past, 1, self.setting.frame_skip, step, tuple(self.rates))
         return true + shown - sensed(there, sensors)[:, 0]
 
+    def _past(self, variants: Sequence[Variant], windows: Windows) -> Past | None:
+        """Return what was before windows, where an effect remembers it and the log shows it."""
+        if windows.observed is None or not any(v.has("replay") for v in variants):
+            return None
+        if self.setting.observation.loops is not None:
+            return None
+        rows, skip = math.ceil(PAST / self.setting.signals.timestep), self.setting.frame_skip
+        rows = min(rows, MOST_PAST, int(windows.steps.max(initial=0)))
+        at = windows.steps[:, None] + np.arange(-rows, 1)
+        columns = windows.observed[windows.episodes[:, None], np.maximum(at, 0)]
+        states = self.setting.observation.full(columns.reshape(-1, columns.shape[-1])).reshape(*at.shape, -1)
+        states[at < 0] = np.nan
+        commands = [
+            self._acting(v, windows)[windows.episodes[:, None], np.maximum(at[:, :-1], 0) * skip] for v in variants
+        ]
+        return Past(states, np.stack(commands))
+
     def _signals(self, variant: Variant, windows: Windows) -> np.ndarray:
         """Return commands as they act in every physics step of every window ``(W, L·skip, nu)``."""
         skip, length = self.setting.frame_skip, windows.length
+        at = np.maximum(windows.steps[:, None] * skip + np.arange(-self._engine.lead, length * skip), 0)
+        return self._acting(variant, windows)[windows.episodes[:, None], at]
+
+    def _acting(self, variant: Variant, windows: Windows) -> np.ndarray:
+        """Return commands as they act in every physics step of every episode ``(E, N·skip, nu)``."""
         if self._commands is not windows.commands:
             self._commands, self._filtered = windows.commands, {}
         key = tuple((p.key, p.values) for p in variant.placed if p.effect.has("command"))
@@ -298,9 +327,8 @@ class Twin:
                 self._filtered.clear()
             filters = placed_filters(variant.placed, "command", self.setting)
             step = float(self.setting.model.opt.timestep)
-            self._filtered[key] = filtered(np.repeat(windows.commands, skip, axis=1), filters, step)
-        at = np.maximum(windows.steps[:, None] * skip + np.arange(-self._engine.lead, length * skip), 0)
-        return self._filtered[key][windows.episodes[:, None], at]
+            self._filtered[key] = filtered(np.repeat(windows.commands, self.setting.frame_skip, axis=1), filters, step)
+        return self._filtered[key]
 
 
 def secants(path: np.ndarray, steps: float) -> np.ndarray:
