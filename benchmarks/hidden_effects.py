@@ -36,7 +36,7 @@ KINDS = ("null", "single", "double", "outside")
 STRENGTH = {
     "joint_stiffness": ("stiffness",), "joint_cogging": ("amplitude",), "payload": ("mass",),
     "joint_stribeck": ("coulomb", "static"), "contact_stiffness": ("time_constant",),
-    "joint_elasticity": ("stiffness",),
+    "joint_elasticity": ("compliance",),
 }  # fmt: skip
 NEUTRAL = {"gain": 1.0, "factor": 1.0}
 #: Parameters that need not be told: structure, or angles that are equal modulo a turn.

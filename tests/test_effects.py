@@ -692,7 +692,11 @@ def test_only_a_first_number_is_absent_at_a_bound() -> None:
     ]
     # friction at rest, as at speed; what rolls with resistance and turns on the spot without
     drag = {("axis_drag", axis) for axis in "yz"}  # of a body that only moves ahead
-    assert {*shapes} <= drag | {("joint_stribeck", "static"), ("contact_rolling", "torsional")}
+    rotor = {
+        ("joint_elasticity", "damping"),
+        ("joint_elasticity", "inertia"),
+    }  # a spring without, or beside the model's
+    assert {*shapes} <= drag | rotor | {("joint_stribeck", "static"), ("contact_rolling", "torsional")}
 
 
 @pytest.mark.parametrize("backend", ["mujoco", "warp"])

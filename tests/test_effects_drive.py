@@ -76,11 +76,11 @@ def test_a_transmission_that_gives_is_a_rotor_behind_a_spring(actuator: str) -> 
     commands = np.repeat(rng.uniform(-size, size, 15), 8)
     start = (0.3, -0.4)
     true = true_path(actuator, commands, start)
-    effect = {"effect": "joint_elasticity", "target": "shoulder", "stiffness": STIFFNESS, "damping": DAMPING}
+    effect = {"effect": "joint_elasticity", "target": "shoulder", "compliance": 1 / STIFFNESS, "damping": DAMPING}
     state, effect = (*start, 0.0, 0.0), {**effect, "inertia": ROTOR}
     error, finer = (np.abs(simulated(rigid(actuator, 0.0, step), effect, commands, state) - true)[:, :2].max()
                     for step in (0.001, 0.00025))  # fmt: skip
-    stiff = simulated(rigid(actuator, ROTOR), {**effect, "stiffness": 3e4}, commands, state)
+    stiff = simulated(rigid(actuator, ROTOR), {**effect, "compliance": 1 / 3e4}, commands, state)
     assert error < 0.02 * np.ptp(true[:, :2])
     assert finer < 0.35 * error
     assert np.abs(stiff - true)[:, :2].max() > 5 * error
@@ -89,7 +89,13 @@ def test_a_transmission_that_gives_is_a_rotor_behind_a_spring(actuator: str) -> 
 def test_a_stiff_transmission_is_none() -> None:
     rng = np.random.default_rng(4)
     commands = np.repeat(rng.uniform(-0.3, 0.3, 10), 8)
-    effect = {"effect": "joint_elasticity", "target": "shoulder", "stiffness": 2e4, "damping": 3.0, "inertia": ROTOR}
+    effect = {
+        "effect": "joint_elasticity",
+        "target": "shoulder",
+        "compliance": 1 / 2e4,
+        "damping": 3.0,
+        "inertia": ROTOR,
+    }
     model = rigid(SERVO, ROTOR)
     path = simulated(model, effect, commands, (0.3, -0.4, 0.0, 0.0))
     data = mujoco.MjData(model)

@@ -551,7 +551,7 @@ def _elasticity(_t: float, _v: float, i: float, rng: np.random.Generator) -> Dra
 
     def draw(size: float) -> dict[str, float]:
         stiffness = 0.02 * i / (DT**2 * size)
-        return {"stiffness": stiffness, "damping": 2 * ratio * math.sqrt(stiffness * rotor), "inertia": rotor}
+        return {"compliance": 1 / stiffness, "damping": 2 * ratio * math.sqrt(stiffness * rotor), "inertia": rotor}
 
     return draw
 

@@ -325,7 +325,7 @@ JOINT_FORCES: dict[str, Callable[[Plant, str, Mapping[str, float]], Force]] = {
     "joint_friction": lambda p, j, x: _dry_friction(p, j, lambda _q, _v: x["friction"]),
     "joint_stribeck": lambda p, j, x: _dry_friction(p, j, _stribeck_level(x["coulomb"], x["static"], x["velocity"])),
     "joint_load_friction": lambda p, j, x: _load_friction(p, j, x["coefficient"]),
-    "joint_elasticity": lambda p, j, x: _elasticity(p, j, x["stiffness"], x["damping"], x["inertia"]),
+    "joint_elasticity": lambda p, j, x: _elasticity(p, j, 1 / x["compliance"], x["damping"], x["inertia"]),
     "joint_coupling": lambda p, j, x: _coupling(p, j, x["stiffness"]),
 }
 #: Those with sticking, which are evaluated last; and the one of them that no vocabulary knows.

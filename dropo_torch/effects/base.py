@@ -248,14 +248,14 @@ class Effect(abc.ABC):
 
     def replay(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
-        drives: Sequence[Drive],
+        drive: Drive,
     ) -> np.ndarray:  # fmt: skip
         """Return :meth:`recall` where the log shows the past: the states of P rows before, and the one that begins.
 
         Args:
             setting, target, values: see :meth:`recall`.
             position, velocity: the states, ``(R, P + 1, nq)`` and ``(R, P + 1, nv)``; NaN before an episode begins.
-            drives: the actuators under the commands that follow each of the P rows before; a step is a row.
+            drive: the actuators under the commands of the P rows before, of which each is a step.
         """
         return self.recall(setting, target, values, position[:, -1], velocity[:, -1])
 

@@ -65,12 +65,12 @@ class Drives:
 
 @dataclass(frozen=True)
 class Drive:
-    """The actuators of R simulations under the commands of a physics step.
+    """The actuators of R simulations under the commands of a step, or of several.
 
     Attributes:
         drives: their laws.
-        command: the commands, ``(R, nu)``.
-        step: seconds of the physics step.
+        command: the commands, ``(R, nu)``; or of P steps, ``(R, P, nu)``.
+        step: seconds of a step.
     """
 
     drives: Drives
@@ -87,20 +87,22 @@ class Drive:
 
         Args:
             dof: its number.
-            position, velocity: its own, or those of the rotor that drives it, ``(R,)``.
+            position, velocity: its own, or those of the rotor that drives it, ``(R,)``; or, under so many commands,
+                ``(R, P)``.
 
         Returns:
-            Generalized forces, and their derivatives by position and velocity with the other sign, ``(R,)`` each.
+            Generalized forces, and their derivatives by position and velocity with the other sign, like ``position``.
         """
         own = self.drives.dofs == dof
-        gear, gain, constant, stiff, damp, least, most, weakest, strongest, low, high = self.drives.numbers[:, :, own]
-        commands = np.clip(self.command[:, self.drives.commands[own]], least, most)
-        free = gain * commands + constant + gear * (stiff * position[:, None] + damp * velocity[:, None])
-        force = gear * np.clip(free, weakest, strongest)
-        total = force.sum(1)
-        within = (free > weakest) & (free < strongest) & ((total > low.max(1)) & (total < high.min(1)))[:, None]
-        slopes = (-(within * gear**2 * factor).sum(1) for factor in (stiff, damp))
-        return (np.clip(total, low.max(1), high.min(1)), *slopes)
+        numbers = self.drives.numbers[:, :, own]
+        numbers = numbers.reshape(*numbers.shape[:2], *(1,) * (position.ndim - 1), -1)
+        gear, gain, constant, stiff, damp, least, most, weakest, strongest, low, high = numbers
+        commands = np.clip(self.command[..., self.drives.commands[own]], least, most)
+        free = gain * commands + constant + gear * (stiff * position[..., None] + damp * velocity[..., None])
+        total, low, high = (gear * np.clip(free, weakest, strongest)).sum(-1), low.max(-1), high.min(-1)
+        within = (free > weakest) & (free < strongest) & ((total > low) & (total < high))[..., None]
+        slopes = (-(within * gear**2 * factor).sum(-1) for factor in (stiff, damp))
+        return (np.clip(total, low, high), *slopes)
 
 
 def _numbers(model: mujoco.MjModel, own: np.ndarray) -> np.ndarray:

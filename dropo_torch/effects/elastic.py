@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import replace
-
 import mujoco
 import numpy as np
 
@@ -19,8 +16,6 @@ LEAST_ROTOR = 0.01
 #: Frequencies from which a search begins, in radians of a logged step; the rotor's inertia there, relative to the
 #: joint's, and the spring's damping, relative to the critical one.
 FREQUENCIES, ROTOR, DAMPED = (0.05, 0.15, 0.4), 0.2, 0.1
-#: Steps of the rotor from one row of the log to the next.
-STEPS = 2
 
 
 class JointElasticity(JointEffect):
@@ -48,24 +43,30 @@ class JointElasticity(JointEffect):
         return float(max(setting.signals.inertia[dof] - setting.model.dof_armature[dof], 1e-12))
 
     def quantities(self, setting: Setting, target: str | None) -> tuple[Quantity, ...]:
-        dof, inertia = setting.dof(target), self.own_inertia(setting, target)
-        stiffest = STIFFEST**2 / (setting.model.dof_invweight0[dof] * setting.model.opt.timestep**2)
-        middle = inertia * (FREQUENCIES[1] / setting.signals.timestep) ** 2
-        most = max(float(stiffest), 2 * middle)
-        damping = 2 * np.sqrt(middle * inertia)
+        inertia = self.own_inertia(setting, target)
+        stiffness = inertia * (FREQUENCIES[1] / setting.signals.timestep) ** 2
+        damping = 2 * np.sqrt(stiffness * inertia)
         return (
-            Quantity("stiffness", unit(setting, target, "N·m/rad", "N/m"), most, 1e-3 * middle, most, middle),
+            Quantity("compliance", unit(setting, target, "rad/(N·m)", "m/N"), 0.0, 0.0, 1e3 / stiffness, 1 / stiffness),
             Quantity("damping", unit(setting, target, "N·m·s/rad", "N·s/m"), 0.0, 0.0, 10 * damping, damping),
             Quantity("inertia", unit(setting, target, "kg·m²", "kg"), 0.0, 0.0, 20 * inertia, inertia),
         )
 
     def starts(self, setting: Setting, target: str | None) -> list[np.ndarray]:
-        inertia, most = self.own_inertia(setting, target), self.quantities(setting, target)[0].high
+        inertia, stiffest = self.own_inertia(setting, target), self.stiffest(setting, target)
         rotor = float(setting.model.dof_armature[setting.dof(target)]) or ROTOR * inertia
         stiffnesses = [inertia * (f / setting.signals.timestep) ** 2 for f in FREQUENCIES]
-        return [np.array([k, 2 * DAMPED * np.sqrt(k * inertia), rotor]) for k in stiffnesses if k < 0.9 * most]
+        return [np.array([1 / k, 2 * DAMPED * np.sqrt(k * inertia), rotor]) for k in stiffnesses if k < 0.9 * stiffest]
+
+    @staticmethod
+    def stiffest(setting: Setting, target: str | None) -> float:
+        """Return the largest stiffness that a physics step can follow."""
+        invweight = setting.model.dof_invweight0[setting.dof(target)]
+        return float(STIFFEST**2 / (invweight * setting.model.opt.timestep**2))
 
     def apply(self, model: mujoco.MjModel, target: str | None, values: np.ndarray) -> None:
+        if values[0] == 0:
+            return
         joint = object_number(model, "jnt", target)
         dof = model.jnt_dofadr[joint]
         model.dof_armature[dof] = max(model.dof_armature[dof] - values[2], 0.0)
@@ -80,50 +81,58 @@ class JointElasticity(JointEffect):
     def recall(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray
     ) -> np.ndarray:
-        """Return what is not known yet, for it depends on the actuators: position and velocity of the rotor, NaN."""
-        return np.full((len(position), 2), np.nan)
+        """Return the rotor's position and velocity, and whether they are known, ``(R, 3)``: the drive decides."""
+        q, v = position[:, setting.coordinate(target)], velocity[:, setting.dof(target)]
+        return np.stack([q, v, np.zeros_like(q)], 1)
 
     def replay(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
-        drives: Sequence[Drive],
+        drive: Drive,
     ) -> np.ndarray:  # fmt: skip
-        """Return the rotor's position and velocity, which turned under the commands while the joint moved as logged."""
-        q, v = position[..., setting.coordinate(target)], velocity[..., setting.dof(target)]
-        rotor = np.full((len(q), 2), np.nan)
-        for row, drive in enumerate(drives):
-            for a in (np.arange(STEPS) + 0.5) / STEPS:  # the joint's motion between two rows is a line
-                q_now, v_now = ((1 - a) * x[:, row] + a * x[:, row + 1] for x in (q, v))
-                short = replace(drive, step=drive.step / STEPS)
-                rotor = self._turned(setting, target, values, q_now, v_now, rotor, short)[1]
-        return rotor
+        """Return :meth:`recall` of a rotor that turned under the commands while the joint moved as the log shows."""
+        dof, half = setting.dof(target), 0.5 * drive.step
+        q, v = position[..., setting.coordinate(target)], velocity[..., dof]
+        seen = np.isfinite(q[:, :-1])
+        q, v = np.where(np.isfinite(q), q, 0.0), np.where(np.isfinite(v), v, 0.0)
+        stiffness, damping, inertia = (x[:, None] for x in self._numbers(setting, target, values))
+        given, stiff, damp = drive.given(dof, q[:, :-1], v[:, :-1])
+        held = q[:, :-1] + given / (stiffness + stiff)
+        middle_q, middle_v = (0.5 * (x[:, :-1] + x[:, 1:]) for x in (q, v))
+        constant = given + stiff * q[:, :-1] + damp * v[:, :-1] + stiffness * middle_q + damping * middle_v
+        whole = inertia + half * (damp + damping) + half**2 * (stiff + stiffness)
+        terms = inertia / whole, half * (stiff + stiffness) / whole, half * constant / whole
+        keeps, pulls, drives = (np.ascontiguousarray(np.broadcast_to(x, q[:, :-1].shape).T) for x in terms)
+        angle, speed, known = q[:, 0].copy(), v[:, 0].copy(), np.zeros(len(q), dtype=bool)
+        for row in range(seen.shape[1]):  # the implicit midpoint rule, as in a simulation
+            begins = seen[:, row] & ~known
+            if begins.any():
+                angle[begins], speed[begins], known = held[begins, row], v[begins, row], known | begins
+            mean = keeps[row] * speed - pulls[row] * angle + drives[row]
+            angle, speed = angle + drive.step * mean, 2 * mean - speed
+        recalled = self.recall(setting, target, values, position[:, -1], velocity[:, -1])
+        return np.where(known[:, None], np.stack([angle, speed, np.ones_like(angle)], 1), recalled)
 
     def force_under(
         self, setting: Setting, target: str | None, values: np.ndarray, position: np.ndarray, velocity: np.ndarray,
         memory: np.ndarray, drive: Drive,
     ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        dof, out = setting.dof(target), np.zeros_like(velocity)
+        dof, out, half = setting.dof(target), np.zeros_like(velocity), 0.5 * drive.step
         q, v = position[:, setting.coordinate(target)], velocity[:, dof]
-        out[:, dof], rotor = self._turned(setting, target, values, q, v, memory, drive)
-        return out, rotor
-
-    def _turned(
-        self, setting: Setting, target: str | None, values: np.ndarray, q: np.ndarray, v: np.ndarray,
-        rotor: np.ndarray, drive: Drive,
-    ) -> tuple[np.ndarray, np.ndarray]:  # fmt: skip
-        """The spring's force on the joint in a step at whose middle that is at ``q`` with ``v``; the rotor after it.
-
-        By the implicit midpoint rule, which is stable however stiff spring and servo are.
-        """
-        dof, step = setting.dof(target), drive.step
-        stiffness, damping, inertia = values.T
-        inertia = np.maximum(inertia, LEAST_ROTOR * self.own_inertia(setting, target))
-        angle, speed = rotor.T
-        if (begins := np.isnan(angle)).any():
+        stiffness, damping, inertia = self._numbers(setting, target, values)
+        angle, speed, known = memory.T
+        if not known.all():
             given, stiff, _ = drive.given(dof, q, v)
-            angle, speed = np.where(begins, q + given / (stiffness + stiff), angle), np.where(begins, v, speed)
+            angle, speed = np.where(known, angle, q + given / (stiffness + stiff)), np.where(known, speed, v)
         given, stiff, damp = drive.given(dof, angle, speed)
-        half = 0.5 * step
         pull = given + damp * speed + stiffness * (q - angle) + damping * v
-        mean = (inertia * speed + half * pull) / (inertia + half * (damp + damping) + half**2 * (stiff + stiffness))
-        force = stiffness * (angle + half * mean - q) + damping * (mean - v)
-        return force, np.stack([angle + step * mean, 2 * mean - speed], 1)
+        whole = inertia + half * (damp + damping) + half**2 * (stiff + stiffness)
+        mean = (inertia * speed + half * pull) / whole  # the implicit midpoint rule: stable, however stiff
+        spring = stiffness * (angle + half * mean - q) + damping * (mean - v)
+        out[:, dof] = np.where(values[:, 0] > 0, spring, 0.0)
+        return out, np.stack([angle + drive.step * mean, 2 * mean - speed, np.ones_like(angle)], 1)
+
+    def _numbers(self, setting: Setting, target: str | None, values: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Stiffness, damping, and an inertia of the rotor that is not nothing, ``(R,)`` each."""
+        compliance, damping, inertia = values.T
+        stiffness = 1 / np.maximum(compliance, 1 / self.stiffest(setting, target))
+        return stiffness, damping, np.maximum(inertia, LEAST_ROTOR * self.own_inertia(setting, target))

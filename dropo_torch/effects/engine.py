@@ -348,12 +348,11 @@ class VariantEngine:
         (num_k, num_w, count, _), nq, row = past.commands.shape, self._base.nq, self._setting.signals.timestep
         states = np.broadcast_to(past.states, (num_k, *past.states.shape)).reshape(num_k * num_w, count + 1, -1)
         commands = past.commands.reshape(num_k * num_w, count, -1)
+        drive = Drive(drives, commands, row)
         for f in forces:
             if f.effect.has("replay"):
-                own, given = states[f.rows], [Drive(drives, commands[:, i], row).at(f.rows) for i in range(count)]
-                f.memory.now = f.effect.replay(
-                    self._setting, f.target, f.values, own[..., :nq], own[..., nq:], given
-                )  # fmt: skip
+                own = self._setting, f.target, f.values, states[f.rows, :, :nq], states[f.rows, :, nq:]
+                f.memory.now = f.effect.replay(*own, drive.at(f.rows))
 
     def _begin(
         self, batch: mujoco.batch.Batch, models: Models, variants: Sequence[Variant], starts: np.ndarray,

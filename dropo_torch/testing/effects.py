@@ -338,7 +338,7 @@ def _acts(case: EffectCase, target: str | None) -> dict[str, Callable[[], list[t
         given = [torch.as_tensor(a) for a in arguments if isinstance(a, np.ndarray | torch.Tensor)]
         before = [a.clone() for a in given]
         found = call(*arguments)
-        if not all(torch.equal(a, b) for a, b in zip(given, before, strict=True)):
+        if not all(np.array_equal(a, b, equal_nan=True) for a, b in zip(given, before, strict=True)):
             raise Broken(f"other arguments after {call.__name__} at {target}", "the arguments as they were given")
         return [torch.as_tensor(part).clone() for part in (found if isinstance(found, tuple) else (found,))]
 
