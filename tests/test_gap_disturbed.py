@@ -79,6 +79,13 @@ def test_pushes_are_dated_and_the_force_is_that_of_the_push(tmp_path: Path) -> N
     assert len(calm.train) + len(calm.held) == ROWS - 1 - sum(s.last - s.first for s in spans)
 
 
+def test_many_small_wrongs_do_not_hide_a_push(tmp_path: Path) -> None:
+    small = {(first, first + 20): (0.0, 0.5, 0.0) for first in range(100, 2000, 150) if not 550 < first < 690}
+    scene = scene_of(tmp_path, pushed={**PUSHED, **small})
+    spans = find_spans(scene, scene.begin, scene.noise)
+    assert [round(span.told.begin) for span in spans] == [6, 20]
+
+
 @pytest.mark.parametrize(
     "truth", [{}, {"friction": 0.4}, {"stop": 1.2}, {"cable": 3.0}], ids=["right", "friction", "stop", "cable"]
 )

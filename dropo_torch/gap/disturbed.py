@@ -96,20 +96,23 @@ def find_spans(scene: Scene, hypothesis: Hypothesis, noise: np.ndarray) -> tuple
     (chance, reduced), least = np.zeros((2, len(windows))), np.log(evidence.rules.chance.error / len(windows))
     chance[rows], reduced[rows] = odds(evidence, windows.select(rows), hypothesis.variant)
     far = chance < least
-    if not far.any() or far[rows].mean() > rules.share:
+    if not far.any():
         return ()
     if len(rows) < len(windows):  # between those that were looked at
         more = _between(far, rows)
         chance[more], reduced[more] = odds(evidence, windows.select(more), hypothesis.variant)
         far = chance < least
     runs = _runs(np.flatnonzero(far), windows)
-    if len(runs) > rules.spans:
+    lost = np.array([reduced[a:b].sum() for a, b in runs])
+    main = [run for run, own in zip(runs, lost, strict=True) if own > rules.minor * lost.max()]
+    if len(main) > rules.spans or sum(b - a for a, b in main) > rules.share * len(windows):
         return ()
     calm = windows.select(np.setdiff1d(rows, np.concatenate([np.arange(a - 1, b + 1) for a, b in runs])))
-    spans = [_span(scene, evidence, hypothesis, windows, run, calm) for run in runs]
-    lost = [float(reduced[a:b].sum()) for a, b in runs]
-    most = sum(x for x, span in zip(lost, spans, strict=True) if span is not None) > scene.rules.most * sum(lost)
-    return tuple(span for span in spans if span is not None) if most else ()
+    if not len(calm):
+        return ()
+    spans = {run: _span(scene, evidence, hypothesis, windows, run, calm) for run in main}
+    told = sum(own for run, own in zip(runs, lost, strict=True) if spans.get(run) is not None)
+    return tuple(s for s in spans.values() if s is not None) if told > scene.rules.most * lost.sum() else ()
 
 
 def _all_windows(scene: Scene, hypothesis: Hypothesis) -> Windows:

@@ -292,8 +292,9 @@ class Disturbed:
 
     Attributes:
         typical: χ² per degree of freedom of a typical stretch, at most; as if that were noise, others stand out.
-        share: share of the log that stands out, at most.
+        share: share of the log that spans take, at most.
         spans: spans, at most.
+        minor: share of what the worst span leaves up to which another one is none, for the model errs there otherwise.
         sure: standard errors of a joint's free force, by which it is one; and
         left: χ² per degree of freedom that free forces may leave.
         near: distance of a joint's position, velocity and commands from those of another time, in their standard
@@ -303,6 +304,7 @@ class Disturbed:
     typical: float = 3.0
     share: float = 0.1
     spans: int = 6
+    minor: float = 0.02
     sure: float = 5.0
     left: float = 2.0
     near: float = 0.5
